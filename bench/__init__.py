@@ -1,0 +1,1 @@
+"""Compare gradient estimators through physics simulation against a certified gradient."""

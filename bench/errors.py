@@ -1,0 +1,29 @@
+"""What a user can get wrong, and the statuses a cell can end in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from typing import Literal, get_args
+
+Status = Literal[
+    "ok", "nonfinite", "diverged", "timeout", "crashed", "unsupported", "unavailable", "error"
+]
+STATUSES: tuple[str, ...] = get_args(Status)
+
+
+class UserError(Exception):
+    """Bad input. Its message says what was given, what is allowed and the nearest valid name."""
+
+
+class Unsupported(Exception):
+    """A combination of plugins that cannot work, with the reason; becomes a row of that status."""
+
+
+def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:
+    """The error for a name that does not exist, with the nearest one that does."""
+    names = sorted(allowed)
+    text = str(given)
+    near = get_close_matches(text.lower(), [n.lower() for n in names], n=1, cutoff=0.4)
+    hint = f"; did you mean '{next(n for n in names if n.lower() == near[0])}'?" if near else ""
+    return UserError(f"unknown {what} '{text}'{hint} (allowed: {', '.join(names) or 'none'})")

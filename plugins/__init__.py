@@ -1,0 +1,1 @@
+"""The built-in plugins: one class per file, found by being there."""

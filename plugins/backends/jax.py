@@ -1,0 +1,121 @@
+"""JAX: reverse-mode (or forward-mode) differentiation through lax.scan, compiled by XLA."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, Backend, Ops, Problem, Program, Unsupported, param
+
+
+@dataclass(frozen=True)
+class Jax(Backend):
+    """Gradients: exact derivative of the program, reverse mode by default; float64 or float32; no implicit equations."""
+
+    name = "jax"
+    requires = ("jax",)
+    compiles = True
+    reference_rank: ClassVar[int | None] = 0
+
+    mode: str = param("reverse", "direction of differentiation", choices=("reverse", "forward"))
+
+    def compile(self, program: Program) -> Problem:
+        """The program as jitted functions; compilation happens at the first call with each batch shape."""
+        return JaxProblem(program, self.ops(), self.dtype, self.mode)
+
+    def ops(self) -> Ops:
+        """Array operations lent to the model code."""
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        return JaxOps()
+
+
+class JaxOps:
+    """jax.numpy, lax.scan, and no root."""
+
+    def __init__(self) -> None:
+        import jax.numpy
+
+        self.xp = jax.numpy
+
+    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
+        """lax.scan, keeping the carry."""
+        import jax
+
+        return jax.lax.scan(lambda c, x: (step(c, x), None), carry, xs, length)[0]
+
+    def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
+        """Refused: the implicit backend does this."""
+        raise Unsupported("no implicit solve on this backend; use backend implicit")
+
+
+_compiled: dict[tuple[Any, ...], tuple[Any, float]] = {}
+"""Compiled functions and their compile seconds, by program structure, function, mode, dtype and shapes."""
+
+
+class JaxProblem(Problem):
+    """A program compiled once per batch shape; float parameters are traced, so sweeping them compiles nothing."""
+
+    def __init__(self, program: Program, ops: Ops, dtype: str, mode: str) -> None:
+        super().__init__(program)
+        self._ops, self._dtype, self._mode = ops, np.dtype(dtype), mode
+        self._parameters = program.parameters().astype(self._dtype)
+
+    def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._call(self._cost, theta, w)
+
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._call(self._cost_gradient, theta, w)
+
+    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._call(self._score_function, theta, w)
+
+    def _call(self, function: Callable[..., Array], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        import jax
+
+        args = (self._parameters, theta.astype(self._dtype), w.astype(self._dtype))
+        key = (
+            type(self._ops), self.program.structure, function.__name__, self._mode, self._dtype,
+            theta.shape, w.shape,
+        )  # fmt: skip
+        if key not in _compiled:
+            start = time.perf_counter()
+            compiled = jax.jit(function).lower(*args).compile()
+            _compiled[key] = (compiled, time.perf_counter() - start)
+        compiled, seconds = _compiled[key]
+        if key not in self._charged:
+            self._charged.add(key)
+            self.usage.compile_s += seconds
+        return np.asarray(compiled(*args), dtype=np.float64)
+
+    def _cost(self, parameters: Array, theta: Array, w: Array) -> Array:
+        return self.program.bind(parameters).cost(self._ops, theta, w)
+
+    def _cost_gradient(self, parameters: Array, theta: Array, w: Array) -> Array:
+        def cost(full: Array) -> Array:
+            return self._cost(parameters, full, w)
+
+        return self._derivative(cost, theta, w.shape[1])
+
+    def _score_function(self, parameters: Array, theta: Array, w: Array) -> Array:
+        def log_probability(scored: Array) -> Array:
+            return self.program.bind(parameters).log_probability(self._ops, theta, scored, w)
+
+        return self._derivative(log_probability, theta, w.shape[1])
+
+    def _derivative(self, function: Callable[[Array], Array], theta: Array, batch: int) -> Array:
+        """Derivative of column b of ``function`` by column b of theta, ``(d, B)``."""
+        import jax
+        import jax.numpy as jnp
+
+        full = jnp.broadcast_to(theta, (self.dim, batch))
+        if self._mode == "reverse":
+            result, back = jax.vjp(function, full)
+            return back(jnp.ones_like(result))[0]
+        basis = jnp.eye(self.dim, dtype=full.dtype)
+        return jax.vmap(lambda e: jax.jvp(function, (full,), (jnp.broadcast_to(e[:, None], full.shape),))[1])(basis)

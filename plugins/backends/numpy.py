@@ -1,0 +1,94 @@
+"""NumPy: costs natively, derivatives by batched central differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, Backend, Problem, Program, Unsupported, param
+
+
+@dataclass(frozen=True)
+class Numpy(Backend):
+    """Gradients: central differences, 2 d rollouts each, error of order step^2; float64 or float32; no implicit equations."""
+
+    name = "numpy"
+    reference_rank: ClassVar[int | None] = 3
+
+    step: float = param(1e-6, "step of the central differences, in units of theta", positive=True)
+
+    def compile(self, program: Program) -> Problem:
+        """Nothing to compile."""
+        return NumpyProblem(program, self.dtype, self.step)
+
+
+class NumpyOps:
+    """NumPy, a Python loop, and no root."""
+
+    def __init__(self) -> None:
+        import array_api_compat.numpy
+
+        self.xp = array_api_compat.numpy
+
+    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
+        """A loop over the leading axis."""
+        for t in range(length):
+            carry = step(carry, tuple(x[t] for x in xs))
+        return carry
+
+    def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
+        """Refused: the implicit backend does this."""
+        raise Unsupported("no implicit solve on this backend; use backend implicit")
+
+
+class NumpyProblem(Problem):
+    """A program run by NumPy."""
+
+    block = 1 << 13
+
+    def __init__(self, program: Program, dtype: str, step: float) -> None:
+        super().__init__(program)
+        self._ops, self._dtype, self._step = NumpyOps(), np.dtype(dtype), step
+        self._bound = program.bind([self._dtype.type(p) for p in program.parameters()])
+
+    def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            cost = self._bound.cost(self._ops, theta.astype(self._dtype), w.astype(self._dtype))
+        return np.asarray(cost, dtype=np.float64)
+
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        self.usage.rollouts += 2 * self.dim * w.shape[1]
+        return self._differences(lambda moved, w: self._value(moved, w), theta, w)
+
+    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        self.usage.rollouts += 2 * self.dim * w.shape[1]
+
+        def log_probability(moved: np.ndarray, w: np.ndarray) -> np.ndarray:
+            fixed = np.broadcast_to(theta, (self.dim, theta.shape[1]))
+            fixed = np.tile(fixed, (1, moved.shape[1] // fixed.shape[1])) if fixed.shape[1] > 1 else fixed
+            with np.errstate(all="ignore"):
+                return np.asarray(self._bound.log_probability(self._ops, fixed, moved, w), dtype=np.float64)
+
+        return self._differences(log_probability, theta, w)
+
+    def _differences(
+        self, function: Callable[[np.ndarray, np.ndarray], np.ndarray], theta: np.ndarray, w: np.ndarray
+    ) -> np.ndarray:
+        """(function(theta + h e_i) - function(theta - h e_i)) / 2h for all i, several i to a batch."""
+        dim, batch = self.dim, w.shape[1]
+        theta = np.broadcast_to(theta, (dim, batch))
+        rows = np.empty((dim, batch))
+        group = max(1, self.block // (2 * batch))
+        for start in range(0, dim, group):
+            chosen = range(start, min(start + group, dim))
+            moved = np.tile(theta[:, None, :], (1, 2 * len(chosen), 1))
+            for j, i in enumerate(chosen):
+                moved[i, 2 * j] += self._step
+                moved[i, 2 * j + 1] -= self._step
+            f = function(moved.reshape(dim, -1), np.tile(w, (1, 2 * len(chosen))))
+            f = f.reshape(len(chosen), 2, batch)
+            rows[start : start + len(chosen)] = (f[:, 0] - f[:, 1]) / (2 * self._step)
+        return rows

@@ -1,0 +1,81 @@
+"""PyTorch: autograd through the same rollout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, Backend, Problem, Program, Unsupported
+
+
+@dataclass(frozen=True)
+class Torch(Backend):
+    """Gradients: reverse-mode autograd of the program on the CPU; float64 or float32; no implicit equations."""
+
+    name = "torch"
+    requires = ("torch",)
+    reference_rank: ClassVar[int | None] = 2
+
+    def compile(self, program: Program) -> Problem:
+        """The program run eagerly; nothing is compiled."""
+        return TorchProblem(program, self.dtype)
+
+
+class TorchOps:
+    """torch through array-api-compat, a Python loop, and no root."""
+
+    def __init__(self) -> None:
+        import array_api_compat.torch
+
+        self.xp = array_api_compat.torch
+
+    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
+        """A loop over the leading axis."""
+        slices = [x.unbind(0) for x in xs]
+        for t in range(length):
+            carry = step(carry, tuple(x[t] for x in slices))
+        return carry
+
+    def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
+        """Refused: the implicit backend does this."""
+        raise Unsupported("no implicit solve on this backend; use backend implicit")
+
+
+class TorchProblem(Problem):
+    """A program run by torch."""
+
+    block = 1 << 12
+
+    def __init__(self, program: Program, dtype: str) -> None:
+        import torch
+
+        super().__init__(program)
+        self._torch, self._ops = torch, TorchOps()
+        self._dtype = getattr(torch, dtype)
+
+    def _tensor(self, array: np.ndarray) -> Array:
+        return self._torch.as_tensor(np.ascontiguousarray(array)).to(self._dtype)
+
+    def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        with self._torch.no_grad():
+            cost = self.program.cost(self._ops, self._tensor(theta), self._tensor(w))
+        return cost.to(self._torch.float64).numpy()
+
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._derivative(lambda full, w: self.program.cost(self._ops, full, w), theta, w)
+
+    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        fixed = self._tensor(theta)
+        return self._derivative(lambda full, w: self.program.log_probability(self._ops, fixed, full, w), theta, w)
+
+    def _derivative(self, function: Callable[[Array, Array], Array], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Derivative of column b of ``function`` by column b of theta, ``(d, B)``; zero where they are not connected."""
+        full = self._tensor(np.broadcast_to(theta, (self.dim, w.shape[1]))).requires_grad_()
+        result = function(full, self._tensor(w))
+        if not result.requires_grad:
+            return np.zeros((self.dim, w.shape[1]))
+        (gradient,) = self._torch.autograd.grad(result.sum(), full, allow_unused=True, materialize_grads=True)
+        return gradient.to(self._torch.float64).numpy()

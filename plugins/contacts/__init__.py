@@ -1,0 +1,1 @@
+"""How touching bodies push on each other."""

@@ -1,0 +1,54 @@
+"""Implicit contact on the central path of the complementarity condition."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from bench.contracts import Array, Contact, ImpulseLaw, Ops, State, param
+from plugins.contacts.impulse import response
+
+
+@dataclass(frozen=True)
+class Complementarity(ImpulseLaw):
+    """0 <= lambda, y >= 0, lambda y = kappa at the end of the step, with y = gap + lambda / stiffness.
+
+    kappa -> 0 is hard contact, and infinite stiffness rigid: inelastic impacts, whatever the scene's restitution.
+    A finite stiffness is the penalty spring of that stiffness taken at the end of the step instead of its start.
+    Solved through the Fischer-Burmeister function p + y - sqrt(p^2 + y^2 + 2 c kappa), whose root lies on the
+    central path, with p = c lambda the gap that the force opens in a step (c = dt^2 J M^-1 J^T).
+    """
+
+    name = "complementarity"
+    smoothing: ClassVar[str] = "kappa"
+    needs_root: ClassVar[bool] = True
+
+    kappa: float = param(1e-4, "central-path parameter, force times gap", "N m", positive=True)
+    stiffness: float = param(float("inf"), "force per remaining penetration; inf: rigid", "N/m", positive=True)
+
+    def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: float) -> State:
+        """Velocity change over the step; positions follow from it."""
+        xp = ops.xp
+        opened = dt * dt * response(xp, contact, before.q)
+
+        def effect(p: Array, args: Any) -> Array:
+            q, dt, opened = args
+            return dt * contact.acceleration(q, p / opened)
+
+        def residual(p: Array, args: Any) -> Array:
+            (q, dt, opened), q_free, kappa, compliance = args
+            y = contact.gap(q_free + dt * effect(p, args[0])) + compliance * p / opened
+            return p + y - xp.sqrt(p * p + y * y + 2.0 * opened * kappa)
+
+        system = (before.q, dt, opened)
+        compliance = 1.0 / self.stiffness
+        guess = opened * _central_path_force(xp, contact.gap(free.q), opened + compliance, self.kappa)
+        p = ops.root(residual, guess, (system, free.q, self.kappa, compliance))
+        dv = effect(p, system)
+        return State(0.0 * dv, dv)
+
+
+def _central_path_force(xp: Any, a: Array, c: Array, kappa: Any) -> Array:
+    """lambda >= 0 with (a + c lambda) lambda = kappa: exact for one contact whose gap is linear in position."""
+    root = xp.sqrt(a * a + 4.0 * c * kappa)
+    apart = 2.0 * kappa / (xp.abs(a) + root)
+    pressed = (xp.abs(a) + root) / (2.0 * c)
+    return xp.where(a > 0, apart, pressed)

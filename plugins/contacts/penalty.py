@@ -1,0 +1,32 @@
+"""A spring and damper while bodies overlap."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from bench.contracts import Array, ForceLaw, param
+
+
+@dataclass(frozen=True)
+class Penalty(ForceLaw):
+    """lambda = k d + c d' while the penetration d = max(0, -gap) is positive.
+
+    ``damping_mode`` says where the damper acts, since sources differ and gradients with them:
+    ``clipped`` max(0, k d + c d'), never adhesive; ``approach`` k d + c max(0, d'); ``linear`` k d + c d', which
+    pulls at the end of a separation.
+    """
+
+    name = "penalty"
+
+    stiffness: float = param(1e3, "k, force per penetration", "N/m", positive=True)
+    damping: float = param(0.0, "c, force per penetration rate", "N s/m", low=0.0)
+    damping_mode: str = param("clipped", "where the damper acts", choices=("clipped", "approach", "linear"))
+
+    def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
+        """Normal force, zero without penetration."""
+        damper = -self.damping * gap_rate
+        if self.damping_mode == "approach":
+            damper = xp.where(damper > 0, damper, 0.0 * damper)
+        force = damper - self.stiffness * gap
+        if self.damping_mode == "clipped":
+            force = xp.where(force > 0, force, 0.0 * force)
+        return xp.where(gap < 0, force, 0.0 * force)

@@ -1,0 +1,42 @@
+"""A penalty spring with its clip smoothed."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from bench.contracts import Array, ForceLaw, param
+
+
+@dataclass(frozen=True)
+class Softplus(ForceLaw):
+    """The penalty law with max(0, z) replaced by softplus_beta(z) = log(1 + exp(beta z)) / beta.
+
+    ``smooths="clip"``: only the outer clip, force = softplus_beta(k d + c d') with d = max(0, -gap), so that it still
+    has a kink at touch and pushes with log(2)/beta from afar; beta then is per newton.
+    ``smooths="gap"``: the gap as well, force = softplus of (k softplus_beta(-gap) + c d' weighted by the smoothed
+    contact indicator); without damping this is k softplus_beta(-gap), and beta is per metre.
+    As beta grows both tend to ``penalty[damping_mode=clipped]``.
+    """
+
+    name = "softplus"
+    smoothing: ClassVar[str] = "beta"
+
+    stiffness: float = param(1e3, "k, force per penetration", "N/m", positive=True)
+    damping: float = param(0.0, "c, force per penetration rate", "N s/m", low=0.0)
+    beta: float = param(1e2, "sharpness of the softplus", "1/m for smooths=gap, 1/N for smooths=clip", positive=True)
+    smooths: str = param("gap", "what is smoothed", choices=("gap", "clip"))
+
+    def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
+        """Normal force, positive everywhere."""
+        if self.smooths == "clip":
+            penetration = xp.where(gap < 0, -gap, 0.0 * gap)
+            damper = xp.where(gap < 0, -self.damping * gap_rate, 0.0 * gap)
+            return _softplus(xp, self.stiffness * penetration + damper, self.beta)
+        penetration = _softplus(xp, -gap, self.beta)
+        touching = 1.0 / (1.0 + xp.exp(xp.clip(self.beta * gap, -700.0, 700.0)))
+        force = self.stiffness * penetration - self.damping * touching * gap_rate
+        return xp.where(force > 0, force, 0.0 * force)
+
+
+def _softplus(xp: Any, z: Array, beta: Any) -> Array:
+    positive = xp.where(z > 0, z, 0.0 * z)
+    return positive + xp.log1p(xp.exp(-beta * xp.abs(z))) / beta

@@ -1,0 +1,21 @@
+"""Explicit (forward) Euler."""
+
+from dataclasses import dataclass
+
+from bench.contracts import Array, Dynamics, Integrator, State
+
+
+@dataclass(frozen=True)
+class ExplicitEuler(Integrator):
+    """q+ = q + dt v, v+ = v + dt a(q, v, u).
+
+    On an undamped oscillator it gains energy at every dt.
+    """
+
+    name = "explicit_euler"
+    order = 1
+
+    def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
+        """One step, everything taken at its start."""
+        v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)
+        return State(state.q + dt * state.v, v)

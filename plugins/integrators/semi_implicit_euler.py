@@ -1,0 +1,22 @@
+"""Semi-implicit (symplectic) Euler."""
+
+from dataclasses import dataclass
+
+from bench.contracts import Array, Dynamics, Integrator, State
+
+
+@dataclass(frozen=True)
+class SemiImplicitEuler(Integrator):
+    """v+ = v + dt a(q, v, u), then q+ = q + dt v+.
+
+    Stable on x'' = -w^2 x with velocity factor d while (w dt)^2 < 2 (1 + d).
+    """
+
+    name = "semi_implicit_euler"
+    order = 1
+    takes_impulses = True
+
+    def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
+        """One step; impulses act on the new velocity."""
+        v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)
+        return dynamics.with_impulse(state, State(state.q + dt * v, v), dt)

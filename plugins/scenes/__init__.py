@@ -1,0 +1,1 @@
+"""Minimal physical problems and plain functions: what is differentiated."""
