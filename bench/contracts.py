@@ -102,8 +102,9 @@ class Plugin:
 class Ops(Protocol):
     """What a backend lends to the model code."""
 
-    xp: Any
-    """Array namespace following the Python array API standard (numpy, torch via array-api-compat, jax.numpy)."""
+    @property
+    def xp(self) -> Any:
+        """Array namespace following the Python array API standard (numpy, torch via array-api-compat, jax.numpy)."""
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
         """Fold ``carry = step(carry, x)`` over the leading axis of each leaf of the tuple ``xs``; return the last carry."""
@@ -254,6 +255,15 @@ class Contact(NamedTuple):
     gap_rate: Callable[[Array, Array], Array]
     acceleration: Callable[[Array, Array], Array]
     restitution: Any
+
+    def response(self, xp: Any, q: Array) -> Array:
+        """Gap acceleration of each contact per unit of its own force, diag(J M^-1 J^T), ``(n_contacts, B)`` [1/kg]."""
+        gap = self.gap(q)
+        rows = []
+        for i in range(gap.shape[0]):
+            unit = xp.stack([0.0 * gap[j] + float(i == j) for j in range(gap.shape[0])])
+            rows.append(self.gap_rate(q, self.acceleration(q, unit))[i])
+        return xp.stack(rows)
 
 
 @dataclass(frozen=True)

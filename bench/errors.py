@@ -6,9 +6,7 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Literal, get_args
 
-Status = Literal[
-    "ok", "nonfinite", "diverged", "timeout", "crashed", "unsupported", "unavailable", "error"
-]
+Status = Literal["ok", "nonfinite", "diverged", "timeout", "crashed", "unsupported", "unavailable", "error"]
 STATUSES: tuple[str, ...] = get_args(Status)
 
 

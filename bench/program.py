@@ -113,8 +113,8 @@ class Program:
     @property
     def action_feedback(self) -> bool:
         """Whether the policy has feedback under action noise, so that the score is not simply w / sigma."""
-        has_feedback = type(self.scene).feedback is not MechanicalScene.feedback if self._mechanical else False
-        return self.action_noise and has_feedback
+        scene = type(self.scene)
+        return self.action_noise and issubclass(scene, MechanicalScene) and scene.feedback is not MechanicalScene.feedback
 
     @property
     def n_noise(self) -> int:
@@ -124,19 +124,13 @@ class Program:
             return self.scene.horizon * self.scene.n_u
         return self.dim
 
-    @property
-    def _mechanical(self) -> bool:
-        return isinstance(self.scene, MechanicalScene)
-
     @cached_property
     def structure(self) -> tuple[Any, ...]:
         """All that decides the shape of the computation: equal structures differ in :meth:`parameters` alone."""
         parts = []
         for axis, plugin in self.parts.items():
             traced = set(_traced_fields(plugin))
-            static = [
-                (f.name, getattr(plugin, f.name)) for f in dataclasses.fields(plugin) if f.name not in traced
-            ]
+            static = [(f.name, getattr(plugin, f.name)) for f in dataclasses.fields(plugin) if f.name not in traced]
             parts.append((axis, type(plugin), tuple(static)))
         return tuple(parts)
 

@@ -19,7 +19,7 @@ class Implicit(Jax):
     """
 
     name = "implicit"
-    requires = ("jax", "optimistix", "lineax")
+    requires: ClassVar[tuple[str, ...]] = ("jax", "optimistix", "lineax")
     provides = Backend.provides | {"root"}
     reference_rank: ClassVar[int | None] = 1
 
@@ -51,7 +51,7 @@ class ImplicitOps(JaxOps):
         def solve(function: Callable[..., Array], start: Array, args: Any, diagonal: bool) -> Array:
             linear = lineax.Diagonal() if diagonal else lineax.LU()
             tags = frozenset({lineax.diagonal_tag}) if diagonal else frozenset()
-            solution = optimistix.root_find(
+            solution: Any = optimistix.root_find(
                 function, optimistix.Newton(rtol=tolerance, atol=tolerance, linear_solver=linear), start, args,
                 max_steps=64, throw=False, tags=tags,
             )  # fmt: skip

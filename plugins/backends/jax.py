@@ -17,7 +17,7 @@ class Jax(Backend):
     """Gradients: exact derivative of the program, reverse mode by default; float64 or float32; no implicit equations."""
 
     name = "jax"
-    requires = ("jax",)
+    requires: ClassVar[tuple[str, ...]] = ("jax",)
     compiles = True
     reference_rank: ClassVar[int | None] = 0
 
@@ -79,10 +79,8 @@ class JaxProblem(Problem):
         import jax
 
         args = (self._parameters, theta.astype(self._dtype), w.astype(self._dtype))
-        key = (
-            type(self._ops), self.program.structure, function.__name__, self._mode, self._dtype,
-            theta.shape, w.shape,
-        )  # fmt: skip
+        solver = type(self._ops) if self.program.needs_root else None
+        key = (solver, self.program.structure, function.__name__, self._mode, self._dtype, theta.shape, w.shape)
         if key not in _compiled:
             start = time.perf_counter()
             compiled = jax.jit(function).lower(*args).compile()

@@ -57,7 +57,7 @@ class TorchProblem(Problem):
         self._dtype = getattr(torch, dtype)
 
     def _tensor(self, array: np.ndarray) -> Array:
-        return self._torch.as_tensor(np.ascontiguousarray(array)).to(self._dtype)
+        return self._torch.tensor(np.ascontiguousarray(array), dtype=self._dtype)
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         with self._torch.no_grad():

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from bench.contracts import Array, Contact, ImpulseLaw, Ops, State, param
-from plugins.contacts.impulse import response
 
 
 @dataclass(frozen=True)
@@ -27,15 +26,16 @@ class Complementarity(ImpulseLaw):
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: float) -> State:
         """Velocity change over the step; positions follow from it."""
         xp = ops.xp
-        opened = dt * dt * response(xp, contact, before.q)
+        opened = dt * dt * contact.response(xp, before.q)
 
-        def effect(p: Array, args: Any) -> Array:
-            q, dt, opened = args
+        def effect(p: Array, system: Any) -> Array:
+            q, dt, opened = system
             return dt * contact.acceleration(q, p / opened)
 
         def residual(p: Array, args: Any) -> Array:
-            (q, dt, opened), q_free, kappa, compliance = args
-            y = contact.gap(q_free + dt * effect(p, args[0])) + compliance * p / opened
+            system, q_free, kappa, compliance = args
+            _, dt, opened = system
+            y = contact.gap(q_free + dt * effect(p, system)) + compliance * p / opened
             return p + y - xp.sqrt(p * p + y * y + 2.0 * opened * kappa)
 
         system = (before.q, dt, opened)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bench.contracts import Array, Contact, ImpulseLaw, Ops, State, param
+from bench.contracts import Contact, ImpulseLaw, Ops, State, param
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Impulse(ImpulseLaw):
         overlap = -contact.gap(before.q + dt * before.v)
         hit = (overlap > 0) & (rate < 0)
         approach = xp.where(hit, -rate, 0.0 * rate + 1.0)
-        strength = (1.0 + contact.restitution) * approach / response(xp, contact, before.q)
+        strength = (1.0 + contact.restitution) * approach / contact.response(xp, before.q)
         strength = xp.where(hit, strength, 0.0 * strength)
         dv = contact.acceleration(before.q, strength)
         if not self.time_of_impact:
@@ -36,13 +36,3 @@ class Impulse(ImpulseLaw):
         early = overlap / approach - dt
         early = xp.where(early < 0, early, 0.0 * early)
         return State(contact.acceleration(before.q, strength * early), dv)
-
-
-def response(xp: object, contact: Contact, q: Array) -> Array:
-    """Gap acceleration of each contact per unit of its own force, diag(J M^-1 J^T), ``(n_contacts, B)`` [1/kg]."""
-    gap = contact.gap(q)
-    rows = []
-    for i in range(gap.shape[0]):
-        unit = xp.stack([0.0 * gap[j] + (1.0 if i == j else 0.0) for j in range(gap.shape[0])])  # type: ignore[attr-defined]
-        rows.append(contact.gap_rate(q, contact.acceleration(q, unit))[i])
-    return xp.stack(rows)  # type: ignore[attr-defined,no-any-return]

@@ -18,7 +18,9 @@ class Pushing(MechanicalScene):
     """
 
     name = "pushing"
-    leaves_out: ClassVar[str] = "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
+    leaves_out: ClassVar[str] = (
+        "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
+    )
     noise = "action"
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 1
@@ -69,6 +71,4 @@ class Pushing(MechanicalScene):
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         """Weights (0.1, 10, 0.1, 0.1) on the squared distance to x = (1, 2), v = (speed, 0)."""
-        return (
-            0.1 * (q[0] - 1.0) ** 2 + 10.0 * (q[1] - 2.0) ** 2 + 0.1 * (v[0] - self.speed) ** 2 + 0.1 * v[1] ** 2
-        )
+        return 0.1 * (q[0] - 1.0) ** 2 + 10.0 * (q[1] - 2.0) ** 2 + 0.1 * (v[0] - self.speed) ** 2 + 0.1 * v[1] ** 2

@@ -1,0 +1,134 @@
+"""Hydra configuration to a checked :class:`~bench.grid.Experiment`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bench import registry
+from bench.errors import UserError, unknown
+from bench.grid import AXES, Choice, Experiment
+
+SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+LISTS = tuple(AXES.values())
+
+
+def config_dir() -> Path:
+    """Where ``config.yaml`` and the experiments lie: beside the package in a checkout, inside it when installed."""
+    package = Path(__file__).resolve().parent
+    inside = package / "conf"
+    return inside if inside.is_dir() else package.parent / "conf"
+
+
+def experiments() -> list[str]:
+    """Names of the experiments that come with the package."""
+    return sorted(path.stem for path in (config_dir() / "experiment").glob("*.yaml"))
+
+
+def load(overrides: Sequence[str]) -> Experiment:
+    """The experiment that Hydra composes from overrides; raises :class:`UserError` for anything wrong in them."""
+    from hydra import compose, initialize_config_dir
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        with initialize_config_dir(str(config_dir()), version_base="1.3"):
+            config = compose("config", overrides=[_prepared(o) for o in overrides])
+        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(str(error).strip().splitlines()[0]) from None
+    assert isinstance(plain, dict)
+    return experiment({str(k): v for k, v in plain.items()})
+
+
+def _known_keys() -> set[str]:
+    import yaml
+
+    return set(yaml.safe_load((config_dir() / "config.yaml").read_text())) - {"defaults"}
+
+
+def _prepared(override: str) -> str:
+    """The override as Hydra wants it, with experiments and plugin parameters reachable without ``+``."""
+    if "=" not in override:
+        raise UserError(f"'{override}' is not an override: write key=value (commands come first: see --help)")
+    key, _, value = override.partition("=")
+    bare = key.lstrip("+~")
+    head = bare.partition(".")[0]
+    if head == "experiment":
+        if value not in experiments():
+            raise unknown("experiment", value, experiments())
+        return f"+experiment={value}"
+    if head == "hydra" or key.startswith("~"):
+        raise UserError(f"'{override}': Hydra's own settings cannot be changed here")
+    if head not in _known_keys():
+        raise unknown("setting", bare, {*_known_keys(), "experiment"})
+    if head in AXES or head == "sweep":
+        return f"++{bare}={value}"
+    if bare != head and head != "reference":
+        raise UserError(f"'{bare}' is not a setting: '{head}' has no parts")
+    return f"{bare}={value}"
+
+
+def experiment(config: Mapping[str, Any]) -> Experiment:
+    """A resolved configuration checked against the registry."""
+    extra = set(config) - _known_keys()
+    if extra:
+        raise unknown("setting", sorted(extra)[0], _known_keys())
+    name = str(config["name"])
+    if not SAFE_NAME.fullmatch(name) or ".." in name:
+        raise UserError(f"name={name!r} must be letters, digits, '.', '_' and '-', since it names a folder")
+    choices = {kind: [_choice(kind, item) for item in _listed(config, kind)] for kind in LISTS}
+    for group, kind in AXES.items():
+        for plugin, values in _table(config, group).items():
+            entry = registry.find(kind, plugin)
+            if not isinstance(values, Mapping):
+                raise UserError(f"{group}.{plugin}={values!r} must name a parameter: {group}.{plugin}.parameter=value")
+            if entry.plugin is not None:
+                registry.build(entry.plugin, values)
+    counts = {key: registry.coerce(int, config[key], key) for key in ("samples", "repeats", "seed")}
+    settings = _table(config, "reference")
+    for key in settings:
+        if key not in ("samples", "tolerance"):
+            raise unknown("setting of reference", key, ("samples", "tolerance"))
+    budget = registry.coerce(int, settings["samples"], "reference.samples")
+    tolerance = registry.coerce(float, settings["tolerance"], "reference.tolerance")
+    if budget < 4096 or not tolerance > 0:
+        raise UserError("reference.samples must be at least 4096 and reference.tolerance greater than 0")
+    return Experiment(
+        name=name,
+        choices=choices,
+        values={group: _table(config, group) for group in AXES},
+        sweep=_table(config, "sweep"),
+        results_dir=Path(str(config["results_dir"])).expanduser(),
+        question=str(config["question"] or ""),
+        marks=_table(config, "marks"),
+        reference_samples=budget,
+        reference_tolerance=tolerance,
+        **counts,
+    )
+
+
+def _table(config: Mapping[str, Any], key: str) -> dict[str, Any]:
+    value = config[key] if config[key] is not None else {}
+    if not isinstance(value, Mapping):
+        raise UserError(f"{key}={value!r} must be a table of settings: {key}.name=value")
+    return {str(k): v for k, v in value.items()}
+
+
+def _listed(config: Mapping[str, Any], kind: str) -> list[Any]:
+    value = config[kind]
+    listed = value if isinstance(value, list) else [value]
+    if not listed or value is None:
+        raise UserError(f"{kind} is empty: give at least one of {', '.join(sorted(registry.entries()[kind]))}")
+    return listed
+
+
+def _choice(kind: str, text: Any) -> Choice:
+    name, values = registry.parse_identity(text)
+    entry = registry.find(kind, name)
+    if entry.plugin is not None:
+        registry.build(entry.plugin, values)
+    return Choice(entry, tuple(sorted(values.items())))

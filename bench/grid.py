@@ -1,0 +1,317 @@
+"""From an experiment's axes to cells, and what makes two cells the same."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from bench import registry
+from bench.contracts import Backend, ContactLaw, Estimator, Integrator, MechanicalScene, Plugin, Scene, Unsupported
+from bench.errors import UserError, unknown
+from bench.program import Program
+
+AXES = {
+    "scene": "scenes",
+    "contact": "contacts",
+    "integrator": "integrators",
+    "backend": "backends",
+    "estimator": "estimators",
+}
+"""Configuration groups of plugin parameters, and the kinds they belong to."""
+COUNTS = ("samples", "repeats", "seed")
+"""What a sweep can vary beside plugin parameters."""
+OWN_COLUMNS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype")
+"""Plugin parameters that have a column of their own and so are left out of identity strings."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A plugin chosen on an axis, with the parameters its identity string set."""
+
+    entry: registry.Entry
+    values: tuple[tuple[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A named sweep, resolved from configuration."""
+
+    name: str
+    choices: Mapping[str, Sequence[Choice]]
+    values: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
+    """Parameters set for plugins by group (``scene``, ...), plugin name and parameter."""
+    sweep: Mapping[str, Any] = field(default_factory=dict)
+    samples: int = 256
+    repeats: int = 64
+    seed: int = 0
+    results_dir: Path = Path("results")
+    question: str = ""
+    marks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Per axis, named values to draw as lines in the charts."""
+    reference_samples: int = 1 << 18
+    reference_tolerance: float = 0.005
+
+    @property
+    def directory(self) -> Path:
+        """Where the experiment's files lie."""
+        return self.results_dir / self.name
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One point of a sweep: a problem, an estimator, counts and a seed."""
+
+    scene: Scene
+    contact: ContactLaw | None
+    integrator: Integrator | None
+    backend: Backend
+    estimator: Estimator
+    samples: int
+    repeats: int
+    seed: int
+
+    @property
+    def parts(self) -> tuple[Plugin | None, ...]:
+        """The five plugins; None where the scene has no such axis."""
+        return (self.scene, self.contact, self.integrator, self.backend, self.estimator)
+
+    @cached_property
+    def key(self) -> str:
+        """Hash of everything that decides the cell's numbers; library versions are columns instead."""
+        text = "|".join(["" if p is None else _fingerprint(p) for p in self.parts])
+        text += f"|{self.samples}|{self.repeats}|{self.seed}|{core_hash()}"
+        return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+    @cached_property
+    def program_key(self) -> str:
+        """Hash of everything that decides the reference gradient."""
+        text = "|".join(["" if p is None else _fingerprint(p) for p in self.parts[:3]])
+        return hashlib.sha256(f"{text}|{core_hash()}".encode()).hexdigest()[:32]
+
+    def program(self) -> Program:
+        """The program; raises :class:`Unsupported` for a combination without meaning."""
+        return Program(self.scene, self.contact, self.integrator)
+
+    def columns(self) -> dict[str, Any]:
+        """The identity columns of the cell's row."""
+        contact = None if self.contact is None else type(self.contact)
+        smoothing = math.nan
+        given = dict(self.scene.contact_values) if isinstance(self.scene, MechanicalScene) else {}
+        if contact is not None and contact.smoothing:
+            smoothing = getattr(self.contact, contact.smoothing)
+        stiffness = getattr(self.contact, "stiffness", getattr(self.scene, "stiffness", math.nan))
+        return {
+            "scene": label(self.scene),
+            "contact": label(self.contact, {**given, **({contact.smoothing: smoothing} if contact else {})}),
+            "integrator": label(self.integrator),
+            "backend": label(self.backend),
+            "estimator": self.estimator.name,
+            "estimator_params": registry.identity("", changed(self.estimator)).strip("[]"),
+            "noise": self.scene.noise,
+            "horizon": getattr(self.scene, "horizon", 0),
+            "dt": getattr(self.scene, "dt", math.nan),
+            "stiffness": stiffness,
+            "sigma": self.scene.sigma,
+            "smoothing": smoothing,
+            "samples": self.samples,
+            "repeats": self.repeats,
+            "dim": int(self.scene.theta0().size),
+            "seed": self.seed,
+            "dtype": self.backend.dtype,
+            "key": self.key,
+        }
+
+    def refusal(self) -> tuple[str, str] | None:
+        """Status and reason why this cell cannot run, or None."""
+        for part in self.parts:
+            if part is not None:
+                entry = registry.find(part.kind, part.name)
+                if not entry.available:
+                    return "unavailable", f"{part.kind.removesuffix('s')} {part.name} is {entry.reason}"
+        try:
+            program = self.program()
+        except Unsupported as error:
+            return "unsupported", str(error)
+        backend, estimator = self.backend, self.estimator
+        if program.needs_root and "root" not in backend.provides:
+            part = next(p for p in (self.contact, self.integrator) if p is not None and p.needs_root)
+            return "unsupported", f"{part.name} solves an equation each step, backend {backend.name} has no root finder"
+        lacking = estimator.needs - backend.provides
+        if lacking:
+            return "unsupported", f"{estimator.name} needs {', '.join(sorted(lacking))}, which {backend.name} lacks"
+        reason = backend.refuses(program) or estimator.refuses(program)
+        return ("unsupported", reason) if reason else None
+
+
+def changed(plugin: Plugin, given: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Parameters that differ from their defaults, or from ``given``."""
+    given = given or {}
+    table = registry.parameters(type(plugin))
+    return {
+        name: getattr(plugin, name)
+        for name, parameter in table.items()
+        if getattr(plugin, name) != given.get(name, parameter.default)
+    }
+
+
+def label(plugin: Plugin | None, given: Mapping[str, Any] | None = None) -> str:
+    """Identity string of a plugin, without the parameters that have their own column; ``none`` for no plugin."""
+    if plugin is None:
+        return "none"
+    values = {k: v for k, v in changed(plugin, given).items() if k not in OWN_COLUMNS}
+    return registry.identity(plugin.name, values)
+
+
+@registry.remember
+def _fingerprint(plugin: Plugin) -> str:
+    table = registry.parameters(type(plugin))
+    values = {name: getattr(plugin, name) for name in sorted(table)}
+    return json.dumps([plugin.kind, plugin.name, values, registry.source_hash(type(plugin))], default=repr)
+
+
+@registry.remember
+def core_hash() -> str:
+    """Hash of the harness's own files that decide numbers."""
+    digest = hashlib.sha256()
+    for name in ("contracts", "noise", "program", "reference", "statistics"):
+        digest.update(Path(__file__).with_name(f"{name}.py").read_bytes())
+    return digest.hexdigest()
+
+
+# ------------------------------------------------------------------------------------------------ expansion
+
+
+def cells(experiment: Experiment) -> list[Cell]:
+    """The cells of an experiment, each once, in sweep order; raises :class:`UserError` for what cannot be."""
+    _check_axes(experiment)
+    found: dict[str, Cell] = {}
+    for point in points(experiment.sweep):
+        for scene_choice in experiment.choices["scenes"]:
+            for rest in itertools.product(*(experiment.choices[kind] for kind in list(AXES.values())[1:])):
+                cell = _cell(experiment, point, (scene_choice, *rest))
+                if cell is not None:
+                    found.setdefault(cell.key, cell)
+    if not found:
+        raise UserError("the experiment has no cells: choose at least one of each of scenes, backends, estimators")
+    return list(found.values())
+
+
+def points(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The points of a sweep: named axes are multiplied, ``zip`` steps through its axes together, ``union`` joins sweeps.
+
+    ``{a: [1, 2], b: [3], zip: {c: [4, 5], d: [6, 7]}}`` has 4 points; ``{union: [s1, s2]}`` those of s1, then of s2.
+    """
+    factors: list[list[dict[str, Any]]] = []
+    for axis, value in sweep.items():
+        if axis == "product":
+            factors.append(points(_mapping(value, "sweep.product")))
+        elif axis == "zip":
+            columns = {name: _values(name, v) for name, v in _flat(_mapping(value, "sweep.zip")).items()}
+            lengths = {name: len(v) for name, v in columns.items()}
+            if len(set(lengths.values())) > 1:
+                raise UserError(f"zipped axes must be equally long, given {lengths}")
+            factors.append([dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)])
+        elif axis == "union":
+            if not isinstance(value, list | tuple):
+                raise UserError("sweep.union must be a list of sweeps")
+            factors.append([point for part in value for point in points(_mapping(part, "sweep.union"))])
+        else:
+            factors.extend([{name: v} for v in _values(name, vs)] for name, vs in _flat({axis: value}).items())
+    return [dict(itertools.chain(*(p.items() for p in combo))) for combo in itertools.product(*factors)]
+
+
+def swept(sweep: Mapping[str, Any]) -> list[str]:
+    """Names of the axes of a sweep, in order."""
+    return list(dict.fromkeys(name for point in points(sweep) for name in point))
+
+
+def _mapping(value: Any, where: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise UserError(f"{where} must be axes with lists of values, not {value!r}")
+    return value
+
+
+def _flat(sweep: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in sweep.items():
+        path = f"{prefix}{name}"
+        flat.update(_flat(value, path + ".") if isinstance(value, Mapping) else {path: value})
+    return flat
+
+
+def _values(axis: str, values: Any) -> list[Any]:
+    listed = list(values) if isinstance(values, list | tuple) else [values]
+    if not listed:
+        raise UserError(f"sweep.{axis} is empty: give at least one value")
+    return listed
+
+
+def _applies(axis: str, plugin: type[Plugin]) -> str | None:
+    """The parameter of ``plugin`` that the axis names, or None: ``gamma``, ``alpha_order.gamma``, ``estimator.alpha_order.gamma``."""
+    *path, parameter = axis.split(".")
+    if parameter not in registry.parameters(plugin):
+        return None
+    group = next(g for g, kind in AXES.items() if kind == plugin.kind)
+    return parameter if path in ([], [plugin.name], [group, plugin.name]) else None
+
+
+def _check_axes(experiment: Experiment) -> None:
+    chosen = [c.entry.plugin for kind in AXES.values() for c in experiment.choices[kind] if c.entry.plugin]
+    names = {name for plugin in chosen for name in registry.parameters(plugin)} | set(COUNTS)
+    for axis in swept(experiment.sweep):
+        if axis not in COUNTS and not any(_applies(axis, plugin) for plugin in chosen):
+            raise unknown("sweep axis", axis, names)
+
+
+def _cell(experiment: Experiment, point: Mapping[str, Any], choices: Iterable[Choice]) -> Cell | None:
+    scene_choice, contact_choice, integrator_choice, backend_choice, estimator_choice = choices
+    used: dict[str, str] = {}
+
+    def make(choice: Choice, given: Mapping[str, Any] | None = None) -> Plugin:
+        plugin = choice.entry.plugin
+        if plugin is None:
+            raise UserError(
+                f"{choice.entry.kind.removesuffix('s')} '{choice.entry.name}' cannot be used: {choice.entry.reason}"
+            )
+        group = next(g for g, kind in AXES.items() if kind == plugin.kind)
+        values = {k: v for k, v in (given or {}).items() if k in registry.parameters(plugin)}
+        values |= experiment.values.get(group, {}).get(plugin.name, {})
+        values |= dict(choice.values)
+        for axis, value in point.items():
+            parameter = _applies(axis, plugin)
+            if parameter is not None and axis not in COUNTS:
+                if axis in used:
+                    raise UserError(
+                        f"sweep axis '{axis}' is a parameter of both {used[axis]} and {plugin.name}: "
+                        f"write sweep.{used[axis]}.{parameter} or sweep.{plugin.name}.{parameter}"
+                    )
+                used[axis] = plugin.name
+                values[parameter] = value
+        return _build(plugin, tuple(sorted(values.items())))
+
+    scene = make(scene_choice)
+    assert isinstance(scene, Scene)
+    contact = integrator = None
+    if isinstance(scene, MechanicalScene):
+        integrator = make(integrator_choice)
+        if scene.n_contacts:
+            contact = make(contact_choice, scene.contact_values)
+    counts = {}
+    for name, low in (("samples", 1), ("repeats", 2), ("seed", 0)):
+        count = registry.coerce(int, point.get(name, getattr(experiment, name)), name)
+        if count < low:
+            raise UserError(f"{name}={count} must be at least {low}")
+        counts[name] = count
+    return Cell(scene, contact, integrator, make(backend_choice), make(estimator_choice), **counts)  # type: ignore[arg-type]
+
+
+@registry.remember
+def _build(plugin: type[Plugin], values: tuple[tuple[str, Any], ...]) -> Plugin:
+    return registry.build(plugin, dict(values))

@@ -1,0 +1,119 @@
+"""Rows in, files out: tables, charts and the record of a run. Knows no plugin."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.store import IDENTITY, write_whole
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from bench.grid import Experiment
+
+LIBRARIES = ("numpy", "scipy", "jax", "jaxlib", "torch", "optimistix", "lineax", "hydra-core", "pandas", "pyarrow")
+
+
+def latest(rows: pd.DataFrame) -> pd.DataFrame:
+    """The newest row of each cell, when editing a plugin has left rows of older versions behind."""
+    return rows.drop_duplicates(list(IDENTITY), keep="last").reset_index(drop=True)
+
+
+def write(
+    experiment: Experiment,
+    rows: pd.DataFrame,
+    axes: Sequence[str],
+    names: Sequence[str],
+    words: list[str],
+    seconds: float,
+) -> list[Path]:
+    """Write tables, charts and ``run.json`` from rows, print the table, and return the files' paths.
+
+    ``axes`` are the swept axes; ``names`` all registered estimators in the order that fixes their colours.
+    """
+    from bench.report import charts, tables
+
+    directory = experiment.directory
+    paths = tables.write(rows, directory)
+    paths += charts.write(experiment, rows, axes, names)
+    if seconds:
+        paths.append(_record(experiment, rows, words, seconds))
+    tables.show(experiment, rows, axes)
+    print("\nWritten:")
+    for path in paths:
+        print(f"  {path}")
+    return paths
+
+
+def _record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds: float) -> Path:
+    record: dict[str, Any] = {
+        "command": " ".join(["python -m bench", *words]),
+        "experiment": experiment.name,
+        "question": experiment.question,
+        "config": {
+            **{kind: [_identity(c) for c in chosen] for kind, chosen in experiment.choices.items()},
+            "sweep": experiment.sweep,
+            **{group: values for group, values in experiment.values.items() if values},
+            "samples": experiment.samples,
+            "repeats": experiment.repeats,
+            "seed": experiment.seed,
+            "reference": {"samples": experiment.reference_samples, "tolerance": experiment.reference_tolerance},
+        },
+        "seeds": sorted({int(seed) for seed in rows["seed"]}),
+        "counts": {str(k): int(v) for k, v in rows["status"].value_counts().items()},
+        "duration_s": round(seconds, 3),
+        "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "python": platform.python_version(),
+        "versions": {name: _version(name) for name in LIBRARIES},
+        "machine": {
+            "system": platform.system(),
+            "processor": _processor(),
+            "cores": os.cpu_count(),
+            "load_average": list(os.getloadavg()) if hasattr(os, "getloadavg") else None,
+        },
+        "git_commit": _commit(),
+        "argv": [Path(sys.argv[0]).name, *words],
+    }
+    path = experiment.directory / "run.json"
+    write_whole(path, (json.dumps(record, indent=1, default=str) + "\n").encode())
+    return path
+
+
+def _identity(choice: Any) -> str:
+    values = ",".join(f"{k}={v}" for k, v in choice.values)
+    return f"{choice.entry.name}[{values}]" if values else choice.entry.name
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor()
+
+
+def _commit() -> str | None:
+    try:
+        where = Path(__file__).resolve().parent
+        done = subprocess.run(
+            ["git", "-C", str(where), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

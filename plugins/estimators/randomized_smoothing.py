@@ -1,0 +1,35 @@
+"""Randomized smoothing of the parameters."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.contracts import Problem, SampleMean, param
+
+
+@dataclass(frozen=True)
+class RandomizedSmoothing(SampleMean):
+    """Approximates grad J_s with (f(theta + s w) - f(theta - s w)) w / 2s, or (f(theta + s w) - f(theta)) w / s.
+
+    ``variant``: ``antithetic`` (2 rollouts a sample) or ``forward`` (1, and one for the centre). The radius s is its
+    own, sigma by default; noise is on theta, without action noise: under a feedback policy with action noise, or with
+    another radius, its target is not J_sigma. Requires costs alone (Nesterov, Spokoiny 2017).
+    """
+
+    name = "randomized_smoothing"
+    across_jumps = True
+
+    variant: str = param("antithetic", "which difference", choices=("antithetic", "forward"))
+    radius: float | None = param(
+        None, "s, standard deviation of the smoothing, in units of theta; null: sigma", positive=True
+    )
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """One directional difference a sample, along its own direction."""
+        s = problem.sigma if self.radius is None else self.radius
+        direction = problem.directions(w)
+        still = np.zeros_like(w)
+        ahead = problem.displaced(s * direction, theta, still)
+        if self.variant == "antithetic":
+            return (ahead - problem.displaced(-s * direction, theta, still)) * direction / (2 * s)
+        return (ahead - problem.value(theta, still[:, :1])) * direction / s

@@ -1,0 +1,35 @@
+"""Score-function (likelihood-ratio, zeroth-order) gradient."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.contracts import Estimator, Problem, columns, param, per_repeat
+
+
+@dataclass(frozen=True)
+class Reinforce(Estimator):
+    """Approximates grad J_sigma with the mean of (f - b) d log p(actions)/dtheta (Williams 1992).
+
+    Baseline b: ``none``; ``center``, f at w = 0; ``leave_one_out``, the mean cost of the other samples of the batch.
+    Requires costs and scores. Unbiased for any cost, with jumps too.
+    """
+
+    name = "reinforce"
+    needs = frozenset({"value", "score"})
+    across_jumps = True
+
+    baseline: str = param("center", "what is subtracted from f", choices=("none", "center", "leave_one_out"))
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Mean over samples of (f - b) * score."""
+        w = columns(noise)
+        f = per_repeat(problem.value(theta, w), noise)
+        score = per_repeat(problem.score(theta, w), noise)
+        if self.baseline == "center":
+            f = f - problem.value(theta, np.zeros((w.shape[0], 1)))
+        elif self.baseline == "leave_one_out":
+            if f.shape[1] < 2:
+                raise ValueError("baseline leave_one_out needs at least 2 samples")
+            f = (f - f.mean(axis=1, keepdims=True)) * f.shape[1] / (f.shape[1] - 1)
+        return np.einsum("rn,rnd->rd", f, score) / f.shape[1]

@@ -1,0 +1,99 @@
+"""One elastic bounce without gravity: the smallest test of a contact gradient."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, ContactLaw, Integrator, MechanicalScene, State, param
+
+
+@dataclass(frozen=True)
+class BounceOnce(MechanicalScene):
+    """A ball flies at constant speed to the ground and back; q is the height of its centre.
+
+    State (q, v); theta = (y0, vy0, u0), initial height and velocity and a vertical force during the first step alone,
+    with parameter noise; f = q_T. A rigid bounce ends at radius + restitution |z| with
+    z = y0 - radius + T (vy0 + dt u0 / mass). The default height starts the contact in the middle of a step. Height 1,
+    the source's, starts it on the boundary between two steps, a kink of the penalty program.
+    Source: Zhong, Han, Brikis 2022, task 1.
+    """
+
+    name = "bounce_once"
+    leaves_out: ClassVar[str] = "the horizontal motion (free, uncoupled), gravity, spin"
+    n_q: ClassVar[int] = 1
+    n_u: ClassVar[int] = 1
+    n_contacts: ClassVar[int] = 1
+    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 0.0}
+
+    sigma: float = param(0.1, "standard deviation of the noise on theta", "m, m/s and N", positive=True)
+    horizon: int = param(480, "number of time steps", positive=True)
+    dt: float = param(1.0 / 480.0, "length of a time step", "s", positive=True)
+    mass: float = param(1.0, "mass of the ball", "kg", positive=True)
+    radius: float = param(0.1, "radius of the ball", "m", positive=True)
+    height: float = param(1.0 + 1.0 / 480.0, "initial height of the centre at theta", "m", positive=True)
+    velocity: float = param(-2.0, "initial velocity at theta, upwards", "m/s")
+    force: float = param(0.0, "force during the first step at theta, upwards", "N")
+    restitution: float = param(1.0, "restitution of impulse laws", low=0.0, high=1.0)
+
+    def theta0(self) -> np.ndarray:
+        """(height, velocity, force)."""
+        return np.array([self.height, self.velocity, self.force])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Height and velocity."""
+        return State(theta[0:1], theta[1:2])
+
+    def planned_controls(self, xp: Any, theta: Array) -> Array:
+        """The force in the first step, none after it."""
+        first = theta[None, 2:3, :]
+        later = xp.zeros((self.horizon - 1, 1, theta.shape[1]), dtype=theta.dtype)
+        return xp.concat([first, later], axis=0)
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """The force."""
+        return u / self.mass
+
+    def gap(self, xp: Any, q: Array) -> Array:
+        """Height of the lowest point."""
+        return q - self.radius
+
+    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+        """v."""
+        return v
+
+    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+        """Upwards."""
+        return force / self.mass
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """The final height."""
+        return q[0]
+
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray | None:
+        """With impulses corrected for the time of impact: (P(z > 0) - restitution P(z < 0)) dz/dtheta, z being normal.
+
+        It takes that no sample starts inside the ground; with the default theta that is 9 standard deviations away.
+        """
+        semi_implicit = integrator is not None and integrator.name == "semi_implicit_euler"
+        if not (semi_implicit and contact is not None and getattr(contact, "time_of_impact", False)):
+            return None
+        slope = self._free_slope()
+        spread = self.sigma * float(np.linalg.norm(slope))
+        above = 0.5 * math.erfc(-self._free_end() / (math.sqrt(2) * spread))
+        return np.asarray((above - self.restitution * (1.0 - above)) * slope)
+
+    def physical_gradient(self) -> np.ndarray:
+        """-restitution (1, T, T dt / mass) after a rigid bounce, (1, T, T dt / mass) without."""
+        return np.asarray(self._free_slope() * (1.0 if self._free_end() > 0 else -self.restitution))
+
+    def _free_end(self) -> float:
+        """z, the final gap if there were no ground."""
+        return self.height - self.radius + self.horizon * self.dt * (self.velocity + self.dt * self.force / self.mass)
+
+    def _free_slope(self) -> np.ndarray:
+        """dz / dtheta."""
+        end = self.horizon * self.dt
+        return np.array([1.0, end, end * self.dt / self.mass])

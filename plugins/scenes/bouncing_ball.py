@@ -1,0 +1,87 @@
+"""A ball dropped on the ground: one stiff contact under gravity."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, MechanicalScene, State, param
+
+
+@dataclass(frozen=True)
+class BouncingBall(MechanicalScene):
+    """A ball on a vertical line under gravity; q is the height of its lowest point.
+
+    State (q, v); theta = (initial height, initial velocity), with parameter noise; f = (q_T - target)^2.
+    The default lands at 0.45 s and is on its way down again at T = 1 s.
+
+    Under gravity an impulse that takes the velocity of a step boundary has a wrong derivative at every dt, time of
+    impact or not: the speed of impact then depends on theta only through the step the impact falls in, in jumps.
+    Differences over a span of theta that moves the impact by many steps are right.
+    """
+
+    name = "bouncing_ball"
+    leaves_out: ClassVar[str] = "horizontal motion, spin, air, the ball's shape"
+    n_q: ClassVar[int] = 1
+    n_contacts: ClassVar[int] = 1
+    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
+
+    sigma: float = param(0.05, "standard deviation of the noise on height and velocity", "m and m/s", positive=True)
+    horizon: int = param(400, "number of time steps", positive=True)
+    dt: float = param(0.0025, "length of a time step", "s", positive=True)
+    mass: float = param(1.0, "mass of the ball", "kg", positive=True)
+    gravity: float = param(9.81, "gravitational acceleration", "m/s^2", positive=True)
+    height: float = param(1.0, "initial height at theta", "m", positive=True)
+    velocity: float = param(0.0, "initial velocity at theta, upwards", "m/s")
+    target: float = param(0.5, "height wanted at the end", "m")
+    restitution: float = param(1.0, "restitution of impulse laws and of the physical gradient", low=0.0, high=1.0)
+
+    def theta0(self) -> np.ndarray:
+        """(height, velocity)."""
+        return np.array([self.height, self.velocity])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """theta itself."""
+        return State(theta[0:1], theta[1:2])
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Gravity."""
+        return 0.0 * q - self.gravity
+
+    def gap(self, xp: Any, q: Array) -> Array:
+        """q."""
+        return q
+
+    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+        """v."""
+        return v
+
+    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+        """Upwards."""
+        return force / self.mass
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Squared distance to the target."""
+        return (q[0] - self.target) ** 2
+
+    def physical_gradient(self) -> np.ndarray | None:
+        """Grad f of rigid bounces with the scene's restitution, from event to event; None if the ball comes to rest."""
+        g, end, e = self.gravity, self.horizon * self.dt, self.restitution
+        start = np.array([0.0, self.velocity, self.height])  # time, velocity and height at the last take-off
+        slopes = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])  # by theta
+        for _ in range(1000):
+            time, v, q = start
+            impact = math.sqrt(v * v + 2 * g * q)
+            if time + (v + impact) / g > end:
+                rest = end - time
+                reached = q + v * rest - 0.5 * g * rest**2
+                slope = slopes[2] + slopes[1] * rest - (v - g * rest) * slopes[0]
+                return np.asarray(2 * (reached - self.target) * slope)
+            if e * impact == 0.0:
+                return None
+            impact_slope = (v * slopes[1] + g * slopes[2]) / impact
+            slopes = np.array([slopes[0] + (slopes[1] + impact_slope) / g, e * impact_slope, [0.0, 0.0]])
+            start = np.array([time + (v + impact) / g, e * impact, 0.0])
+        return None

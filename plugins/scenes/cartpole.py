@@ -1,0 +1,63 @@
+"""Balancing a pole on a cart: a feedback policy, where noise on actions and noise on theta differ."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, MechanicalScene, State, param
+
+
+@dataclass(frozen=True)
+class Cartpole(MechanicalScene):
+    """A point mass m on a massless pole of length l on a cart M, under the linear policy u = -K (x, a, x', a').
+
+    State (x, a, x', a') with the angle a from upright, starting at rest at ``angle``; theta = K (d = 4).
+    x'' = (u + m sin a (l a'^2 - g cos a)) / (M + m sin^2 a) and a'' = (g sin a - x'' cos a) / l.
+    f = dt sum (x^2 + 10 a^2 + 0.01 u^2) plus x^2 + 10 a^2 + 0.1 x'^2 + 0.1 a'^2 at the end.
+    ``noise=action`` perturbs the force of each step, so that the score sums over the states visited;
+    ``noise=parameter`` perturbs the gains by the same sigma.
+    """
+
+    name = "cartpole"
+    leaves_out = "the track's ends, friction, the pole's inertia about its tip"
+    n_q: ClassVar[int] = 2
+    n_u: ClassVar[int] = 1
+
+    sigma: float = param(0.1, "standard deviation of the noise on each force, or on each gain", "N", positive=True)
+    horizon: int = param(50, "number of time steps", positive=True)
+    dt: float = param(0.02, "length of a time step", "s", positive=True)
+    noise: str = param("action", "what the noise perturbs", choices=("action", "parameter"))
+    cart_mass: float = param(1.0, "M", "kg", positive=True)
+    pole_mass: float = param(0.1, "m", "kg", positive=True)
+    length: float = param(0.5, "l, length of the pole", "m", positive=True)
+    gravity: float = param(9.81, "gravitational acceleration", "m/s^2")
+    angle: float = param(0.2, "initial angle of the pole from upright", "rad")
+
+    def theta0(self) -> np.ndarray:
+        """Gains (-3, -40, -4, -8): near the optimum of the quadratic cost, stable with the default masses."""
+        return np.array([-3.0, -40.0, -4.0, -8.0])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """At rest, the pole leaning by ``angle``."""
+        zero = 0.0 * theta[0]
+        return State(xp.stack([zero, zero + self.angle]), xp.stack([zero, zero]))
+
+    def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
+        """-K (x, a, x', a')."""
+        return -(theta[0:1] * q[0:1] + theta[1:2] * q[1:2] + theta[2:3] * v[0:1] + theta[3:4] * v[1:2])
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Of cart and pole under the force u on the cart."""
+        sine, cosine = xp.sin(q[1]), xp.cos(q[1])
+        swing = self.length * v[1] * v[1] - self.gravity * cosine
+        cart = (u[0] + self.pole_mass * sine * swing) / (self.cart_mass + self.pole_mass * sine * sine)
+        return xp.stack([cart, (self.gravity * sine - cart * cosine) / self.length])
+
+    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Distance from the origin and effort of one step."""
+        return self.dt * (q[0] ** 2 + 10.0 * q[1] ** 2 + 0.01 * u[0] ** 2)
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Distance of the last state from rest at the origin."""
+        return q[0] ** 2 + 10.0 * q[1] ** 2 + 0.1 * v[0] ** 2 + 0.1 * v[1] ** 2

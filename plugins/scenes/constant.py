@@ -1,0 +1,31 @@
+"""A flat cost: whatever an estimator reports beyond zero is its own noise."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.contracts import Array, ContactLaw, FunctionScene, Integrator, param
+
+
+@dataclass(frozen=True)
+class Constant(FunctionScene):
+    """f = value, grad J = 0. Score-function terms without a baseline still have variance (value / sigma)^2 a coordinate."""
+
+    name = "constant"
+    leaves_out = "dynamics"
+
+    dimension: int = param(5, "d, length of theta", positive=True)
+    value: float = param(3.0, "the cost")
+
+    def theta0(self) -> np.ndarray:
+        """Evenly from 0.5 to 1.5."""
+        return np.linspace(0.5, 1.5, self.dimension)
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """The value, with derivative 0."""
+        return 0.0 * xp.sum(x, axis=0) + self.value
+
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray:
+        """Zero."""
+        return np.zeros(self.dimension)

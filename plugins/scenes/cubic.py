@@ -1,0 +1,37 @@
+"""A cubic: the simplest cost whose smoothed gradient differs from its own."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.contracts import Array, ContactLaw, FunctionScene, Integrator, param
+
+
+@dataclass(frozen=True)
+class Cubic(FunctionScene):
+    """f = sum_i x_i^3 / 3, with x = theta + sigma w.
+
+    grad J = theta^2 + sigma^2, where the gradient of f itself is theta^2. theta runs evenly from 0.5 to 1.5.
+    """
+
+    name = "cubic"
+    leaves_out = "dynamics"
+
+    dimension: int = param(5, "d, length of theta", positive=True)
+
+    def theta0(self) -> np.ndarray:
+        """Evenly from 0.5 to 1.5."""
+        return np.linspace(0.5, 1.5, self.dimension)
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """The cubes."""
+        return xp.sum(x * x * x, axis=0) / 3.0
+
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray:
+        """theta^2 + sigma^2."""
+        return np.asarray(self.theta0() ** 2 + self.sigma**2)
+
+    def physical_gradient(self) -> np.ndarray:
+        """theta^2."""
+        return np.asarray(self.theta0() ** 2)

@@ -1,0 +1,41 @@
+"""A unit step: the smallest cost with a jump."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.contracts import Array, ContactLaw, FunctionScene, Integrator, param
+
+
+@dataclass(frozen=True)
+class Heaviside(FunctionScene):
+    """f = 1 where x >= 0, else 0, with x = theta + sigma w (d = 1).
+
+    Its derivative is 0 wherever it exists, while grad J = phi(theta / sigma) / sigma. Source: Suh et al. 2022.
+    """
+
+    name = "heaviside"
+    leaves_out = "dynamics; stands for a contact that is made or missed"
+    continuous = False
+
+    theta: float = param(0.0, "where the gradient is estimated; the jump is at 0")
+
+    def theta0(self) -> np.ndarray:
+        """``(1,)``."""
+        return np.array([self.theta])
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """The step, with derivative 0."""
+        zero = 0.0 * x[0]
+        return xp.where(x[0] >= 0, zero + 1.0, zero)
+
+    def breakpoints(self) -> tuple[tuple[float, ...], ...]:
+        """The jump."""
+        return ((0.0,),)
+
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray:
+        """phi(theta / sigma) / sigma."""
+        z = self.theta / self.sigma
+        return np.array([math.exp(-0.5 * z * z) / (math.sqrt(2 * math.pi) * self.sigma)])

@@ -1,0 +1,38 @@
+"""A plane: every gradient estimator without bias of its own is exact on average."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.contracts import Array, ContactLaw, FunctionScene, Integrator, param
+
+
+@dataclass(frozen=True)
+class Linear(FunctionScene):
+    """f = sum_i a_i x_i, with x = theta + sigma w and a_i = slope (i + 1) / d for i = 0 .. d - 1.
+
+    grad J = a, whatever sigma and theta; first-order gradients have variance 0.
+    """
+
+    name = "linear"
+    leaves_out = "dynamics"
+
+    dimension: int = param(5, "d, length of theta", positive=True)
+    slope: float = param(2.0, "the largest of the slopes a_i")
+
+    def theta0(self) -> np.ndarray:
+        """Evenly from 0.5 to 1.5."""
+        return np.linspace(0.5, 1.5, self.dimension)
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """a . x."""
+        return self.slope * xp.sum(xp.asarray(_ramp(self.dimension)[:, None], dtype=x.dtype) * x, axis=0)
+
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray:
+        """The slopes a."""
+        return np.asarray(self.slope * _ramp(self.dimension))
+
+
+def _ramp(dimension: int) -> np.ndarray:
+    return np.arange(1, dimension + 1) / dimension

@@ -1,0 +1,59 @@
+"""Swinging up a pendulum: smooth nonlinear dynamics."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, MechanicalScene, State, param
+
+
+@dataclass(frozen=True)
+class Pendulum(MechanicalScene):
+    """A point mass on a rod, hanging at rest: m l^2 q'' = u - m g l sin q - b q'; q from the lowest point.
+
+    State (q, q'); theta is the torque of each step (d = horizon). f = 1 + cos q_T + 0.1 q'_T^2 (0 at rest upright)
+    plus ``effort`` dt sum u^2.
+    """
+
+    name = "pendulum"
+    leaves_out = "the rod's mass, torque limits, contact"
+    noise = "action"
+    n_q: ClassVar[int] = 1
+    n_u: ClassVar[int] = 1
+
+    sigma: float = param(0.3, "standard deviation of the noise on each torque", "N m", positive=True)
+    horizon: int = param(50, "number of time steps", positive=True)
+    dt: float = param(0.02, "length of a time step", "s", positive=True)
+    mass: float = param(1.0, "mass at the tip", "kg", positive=True)
+    length: float = param(0.5, "length of the rod", "m", positive=True)
+    gravity: float = param(9.81, "gravitational acceleration", "m/s^2")
+    damping: float = param(0.0, "b, torque per angular velocity at the pivot", "N m s", low=0.0)
+    torque: float = param(2.0, "torque of every step at theta", "N m")
+    effort: float = param(1e-3, "cost per squared torque and second", "1/(N^2 m^2 s)", low=0.0)
+
+    def theta0(self) -> np.ndarray:
+        """The same torque at every step."""
+        return np.full(self.horizon, self.torque)
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Hanging at rest."""
+        zero = 0.0 * theta[:1]
+        return State(zero, zero)
+
+    def planned_controls(self, xp: Any, theta: Array) -> Array:
+        """theta, one torque a step."""
+        return theta[:, None, :]
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Torque, damping and gravity over the moment of inertia."""
+        inertia = self.mass * self.length * self.length
+        return (u - self.damping * v) / inertia - self.gravity / self.length * xp.sin(q)
+
+    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Effort of one step."""
+        return self.effort * self.dt * u[0] * u[0]
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Height missing to the top, in rod lengths, and what is left of the velocity."""
+        return 1.0 + xp.cos(q[0]) + 0.1 * v[0] * v[0]

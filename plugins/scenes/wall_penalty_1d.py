@@ -1,0 +1,91 @@
+"""A point running into a soft wall: how the step size alone ruins a penalty gradient."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, MechanicalScene, State, param
+
+
+@dataclass(frozen=True)
+class WallPenalty1d(MechanicalScene):
+    """A point of mass 1 at q0 > 0 moves at velocity -1 into a wall at q = 0, which pushes with -v - 50 q, unclipped.
+
+    State (q, v); theta = q0 (d = 1), with parameter noise; f = |q_T - 1| with T = horizon dt = 2 s. The wall is a
+    penalty law with the values of ``contact_values``; unlike elsewhere the softness is part of the physics, which the
+    physical gradient takes at dt -> 0. Source: Paulus et al. 2025, toy example.
+    """
+
+    name = "wall_penalty_1d"
+    leaves_out: ClassVar[str] = "gravity, the second and third dimension, shapes"
+    n_q: ClassVar[int] = 1
+    n_contacts: ClassVar[int] = 1
+    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 50.0, "damping": 1.0, "damping_mode": "linear"}
+
+    sigma: float = param(0.1, "standard deviation of the noise on q0", "m", positive=True)
+    horizon: int = param(200, "number of time steps", positive=True)
+    dt: float = param(0.01, "length of a time step", "s", positive=True)
+    start: float = param(0.6, "q0 at theta", "m")
+    restitution: float = param(1.0, "restitution of impulse laws", low=0.0, high=1.0)
+
+    def theta0(self) -> np.ndarray:
+        """(q0,)."""
+        return np.array([self.start])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """At q0, moving towards the wall at 1 m/s."""
+        return State(theta[0:1], 0.0 * theta[0:1] - 1.0)
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """None but the wall's."""
+        return 0.0 * v
+
+    def gap(self, xp: Any, q: Array) -> Array:
+        """q."""
+        return q
+
+    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+        """v."""
+        return v
+
+    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+        """Away from the wall, mass 1."""
+        return force
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Distance to q = 1."""
+        return xp.abs(q[0] - 1.0)
+
+    def breakpoints(self) -> tuple[tuple[float, ...], ...]:
+        """Of the physics: start in touch; end at q = 1 after a bounce, when leaving, when touching, at q = 1 untouched.
+
+        A program has weaker kinks besides, wherever contact begins or ends on the boundary between two steps.
+        """
+        end = self.horizon * self.dt
+        _, duration, speed = self._wall()
+        return ((0.0, end - duration - 1.0 / speed, end - duration, end, end + 1.0),)
+
+    def physical_gradient(self) -> np.ndarray | None:
+        """Exact for dt -> 0 under the penalty wall; None for a start inside the wall."""
+        end = self.horizon * self.dt
+        rate, duration, speed = self._wall()
+        if self.start < 0.0:
+            return None
+        inside = end - self.start  # time since first touch
+        if inside <= 0.0:
+            return np.array([-1.0 if -inside < 1.0 else 1.0])
+        if inside < duration:
+            decay = math.exp(-0.5 * self.contact_values["damping"] * inside)
+            sine = 0.5 * self.contact_values["damping"] / rate * math.sin(rate * inside)
+            return np.array([-decay * (math.cos(rate * inside) - sine)])
+        return np.array([-speed if speed * (inside - duration) > 1.0 else speed])
+
+    def _wall(self) -> tuple[float, float, float]:
+        """Angular frequency of a contact, its duration, and the speed after it."""
+        half = 0.5 * self.contact_values["damping"]
+        rate = math.sqrt(self.contact_values["stiffness"] - half * half)
+        duration = math.pi / rate
+        return rate, duration, math.exp(-half * duration)

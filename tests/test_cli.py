@@ -1,0 +1,181 @@
+"""The commands as a user types them: what runs, what is cached, and what bad input answers."""
+
+import json
+
+import pandas as pd
+import pytest
+
+from bench.cli import main
+from bench.store import COLUMNS, IDENTITY
+
+TINY = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny"]
+TIMES = ["time_s", "time_iqr_s", "compile_s", "peak_memory_mb"]
+
+
+def test_run_then_report_then_plan(tmp_path, capsys):
+    where = f"results_dir={tmp_path}"
+    assert main([*TINY, where, "sweep.sigma=[0.1,0.2]"]) == 0
+    directory = tmp_path / "tiny"
+    for name in ("rows.parquet", "bias_variance.csv", "bias_variance.md", "bias_variance.tex", "run.json"):
+        assert (directory / name).stat().st_size > 0
+    table = pd.read_csv(directory / "bias_variance.csv")
+    assert list(table.columns) == list(COLUMNS)
+    assert len(table) == 4
+    assert (table["status"] == "ok").all()
+    assert json.loads((directory / "run.json").read_text())["counts"] == {"ok": 4}
+    printed = capsys.readouterr().out
+    assert "bias_variance.csv" in printed
+
+    for path in directory.iterdir():
+        if path.name != "rows.parquet":
+            path.unlink()
+    assert main(["report", *TINY, where, "sweep.sigma=[0.1,0.2]"]) == 0
+    again = pd.read_csv(directory / "bias_variance.csv")
+    pd.testing.assert_frame_equal(again, table)
+    capsys.readouterr()
+    assert main(["plan", *TINY, where, "sweep.sigma=[0.1,0.2,0.3]"]) == 0
+    assert "6 cells, 4 stored, 2 to run" in capsys.readouterr().out
+
+
+def test_only_missing_cells_run_and_rows_are_kept(tmp_path, monkeypatch):
+    from bench import runner
+
+    measured = []
+    real = runner.measure
+    monkeypatch.setattr(runner, "measure", lambda cell, *rest: (measured.append(cell.key), real(cell, *rest))[1])
+    where = f"results_dir={tmp_path}"
+    assert main([*TINY, where, "sweep.sigma=[0.1]"]) == 0
+    assert main([*TINY, where, "sweep.sigma=[0.1,0.2]"]) == 0
+    assert len(measured) == len(set(measured)) == 4
+    assert main([*TINY, where, "sweep.sigma=[0.2]"]) == 0
+    assert len(pd.read_parquet(tmp_path / "tiny" / "rows.parquet")) == 4
+    assert len(pd.read_csv(tmp_path / "tiny" / "bias_variance.csv")) == 2
+
+
+def test_same_seed_same_rows(tmp_path):
+    overrides = [
+        "scenes=[pushing,heaviside]", "contacts=[penalty]", "backends=[jax,torch,numpy]", "scene.pushing.horizon=5",
+        "estimators=[fobg,reinforce,alpha_order]", "samples=8", "repeats=8", "name=twice", "reference.samples=4096",
+    ]  # fmt: skip
+    tables = []
+    for run in ("a", "b"):
+        assert main([*overrides, f"results_dir={tmp_path / run}"]) == 0
+        tables.append(pd.read_csv(tmp_path / run / "twice" / "bias_variance.csv").drop(columns=TIMES))
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+
+
+def test_a_failing_cell_is_a_row_and_exit_status_1(tmp_path):
+    assert main([*TINY, f"results_dir={tmp_path}", "samples=1", "estimators=[fobg,inverse_variance]"]) == 1
+    table = pd.read_csv(tmp_path / "tiny" / "bias_variance.csv").set_index("estimator")
+    assert table.loc["fobg", "status"] == "ok"
+    assert table.loc["inverse_variance", "status"] == "error"
+    assert "at least 4 samples" in table.loc["inverse_variance", "reason"]
+
+
+def test_unsupported_combinations_are_rows(tmp_path):
+    words = [
+        "scenes=[pushing]", "contacts=[penalty,complementarity]", "integrators=[semi_implicit_euler,explicit_euler]",
+        "backends=[numpy]", "estimators=[reinforce]", "scene.pushing.horizon=3", "samples=8", "repeats=4",
+        "reference.samples=4096", "name=mixed", f"results_dir={tmp_path}",
+    ]  # fmt: skip
+    assert main(words) == 0
+    table = pd.read_csv(tmp_path / "mixed" / "bias_variance.csv")
+    assert sorted(table["status"]) == ["ok", "ok", "unsupported", "unsupported"]
+    reasons = " ".join(table["reason"].dropna())
+    assert "numpy has no root finder" in reasons
+    assert "explicit_euler has no place for the impulses" in reasons
+
+
+def test_identity_columns_tell_cells_apart(tmp_path):
+    words = [
+        "scenes=[pushing]", "contacts=[impulse,'impulse[time_of_impact=false]','softplus[beta=10,smooths=clip]',softplus]",
+        "backends=[numpy]", "estimators=[reinforce,'reinforce[baseline=none]']", "scene.pushing.horizon=3", "samples=8",
+        "repeats=4", "reference.samples=4096", "name=names", f"results_dir={tmp_path}",
+    ]  # fmt: skip
+    assert main(words) == 0
+    table = pd.read_csv(tmp_path / "names" / "bias_variance.csv")
+    assert len(table) == 8
+    assert not table.duplicated(list(IDENTITY)).any()
+    assert set(table["contact"]) == {"impulse", "impulse[time_of_impact=false]", "softplus[smooths=clip]", "softplus"}
+
+
+BAD = [
+    (["+experiment=stifness_sweep"], ["stifness_sweep", "'stiffness_sweep'"]),
+    (["scenes=[pushng]"], ["pushng", "'pushing'"]),
+    (["contacts=[penality]"], ["penality", "'penalty'"]),
+    (["integrators=[eular]"], ["eular", "explicit_euler"]),
+    (["backends=[jaxx]"], ["jaxx", "'jax'"]),
+    (["estimators=[fobgg]"], ["fobgg", "'fobg'"]),
+    (["scenes=[]"], ["scenes is empty"]),
+    (["sweep.stifness=[1e3]"], ["stifness", "'stiffness'"]),
+    (["sweep.stiffness=[]"], ["sweep.stiffness is empty"]),
+    (["sweep.stiffness=[abc]"], ["stiffness", "must be a number"]),
+    (["sweep.stiffness=[-1]"], ["penalty.stiffness=-1", "greater than 0"]),
+    (["sweep.sigma=[-1]"], ["pushing.sigma=-1", "greater than 0"]),
+    (["sweep.horizon=[0]"], ["pushing.horizon=0", "greater than 0"]),
+    (["sweep.horizon=[2.5]"], ["horizon=2.5", "whole number"]),
+    (["samples=0"], ["samples=0", "at least 1"]),
+    (["sweep.samples=[8,0]"], ["samples=0", "at least 1"]),
+    (["repeats=1"], ["repeats=1", "at least 2"]),
+    (["samples=many"], ["samples='many'", "whole number"]),
+    (["sample=3"], ["sample", "'samples'"]),
+    (["scene.pushing.mas=0.2"], ["mas", "'mass'"]),
+    (["scene.pushing.mass=heavy"], ["pushing.mass='heavy'", "a number"]),
+    (["scene.pushing.mass=true"], ["pushing.mass=True", "a number"]),
+    (["scene.pushing=3"], ["scene.pushing=3", "parameter"]),
+    (["estimator.alpha_ordr.gamma=1"], ["alpha_ordr", "'alpha_order'"]),
+    (["estimators=[reinforce[baseline=center]"], ["reinforce"]),
+    (["estimators=['reinforce[baseline=centre]']"], ["centre", "'center'"]),
+    (["name=../up"], ["name='../up'"]),
+    (["scenes=["], ["scenes"]),
+    (["nonsense=1"], ["nonsense", "allowed"]),
+    (["rum"], ["rum", "'run'"]),
+    (["list", "fbog"], ["fbog", "'fobg'"]),
+    (["check", "fbog"], ["fbog", "'fobg'"]),
+    (["sweep={zip: {sigma: [0.1], horizon: [3, 4]}}"], ["equally long"]),
+    (["reference.samples=1"], ["reference.samples"]),
+    (["hydra.run.dir=/tmp"], ["Hydra"]),
+    (["-m", "+experiment=quick,stiffness_sweep"], ["multirun"]),
+]
+
+
+@pytest.mark.parametrize(("words", "said"), BAD, ids=[" ".join(words) for words, _ in BAD])
+def test_bad_input(words, said, tmp_path, capsys):
+    extra = [] if words[0] in ("list", "check") else [f"results_dir={tmp_path / 'out'}"]
+    assert main([*words, *extra]) == 2
+    answer = capsys.readouterr()
+    assert answer.out == ""
+    message = answer.err.strip()
+    assert message.startswith("bench: ")
+    assert "Traceback" not in message
+    assert len(message.splitlines()) == 1
+    for part in said:
+        assert part in message
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_directory_that_cannot_be_made(tmp_path, capsys):
+    blocker = tmp_path / "file"
+    blocker.write_text("mine")
+    assert main([*TINY, f"results_dir={blocker}"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+    assert blocker.read_text() == "mine"
+
+
+def test_report_without_rows(tmp_path, capsys):
+    assert main(["report", *TINY, f"results_dir={tmp_path}"]) == 2
+    assert "no rows" in capsys.readouterr().err
+
+
+def test_unreadable_rows_are_not_written_over(tmp_path, capsys):
+    path = tmp_path / "tiny" / "rows.parquet"
+    path.parent.mkdir()
+    path.write_bytes(b"not parquet")
+    assert main([*TINY, f"results_dir={tmp_path}"]) == 2
+    assert "cannot be read" in capsys.readouterr().err
+    assert path.read_bytes() == b"not parquet"
+
+
+def test_help_names_the_experiments(capsys):
+    assert main(["--help"]) == 0
+    assert "stiffness_sweep" in capsys.readouterr().out
