@@ -30,13 +30,24 @@ def experiments() -> list[str]:
 def load(overrides: Sequence[str]) -> Experiment:
     """The experiment that Hydra composes from overrides; raises :class:`UserError` for anything wrong in them."""
     from hydra import compose, initialize_config_dir
+    from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
+    parser = OverridesParser.create()
+    prepared = []
+    for override in overrides:
+        prepared.append(_prepared(override))
+        try:
+            parser.parse_override(prepared[-1])
+        except HydraException:
+            raise UserError(
+                f"'{override}' cannot be read: write key=value with lists as [a,b] and texts in quotes"
+            ) from None
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
-            config = compose("config", overrides=[_prepared(o) for o in overrides])
+            config = compose("config", overrides=prepared)
         plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(str(error).strip().splitlines()[0]) from None

@@ -176,6 +176,8 @@ class MechanicalScene(Scene):
     n_q: ClassVar[int]
     n_u: ClassVar[int] = 0
     n_contacts: ClassVar[int] = 0
+    open_loop: ClassVar[bool] = False
+    """Whether theta is the sequence of controls itself, step by step."""
     contact_values: ClassVar[Mapping[str, Any]] = {}
     """Values this scene gives to the parameters of whatever contact law is used, unless the user sets them."""
     velocity_factor = 1.0
@@ -195,8 +197,8 @@ class MechanicalScene(Scene):
         """Generalised acceleration without contact, ``(n_v, B)``; ``u`` is ``(n_u, B)``."""
 
     def planned_controls(self, xp: Any, theta: Array) -> Array | None:
-        """The open-loop part of the control law, ``(horizon, n_u, B)``, or None."""
-        return None
+        """The part of the control law that looks at no state, ``(horizon, n_u, B)``, or None."""
+        return xp.reshape(theta, (self.horizon, self.n_u, theta.shape[1])) if self.open_loop else None
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array | None:
         """The feedback part of the control law, ``(n_u, B)``, added to the planned one, or None."""
@@ -235,8 +237,8 @@ class ContactLaw(Plugin):
     """Name of the parameter that smooths the law, if it has one (``beta``, ``kappa``)."""
     needs_root: ClassVar[bool] = False
     """Whether the law solves an equation each step, so that only backends with ``root`` can run it."""
-    continuous: ClassVar[bool] = True
-    """Whether the state after a step is continuous in the state before it."""
+    continuous = True
+    """Whether the state after a step is continuous in the state before it; a property where parameters decide it."""
 
 
 @dataclass(frozen=True)
@@ -340,9 +342,9 @@ class Problem(ABC):
         return self.program.dim
 
     @property
-    def action_feedback(self) -> bool:
-        """Whether noise on actions differs from noise on theta (a feedback policy under action noise)."""
-        return self.program.action_feedback
+    def noise_on_theta(self) -> bool:
+        """Whether the noise of J is noise on theta: always, but for action noise under a policy."""
+        return self.program.noise_on_theta
 
     def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Costs f(theta, w), ``(B,)``."""
@@ -355,8 +357,8 @@ class Problem(ABC):
         return self._blocks(self._grad, theta, w)
 
     def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Per-sample scores d log p(actions | theta)/dtheta, ``(d, B)``; w / sigma unless a policy has feedback."""
-        if not self.action_feedback:
+        """Per-sample scores d log p(actions | theta)/dtheta, ``(d, B)``; w / sigma where noise is on theta."""
+        if self.noise_on_theta:
             return w / self.sigma
         return self._blocks(self._score, theta, w)
 

@@ -111,10 +111,12 @@ class Program:
         return self.scene.noise == "action"
 
     @property
-    def action_feedback(self) -> bool:
-        """Whether the policy has feedback under action noise, so that the score is not simply w / sigma."""
-        scene = type(self.scene)
-        return self.action_noise and issubclass(scene, MechanicalScene) and scene.feedback is not MechanicalScene.feedback
+    def noise_on_theta(self) -> bool:
+        """Whether the noise of J is noise on theta, so that the score is w / sigma.
+
+        True of parameter noise, and of action noise where theta is the controls themselves; not under a policy.
+        """
+        return not self.action_noise or (isinstance(self.scene, MechanicalScene) and self.scene.open_loop)
 
     @property
     def n_noise(self) -> int:

@@ -63,7 +63,7 @@ def certify(problem: Problem, provides: frozenset[str], samples: int, tolerance:
         found = Reference(np.asarray(closed, dtype=np.float64).reshape(1, -1), "closed_form")
     else:
         quadrature = None
-        if program.n_noise <= 2 and not program.action_feedback:
+        if program.n_noise <= 2 and program.noise_on_theta:
             quadrature = _quadrature(problem, theta)
         found = quadrature or _sampled(problem, theta, provides, samples, tolerance)
     physical = scene.physical_gradient()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import traceback
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Protocol
 
@@ -111,11 +111,8 @@ def measure(cell: Cell, problems: Problems, references: References) -> dict[str,
         parts.append(estimate(w[calls:]))
     estimates = np.concatenate(parts)
 
-    summary = statistics.summarise(estimates, truth_of(truth), cell.samples)
-    columns = summary.columns()
     result = {
         "status": "ok",
-        "reason": columns.pop("note"),
         "reference_method": truth.method,
         "model_error": truth.model_error,
         "time_s": clock.median_s,
@@ -125,18 +122,15 @@ def measure(cell: Cell, problems: Problems, references: References) -> dict[str,
         "gradients": usage.gradients / (calls + 1),
         "peak_memory_mb": timing.peak_memory_mb(),
         "device": "cpu",
-        **columns,
     }
+    if not np.isfinite(truth.batches).all():
+        return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}
+    summary = asdict(statistics.summarise(estimates, truth_of(truth), cell.samples))
+    result |= {"reason": summary.pop("note"), **summary}
     bad = ~np.isfinite(estimates).all(axis=1)
     if bad.any():
-        first = int(np.argmax(bad))
         result["status"] = "nonfinite"
-        result["reason"] = (
-            f"{bad.sum()} of {cell.repeats} estimates are not finite, first repeat {first} of seed {cell.seed}"
-        )
-    elif not np.isfinite(truth.batches).all():
-        result["status"] = "nonfinite"
-        result["reason"] = "the reference gradient is not finite"
+        result["reason"] += f", the first in repeat {int(np.argmax(bad))} of seed {cell.seed}"
     return result
 
 

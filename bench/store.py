@@ -17,13 +17,26 @@ from bench.errors import UserError
 if TYPE_CHECKING:
     import pandas as pd
 
-COLUMNS = ["experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise", "horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats", "dim", "seed", "status", "reason", "grad_norm", "reference_norm", "reference_method", "reference_se", "bias", "bias_low", "bias_high", "bias_rel", "variance", "variance_per_sample", "rmse", "rmse_rel", "cosine", "sign_agreement", "finite_fraction", "model_error", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients", "peak_memory_mb", "dtype", "device", "versions", "key"]
+COLUMNS = [
+    "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise",
+    "horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats", "dim", "seed", "status", "reason",
+    "grad_norm", "reference_norm", "reference_method", "reference_se", "bias", "bias_low", "bias_high",
+    "bias_rel", "variance", "variance_per_sample", "rmse", "rmse_rel", "cosine", "sign_agreement",
+    "finite_fraction", "model_error", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients",
+    "peak_memory_mb", "dtype", "device", "versions", "key",
+]  # fmt: skip
 """The columns of a row: a contract with people's scripts."""
 EXTRA_COLUMNS = ("variance_low", "variance_high")
 """Columns of ``rows.parquet`` beyond the contract: the 95% interval of the variance."""
-IDENTITY = ["scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise", "horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats", "seed", "dtype"]
+IDENTITY = [
+    "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise", "horizon", "dt",
+    "stiffness", "sigma", "smoothing", "samples", "repeats", "seed", "dtype",
+]  # fmt: skip
 """The columns that say which cell a row is, whatever version of the code made it."""
-TEXT = ["experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise", "status", "reason", "reference_method", "dtype", "device", "versions", "key"]
+TEXT = [
+    "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise", "status",
+    "reason", "reference_method", "dtype", "device", "versions", "key",
+]  # fmt: skip
 
 
 class Store:

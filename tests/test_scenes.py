@@ -89,10 +89,8 @@ def variance(samples):
 def zeroth_order(problem, w, baseline=True):
     """Per-sample score-function terms, with baseline f(theta, 0)."""
     theta = problem.program.scene.theta0()
-    cost = problem.value(theta, w)
-    if baseline:
-        cost = cost - problem.value(theta, np.zeros((w.shape[0], 1)))
-    return cost * problem.score(theta, w)
+    cost = problem.value(theta, np.hstack([w, quiet(problem)]))  # one batch, one compilation
+    return (cost[:-1] - cost[-1] * baseline) * problem.score(theta, w)
 
 
 def assert_mean(samples, expected):
@@ -105,11 +103,17 @@ def assert_mean(samples, expected):
 
 
 def combinations(root):
-    """Scene x law, for laws that solve an equation or for those that do not."""
+    """Scene x law, for laws that solve an equation or for those that do not, in few steps where those would be many.
+
+    Inelastically, a bouncing ball forgets where it came from once it lies still: it is also stopped soon after landing.
+    """
     for name, cls in SCENES.items():
-        scenes = [cls()]
-        if name == "cartpole":
-            scenes = [Cartpole(noise=noise) for noise in ("action", "parameter")]
+        scenes = {
+            "cartpole": [Cartpole(noise=noise) for noise in ("action", "parameter")],
+            "bounce_once": [BounceOnce(horizon=96, dt=1 / 96)],
+            "bouncing_ball": [BouncingBall(horizon=100, dt=0.01), BouncingBall(horizon=48, dt=0.01)][: 1 + root],
+            "wall_penalty_1d": [WallPenalty1d(horizon=100, dt=0.02)],
+        }.get(name, [cls()])
         for scene in scenes:
             contacts = getattr(scene, "n_contacts", 0)
             laws = [law for law in LAWS.values() if law.needs_root == root] if contacts else [] if root else [None]
@@ -167,7 +171,8 @@ def test_implicit_gradient_is_that_of_its_program(scene, law):
             for i in {0, theta.size // 2}:
                 step = 1e-6 * np.eye(theta.size)[i]
                 difference = (problem.value(theta + step, w) - problem.value(theta - step, w)) / 2e-6
-                assert np.abs(exact[i] - difference).max() <= 1e-5 * np.abs(exact).max()
+                # 1e-9: rounding of the costs over the step, where a ball at rest has forgotten its start
+                assert np.abs(exact[i] - difference).max() <= 1e-5 * np.abs(exact).max() + 1e-9
 
 
 # --------------------------------------------------------------------------------------------- closed forms
@@ -184,9 +189,9 @@ CLOSED = [
     Cubic(dimension=2, sigma=0.5),
     Constant(),
     DoubleIntegrator(),
-    BounceOnce(),
-    BounceOnce(velocity=-0.95),
-    BounceOnce(velocity=-0.95, restitution=0.5, mass=0.01, force=1.0),
+    BounceOnce(horizon=48, dt=1 / 48),
+    BounceOnce(horizon=48, dt=1 / 48, velocity=-0.95),
+    BounceOnce(horizon=48, dt=1 / 48, velocity=-0.95, restitution=0.5, mass=0.01, force=1.0),
 ]
 
 
@@ -309,7 +314,7 @@ def test_cubic_smoothing_shifts_the_gradient():
 @pytest.mark.parametrize("noise", ["action", "parameter"])
 def test_cartpole_scores_and_gradients_agree(noise):
     problem = Jax().compile(program(Cartpole(noise=noise)))
-    w = normal(problem.program.n_noise, 20_000)
+    w = normal(problem.program.n_noise, 5_000)
     assert_mean(zeroth_order(problem, w) - problem.grad(problem.program.scene.theta0(), w), 0.0)
 
 
@@ -410,8 +415,8 @@ def test_bouncing_ball_impulse_derivative_is_wrong_under_gravity():
     theta = BouncingBall().theta0()[:, None] + 0.05 * w
     physics = np.array([dataclasses.replace(scene, height=h, velocity=v).physical_gradient() for h, v in theta.T]).T
     coarse = Jax().compile(program(BouncingBall(), Impulse))
-    terms = zeroth_order(coarse, normal(2, 100_000, seed=1))
-    error = terms.std(axis=1) / math.sqrt(100_000) + physics.std(axis=1) / math.sqrt(4000)
+    terms = zeroth_order(coarse, normal(2, 40_000, seed=1))
+    error = terms.std(axis=1) / math.sqrt(40_000) + physics.std(axis=1) / math.sqrt(4000)
     # 0.05: the forward error of the program, of order dt
     assert np.all(np.abs(terms.mean(axis=1) - physics.mean(axis=1)) < 5 * error + 0.05)
     assert np.abs(coarse.grad(BouncingBall().theta0(), w).mean(axis=1) - physics.mean(axis=1)).max() > 1
@@ -445,9 +450,34 @@ def test_wall_exact_gradient():
     assert WallPenalty1d(start=-0.1).physical_gradient() is None
 
 
-def test_wall_program_tends_to_the_exact_gradient_inside_the_wall_too():
-    starts = np.linspace(1.56, 1.99, 200)
-    assert np.abs(along(wall(2000), starts) - exact(starts)).max() < 0.02
+def test_wall_differences_tend_to_the_exact_gradient_inside_the_wall_too():
+    """Over 20 steps' worth of q0, for rollouts that end in contact; the derivative does not tend there, see below."""
+    starts = np.linspace(1.58, 1.98, 200)
+    values = [wall(2000).value(starts[None] + shift, np.zeros((1, 200))) for shift in (0.01, -0.01)]
+    assert np.abs((values[0] - values[1]) / 0.02 - exact(starts)).max() < 0.02
+
+
+@pytest.mark.parametrize("steps", [200, 1000])
+@pytest.mark.parametrize(
+    ("start", "values", "smoothed", "mean"),
+    [
+        (0.6, {}, 0.797, 0.797),  # through the wall, entry and exit make up for each other
+        (1.8, {}, -0.087, -0.186),  # ending in it they cannot
+        (0.6, {"damping_mode": "clipped"}, 0.804, 1.573),  # a clipped damper jumps on entry alone
+        (0.6, {"damping": 0.0}, 0.342, 0.342),
+    ],
+    ids=["linear", "linear-inside", "clipped", "undamped"],
+)
+def test_wall_damper_jumps_bias_the_mean_gradient(steps, start, values, smoothed, mean):
+    """A damper that acts from first touch makes rollouts jump by O(dt) once a step's worth of q0: O(1) bias at any dt."""
+    scene = WallPenalty1d(horizon=steps, dt=2.0 / steps, start=start)
+    problem = Jax().compile(program(scene, Penalty, **values))
+    assert problem.program.continuous == ("damping" in values)
+    w = np.linspace(-8.0, 8.0, 8001)
+    weights = np.exp(-0.5 * w**2) / math.sqrt(2 * math.pi) * (w[1] - w[0])
+    # 2e-3 and 6e-3: the sums step over the jumps, and dt
+    assert zeroth_order(problem, w[None])[0] @ weights == pytest.approx(smoothed, abs=2e-3)
+    assert problem.grad(scene.theta0(), w[None])[0] @ weights == pytest.approx(mean, abs=6e-3)
 
 
 def wall_error(steps, points):
@@ -479,15 +509,18 @@ def test_wall_sign_changes_at_the_finest_step():
     assert sign_changes(20_000) == 2
 
 
-@pytest.mark.parametrize("steps", [20, 200, 2000])
+@pytest.mark.parametrize("steps", [20, 2000])
 def test_wall_impulse_without_time_of_impact_has_the_wrong_sign(steps):
     """Wherever there is contact, but within a step of the kink at q0 = 1."""
     starts = np.linspace(0.0, 2.0, 2002)[1:-1]
     wrong = np.sign(along(wall(steps, Impulse, time_of_impact=False), starts)) != np.where(starts < 1, -1, 1)
     assert np.all(wrong[np.abs(starts - 1.0) > 2.0 / steps])
     assert wrong.mean() == pytest.approx(1.0 - 1.0 / steps, abs=2e-3)
-    right = np.sign(along(wall(steps, Impulse), starts)) == np.where(starts < 1, -1, 1)
-    assert right.mean() > 0.999
+
+
+def test_wall_impulse_with_time_of_impact_has_the_right_sign():
+    starts = np.linspace(0.0, 2.0, 2002)[1:-1]
+    assert np.all(np.sign(along(wall(20, Impulse), starts)) == np.where(starts < 1, -1, 1))
 
 
 # ------------------------------------------------------------------------------------------------- pushing
@@ -511,8 +544,8 @@ def test_pushing_published_gradient_norm():
 
 @pytest.fixture(scope="module")
 def sweep():
-    """By beta: first- and zeroth-order variance, and the first-order variances of 100 sets of 1,000 samples."""
-    scene, sets = Pushing(), 100
+    """By beta: first- and zeroth-order variance, and the first-order variances of 48 sets of 1,000 samples."""
+    scene, sets = Pushing(), 48
     w = normal(30, 1000 * sets)
 
     @functools.cache

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,10 +37,14 @@ PROBLEM = ("scene", "contact", "integrator", "horizon", "dt", "stiffness", "sigm
 UNITS = {"horizon": "steps", "dt": "s", "stiffness": "N/m", "kappa": "N m"}
 REFUSED = ("unsupported", "unavailable")
 """Statuses of cells that were never run."""
-EXACT, CLOSE = 1e-6, 1e-4
+EXACT, CLOSE = 1e-6, 1e-2
 """Relative difference below which backends count as giving the same numbers, and nearly the same."""
 TIE = 1.1
 """Relative RMSEs within this factor of the lowest share the first place: R repeats do not resolve less."""
+GOALS = (0.3, 0.1, 0.03)
+"""Relative RMSEs to which the terminal names the fastest way."""
+NEGLIGIBLE = 0.01
+"""Relative bias below which the terminal does not remark on it."""
 WIDTH = 100
 FULL_ROWS = 40
 """Rows up to which the terminal shows each."""
@@ -124,26 +130,23 @@ def numeric_axes(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]
 
 
 def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row per cell whatever the seed: medians over the seeds that ended well, where there are several seeds."""
+    """One row per cell whatever the seed, medians over the seeds that ended well; ``lost`` counts those that did not."""
+    rows = rows.assign(lost=((rows["status"] != "ok") & ~rows["status"].isin(REFUSED)).astype(float))
     if rows["seed"].nunique() < 2:
         return rows
-    keys = [c for c in IDENTITY if c != "seed"]
-    merged = []
-    for _, part in rows.groupby(keys, dropna=False, sort=False):
-        good = part[part["status"] == "ok"]
-        row = part.iloc[0].copy()
-        if len(good):
-            row = good.iloc[0].copy()
-            numeric = good.select_dtypes("number").columns
-            row[numeric] = good[numeric].median()
-        merged.append(row)
-    return pd.DataFrame(merged).infer_objects().reset_index(drop=True)
+    cell = rows.groupby([c for c in IDENTITY if c != "seed"], dropna=False, sort=False).ngroup()
+    good = rows["status"] == "ok"
+    merged = rows.assign(cell=cell, bad=~good).sort_values("bad", kind="stable").drop_duplicates("cell")
+    merged = merged.set_index("cell").sort_index().drop(columns="bad")
+    medians = rows[good].groupby(cell[good])[list(rows.select_dtypes("number").columns)].median()
+    merged.loc[medians.index, medians.columns] = medians
+    return merged.assign(lost=rows["lost"].groupby(cell).sum()).reset_index(drop=True)
 
 
 # ------------------------------------------------------------------------------------- problem families
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Family:
     """The rows of one problem along an axis, and the identity columns that tell it from its neighbours."""
 
@@ -156,8 +159,8 @@ class Family:
         return ", ".join(parts)
 
 
-def families(table: pd.DataFrame) -> list[Family]:
-    """The problems of a table made by :func:`along`, in order of appearance.
+def families(table: pd.DataFrame, always: Sequence[str] = ()) -> list[Family]:
+    """The problems of a table made by :func:`along`, in order of appearance; ``always`` are columns to name anyway.
 
     A numeric column splits problems when it varies at fixed ``x``; one that moves with ``x`` (a zipped axis) does not.
     """
@@ -169,7 +172,7 @@ def families(table: pd.DataFrame) -> list[Family]:
     groups = [(dict(zip(keys, key, strict=True)), part) for key, part in table.groupby(keys, dropna=False, sort=False)]
     telling: list[str] = []
     for key in keys:
-        if _distinct(groups, [*telling, key]) > _distinct(groups, telling):
+        if key in always or _distinct(groups, [*telling, key]) > _distinct(groups, telling):
             telling.append(key)
     telling = telling or ["scene", "contact"]
     return [
@@ -188,7 +191,7 @@ def _says_something(column: str, value: Any) -> bool:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Line:
     """One estimator along ``x``, on one backend or on several that agree."""
 
@@ -202,14 +205,22 @@ class Line:
     """Median time per estimate on each backend."""
     failed: int
 
+    @cached_property
+    def at(self) -> dict[float, dict[str, Any]]:
+        """The rows by ``x``."""
+        return {float(x): row for x, row in zip(self.rows.index, self.rows.to_dict("records"), strict=True)}
+
     @property
     def label(self) -> str:
         """The estimator's identity string."""
         return f"{self.estimator}[{self.params}]" if self.params else self.estimator
 
 
-def lines(rows: pd.DataFrame, exact: float = EXACT, close: float = CLOSE) -> list[Line]:
-    """The lines of one family, in order of appearance; cells that were never run are left out."""
+def lines(rows: pd.DataFrame, exact: float = EXACT, close: float | None = CLOSE) -> list[Line]:
+    """The lines of one family, in order of appearance; cells that were never run are left out.
+
+    Backends within a relative difference of ``close`` are one line; each is its own without it.
+    """
     rows = rows[~rows["status"].isin(REFUSED)]
     several = rows["dtype"].nunique() > 1
     found = []
@@ -220,12 +231,14 @@ def lines(rows: pd.DataFrame, exact: float = EXACT, close: float = CLOSE) -> lis
             runs[name] = run.drop_duplicates("x", keep="last").set_index("x").sort_index()
         while runs:
             first, mine = next(iter(runs.items()))
-            merged = {name: agree(mine, run, exact) for name, run in runs.items() if agree(mine, run, close)}
+            merged = {first: True}
+            if close is not None:
+                merged = {name: agree(mine, run, exact) for name, run in runs.items() if agree(mine, run, close)}
             merged = dict(sorted(merged.items(), key=lambda item: not item[1]))
             seconds = {name: float(runs[name]["time_s"].median()) for name in merged}
-            failed = sum(int((runs[name]["status"] != "ok").sum()) for name in merged)
-            found.append(Line(str(estimator), str(params), merged | {first: True}, mine, seconds, failed))
-            runs = {name: run for name, run in runs.items() if name not in merged and name != first}
+            failed = sum(int(runs[name]["lost"].sum()) for name in merged)
+            found.append(Line(str(estimator), str(params), merged, mine, seconds, failed))
+            runs = {name: run for name, run in runs.items() if name not in merged}
     return found
 
 
@@ -355,7 +368,7 @@ class Readable:
     """The main table as text, not yet escaped for any format."""
 
     title: str
-    shared: str
+    shared: list[str]
     headers: list[str]
     body: list[list[str]]
     numeric: list[bool]
@@ -366,12 +379,14 @@ class Readable:
 def readable(rows: pd.DataFrame) -> Readable:
     """The main table: identity columns that vary, the results, and for what failed its status and reason."""
     varying = [c for c in IDENTITY if rows[c].nunique(dropna=False) > 1]
-    constant = {c: rows[c].iloc[0] for c in IDENTITY if c not in varying}
-    shared = ", ".join(
-        f"{c} {v if isinstance(v, str) else axis_value(v)}"
-        for c, v in constant.items()
-        if v not in ("", "none") and not (isinstance(v, float) and math.isnan(v))
-    )
+    problems = rows.groupby(["scene", "contact"], sort=False)
+    main = ("scene", "contact", "backend", "estimator", "estimator_params")
+    implied = [c for c in varying if c not in main and (problems[c].nunique(dropna=False) == 1).all()]
+    shared = [f"The same in every row: {_named(rows.iloc[0], [c for c in IDENTITY if c not in varying])}."]
+    for (scene, contact), part in problems if implied else ():
+        problem = f"{scene}, {contact}" if contact != "none" else str(scene)
+        shared.append(f"In every row of {problem}: {_named(part.iloc[0], implied)}.")
+    varying = [c for c in varying if c not in implied]
     reasons = {text: i + 1 for i, text in enumerate(dict.fromkeys(r for r in rows["reason"] if r))}
     with_status = bool(reasons) or (rows["status"] != "ok").any()
     headers = [*varying, "bias [95% interval]", "relative bias", "variance", "rel. RMSE", "cosine", "time [ms]"]
@@ -394,13 +409,18 @@ def readable(rows: pd.DataFrame) -> Readable:
     ]
     return Readable(
         title=f"{rows['experiment'].iloc[0]}: bias and variance",
-        shared=f"The same in every row: {shared}." if shared else "",
+        shared=shared,
         headers=[*headers, *(["status"] if with_status else [])],
         body=body,
         numeric=[*(c in NUMBERS or c == "seed" for c in varying), *([True] * 6), *([False] if with_status else [])],
         footnotes=footnotes,
         reasons=[f"({i}) {text}" for text, i in reasons.items()],
     )
+
+
+def _named(row: Any, columns: Sequence[str]) -> str:
+    texts = {c: row[c] if isinstance(row[c], str) else axis_value(row[c]) for c in columns}
+    return ", ".join(f"{c} {text}" for c, text in texts.items() if text not in ("", "none", "-"))
 
 
 def _relative_bias(row: Any) -> str:
@@ -414,8 +434,8 @@ def markdown(rows: pd.DataFrame) -> str:
     """The main table in Markdown."""
     table, e = readable(rows), escape_markdown
     out = [f"# {e(table.title)}", ""]
-    if table.shared:
-        out += [e(table.shared), ""]
+    for text in table.shared:
+        out += [e(text), ""]
     out.append("| " + " | ".join(map(e, table.headers)) + " |")
     out.append("|" + "|".join("--:" if right else "---" for right in table.numeric) + "|")
     out += ["| " + " | ".join(map(e, cells)) + " |" for cells in table.body]
@@ -432,7 +452,7 @@ def latex(rows: pd.DataFrame) -> str:
     spec = "".join("r" if right else "l" for right in table.numeric)
     head = " & ".join(map(e, table.headers)) + r" \\"
     body = [" & ".join(map(e, cells)) + r" \\" for cells in table.body]
-    notes = [e(text) for text in (table.title + ".", table.shared, *table.footnotes, *table.reasons) if text]
+    notes = [e(text) for text in (table.title + ".", *table.shared, *table.footnotes, *table.reasons) if text]
     if long:
         out = [
             r"% needs \usepackage{booktabs,longtable}",
@@ -481,63 +501,74 @@ def show(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]) -> Non
     counts = rows["status"].value_counts()
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     console.print(f"{len(rows)} cells: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
-    found = numeric_axes(experiment, rows, axes)
-    axis = max(found, key=lambda a: found[a]) if found else None
-    groups = families(along(rows, axis, experiment))
-    groups = [g for g in groups if not g.rows["status"].isin(REFUSED).all()]
-    if len(rows) <= FULL_ROWS or axis is None:
-        _show_rows(console, groups, axis)
-    else:
-        for group in groups:
+    parts = _parts(experiment, rows, axes)
+    condensed = len(rows) > FULL_ROWS
+    for axis, group in parts:
+        if condensed and axis is not None:
             _show_family(console, group, axis)
-    _show_legend(console, condensed=len(rows) > FULL_ROWS and axis is not None)
-    _show_verdict(console, groups, axis)
+        else:
+            _show_rows(console, group, axis, merge=condensed)
+    _show_legend(console, condensed=condensed and any(axis is not None for axis, _ in parts))
     _show_reasons(console, rows)
+    console.print("\nIn short", style="bold")
+    for axis, group in parts:
+        _show_verdict(console, group, axis)
 
 
-def _show_rows(console: Console, groups: Sequence[Family], axis: str | None) -> None:
-    """One printed line per cell or, without an axis, per estimator and the backends that agree."""
-    for group in groups:
-        table = _table(group.title())
-        if axis is not None:
-            table.add_column(short_axis(axis), justify="right")
-        for name in ("estimator", "backend"):
-            table.add_column(name, overflow="fold")
-        for name in ("rel. bias [95%]", "variance", "rel. RMSE", "cosine", "time"):
-            table.add_column(name, justify="right")
-        found = lines(group.rows)
-        best = _best(found)
-        for x in sorted({x for line in found for x in line.rows.index}):
-            for line in found:
-                if x not in line.rows.index:
-                    continue
-                row = line.rows.loc[x]
-                cells = [] if axis is None else [axis_value(x)]
-                cells += [line.label, _backends(line, timed=False)]
-                if row["status"] != "ok":
-                    table.add_row(*cells, _styled(row["status"], "red"), "-", "-", "-", "-")
-                    continue
-                times = [
-                    duration(line.seconds[name] if len(found) and axis is None else row["time_s"])
-                    for name in (line.backends if axis is None else list(line.backends)[:1])
-                ]
-                table.add_row(
-                    *cells, _bias(row, relative), number(row["variance"]), _rmse(row, best.get(x, math.nan)),
-                    number(row["cosine"], 3), "\n".join(times),
-                )  # fmt: skip
-        console.print(table)
+def _parts(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]) -> list[tuple[str | None, Family]]:
+    """The problems to print, each along the longest axis that it was swept along; every cell that ran is in one."""
+    found = numeric_axes(experiment, rows, axes)
+    parts: list[tuple[str | None, Family]] = []
+    seen: set[str] = set()
+    for axis in (*sorted(found, key=lambda a: -found[a]), None):
+        for group in families(along(rows, axis, experiment), always=("scene", "contact")):
+            ran = group.rows[~group.rows["status"].isin(REFUSED)]
+            if set(ran["key"]) - seen and (axis is None or ran["x"].nunique() > 1):
+                seen |= set(ran["key"])
+                parts.append((axis, group))
+    return parts
+
+
+def _show_rows(console: Console, group: Family, axis: str | None, merge: bool) -> None:
+    """One printed line per cell or, to ``merge``, per estimator and the backends that agree."""
+    table = _table(group.title())
+    if axis is not None:
+        table.add_column(short_axis(axis), justify="right")
+    for name in ("estimator", "backend"):
+        table.add_column(name, overflow="fold")
+    for name in ("rel. bias [95%]", "variance", "rel. RMSE", "cosine", "time"):
+        table.add_column(name, justify="right")
+    found = lines(group.rows) if merge else lines(group.rows, close=None)
+    best = _best(found)
+    for x in sorted({x for line in found for x in line.at}):
+        for line in found:
+            if x not in line.at:
+                continue
+            row = line.at[x]
+            cells = [] if axis is None else [axis_value(x)]
+            cells += [line.label, "\n".join(_backends(line))]
+            if row["status"] != "ok":
+                table.add_row(*cells, _styled(row["status"], "red"), "-", "-", "-", "-")
+                continue
+            times = line.seconds.values() if merge else [row["time_s"]]
+            table.add_row(
+                *cells, _bias(row, relative) + _noted(row), number(row["variance"]), _rmse(row, best.get(x, math.nan)),
+                number(row["cosine"], 3), "\n".join(map(duration, times)),
+            )  # fmt: skip
+    console.print(table)
 
 
 def _show_family(console: Console, group: Family, axis: str) -> None:
     """A pivot: two printed lines per estimator and agreeing backends, a column per value of the axis."""
     found = lines(group.rows)
     best = _best(found)
-    values = sorted({x for line in found for x in line.rows.index})
-    room = max(1, (console.width - 40) // 8)
+    values = sorted({x for line in found for x in line.at})
+    room = max(1, (console.width - 44) // 8)
     for start in range(0, len(values), room):
         chunk = values[start : start + room]
         table = _table(f"{group.title()}   (columns: {axis_text(axis)})")
-        table.add_column("estimator, time of one estimate", max_width=30, overflow="fold")
+        width = min(60, max(34, console.width - 12 - 8 * len(chunk)))
+        table.add_column("estimator, time", max_width=width, overflow="fold")
         table.add_column("", no_wrap=True)
         for x in chunk:
             table.add_column(axis_value(x), justify="right", no_wrap=True)
@@ -545,18 +576,18 @@ def _show_family(console: Console, group: Family, axis: str) -> None:
         for line in found:
             upper, lower = [], []
             for x in chunk:
-                row = line.rows.loc[x] if x in line.rows.index else None
+                row = line.at.get(x)
                 if row is None or row["status"] != "ok":
                     upper.append(_styled("" if row is None else row["status"][:6], "red"))
                     lower.append(_styled("", ""))
                     continue
                 high = relative(row, "bias_high")
                 text = number(relative(row, "bias")) if resolved(row) else f"<{number(high)}" if high > 0 else "0"
-                upper.append(_styled(text, "yellow" if resolved(row) else "dim"))
+                upper.append(_styled(text + _noted(row), "yellow" if resolved(row) else "dim"))
                 lower.append(_rmse(row, best.get(x, math.nan)))
             failed = str(line.failed) if line.failed else ""
             table.add_row(_styled(line.label, "bold"), "bias", *upper, failed)
-            table.add_row(f"  {_backends(line, timed=True)}", "rmse", *lower, "")
+            table.add_row(_timed_backends(line, width), "rmse", *lower, "")
         console.print(table)
 
 
@@ -576,24 +607,34 @@ def _styled(text: str, style: str) -> Text:
     return Text(text, style=style)
 
 
+def _noted(row: Any) -> str:
+    return "?" if row["reason"] else ""
+
+
 def _rmse(row: Any, best: float) -> Text:
     value = row["rmse_rel"]
     mark = "*" if value <= TIE * best else ""
     return _styled(number(value) + mark, "bold green" if mark and value < 1 else "red" if value >= 1 else "")
 
 
-def _backends(line: Line, timed: bool) -> str:
-    names = [("" if exact else "~") + name for name, exact in line.backends.items()]
-    if not timed:
-        return "\n".join(names)
-    return ", ".join(f"{text} {duration(line.seconds[name])}" for text, name in zip(names, line.backends, strict=True))
+def _backends(line: Line) -> list[str]:
+    return [("" if exact else "~") + name for name, exact in line.backends.items()]
+
+
+def _timed_backends(line: Line, width: int) -> str:
+    """``jax 0.21ms, torch 12ms``, broken between backends."""
+    times = [duration(seconds).replace(" ", "") for seconds in line.seconds.values()]
+    text = ", ".join(f"{name}\0{time}" for name, time in zip(_backends(line), times, strict=True))
+    return textwrap.fill(text, width, initial_indent="  ", subsequent_indent="  ").replace("\0", " ")
 
 
 def _best(found: Sequence[Line]) -> dict[float, float]:
-    """The lowest relative RMSE at each ``x``."""
-    good = [line.rows.loc[line.rows["status"] == "ok", "rmse_rel"].dropna() for line in found]
-    together = pd.concat(good) if good else pd.Series(dtype=float)
-    return {float(x): float(v) for x, v in together.groupby(level=0).min().items()}  # type: ignore[arg-type]
+    """The lowest relative RMSE at each ``x`` where there is one."""
+    best: dict[float, float] = {}
+    for x, row in sorted(((x, row) for line in found for x, row in line.at.items()), key=lambda item: item[0]):
+        if row["status"] == "ok" and math.isfinite(row["rmse_rel"]):
+            best[x] = min(row["rmse_rel"], best.get(x, math.inf))
+    return best
 
 
 def _show_legend(console: Console, condensed: bool) -> None:
@@ -602,41 +643,56 @@ def _show_legend(console: Console, condensed: bool) -> None:
     )
     console.print(
         f"\nbias: |mean - reference| / |grad J|, {bias} (95%). rmse: error of one estimate / |grad J|, above 1 worse than "
-        "answering zero; * lowest, within 10%. Backends on one line agree to 1e-6, with ~ to 1e-4."
-        + (" fail: cells not ok." if condensed else "")
+        "answering zero; * lowest, within 10%. A ? is explained below. Backends on one line agree to 1e-6, with ~ to 1%."
+        + (" Under each estimator: backends and their time per estimate. fail: cells not ok." if condensed else "")
     )
 
 
-FINDINGS: dict[str, Callable[[Any, float], bool]] = {
-    "lowest error": lambda row, best: bool(row["rmse_rel"] <= TIE * best),
-    "mostly bias, more samples do not help": lambda row, best: (
-        resolved(row) and row["bias"] ** 2 > row["rmse"] ** 2 / 2
-    ),
-    "no better than answering zero": lambda row, best: bool(row["rmse_rel"] >= 1),
-}
-"""What the digest says of an estimator, from one row and the lowest relative RMSE beside it."""
+def _show_verdict(console: Console, group: Family, axis: str | None) -> None:
+    """Of one problem: which estimators have the lowest error, whose error is bias, and which are useless, and where."""
+    found = lines(group.rows)
+    best = _best(found)
+    winners: dict[float, list[str]] = {x: [] for x in best}
+    biased: dict[str, dict[float, bool]] = {}
+    useless: dict[str, dict[float, bool]] = {}
+    for line in found:
+        for x, row in line.at.items():
+            good = row["status"] == "ok"
+            if good and row["rmse_rel"] <= TIE * best.get(x, math.nan) and line.label not in winners[x]:
+                winners[x].append(line.label)
+            mostly = good and resolved(row) and row["bias_rel"] > NEGLIGIBLE and row["bias"] ** 2 > row["rmse"] ** 2 / 2
+            for found_at, holds in ((biased, mostly), (useless, good and row["rmse_rel"] >= 1)):
+                there = found_at.setdefault(line.label, {})
+                there[x] = there.get(x, False) or holds
+    console.print(f"  {group.title()}" + (f", by {axis_text(axis)}" if axis else ""), style="bold")
+    sets = dict.fromkeys(", ".join(names) for names in winners.values())
+    ranges = (f"{_range({x: ', '.join(n) == text for x, n in winners.items()})}: {text}" for text in sets)
+    _print_wrapped(console, "lowest error: " + "; ".join(text.removeprefix(": ") for text in ranges), 4)
+    for text, where in (("mostly bias, more samples do not help", biased), ("no better than answering zero", useless)):
+        parts = [f"{label} {_range(holds)}".strip() for label, holds in where.items() if any(holds.values())]
+        if parts:
+            _print_wrapped(console, f"{text}: {', '.join(parts)}", 4)
+    if axis is not None and short_axis(axis) == "samples":
+        firsts: dict[str, list[str]] = {}
+        for goal in GOALS:
+            firsts.setdefault(_first(group.rows, goal), []).append(f"{goal:g}")
+        parts = [f"{', '.join(goals)}: {first}" for first, goals in firsts.items()]
+        _print_wrapped(console, f"first to a relative RMSE of {'; '.join(parts)}", 4)
 
 
-def _show_verdict(console: Console, groups: Sequence[Family], axis: str | None) -> None:
-    """Per problem: which estimators have the lowest error, whose error is bias, and which are useless, and where."""
-    from rich.padding import Padding
+def _first(rows: pd.DataFrame, goal: float) -> str:
+    """The fastest cell with a relative RMSE of at most ``goal``."""
+    good = rows[(rows["status"] == "ok") & (rows["rmse_rel"] <= goal) & np.isfinite(rows["time_s"])]
+    if good.empty:
+        return "none"
+    row = good.loc[good["time_s"].idxmin()]
+    label = f"{row['estimator']}[{row['estimator_params']}]" if row["estimator_params"] else row["estimator"]
+    return f"{label} on {row['backend']} in {duration(row['time_s'])} with {row['x']:g} samples"
 
-    name = short_axis(axis) if axis else ""
-    console.print("\nIn short" + (f", by {name}" if axis else ""), style="bold")
-    for group in groups:
-        found = lines(group.rows)
-        best = _best(found)
-        console.print(f"  {group.title()}", style="bold")
-        for text, holds in FINDINGS.items():
-            parts: dict[str, None] = {}
-            for line in found:
-                where = {
-                    x: row["status"] == "ok" and holds(row, best.get(x, math.nan)) for x, row in line.rows.iterrows()
-                }
-                if any(where.values()):
-                    parts[f"{line.label} {_range(where)}".strip()] = None
-            if parts:
-                console.print(Padding(f"{text}: {', '.join(parts)}", (0, 0, 0, 4)))
+
+def _print_wrapped(console: Console, text: str, indent: int) -> None:
+    lead = " " * indent
+    console.print(textwrap.fill(text, console.width, initial_indent=lead, subsequent_indent=lead + "  "))
 
 
 def _range(where: Mapping[float, bool]) -> str:
@@ -653,16 +709,14 @@ def _range(where: Mapping[float, bool]) -> str:
                 runs.append([x])
     if len(runs) == 1 and len(runs[0]) > 1:
         if runs[0][0] == values[0]:
-            return f"<= {axis_value(runs[0][-1])}"
+            return f"<={axis_value(runs[0][-1])}"
         if runs[0][-1] == values[-1]:
-            return f">= {axis_value(runs[0][0])}"
+            return f">={axis_value(runs[0][0])}"
     texts = [axis_value(r[0]) if len(r) == 1 else f"{axis_value(r[0])}..{axis_value(r[-1])}" for r in runs]
     return f"at {' and '.join(texts)}"
 
 
 def _show_reasons(console: Console, rows: pd.DataFrame) -> None:
-    from rich.padding import Padding
-
     noted = rows[rows["reason"] != ""]
     if noted.empty:
         return
@@ -671,4 +725,4 @@ def _show_reasons(console: Console, rows: pd.DataFrame) -> None:
     for (status, _), part in sorted(noted.groupby(["status", kinds]), key=lambda item: -len(item[1])):
         text = _one_line(part["reason"].iloc[0])
         more = "" if part["reason"].nunique() == 1 else " (for example)"
-        console.print(Padding(f"{len(part)} {status}: {text}{more}", (0, 0, 0, 2)))
+        _print_wrapped(console, f"{len(part)} {status}: {text}{more}", 2)

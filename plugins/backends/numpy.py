@@ -18,11 +18,15 @@ class Numpy(Backend):
     name = "numpy"
     reference_rank: ClassVar[int | None] = 3
 
-    step: float = param(1e-6, "step of the central differences, in units of theta", positive=True)
+    step: float | None = param(
+        None, "step of the central differences, in units of theta; null: 1e-6, and 5e-3 in float32", positive=True
+    )
 
     def compile(self, program: Program) -> Problem:
         """Nothing to compile."""
-        return NumpyProblem(program, self.dtype, self.step)
+        # about the cube root of the rounding error, which balances rounding and truncation
+        step = self.step or {"float64": 1e-6, "float32": 5e-3}[self.dtype]
+        return NumpyProblem(program, self.dtype, step)
 
 
 class NumpyOps:

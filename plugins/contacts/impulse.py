@@ -17,7 +17,7 @@ class Impulse(ImpulseLaw):
     """
 
     name = "impulse"
-    continuous: ClassVar[bool] = False
+    continuous = False
 
     time_of_impact: bool = param(True, "correct the position for the time of impact within the step")
 

@@ -21,6 +21,11 @@ class Penalty(ForceLaw):
     damping: float = param(0.0, "c, force per penetration rate", "N s/m", low=0.0)
     damping_mode: str = param("clipped", "where the damper acts", choices=("clipped", "approach", "linear"))
 
+    @property
+    def continuous(self) -> bool:  # type: ignore[override]
+        """Only without damping: at touch a damper sets in at once."""
+        return self.damping == 0.0
+
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
         """Normal force, zero without penetration."""
         damper = -self.damping * gap_rate

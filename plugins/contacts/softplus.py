@@ -25,6 +25,11 @@ class Softplus(ForceLaw):
     beta: float = param(1e2, "sharpness of the softplus", "1/m for smooths=gap, 1/N for smooths=clip", positive=True)
     smooths: str = param("gap", "what is smoothed", choices=("gap", "clip"))
 
+    @property
+    def continuous(self) -> bool:  # type: ignore[override]
+        """With the gap smoothed, or without damping: at touch an unsmoothed damper sets in at once."""
+        return self.smooths == "gap" or self.damping == 0.0
+
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
         """Normal force, positive everywhere."""
         if self.smooths == "clip":

@@ -19,6 +19,7 @@ class DoubleIntegrator(MechanicalScene):
     name = "double_integrator"
     leaves_out = "contact, friction, effort in the cost"
     noise = "action"
+    open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1
 
@@ -35,10 +36,6 @@ class DoubleIntegrator(MechanicalScene):
         """At rest at 0."""
         zero = 0.0 * theta[:1]
         return State(zero, zero)
-
-    def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """theta, one control a step."""
-        return theta[:, None, :]
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """The control."""

@@ -19,6 +19,7 @@ class Pendulum(MechanicalScene):
     name = "pendulum"
     leaves_out = "the rod's mass, torque limits, contact"
     noise = "action"
+    open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1
 
@@ -40,10 +41,6 @@ class Pendulum(MechanicalScene):
         """Hanging at rest."""
         zero = 0.0 * theta[:1]
         return State(zero, zero)
-
-    def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """theta, one torque a step."""
-        return theta[:, None, :]
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """Torque, damping and gravity over the moment of inertia."""

@@ -22,6 +22,7 @@ class Pushing(MechanicalScene):
         "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
     )
     noise = "action"
+    open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1
@@ -44,10 +45,6 @@ class Pushing(MechanicalScene):
         """Bodies just touching, the first moving at ``speed``."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero + 1.0]), xp.stack([zero + self.speed, zero]))
-
-    def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """theta, one force a step."""
-        return theta[:, None, :]
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """The push on the first body."""

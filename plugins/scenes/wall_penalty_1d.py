@@ -16,7 +16,9 @@ class WallPenalty1d(MechanicalScene):
 
     State (q, v); theta = q0 (d = 1), with parameter noise; f = |q_T - 1| with T = horizon dt = 2 s. The wall is a
     penalty law with the values of ``contact_values``; unlike elsewhere the softness is part of the physics, which the
-    physical gradient takes at dt -> 0. Source: Paulus et al. 2025, toy example.
+    physical gradient takes at dt -> 0. Its damper acts from first touch, so that the program jumps by O(dt) once a
+    step's worth of q0: its derivative tends to the physical one where the wall is left again, not for rollouts that
+    end in it. Source: Paulus et al. 2025, toy example.
     """
 
     name = "wall_penalty_1d"
@@ -62,7 +64,7 @@ class WallPenalty1d(MechanicalScene):
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
         """Of the physics: start in touch; end at q = 1 after a bounce, when leaving, when touching, at q = 1 untouched.
 
-        A program has weaker kinks besides, wherever contact begins or ends on the boundary between two steps.
+        A program jumps besides, by O(dt), wherever contact begins or ends on the boundary between two steps.
         """
         end = self.horizon * self.dt
         _, duration, speed = self._wall()

@@ -1,0 +1,268 @@
+"""Checks of backends: their numbers against those of NumPy, differences, and known solutions."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.conformance.kit import Failed, Skipped, require, verifies
+from bench.conformance.subjects import (
+    COLUMNS,
+    DIFFERENCED,
+    LIMIT,
+    Ops,
+    all_programs,
+    can_run,
+    covering,
+    distance,
+    disturbed,
+    plain_backend,
+    rng,
+    samples,
+    telling,
+    title,
+)
+from bench.contracts import Array, Backend, Integrator, MechanicalScene, Problem, State, Unsupported, param
+from bench.program import Program
+
+
+def programs_for(
+    backend: Backend, sort: Callable[[list[Program]], list[Program]], found: Iterable[Program] | None = None
+) -> list[Program]:
+    """Programs of a sort that the backend can run; with other than default parameters only smooth ones and equations."""
+    runs = [program for program in (all_programs() if found is None else found) if can_run(backend, program)]
+    if not runs:
+        raise Skipped("refuses every program")
+    if backend == type(backend)():
+        return sort(runs)
+    few = telling(runs)
+    return [program for program in few if program.needs_root or program.contact is None] or few[:1]
+
+
+@verifies(Backend)
+def value_agrees(backend: Backend) -> str:
+    """Costs equal the plain backend's on every scene and law, to 1e-9."""
+    plain = plain_backend()
+    found = programs_for(backend, list, [program for program in all_programs() if can_run(plain, program)])
+    worst = 0.0
+    for program in found:
+        theta, w = samples(program)
+        value = backend.compile(program).value(theta, w)
+        require(value.shape == (COLUMNS,), f"{title(program)}: shape {value.shape}, not {(COLUMNS,)}")
+        off = distance(value, plain.compile(program).value(theta, w))
+        require(off < 1e-9, f"{title(program)}: costs differ by {off:.1e}")
+        worst = max(worst, off)
+    return f"to {worst:.0e} on {len(found)} programs"
+
+
+@verifies(Backend)
+def gradient_is_that_of_value(backend: Backend) -> str:
+    """Along random directions, against central differences of its own costs; columns at a kink or jump are left out."""
+    if "grad" not in backend.provides:
+        raise Skipped("gives no gradients")
+    worst, judged, found = 0.0, 0, programs_for(backend, covering)
+    for program in found:
+        theta, w = samples(program)
+        problem = backend.compile(program)
+        gradient = problem.grad(theta, w)
+        require(gradient.shape == theta.shape, f"{title(program)}: shape {gradient.shape}, not {theta.shape}")
+        require(np.isfinite(gradient).all(), f"{title(program)}: not finite")
+        off, smooth = _against_differences(problem, gradient, theta, w)
+        require(smooth.any(), f"{title(program)}: no column on which differences settle")
+        off = np.where(smooth, off, 0.0)
+        require(off.max() < 1e-4, f"{title(program)}: differs from central differences by {off.max():.1e}")
+        worst, judged = max(worst, off.max()), judged + smooth.sum()
+    return f"to {worst:.0e} on {judged} of {len(found) * COLUMNS} columns of {len(found)} programs"
+
+
+def _against_differences(
+    problem: Problem, gradient: np.ndarray, theta: np.ndarray, w: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Relative error of directional derivatives per column, and whether differences of two steps agree there."""
+    e = rng("direction").standard_normal(theta.shape)
+    steps = (2e-6, 1e-6)
+    wide, narrow = ((problem.value(theta + h * e, w) - problem.value(theta - h * e, w)) / (2 * h) for h in steps)
+    slope = (gradient * e).sum(axis=0)
+    # rounding leaves about 1e-16 / 1e-6 of the cost in a difference; a gradient below that cannot be judged
+    scale = np.abs(narrow) + np.abs(gradient * e).sum(axis=0) + 1e-5 * np.abs(problem.value(theta, w)) + 1e-9
+    return np.abs(slope - narrow) / scale, np.abs(wide - narrow) < 2e-5 * scale
+
+
+@verifies(Backend)
+def score_is_that_of_actions(backend: Backend) -> str:
+    """w / sigma without feedback; with it, the derivative of log p(actions), of mean zero."""
+    if "score" not in backend.provides:
+        raise Skipped("gives no scores")
+    details = []
+    for program in programs_for(backend, telling):
+        theta, w = samples(program)
+        problem = backend.compile(program)
+        score = problem.score(theta, w)
+        if program.noise_on_theta:
+            off = distance(score, w / program.scene.sigma)
+            require(off < 1e-12, f"{title(program)}: differs from w / sigma by {off:.1e}")
+            continue
+        e, h, ops = rng("direction").standard_normal(theta.shape), 1e-3, Ops()
+        ahead, behind = (program.log_probability(ops, theta, theta + s * h * e, w) for s in (1, -1))
+        off = distance((score * e).sum(axis=0), (ahead - behind) / (2 * h))
+        require(off < 1e-5, f"{title(program)}: differs from differences of log p by {off:.1e}")
+        many = problem.score(program.scene.theta0(), rng("scores").standard_normal((program.n_noise, 4096)))
+        z = np.abs(many.mean(axis=1)) / (many.std(axis=1) / 64)
+        require(z.max() < LIMIT, f"{title(program)}: the mean is {z.max():.1f} standard errors from zero")
+        details.append(f"{title(program)} to {off:.0e}, mean within {z.max():.1f} standard errors of 0")
+    return "; ".join(details) or "w / sigma"
+
+
+@verifies(Backend)
+def columns_are_independent(backend: Backend) -> str:
+    """Column b of a result depends on column b of theta and w, whatever else is in the batch."""
+    worst = 0.0
+    for program in programs_for(backend, telling):
+        problem, (theta, w) = backend.compile(program), samples(program)
+        for capability in sorted(backend.provides & {"value", "grad", "score"}):
+            function = getattr(problem, capability)
+            whole, other = function(theta, w), function(*disturbed(theta, w))
+            kept = np.arange(COLUMNS) != 2
+            off = distance(other[..., kept], whole[..., kept])
+            require(off < DIFFERENCED, f"{capability} of {title(program)}: a column changes others by {off:.1e}")
+            off = max(off, distance(function(theta[:, ::-1], w[:, ::-1])[..., ::-1], whole))
+            require(off < DIFFERENCED, f"{capability} of {title(program)}: the order of columns matters by {off:.1e}")
+            worst = max(worst, off)
+    return f"to {worst:.0e}"
+
+
+@verifies(Backend)
+def shared_theta_is_spread(backend: Backend) -> str:
+    """``theta (d,)`` gives what ``theta (d, B)`` of equal columns does, and a batch what its columns do one by one."""
+    worst = 0.0
+    for program in programs_for(backend, telling)[-1:]:
+        problem, w = backend.compile(program), samples(program)[1]
+        theta = program.scene.theta0()
+        for capability in sorted(backend.provides & {"value", "grad", "score"}):
+            function = getattr(problem, capability)
+            spread = function(np.repeat(theta[:, None], COLUMNS, axis=1), w)
+            off = distance(function(theta, w), spread)
+            require(off < DIFFERENCED, f"{capability} of {title(program)}: theta (d,) and (d, B) differ by {off:.1e}")
+            off = max(off, distance(function(theta, w[:, :1]), spread[..., :1]))
+            require(off < DIFFERENCED, f"{capability} of {title(program)}: a column alone differs by {off:.1e}")
+            worst = max(worst, off)
+    return f"to {worst:.0e}"
+
+
+@verifies(Backend)
+def single_precision_is_finite(backend: Backend) -> str:
+    """With ``dtype=float32``: costs and gradients within single precision of those in double, on smooth scenes."""
+    single = dataclasses.replace(backend, dtype="float32")
+    worst = dict.fromkeys(sorted(backend.provides & {"value", "grad"}), 0.0)
+    smooth = [p for p in programs_for(single, telling) if p.contact is None and p.continuous]
+    for program, capability in itertools.product(smooth, worst):
+        found, expected = (getattr(b.compile(program), capability)(*samples(program)) for b in (single, backend))
+        require(np.isfinite(found).all(), f"{capability} of {title(program)}: not finite in float32")
+        off = distance(found, expected)
+        # 1e-2: a rollout rounds some hundred times, and differences in single precision keep two or three digits
+        require(off < 1e-2, f"{capability} of {title(program)}: float32 differs by {off:.1e}")
+        worst[capability] = max(worst[capability], off)
+    require(any(worst.values()), "float32 gives the numbers of float64")
+    return ", ".join(f"{capability} to {off:.0e}" for capability, off in worst.items())
+
+
+@verifies(Backend)
+def provides_is_truthful(backend: Backend) -> str:
+    """Knows only known capabilities, has those it declares, and refuses equations if ``root`` is not among them."""
+    known = {"value", "grad", "score", "root"}
+    strange = sorted(set(backend.provides) - known)
+    require(not strange, f"{', '.join(strange)} are none of {', '.join(sorted(known))}")
+    require("value" in backend.provides, "gives no costs")
+    for program in programs_for(backend, telling):
+        problem, (theta, w) = backend.compile(program), samples(program)
+        for capability in sorted(backend.provides & {"value", "grad", "score"}):
+            found = getattr(problem, capability)(theta, w)
+            shape = (COLUMNS,) if capability == "value" else theta.shape
+            require(found.shape == shape and found.dtype == np.float64, f"{capability} is {found.dtype}{found.shape}")
+            require(np.isfinite(found).all(), f"{capability} of {title(program)} is not finite")
+    if "root" not in backend.provides:
+        try:
+            _implicit_problem(backend, 1).value(np.zeros(1), np.zeros((1, 1)))
+        except Unsupported:
+            return f"{', '.join(sorted(backend.provides))}; refuses equations"
+        raise Failed("runs a program that solves an equation, but does not declare root")
+    return ", ".join(sorted(backend.provides))
+
+
+COUPLING = np.array([[2.0, 0.5, -0.3], [0.2, 1.5, 0.4], [-0.6, 0.1, 1.8]])
+
+
+@dataclass(frozen=True)
+class _Initial(MechanicalScene):
+    """f = sum_i (i + 1) q_i after one step from q = theta."""
+
+    name = "conformance_initial"
+    n_q: ClassVar[int] = 3
+
+    horizon: int = param(1, "number of time steps", positive=True)
+    unknowns: int = param(3, "d, length of theta", positive=True)
+
+    def theta0(self) -> np.ndarray:
+        return np.zeros(self.unknowns)
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        return State(theta, 0.0 * theta)
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        return 0.0 * q
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        return sum((i + 1.0) * q[i] for i in range(self.unknowns))
+
+
+@dataclass(frozen=True)
+class _Solving(Integrator):
+    """q+ solves COUPLING q+ + q+^3 + 0.1 q+ (q+_0)^2 = q."""
+
+    name = "conformance_solving"
+    needs_root: ClassVar[bool] = True
+
+    def step(self, dynamics: Any, state: State, u: Array, dt: Any) -> State:
+        xp, n = dynamics.ops.xp, state.q.shape[0]
+
+        def residual(z: Array, args: Any) -> Array:
+            return _coupled(xp, n, z) - args[0]
+
+        return State(dynamics.ops.root(residual, 0.0 * state.q, (state.q,)), state.v)
+
+
+def _coupled(xp: Any, n: int, z: Array) -> Array:
+    mixed = xp.stack([sum(COUPLING[i, j] * z[j] for j in range(n)) for i in range(n)])
+    return mixed + z * z * z + 0.1 * z * z[0:1] * z[0:1]
+
+
+def _implicit_problem(backend: Backend, unknowns: int) -> Problem:
+    return backend.compile(Program(_Initial(unknowns=unknowns), None, _Solving()))
+
+
+@verifies(Backend)
+def root_is_differentiated_implicitly(backend: Backend) -> str:
+    """One unknown, and three coupled ones, with known solutions: costs, and gradients by the implicit-function theorem."""
+    if "root" not in backend.provides:
+        raise Skipped("solves no equations")
+    worst = 0.0
+    for n in (1, 3) if backend == type(backend)() else (3,):
+        z = rng("root").uniform(-1.0, 1.0, (n, COLUMNS))
+        theta, w = _coupled(np, n, z), np.zeros((n, COLUMNS))
+        weights = np.arange(1.0, n + 1.0)
+        jacobian = COUPLING[:n, :n, None] + np.eye(n)[:, :, None] * (3 * z * z + 0.1 * z[0] * z[0])[:, None]
+        jacobian[:, 0] += 0.2 * z * z[0]
+        expected = np.linalg.solve(np.moveaxis(jacobian, -1, 0).transpose(0, 2, 1), weights[:, None])[..., 0].T
+        problem = _implicit_problem(backend, n)
+        off = distance(problem.value(theta, w), weights @ z)
+        require(off < 1e-9, f"{n} unknowns: the solution is off by {off:.1e}")
+        if "grad" in backend.provides:
+            off = max(off, distance(problem.grad(theta, w), expected))
+            require(off < 1e-8, f"{n} unknowns: the gradient is off by {off:.1e}")
+        worst = max(worst, off)
+    return f"to {worst:.0e}"

@@ -1,0 +1,197 @@
+"""Checks of contact laws, on two masses over a floor and in rollouts of the registered scenes."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.conformance.kit import Skipped, require, verifies
+from bench.conformance.subjects import (
+    Ops,
+    available,
+    contact_of,
+    distance,
+    largest_jump,
+    law_for,
+    rng,
+    stepping,
+)
+from bench.contracts import (
+    Array,
+    ContactLaw,
+    ForceLaw,
+    ImpulseLaw,
+    MechanicalScene,
+    State,
+)
+from bench.program import Program
+
+
+@dataclass(frozen=True)
+class _Tower(MechanicalScene):
+    """Two masses above each other over a floor: two contacts, which share a body."""
+
+    name = "conformance_tower"
+    n_q: ClassVar[int] = 2
+    n_contacts: ClassVar[int] = 2
+    masses: ClassVar[tuple[float, float]] = (0.5, 2.0)
+
+    def theta0(self) -> np.ndarray:
+        return np.array([1.0, 3.0])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        return State(theta, 0.0 * theta)
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        return 0.0 * q
+
+    def gap(self, xp: Any, q: Array) -> Array:
+        return xp.stack([q[0], q[1] - q[0] - 1.0])
+
+    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+        return xp.stack([v[0], v[1] - v[0]])
+
+    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+        return xp.stack([(force[0] - force[1]) / self.masses[0], force[1] / self.masses[1]])
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        return q[1]
+
+
+PUSH_DT = 0.01
+
+
+def _push(law: ContactLaw, gap: Any, rate: Any, ops: Ops | None = None) -> np.ndarray:
+    """Normal impulse over 0.01 s on both contacts of a tower, ``(2, B)``, for gaps and rates of each."""
+    gaps, rates = (np.asarray(part, dtype=float).reshape(2, -1) for part in (gap, rate))
+    if isinstance(law, ForceLaw):
+        return PUSH_DT * law.force(np, gaps, rates)
+    assert isinstance(law, ImpulseLaw)
+    scene = _Tower()
+    before = State(np.stack([gaps[0], gaps[0] + gaps[1] + 1.0]), np.stack([rates[0], rates[0] + rates[1]]))
+    free = State(before.q + PUSH_DT * before.v, before.v)
+    change = law.impulse(ops or Ops(), contact_of(scene), before, free, PUSH_DT).v
+    upper = scene.masses[1] * change[1]
+    return np.stack([scene.masses[0] * change[0] + upper, upper])
+
+
+FAR = ([[0.05, 0.2, 1.0], [0.05, 0.2, 1.0]], [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Gaps and rates of contacts that do not meet within the step."""
+
+
+def _sharpened(law: ContactLaw, factor: float) -> ContactLaw:
+    """The law with its smoothing changed by a factor, up or down, whichever pushes less from afar."""
+    value = getattr(law, law.smoothing)
+    changed = [dataclasses.replace(law, **{law.smoothing: value * f}) for f in (factor, 1 / factor)]
+    return min(changed, key=lambda one: np.abs(_push(one, *FAR)).max())
+
+
+@verifies(ContactLaw)
+def does_not_push_from_afar(law: ContactLaw) -> str:
+    """No force between bodies apart; with smoothing, one that vanishes as it sharpens."""
+    push = np.abs(_push(law, *FAR)).max() / PUSH_DT
+    if not law.smoothing:
+        require(push == 0, f"a force of {push:.3g} N on bodies apart")
+        return "no force apart"
+    sharp = np.abs(_push(_sharpened(law, 100.0), *FAR)).max() / PUSH_DT
+    detail = f"{push:.2g} N at 5 cm or more, {sharp:.2g} N at 100 times sharper {law.smoothing}"
+    require(sharp <= 0.05 * push + 1e-12, detail)
+    return detail
+
+
+@verifies(ContactLaw)
+def pushes_in_contact(law: ContactLaw) -> str:
+    """Bodies that overlap and approach are pushed apart, and those that approach faster no less."""
+    push = _push(law, [[-0.01] * 3, [1.0] * 3], [[-1.0, -2.0, -4.0], [0.0] * 3])[0] / PUSH_DT
+    require((push > 0).all(), f"forces of {push.round(3).tolist()} N on bodies that overlap and approach: it pulls")
+    require((np.diff(push) >= -1e-9 * push.max()).all(), f"a faster approach lowers the force: {push.tolist()} N")
+    return f"{push.min():.3g} to {push.max():.3g} N at 1 cm overlap"
+
+
+@verifies(ForceLaw)
+def force_grows_with_penetration(law: ForceLaw) -> str:
+    """At rest: repulsive, and the deeper the stronger."""
+    depth = np.linspace(0.001, 0.1, 40)
+    force = law.force(np, np.stack([-depth, -depth]), np.zeros((2, depth.size)))
+    require(force.shape == (2, depth.size), f"shape {force.shape}, not {(2, depth.size)}")
+    require((force > 0).all(), f"a force of {force.min():.3g} N in penetration: it pulls")
+    require((np.diff(force) > 0).all(), "a deeper penetration does not give a larger force")
+    return f"{force.min():.3g} N at 1 mm to {force.max():.3g} N at 10 cm"
+
+
+@verifies(ForceLaw)
+def contacts_are_separate(law: ForceLaw) -> str:
+    """The force of one contact does not depend on another's gap."""
+    draw = rng("separate")
+    gap, rate = 0.02 * draw.standard_normal((2, 50)), draw.standard_normal((2, 50))
+    together = law.force(np, gap, rate)
+    alone = np.concatenate([law.force(np, gap[i : i + 1], rate[i : i + 1]) for i in range(2)])
+    require(distance(together, alone) < 1e-12, "two contacts together differ from each alone")
+    return "2 contacts as each alone"
+
+
+@verifies(ContactLaw)
+def smoothing_converges(law: ContactLaw) -> str:
+    """As the smoothing sharpens by factors of 10, forces settle on those of an unsmoothed law."""
+    if not law.smoothing:
+        raise Skipped("has no smoothing")
+    gaps = np.array([[-0.05, -0.01, -0.001, 0.0, 0.001, 0.01, 0.05], [1.0] * 7])
+    forces = [_push(_sharpened(law, 10.0**k), gaps, 0 * gaps)[0] / PUSH_DT for k in range(5)]
+    changes = [float(np.abs(b - a).max()) for a, b in itertools.pairwise(forces)]
+    detail = "changes of " + ", ".join(f"{c:.2g}" for c in changes) + " N"
+    require(changes[-1] <= 0.2 * changes[0] + 1e-9 * np.abs(forces[-1]).max(), f"{detail} do not fall")
+    return detail
+
+
+@verifies(ImpulseLaw)
+def impulse_keeps_momentum(law: ImpulseLaw) -> str:
+    """Bodies that meet in the air push each other equally, and apart; afterwards they no longer approach."""
+    sharp = _sharpened(law, 1e4) if law.smoothing else law
+    rate = np.array([[0.0, 0.3, -0.2], [-1.0, -3.0, -0.5]])
+    push = _push(sharp, [[1.0] * 3, [0.0] * 3], rate)
+    require((push[1] > 0).all(), f"impulses of {push[1].round(4).tolist()} N s on bodies that meet: it pulls")
+    lost = np.abs(push[0]).max() / push[1].max()
+    require(lost < 1e-3, f"{lost:.1e} of the impulse changes the momentum of the pair")
+    after = rate[1] + push[1] * sum(1 / m for m in _Tower.masses)
+    require((after > -1e-6).all(), f"after the impact the gap changes at {after.min():.3g} m/s: still approaching")
+    return f"momentum to {lost:.0e}, gap rates from {rate[1].min():g} m/s to {after[1]:.3g} m/s"
+
+
+@verifies(ContactLaw)
+def needs_root_of_law_is_truthful(law: ContactLaw) -> str:
+    """Solves an equation if and only if it declares to."""
+    ops = Ops()
+    _push(law, [[-0.01], [1.0]], [[-1.0], [0.0]], ops)
+    require(
+        bool(ops.solved) == law.needs_root, f"needs_root is {law.needs_root}, but {ops.solved} equations were solved"
+    )
+    return f"{ops.solved} equations a step"
+
+
+@verifies(ContactLaw)
+def continuity_in_rollouts_is_as_declared(law: ContactLaw) -> str:
+    """Costs of continuous scenes do not jump along theta if ``continuous``, and do in some scene if not."""
+    values = {f.name: getattr(law, f.name) for f in dataclasses.fields(law) if getattr(law, f.name) != f.default}
+    scenes = [s() for s in available("scenes") if issubclass(s, MechanicalScene) and s.n_contacts and s.continuous]
+    jumps: dict[bool, dict[str, float]] = {True: {}, False: {}}
+    for scene in scenes:
+        program = Program(scene, law_for(scene, type(law), values), stepping())
+        jumps[program.continuous][scene.name] = largest_jump(program)
+    details = []
+    for continuous, found in jumps.items():
+        if not found:
+            continue
+        name, jump = max(found.items(), key=lambda item: item[1])
+        if continuous:
+            require(not jump, f"declares to be continuous, but {name} jumps by {jump:.1e} of its range")
+            details.append(f"no jump in {', '.join(found)}")
+        else:
+            require(jump, f"declares to jump, but no jump was found in {', '.join(found)}")
+            details.append(f"a jump of {jump:.2g} of the range in {name}")
+    if not details:
+        raise Skipped("no continuous scene with contacts is registered")
+    return "; ".join(details)

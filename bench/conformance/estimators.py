@@ -1,0 +1,308 @@
+"""Checks of estimators, on costs whose smoothed gradient is known."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from bench import registry
+from bench.conformance.kit import Failed, Skipped, require, verifies
+from bench.conformance.scenes import closed_form_is_right
+from bench.conformance.subjects import (
+    DIFFERENCED,
+    LIMIT,
+    available,
+    distance,
+    plain_backend,
+    rng,
+    stepping,
+)
+from bench.contracts import (
+    Estimator,
+    FunctionScene,
+    MechanicalScene,
+    Problem,
+    SampleMean,
+)
+from bench.program import Program
+
+SIGMAS = (0.1, 0.5)
+"""Noise levels of the oracles: not 1, where sigma and its square are the same."""
+
+
+class Watched(Problem):
+    """A problem that notes which capabilities are used, and refuses those that are not allowed."""
+
+    def __init__(self, inner: Problem, allowed: frozenset[str]) -> None:
+        super().__init__(inner.program)
+        self._inner, self._allowed = inner, allowed
+        self.used: set[str] = set()
+
+    def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Costs, if allowed."""
+        return self._use("value", theta, w)
+
+    def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Gradients, if allowed."""
+        return self._use("grad", theta, w)
+
+    def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Scores, if allowed."""
+        return self._use("score", theta, w)
+
+    def _use(self, capability: str, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        require(capability in self._allowed, f"uses {capability}, which is not in needs")
+        self.used.add(capability)
+        return getattr(self._inner, capability)(theta, w)
+
+    _value = _grad = _score = None  # type: ignore[assignment]
+
+
+class Oracle(NamedTuple):
+    """A problem whose gradient is known: ``truth (d,)`` to within standard errors ``error (d,)``."""
+
+    problem: Problem
+    truth: np.ndarray
+    error: np.ndarray
+    label: str
+
+    @property
+    def continuous(self) -> bool:
+        """Whether its cost is continuous."""
+        return self.problem.program.continuous
+
+
+@cache
+def oracles() -> tuple[Oracle, ...]:
+    """Every registered function with a closed-form gradient that holds, at each of :data:`SIGMAS`."""
+    found = []
+    for scene_class, sigma in itertools.product(available("scenes"), SIGMAS):
+        if issubclass(scene_class, FunctionScene):
+            scene = registry.build(scene_class, {"sigma": sigma})
+            assert isinstance(scene, FunctionScene)
+            try:
+                closed_form_is_right(scene)
+            except Exception:
+                continue
+            truth = scene.closed_form_gradient(None, None)
+            if truth is not None:
+                problem = plain_backend().compile(Program(scene, None, None))
+                found.append(Oracle(problem, truth, np.zeros_like(truth), f"{scene.name}[sigma={sigma}]"))
+    return tuple(found)
+
+
+@cache
+def feedback_oracle() -> Oracle:
+    """A smooth scene with noise on the actions of a feedback policy, five steps long, by long first-order sampling."""
+    for scene_class in available("scenes"):
+        if not issubclass(scene_class, MechanicalScene) or scene_class.feedback is MechanicalScene.feedback:
+            continue
+        if scene_class.n_contacts or not scene_class.continuous:
+            continue
+        program = Program(registry.build(scene_class, {"horizon": 5, "sigma": 2.0}), None, stepping())  # type: ignore[arg-type]
+        if not program.noise_on_theta:
+            problem = plain_backend().compile(program)
+            w = rng("feedback").standard_normal((program.n_noise, 1 << 15))
+            terms = problem.grad(program.scene.theta0(), w)
+            error = terms.std(axis=1) / math.sqrt(w.shape[1])
+            return Oracle(problem, terms.mean(axis=1), error, f"{program.scene.name}[sigma=2]")
+    raise Skipped("no scene with a feedback policy under action noise is registered")
+
+
+def lively_oracle(estimator: Estimator) -> Oracle:
+    """The first oracle on which no two samples have the same gradient, and sigma matters."""
+    for oracle in usable(estimator, [o for o in oracles() if o.continuous]):
+        w = rng("lively").standard_normal((oracle.problem.program.n_noise, 64))
+        gradients = oracle.problem.grad(oracle.problem.program.scene.theta0(), w)
+        plain = oracle.problem.grad(oracle.problem.program.scene.theta0(), 0.0 * w[:, :1])
+        if len(np.unique(gradients[0])) == 64 and distance(oracle.truth, plain[:, 0]) > 1e-3:
+            return oracle
+    raise Skipped("refuses every oracle whose samples all differ")
+
+
+def usable(estimator: Estimator, found: Iterable[Oracle]) -> Iterator[Oracle]:
+    """The oracles that the estimator does not refuse."""
+    return (oracle for oracle in found if estimator.refuses(oracle.problem.program) is None)
+
+
+def draw_noise(oracle: Oracle, repeats: int, count: int, *key: str | int) -> np.ndarray:
+    """Read-only noise ``(R, N, n_w)``, as estimators get it."""
+    noise = rng("noise", *key).standard_normal((repeats, count, oracle.problem.program.n_noise))
+    noise.setflags(write=False)
+    return noise
+
+
+def estimates(estimator: Estimator, oracle: Oracle, noise: np.ndarray, problem: Problem | None = None) -> np.ndarray:
+    """Estimates of the right shape and finite; :class:`Failed` otherwise."""
+    problem = problem or oracle.problem
+    found = np.asarray(estimator.estimate(problem, problem.program.scene.theta0(), noise))
+    require(found.shape == (noise.shape[0], problem.dim), f"shape {found.shape}, not {(noise.shape[0], problem.dim)}")
+    require(np.isfinite(found).all(), f"{(~np.isfinite(found)).sum()} numbers are not finite on {oracle.label}")
+    return found
+
+
+def target(estimator: Estimator, oracle: Oracle) -> np.ndarray:
+    """What the estimator declares to estimate, ``(d,)``."""
+    if estimator.target == "smoothed":
+        return oracle.truth
+    program = oracle.problem.program
+    return oracle.problem.grad(program.scene.theta0(), np.zeros((program.n_noise, 1)))[:, 0]
+
+
+@verifies(Estimator)
+def shape_and_repeatability(estimator: Estimator) -> str:
+    """Estimates are ``(R, d)``, finite, and the same when asked for again."""
+    labels = []
+    for oracle in usable(estimator, oracles()):
+        noise = draw_noise(oracle, 7, 8)
+        first, second = estimates(estimator, oracle, noise), estimates(estimator, oracle, noise)
+        require(np.array_equal(first, second), f"a second call with the same noise differs on {oracle.label}")
+        labels.append(oracle.label)
+    if not labels:
+        raise Skipped("refuses every oracle")
+    return f"{len(labels)} oracles"
+
+
+@verifies(Estimator)
+def repeats_are_independent(estimator: Estimator) -> str:
+    """Estimate r depends on ``noise[r]`` and on no other."""
+    oracle = lively_oracle(estimator)
+    noise = np.array(draw_noise(oracle, 6, 8))
+    whole = estimates(estimator, oracle, noise)
+    order = np.array([3, 0, 5, 1, 4, 2])
+    worst = distance(estimates(estimator, oracle, noise[order]), whole[order])
+    require(worst < DIFFERENCED, f"permuting the repeats changes the estimates by {worst:.1e}")
+    for r in range(len(noise)):
+        alone = distance(estimates(estimator, oracle, noise[r : r + 1]), whole[r : r + 1])
+        require(alone < DIFFERENCED, f"estimate {r} alone differs from the one in the batch by {alone:.1e}")
+        changed = noise.copy()
+        changed[r] = draw_noise(oracle, 1, 8, "other")[0]
+        moved = np.abs(estimates(estimator, oracle, changed) - whole).max(axis=1) > DIFFERENCED * np.abs(whole).max()
+        require(moved[r], f"estimate {r} does not depend on its own noise")
+        require(moved.sum() == 1, f"the noise of repeat {r} changes estimates {np.flatnonzero(moved).tolist()}")
+        worst = max(worst, alone)
+    return f"differences up to {worst:.0e}"
+
+
+@verifies(Estimator)
+def uses_every_sample(estimator: Estimator) -> str:
+    """Other noise in any one sample of 8 gives another estimate, or in any eighth of 4096 for those that need as many."""
+    oracle = lively_oracle(estimator)
+    unused = set(range(8))
+    for size in (1, 512):
+        noise = draw_noise(oracle, 8, 8 * size)
+        whole = estimates(estimator, oracle, noise)
+        for n in sorted(unused):
+            changed = noise.copy()
+            changed[:, n * size : (n + 1) * size] = draw_noise(oracle, 8, size, "other")
+            if distance(estimates(estimator, oracle, changed), whole) > DIFFERENCED:
+                unused.remove(n)
+        if not unused:
+            return f"all of {8 * size}"
+    raise Failed(f"eighths {sorted(unused)} of the samples are not used")
+
+
+@verifies(Estimator)
+def variance_falls_as_one_over_n(estimator: Estimator) -> str:
+    """Slope of log variance against log N: -1 for sample means and unbiased estimators, -1 or steeper for others."""
+    oracle = lively_oracle(estimator)
+    counts, groups = np.array([32, 128, 512]), 16
+    logs = np.empty((len(counts), groups))
+    for i, n in enumerate(counts):
+        found = estimates(estimator, oracle, draw_noise(oracle, 32 * groups, n, "slope", i))
+        variance = found.reshape(groups, 32, -1).var(axis=1, ddof=1).sum(axis=1)
+        require((variance > 0).all(), f"estimates of {n} samples have no variance, where the samples differ")
+        logs[i] = np.log(variance)
+    slopes = np.polyfit(np.log(counts), logs, 1)[0]
+    slope, error = slopes.mean(), slopes.std(ddof=1) / math.sqrt(groups)
+    allowed = LIMIT * error + 0.02  # 0.02: terms of order 1/N^2 (leave-one-out baselines) at N = 32
+    detail = f"slope {slope:.3f} +- {error:.3f}"
+    require(slope < -1 + allowed, f"{detail}: falls slower than 1/N")
+    if isinstance(estimator, SampleMean) or estimator.unbiased:
+        require(slope > -1 - allowed, f"{detail}: falls faster than 1/N")
+    return detail
+
+
+@verifies(Estimator)
+def bias_is_as_declared(estimator: Estimator) -> str:
+    """On continuous costs: none if ``unbiased``; else one that is below 10% of the gradient or at least halves from N = 8 to 256."""
+    found = list(usable(estimator, [o for o in oracles() if o.continuous]))
+    if not found:
+        raise Skipped("refuses every continuous oracle")
+    return _bias_held(estimator, found)
+
+
+@verifies(Estimator)
+def bias_across_jumps_is_as_declared(estimator: Estimator) -> str:
+    """On costs that jump: none if ``across_jumps``, one that shows if not."""
+    found = list(usable(estimator, [o for o in oracles() if not o.continuous]))
+    if not estimator.unbiased:
+        raise Skipped("declares a bias anyway")
+    if not found or estimator.target != "smoothed":
+        raise Skipped("no oracle with a jump applies")
+    if estimator.across_jumps:
+        return _bias_held(estimator, found)
+    details = []
+    for oracle in found:
+        z, bias = _standard_errors(estimator, oracle, 4, 4096)
+        detail = f"bias {np.linalg.norm(bias):.3g} on {oracle.label}"
+        require(z.max() > LIMIT, f"declares to be biased across jumps, but {detail} is {z.max():.1f} standard errors")
+        details.append(detail)
+    return ", ".join(details)
+
+
+@verifies(Estimator)
+def bias_under_action_feedback(estimator: Estimator) -> str:
+    """As ``bias_is_as_declared``, with noise on the actions of a feedback policy, for estimators that use its score."""
+    if "score" not in estimator.needs or estimator.target != "smoothed":
+        raise Skipped("uses no score")
+    found = list(usable(estimator, [feedback_oracle()]))
+    if not found:
+        raise Skipped("refuses feedback policies")
+    return _bias_held(estimator, found)
+
+
+def _bias_held(estimator: Estimator, found: list[Oracle]) -> str:
+    worst = 0.0
+    for oracle in found:
+        if estimator.unbiased:
+            z, bias = _standard_errors(estimator, oracle, 4, 8192)
+            detail = f"{oracle.label}: bias {np.linalg.norm(bias):.3g}, {z.max():.1f} standard errors"
+            require(z.max() <= LIMIT, f"declares to be unbiased, but {detail}")
+            worst = max(worst, float(z.max()))
+        else:
+            few, many = (float(np.linalg.norm(_standard_errors(estimator, oracle, n, 512)[1])) for n in (8, 256))
+            z = _standard_errors(estimator, oracle, 256, 512)[0].max()
+            bound = max(0.1 * float(np.linalg.norm(target(estimator, oracle))), 0.5 * few)
+            detail = f"{oracle.label}: bias {few:.3g} at 8 samples, {many:.3g} at 256"
+            require(many <= bound or z <= LIMIT, f"{detail} does not shrink")
+            worst = max(worst, many)
+    if estimator.unbiased:
+        return f"at most {worst:.1f} standard errors on {len(found)} oracles"
+    return f"at most {worst:.3g} at 256 samples on {len(found)} oracles"
+
+
+def _standard_errors(estimator: Estimator, oracle: Oracle, count: int, repeats: int) -> tuple[np.ndarray, np.ndarray]:
+    """Bias of each coordinate in its standard errors, beyond rounding, and the bias itself."""
+    found = estimates(estimator, oracle, draw_noise(oracle, repeats, count, oracle.label, count))
+    truth = target(estimator, oracle)
+    bias = found.mean(axis=0) - truth
+    error = np.sqrt(found.var(axis=0, ddof=1) / repeats + oracle.error**2)
+    beyond = np.maximum(np.abs(bias) - DIFFERENCED * (1 + np.abs(truth)), 0.0)
+    return np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0), bias
+
+
+@verifies(Estimator)
+def needs_are_truthful(estimator: Estimator) -> str:
+    """Runs on a problem that has only what it needs, and uses all of that."""
+    oracle = lively_oracle(estimator)
+    watched = Watched(oracle.problem, estimator.needs)
+    estimates(estimator, oracle, draw_noise(oracle, 4, 8), watched)
+    unused = sorted(estimator.needs - watched.used)
+    require(not unused, f"never uses {', '.join(unused)}, which it needs")
+    return ", ".join(sorted(watched.used))

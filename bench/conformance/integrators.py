@@ -1,0 +1,149 @@
+"""Checks of integrators, on a smooth motion."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.conformance.kit import require, verifies
+from bench.conformance.subjects import (
+    Ops,
+    distance,
+)
+from bench.contracts import (
+    Array,
+    Contact,
+    ImpulseLaw,
+    Integrator,
+    MechanicalScene,
+    State,
+    param,
+)
+from bench.program import Dynamics
+
+
+@dataclass(frozen=True)
+class _Swing(MechanicalScene):
+    """q'' = -4 sin q - 0.2 v + u from (1, 0.5): a smooth motion without closed form."""
+
+    name = "conformance_swing"
+    n_q: ClassVar[int] = 1
+    n_u: ClassVar[int] = 1
+
+    stiffness: float = param(4.0, "restoring acceleration at a right angle", "rad/s^2")
+    friction: float = param(0.2, "deceleration per velocity", "1/s")
+    velocity_factor: float = param(1.0, "factor on the velocity each step")
+
+    def theta0(self) -> np.ndarray:
+        return np.array([1.0])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        return State(theta, 0.0 * theta + 0.5)
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        return u - self.stiffness * xp.sin(q) - self.friction * v
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        return q[0]
+
+
+@dataclass(frozen=True)
+class _Kick(ImpulseLaw):
+    """Adds 1 to the velocity and 0.1 to the position, whatever the contact."""
+
+    name = "conformance_kick"
+
+    def impulse(self, ops: Any, contact: Contact, before: State, free: State, dt: Any) -> State:
+        return State(0.0 * free.q + 0.1, 0.0 * free.v + 1.0)
+
+
+@dataclass(frozen=True)
+class _Kicked(_Swing):
+    """The same motion, with a contact."""
+
+    n_contacts: ClassVar[int] = 1
+
+    def gap(self, xp: Any, q: Array) -> Array:
+        return q
+
+    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+        return v
+
+    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+        return force
+
+
+def _advance(integrator: Integrator, dynamics: Dynamics, steps: int, dt: float) -> State:
+    state = State(np.array([[1.0, 0.3]]), np.array([[0.5, -1.0]]))
+    for _ in range(steps):
+        state = integrator.step(dynamics, state, np.full((1, 2), 0.3), dt)
+    return state
+
+
+@verifies(Integrator)
+def error_falls_with_declared_order(integrator: Integrator) -> str:
+    """Slope of log error against log dt over 1 s of a smooth motion, within 0.2 of ``order``."""
+    from scipy.integrate import solve_ivp
+
+    scene = _Swing()
+
+    def motion(t: float, y: np.ndarray) -> np.ndarray:
+        q, v = y.reshape(2, 1, 2)
+        return np.concatenate([v, scene.acceleration(np, q, v, np.full((1, 2), 0.3))]).ravel()
+
+    exact = solve_ivp(motion, (0.0, 1.0), [1.0, 0.3, 0.5, -1.0], "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    steps = np.array([32, 64, 128])
+    errors = []
+    for n in steps:
+        state = _advance(integrator, Dynamics(Ops(), scene, None), n, 1.0 / n)
+        errors.append(np.abs(np.concatenate(state).ravel() - exact).max())
+    require(np.isfinite(errors).all() and min(errors) > 0, f"errors {errors}")
+    slope = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    detail = f"slope {slope:.3f}, declared {integrator.order}"
+    require(abs(slope - integrator.order) < 0.2, detail)
+    return detail
+
+
+@verifies(Integrator)
+def free_motion_is_exact(integrator: Integrator) -> str:
+    """Without forces: q grows by dt v, v is multiplied by the scene's velocity factor, and columns are their own."""
+    scene = _Swing(stiffness=0.0, friction=0.0, velocity_factor=0.5)
+    state = State(np.array([[1.0, 0.3]]), np.array([[0.5, -1.0]]))
+    end = integrator.step(Dynamics(Ops(), scene, None), state, np.zeros((1, 2)), 0.01)
+    off = distance(end.v, 0.5 * state.v)
+    require(off < 1e-9, f"the velocity factor is missed by {off:.1e}")
+    whole = integrator.step(
+        Dynamics(Ops(), dataclasses.replace(scene, velocity_factor=1.0), None), state, np.zeros((1, 2)), 0.01
+    )
+    off = distance(whole.q, state.q + 0.01 * state.v)
+    require(off < 1e-9, f"the position is off by {off:.1e}")
+    return f"to {off:.0e}"
+
+
+@verifies(Integrator)
+def takes_impulses_is_truthful(integrator: Integrator) -> str:
+    """An impulse law changes the step if and only if it is declared to."""
+    plain, kicked = (_advance(integrator, Dynamics(Ops(), _Kicked(), law), 1, 0.01) for law in (None, _Kick()))
+    change = np.array([np.abs(kicked.q - plain.q).max(), np.abs(kicked.v - plain.v).max()])
+    if not integrator.takes_impulses:
+        require(not change.any(), "takes impulses, but does not declare it")
+        return "takes none"
+    require(
+        distance(change, np.array([0.11, 1.0])) < 1e-9, f"an impulse of (0.1, 1) changes (q, v) by {change.tolist()}"
+    )
+    return "an impulse changes velocity, and position by dt times that and its own"
+
+
+@verifies(Integrator)
+def needs_root_of_integrator_is_truthful(integrator: Integrator) -> str:
+    """Solves an equation if and only if it declares to."""
+    ops = Ops()
+    _advance(integrator, Dynamics(ops, _Swing(), None), 1, 0.01)
+    require(
+        bool(ops.solved) == integrator.needs_root,
+        f"needs_root is {integrator.needs_root}, {ops.solved} equations solved",
+    )
+    return f"{ops.solved} equations a step"

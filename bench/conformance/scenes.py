@@ -1,0 +1,188 @@
+"""Checks of scenes: costs, continuity, gradients they state, contact geometry."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from bench.conformance.kit import Skipped, require, verifies
+from bench.conformance.subjects import (
+    COLUMNS,
+    DIFFERENCED,
+    LIMIT,
+    able_backend,
+    available,
+    can_run,
+    contact_of,
+    distance,
+    disturbed,
+    largest_jump,
+    law_for,
+    plain_backend,
+    programs,
+    rng,
+    samples,
+    title,
+)
+from bench.contracts import (
+    ImpulseLaw,
+    MechanicalScene,
+    Scene,
+)
+from bench.program import Program
+
+
+@verifies(Scene)
+def theta_and_noise_are_declared(scene: Scene) -> str:
+    """theta0 is a finite vector, sigma positive, noise one of the two models, breakpoints in order."""
+    theta = scene.theta0()
+    require(isinstance(theta, np.ndarray) and theta.ndim == 1 and theta.size, "theta0 must be a vector (d,)")
+    require(theta.dtype == np.float64 and np.isfinite(theta).all(), "theta0 must be finite and of type float64")
+    require(np.array_equal(theta, scene.theta0()), "theta0 differs between calls")
+    allowed = ("parameter", "action") if isinstance(scene, MechanicalScene) and scene.n_u else ("parameter",)
+    require(scene.noise in allowed, f"noise '{scene.noise}' is none of {', '.join(allowed)}")
+    breaks = scene.breakpoints()
+    require(len(breaks) <= theta.size, f"{len(breaks)} lists of breakpoints for {theta.size} coordinates")
+    for edges in breaks:
+        require(np.isfinite(edges).all() and (np.diff(edges) > 0).all(), f"breakpoints {edges} are not in order")
+    return f"d = {theta.size}, {scene.noise} noise"
+
+
+@verifies(Scene)
+def costs_are_finite(scene: Scene) -> str:
+    """Costs are ``(B,)`` and finite, and each depends on its own column, under every contact law."""
+    found = programs(scene)
+    for program in found:
+        (theta, w), problem = samples(program), able_backend(program).compile(program)
+        cost = problem.value(theta, w)
+        require(cost.shape == (COLUMNS,), f"{title(program)}: shape {cost.shape}, not {(COLUMNS,)}")
+        require(np.isfinite(cost).all(), f"{title(program)}: {(~np.isfinite(cost)).sum()} costs are not finite")
+        other = problem.value(*disturbed(theta, w))
+        kept = np.arange(COLUMNS) != 2
+        # 1e-12: vectorised functions may round differently from one batch to the next
+        require(distance(other[kept], cost[kept]) < 1e-12, f"{title(program)}: a column changes the cost of others")
+    return f"{cost.mean():.4g} on average, {len(found)} programs"
+
+
+@verifies(Scene)
+def noise_is_where_declared(scene: Scene) -> str:
+    """Costs at (theta, w) are those at (theta + sigma w, 0), but for action noise under a policy."""
+    program = programs(scene)[0]
+    if not program.noise_on_theta:
+        raise Skipped("its noise is on the actions of a policy")
+    require(program.n_noise == program.dim, f"{program.n_noise} normal numbers for {program.dim} components of theta")
+    (theta, w), problem = samples(program), able_backend(program).compile(program)
+    off = distance(problem.value(theta + scene.sigma * w, 0 * w), problem.value(theta, w))
+    require(off < 1e-9, f"noise w and a step of sigma w in theta differ by {off:.1e}: theta is not the controls")
+    return f"on theta, to {off:.0e}"
+
+
+@verifies(Scene)
+def backends_agree(scene: Scene) -> str:
+    """Every available backend gives the same cost, to 1e-9, under every contact law it can run."""
+    worst, names = 0.0, set()
+    for program in programs(scene):
+        theta, w = samples(program)
+        expected = able_backend(program).compile(program).value(theta, w)
+        for backend in (plugin() for plugin in available("backends")):
+            if can_run(backend, program):
+                off = distance(backend.compile(program).value(theta, w), expected)
+                require(off < 1e-9, f"{title(program)}: {backend.name} differs by {off:.1e}")
+                worst = max(worst, off)
+                names.add(backend.name)
+    return f"{', '.join(sorted(names))} to {worst:.0e}"
+
+
+@verifies(Scene)
+def continuity_is_as_declared(scene: Scene) -> str:
+    """Along lines through theta0: no jump if ``continuous`` (under a continuous law), one if not."""
+    found = [p for p in programs(scene) if p.contact is None or p.contact.continuous]
+    runs = [p for p in found if can_run(plain_backend(), p)] or found
+    if not runs:
+        raise Skipped("no continuous contact law is available")
+    jump = largest_jump(runs[0], lines=2)
+    if scene.continuous:
+        require(not jump, f"declares to be continuous, but jumps by {jump:.1e} of its range under {title(runs[0])}")
+        return "no jump within 4 sigma of theta0"
+    require(jump, "declares to jump, but no jump was found within 4 sigma of theta0")
+    return f"a jump of {jump:.2g} of the range"
+
+
+@verifies(Scene)
+def closed_form_is_right(scene: Scene) -> str:
+    """Against long sampling, for every law and integrator it is given for, at the default sigma and twice that."""
+    worst, count = 0.0, 0
+    for sigma in (scene.sigma, 2 * scene.sigma):
+        for program in _all_combinations(dataclasses.replace(scene, sigma=sigma)):
+            closed = program.scene.closed_form_gradient(program.contact, program.integrator)
+            if closed is None:
+                continue
+            shape = np.shape(closed)
+            require(shape == (program.dim,), f"{title(program)}: shape {shape}, not {(program.dim,)}")
+            mean, error = _sampled_gradient(program)
+            beyond = np.maximum(np.abs(mean - closed) - DIFFERENCED * (1 + np.abs(closed)), 0.0)
+            z = float(np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0).max())
+            detail = f"{title(program)}, sigma = {sigma:g}: {z:.1f} standard errors from the sampled gradient"
+            require(z < LIMIT, detail)
+            worst, count = max(worst, z), count + 1
+    if not count:
+        raise Skipped("has none")
+    return f"{count} programs, at most {worst:.1f} standard errors from sampling"
+
+
+def _all_combinations(scene: Scene) -> Iterator[Program]:
+    if not isinstance(scene, MechanicalScene):
+        yield Program(scene, None, None)
+        return
+    laws = [law_for(scene, law) for law in available("contacts")] if scene.n_contacts else [None]
+    for law, integrator in itertools.product(laws, available("integrators")):
+        if not isinstance(law, ImpulseLaw) or integrator.takes_impulses:
+            yield Program(scene, law, integrator())
+
+
+def _sampled_gradient(program: Program) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard error of first-order terms where the program is continuous, of antithetic zeroth-order ones if not."""
+    problem, theta = able_backend(program).compile(program), program.scene.theta0()
+    w = rng("closed form").standard_normal((program.n_noise, 1 << 14))
+    if program.continuous:
+        terms = problem.grad(theta, w)
+    else:
+        terms = (problem.value(theta, w) - problem.value(theta, -w)) / 2 * problem.score(theta, w)
+    return terms.mean(axis=1), terms.std(axis=1) / math.sqrt(w.shape[1])
+
+
+@verifies(Scene)
+def physical_gradient_is_finite(scene: Scene) -> str:
+    """Shape ``(d,)`` and finite, where there is one."""
+    gradient = scene.physical_gradient()
+    if gradient is None:
+        raise Skipped("has none")
+    require(gradient.shape == scene.theta0().shape, f"shape {gradient.shape}, not {scene.theta0().shape}")
+    require(np.isfinite(gradient).all(), f"{gradient} is not finite")
+    return f"norm {np.linalg.norm(gradient):.4g}"
+
+
+@verifies(MechanicalScene)
+def contact_geometry_is_consistent(scene: MechanicalScene) -> str:
+    """gap_rate is the derivative of gap along the motion; forces act linearly and push bodies apart."""
+    if not scene.n_contacts:
+        raise Skipped("has no contacts")
+    draw = rng("geometry")
+    start = scene.initial_state(np, scene.theta0()[:, None])
+    q = start.q + 0.1 * draw.standard_normal((scene.n_q, COLUMNS))
+    v = start.v + draw.standard_normal((start.v.shape[0], COLUMNS))
+    shape = (scene.n_contacts, COLUMNS)
+    require(scene.gap(np, q).shape == shape, f"gap has shape {scene.gap(np, q).shape}, not {shape}")
+    off = distance(scene.gap_rate(np, q, v), (scene.gap(np, q + 1e-6 * v) - scene.gap(np, q - 1e-6 * v)) / 2e-6)
+    require(off < 1e-6, f"gap_rate differs from the derivative of gap by {off:.1e}")
+    a, b = draw.uniform(0.0, 1.0, (2, *shape))
+    pushed, parts = scene.contact_acceleration(np, q, a + 2 * b), [scene.contact_acceleration(np, q, f) for f in (a, b)]
+    require(pushed.shape == v.shape, f"contact_acceleration has shape {pushed.shape}, not {v.shape}")
+    require(distance(pushed, parts[0] + 2 * parts[1]) < 1e-12, "contact_acceleration is not linear in the force")
+    response = contact_of(scene).response(np, q)
+    require((response > 0).all(), f"a force of 1 N changes its own gap by {response.min():.3g} m/s^2: it pulls")
+    return f"response {response.min():.3g} to {response.max():.3g} per kg"

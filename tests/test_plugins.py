@@ -1,0 +1,269 @@
+"""Plugins are found by being there, and neither a broken nor an absent one disturbs the rest; imports go one way."""
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+ESTIMATOR = '''
+"""A plugin for a test."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from bench.contracts import Problem, SampleMean, param
+
+
+@dataclass(frozen=True)
+class Dropped(SampleMean):
+    """Approximates grad J_sigma with the first-order mean times a factor."""
+
+    name = "{name}"
+    requires: ClassVar[tuple[str, ...]] = ({requires})
+    needs = frozenset({{"grad"}})
+
+    factor: float = param(1.0, "what the mean is multiplied by")
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Gradients times the factor."""
+        return self.factor * problem.grad(theta, w)
+'''
+
+
+class Tree:
+    """A copy of the code that plugins can be added to, and commands run in."""
+
+    def __init__(self, root: Path) -> None:
+        self.root, self.packages = root / "tree", root / "site"
+        for part in ("bench", "plugins", "conf"):
+            shutil.copytree(ROOT / part, self.root / part, ignore=shutil.ignore_patterns("__pycache__"))
+        self.packages.mkdir()
+
+    def add(self, path: str, text: str) -> None:
+        """A file in the tree."""
+        (self.root / path).write_text(text)
+
+    def install(self, package: str, text: str, entry_points: str) -> None:
+        """What ``pip install`` does to a package of one module: its code, and metadata that names its entry points."""
+        (self.packages / f"{package}.py").write_text(text)
+        information = self.packages / f"{package}-1.0.dist-info"
+        information.mkdir()
+        (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+        (information / "entry_points.txt").write_text(entry_points)
+
+    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """``python -m bench`` with these words."""
+        environment = {**os.environ, "PYTHONPATH": str(self.packages), "PYTHONDONTWRITEBYTECODE": "1"}
+        return subprocess.run(
+            [sys.executable, "-m", "bench", *words], cwd=self.root, env=environment, capture_output=True, text=True
+        )
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory) -> Tree:
+    made = Tree(tmp_path_factory.mktemp("plugins"))
+    made.add("plugins/estimators/half_step.py", ESTIMATOR.format(name="half_step", requires=""))
+    made.add("plugins/estimators/broken.py", "import no_such_module_at_all\n")
+    made.add("plugins/scenes/unfinished.py", "from bench.contracts import Scene\n\nclass Unfinished(Scene:\n")
+    absent = ESTIMATOR.format(name="absent", requires='"no_such_module=some-dist",')
+    made.add("plugins/estimators/absent.py", absent)
+    made.install(
+        "third_party",
+        ESTIMATOR.format(name="third_name", requires=""),
+        "[bench.plugins]\nthird_name = third_party:Dropped\ngone = third_party:NotThere\n",
+    )
+    return made
+
+
+@pytest.fixture(scope="module")
+def listing(tree) -> str:
+    done = tree.run("list")
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def rows(tree) -> pd.DataFrame:
+    """A run of a dropped, a third-party and an unavailable plugin beside a built-in one."""
+    done = tree.run(
+        "scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg,half_step,third_name,absent]",
+        "estimator.half_step.factor=0.5", "samples=8", "repeats=4", "name=mine", "results_dir=out",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return pd.read_parquet(tree.root / "out" / "mine" / "rows.parquet").set_index("estimator")
+
+
+def entry_of(listing: str, name: str) -> str:
+    """The lines about one plugin in the output of ``list``."""
+    lines = listing.splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith(f"  {name} "))
+    length = next((n for n, line in enumerate(lines[start + 1 :]) if not line.startswith("   ")), len(lines))
+    return "\n".join(lines[start : start + 1 + length])
+
+
+@pytest.mark.parametrize("name", ["half_step", "third_name"])
+def test_added_plugin_is_listed_with_its_parameters(listing, name):
+    described = entry_of(listing, name)
+    assert "first-order mean times a factor" in described
+    assert "needs grad" in described
+    assert "factor=1" in described
+    assert "UNAVAILABLE" not in described
+
+
+def test_added_plugins_run_and_take_parameters_from_the_command_line(rows):
+    assert rows.loc[["fobg", "half_step", "third_name"], "status"].tolist() == ["ok"] * 3
+    assert rows.loc["half_step", "estimator_params"] == "factor=0.5"
+    assert rows.loc["half_step", "grad_norm"] == pytest.approx(rows.loc["fobg", "grad_norm"] / 2)
+    assert rows.loc["third_name", "grad_norm"] == rows.loc["fobg", "grad_norm"]
+
+
+def test_parameter_is_checked(tree):
+    done = tree.run("plan", "estimators=[half_step]", "estimator.half_step.facter=0.5")
+    assert done.returncode == 2
+    assert "did you mean 'factor'" in done.stderr
+
+
+def test_added_plugins_conform_and_survive_a_spawned_process(tree):
+    done = tree.run("check", "half_step", "third_name")
+    assert done.returncode == 0, done.stdout + done.stderr
+    passed = [line.split()[1:3] for line in done.stdout.splitlines() if line.startswith("pass")]
+    assert ["half_step", "survives_spawned_process"] in passed
+    assert ["third_name", "survives_spawned_process"] in passed
+
+
+def test_added_plugin_crosses_a_worker_pool(tree):
+    script = (
+        "from concurrent.futures import ProcessPoolExecutor\n"
+        "from multiprocessing import get_context\n"
+        "from plugins.estimators.half_step import Dropped\n"
+        "if __name__ == '__main__':\n"
+        "    with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:\n"
+        "        print(pool.submit(repr, Dropped(factor=3.0)).result())\n"
+    )
+    tree.add("crosses.py", script)
+    done = subprocess.run([sys.executable, "crosses.py"], cwd=tree.root, capture_output=True, text=True)
+    assert done.stdout.strip() == "Dropped(factor=3.0)", done.stderr
+
+
+def test_only_the_named_third_party_plugin_is_listed(tree):
+    done = tree.run("list", "third_name")
+    assert done.returncode == 0
+    assert [line.split()[0] for line in done.stdout.splitlines() if line[:3].strip()] == ["estimators", "third_name"]
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("broken", "No module named 'no_such_module_at_all'"),
+        ("unfinished", "SyntaxError"),
+        ("gone", "NotThere"),
+        ("absent", "pip install some-dist"),
+    ],
+)
+def test_unusable_plugin_is_listed_with_its_reason(listing, name, reason):
+    described = entry_of(listing, name)
+    assert "UNAVAILABLE" in described
+    assert reason in described
+
+
+def test_plugin_that_fails_to_import_is_refused_by_name_only(tree, rows):
+    done = tree.run("plan", "scenes=[quadratic]", "backends=[numpy]", "estimators=[broken]")
+    assert done.returncode == 2
+    assert "no_such_module_at_all" in done.stderr
+    assert (rows["status"] != "error").all()
+
+
+def test_cells_of_an_unavailable_plugin_become_rows(rows):
+    assert rows.loc["absent", "status"] == "unavailable"
+    assert "pip install some-dist" in rows.loc["absent", "reason"]
+
+
+def test_kit_names_the_reason_of_an_unavailable_plugin(tree):
+    done = tree.run("check", "absent")
+    assert done.returncode == 1
+    assert "pip install some-dist" in done.stdout
+
+
+# ---------------------------------------------------------------------------------------------------------- imports
+
+LAYERS = [
+    ["errors"],
+    ["contracts"],
+    ["program"],
+    ["registry", "noise", "statistics", "store", "timing", "health"],
+    ["reference", "grid"],
+    ["config", "workers"],
+    ["runner"],
+    ["report", "conformance"],
+    ["cli"],
+    ["__main__"],
+]
+"""The parts of ``bench``, each importing from those above it in this list alone."""
+LAZY = {("contracts", "program")}
+"""Imports against the order, made when they are first used: names that plugin authors type against."""
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Every module and name that a file imports, at its top or later, as ``bench.grid.Cell``; not those for types alone."""
+    tree = ast.parse(path.read_text())
+    for_types = {
+        id(inner)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree):
+        if id(node) in for_types:
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: a relative import hides where it goes"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def part_of(path: Path) -> str:
+    """``report`` for ``bench/report/tables.py``."""
+    return path.relative_to(ROOT / "bench").parts[0].removesuffix(".py")
+
+
+BENCH_FILES = sorted(p for p in (ROOT / "bench").rglob("*.py") if p != ROOT / "bench" / "__init__.py")
+PLUGIN_FILES = sorted((ROOT / "plugins").rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", BENCH_FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_bench_imports_go_one_way(path):
+    height = {part: index for index, layer in enumerate(LAYERS) for part in layer}
+    own = part_of(path)
+    assert own in height, f"say in LAYERS where bench/{own} belongs"
+    for name in imported(path):
+        if name.partition(".")[0] == "plugins":
+            assert name.count(".") == 0, f"bench knows no plugin by name, and imports {name}"
+        if name.startswith("bench."):
+            part = name.split(".")[1]
+            below = height[part] < height[own] or part == own or (own, part) in LAZY
+            assert below, f"{own} imports {part}, which stands beside or above it"
+
+
+def test_every_part_stands_in_one_layer_and_nothing_imports_the_commands():
+    parts = [part for layer in LAYERS for part in layer]
+    assert len(parts) == len(set(parts))
+    importers = {part_of(path) for path in BENCH_FILES for name in imported(path) if name.startswith("bench.cli")}
+    assert importers == {"__main__"}
+
+
+@pytest.mark.parametrize("path", PLUGIN_FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_plugins_import_the_contracts_alone(path):
+    for name in imported(path):
+        if name.partition(".")[0] == "bench":
+            assert name.startswith("bench.contracts."), f"a plugin imports bench.contracts, not {name}"
