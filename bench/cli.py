@@ -127,7 +127,9 @@ def _write(experiment: Experiment, store: Store, words: list[str], seconds: floa
     if rows.empty:
         raise UserError(f"no rows are stored in '{store.directory}': run the experiment first")
     axes = grid.swept(experiment.sweep)
-    report.write(experiment, rows, axes, sorted(registry.entries()["estimators"]), words, seconds)
+    contacts = registry.entries()["contacts"].items()
+    smoothing = {name: getattr(entry.plugin, "smoothing", "") for name, entry in contacts}
+    report.write(experiment, rows, axes, sorted(registry.entries()["estimators"]), smoothing, words, seconds)
     return 1 if (rows["status"] == "error").any() else 0
 
 

@@ -111,7 +111,7 @@ def measure(cell: Cell, problems: Problems, references: References) -> dict[str,
         parts.append(estimate(w[calls:]))
     estimates = np.concatenate(parts)
 
-    result = {
+    result: dict[str, Any] = {
         "status": "ok",
         "reference_method": truth.method,
         "model_error": truth.model_error,

@@ -27,8 +27,8 @@ ROUNDING = 1e-12
 FEW_REPEATS = 8
 """Fewer repeats than this are remarked on, and too few to say anything about tails."""
 CONCENTRATION = 0.75
-"""Tails are heavy when (sum y)^2 / sum y^2 of the squared deviations y is below this times sqrt(R): in at most 2% of
-cells with normal noise and R = 16, in none of thousands with R = 64, in about half of those with a kurtosis of 100."""
+"""Tails are heavy when (sum y)^2 / sum y^2 of the squared deviations y is below this times sqrt(R): in 5%
+of cells with normal noise at R = 8, 1% at 16, none of thousands at 64; in half of those with a kurtosis of 100."""
 
 
 # ------------------------------------------------------------------------------------- what a mean is known to
@@ -162,6 +162,10 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
     on the normal scale of Sankaran's transform. Where T falls short of tr S the upper end is that for T = tr S, so
     that a lucky draw never claims more than the noise allows; the lower end is 0 where T is within its quantiles
     for no bias at all. A bias of 0 can only be missed from above, and so is covered 97.5% of the time.
+
+    Simulated for d = 1 to 100, R = 16 to 256, equal and very unequal variances, biases of 0 to 10 errors along and
+    across the noise: 91 to 99% covered in 95% or more of the settings under normal, t5 and mildly skewed noise, 88%
+    in the worst. Under a skewness of 6 the worst is 82%, at R = 16; ``tests/test_statistics.py -m slow`` prints all.
     """
     observed, trace = float(difference @ difference), sum(error.trace for error in errors)
     if trace <= 1e-32 * observed or trace == 0.0:  # noise below the last digit of m

@@ -107,7 +107,7 @@ def typed(table: pd.DataFrame) -> pd.DataFrame:
     table = table.copy()
     for name in table.columns:
         if name in TEXT:
-            table[name] = table[name].fillna("").astype(str)
+            table[name] = table[name].astype(object).fillna("").astype(str)
         else:
             table[name] = pd.to_numeric(table[name], errors="coerce").astype("float64")
     return table

@@ -5,8 +5,8 @@ import pytest
 
 from bench import noise
 from bench.grid import Cell
-from bench.runner import Problems, truth_of
 from bench.reference import certify
+from bench.runner import Problems, truth_of
 from bench.statistics import summarise
 from plugins.backends.numpy import Numpy
 from plugins.estimators.finite_difference import FiniteDifference

@@ -188,14 +188,14 @@ class DeniesJumps(SampleMean):
 
 @dataclass(frozen=True)
 class LastingBias(UnusedScore):
-    """First-order, half as large again however many samples there are."""
+    """First-order, two and a half times as large however many samples there are."""
 
     name = "lasting_bias"
     needs = frozenset({"grad"})
     unbiased = False
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return 1.5 * problem.grad(theta, w)
+        return 2.5 * problem.grad(theta, w)
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,29 @@ class Dropped(SampleMean):
         return self.factor * problem.grad(theta, w)
 '''
 
+FAILING_SCENE = '''
+"""A plugin for a test."""
+
+from dataclasses import dataclass
+
+from bench.contracts import FunctionScene
+
+
+@dataclass(frozen=True)
+class Failing(FunctionScene):
+    """A scene that fails when it is used."""
+
+    name = "failing"
+
+    def theta0(self):
+        """Nothing."""
+        raise ValueError("no theta today")
+
+    def cost(self, xp, x):
+        """The first component."""
+        return x[0]
+'''
+
 
 class Tree:
     """A copy of the code that plugins can be added to, and commands run in."""
@@ -75,6 +98,7 @@ def tree(tmp_path_factory) -> Tree:
     made.add("plugins/estimators/half_step.py", ESTIMATOR.format(name="half_step", requires=""))
     made.add("plugins/estimators/broken.py", "import no_such_module_at_all\n")
     made.add("plugins/scenes/unfinished.py", "from bench.contracts import Scene\n\nclass Unfinished(Scene:\n")
+    made.add("plugins/scenes/failing.py", FAILING_SCENE)
     absent = ESTIMATOR.format(name="absent", requires='"no_such_module=some-dist",')
     made.add("plugins/estimators/absent.py", absent)
     made.install(
@@ -131,6 +155,14 @@ def test_parameter_is_checked(tree):
     done = tree.run("plan", "estimators=[half_step]", "estimator.half_step.facter=0.5")
     assert done.returncode == 2
     assert "did you mean 'factor'" in done.stderr
+
+
+def test_failing_plugin_fails_the_kit_for_itself_alone(tree):
+    done = tree.run("check", "failing", "linear", "numpy")
+    assert done.returncode == 1
+    failed = [line for line in done.stdout.splitlines() if line.startswith("fail")]
+    assert {line.split()[1] for line in failed} == {"failing"}
+    assert all("no theta today" in line for line in failed)
 
 
 def test_added_plugins_conform_and_survive_a_spawned_process(tree):

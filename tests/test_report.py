@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 from bench.grid import Experiment
-from bench.report import charts, tables
+from bench.report import charts, tables, terminal, views
 from bench.store import COLUMNS, EXTRA_COLUMNS, TEXT, typed
 
 NAMES = ("alpha_order", "finite_difference", "fobg", "inverse_variance", "randomized_smoothing", "reinforce")
@@ -115,6 +115,11 @@ def stiffness_rows(stiffness=STIFFNESS, sigmas=(0.1, 0.3), estimators=NAMES, bac
     return table(rows)
 
 
+def small_rows(**given):
+    """Two stiffnesses at one sigma."""
+    return stiffness_rows(**{"stiffness": (1e2, 1e4), "sigmas": (0.1,), **given})
+
+
 def experiment(directory=Path("unused"), sweep=None, marks=None, name="made_up"):
     return Experiment(
         name=name,
@@ -149,7 +154,7 @@ def test_every_promised_file_is_written(tmp_path):
 
 def test_pareto_is_what_brute_force_finds(tmp_path):
     generator = np.random.default_rng(0)
-    rows = stiffness_rows(stiffness=(1e2, 1e4), sigmas=(0.1,))
+    rows = small_rows()
     rows["time_s"] = generator.integers(1, 6, len(rows)) / 1e3
     rows["rmse_rel"] = generator.integers(1, 6, len(rows)) / 10
     tables.write(rows, tmp_path)
@@ -211,18 +216,16 @@ def test_text_is_escaped_in_every_format(tmp_path):
      (0.0, "0"), (math.nan, "-"), (math.inf, "inf")],
 )  # fmt: skip
 def test_numbers_are_short(value, text):
-    assert tables.number(value) == text
+    assert views.number(value) == text
 
 
 # -------------------------------------------------------------------------------------------------------- terminal
 
 
-@pytest.mark.parametrize(
-    "rows", [stiffness_rows(), stiffness_rows(stiffness=(1e2, 1e4), sigmas=(0.1,), backends=("jax",))]
-)
+@pytest.mark.parametrize("rows", [stiffness_rows(), small_rows(backends=("jax",))])
 def test_terminal_output_fits_and_says_what_matters(rows, capsys, monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
-    tables.show(experiment(), rows, ["sigma", "stiffness"])
+    terminal.show(experiment(), rows, ["sigma", "stiffness"])
     text = capsys.readouterr().out
     assert max(map(len, text.splitlines())) <= 100
     assert text.isascii()
@@ -237,8 +240,8 @@ def test_backends_that_agree_are_one_line():
     rows = stiffness_rows(sigmas=(0.1,), estimators=("fobg",), backends=("jax", "torch", "numpy"))
 
     def merged():
-        family = tables.families(tables.along(rows, "stiffness", experiment()))[0]
-        return [dict(line.backends) for line in tables.lines(family.rows)]
+        family = views.families(views.along(rows, "stiffness", experiment()))[0]
+        return [dict(line.backends) for line in views.lines(family.rows)]
 
     assert merged() == [{"jax": True, "torch": True, "numpy": False}]
     rows.loc[rows["backend"] == "torch", "rmse"] *= 1.5
@@ -247,7 +250,7 @@ def test_backends_that_agree_are_one_line():
 
 def test_terminal_takes_names_literally(capsys):
     rows = table([row(estimator_params="baseline=[bold]x", scene="[red]s[/red]", samples=n) for n in (16, 64)])
-    tables.show(experiment(sweep={"samples": [16, 64]}), rows, ["samples"])
+    terminal.show(experiment(sweep={"samples": [16, 64]}), rows, ["samples"])
     text = capsys.readouterr().out
     assert "fobg[baseline=[bold]x]" in text
     assert "[red]s[/red]" in text
@@ -277,7 +280,7 @@ def curves(panel):
 def test_charts_are_written_as_png_and_svg(tmp_path):
     made = experiment(tmp_path)
     made.directory.mkdir()
-    paths = charts.write(made, stiffness_rows(), ["sigma", "stiffness"], NAMES)
+    paths = charts.write(made, small_rows(sigmas=(0.1, 0.3)), ["sigma", "stiffness"], NAMES)
     stems = {"bias_variance_sigma", "bias_variance_stiffness", "speed_accuracy"}
     assert {path.name for path in paths} == {f"{stem}.{suffix}" for stem in stems for suffix in ("png", "svg")}
     for path in paths:
@@ -301,13 +304,15 @@ def test_one_line_per_estimator_and_one_colour_everywhere():
 
 
 def test_colours_do_not_depend_on_which_estimators_ran():
-    few = drawn(stiffness_rows(estimators=("reinforce", "fobg")), ["stiffness"])["bias_variance_stiffness"]
-    all_of_them = drawn(stiffness_rows(), ["stiffness"])["bias_variance_stiffness"]
+    few, all_of_them = (
+        drawn(small_rows(estimators=names), ["stiffness"])["bias_variance_stiffness"]
+        for names in (("reinforce", "fobg"), NAMES)
+    )
     assert curves(few.axes[0]) == {name: curves(all_of_them.axes[0])[name] for name in ("reinforce", "fobg")}
 
 
 def test_backends_that_differ_get_a_line_of_their_own():
-    rows = stiffness_rows(sigmas=(0.1,))
+    rows = small_rows()
     rows.loc[(rows["backend"] == "torch") & (rows["estimator"] == "fobg"), ["rmse", "variance"]] *= 2
     panel = drawn(rows, ["stiffness"])["bias_variance_stiffness"].axes[0]
     lines = [line for line in panel.lines if line.get_label() == "fobg"]
@@ -323,7 +328,7 @@ def test_failed_cells_are_crosses():
 
 
 def test_marks_are_drawn():
-    panels = drawn(stiffness_rows(), ["stiffness"])["bias_variance_stiffness"].axes
+    panels = drawn(small_rows(), ["stiffness"])["bias_variance_stiffness"].axes
     assert all(any(list(line.get_xdata()) == [6400, 6400] for line in panel.lines) for panel in panels)
 
 
@@ -339,7 +344,7 @@ def test_a_parameter_in_an_identity_string_is_an_axis():
     sweep = {"gamma": [0.1, 1.0, 10.0]}
     rows = table([row(estimator="alpha_order", estimator_params=p) for p in ("", "gamma=0.1", "delta=0.3,gamma=10")])
     rows = pd.concat([rows, table([row()])], ignore_index=True)
-    found = tables.along(rows, "gamma", experiment(sweep=sweep))
+    found = views.along(rows, "gamma", experiment(sweep=sweep))
     assert list(found["x"]) == [1.0, 0.1, 10.0]
     assert list(found["estimator_params"]) == ["", "", "delta=0.3"]
     assert "bias_variance_gamma" in drawn(rows, ["gamma"], sweep=sweep)
@@ -357,14 +362,14 @@ def test_the_parameter_behind_smoothing_is_an_axis():
 def test_zipped_axes_do_not_split_problems():
     sweep = {"zip": {"stiffness": [1e2, 1e4], "dt": [0.01, 0.001]}}
     rows = table([row(stiffness=k, dt=h) for k, h in ((1e2, 0.01), (1e4, 0.001))])
-    assert len(tables.families(tables.along(rows, "stiffness", experiment(sweep=sweep)))) == 1
+    assert len(views.families(views.along(rows, "stiffness", experiment(sweep=sweep)))) == 1
     assert set(drawn(rows, ["stiffness", "dt"], sweep=sweep)) == {"bias_variance_stiffness", "bias_variance_dt"}
 
 
 def test_seeds_become_medians_and_lost_ones_stay_visible():
     rows = [row(stiffness=k, seed=s, bias_rel=0.1 * s) for k in (1e2, 1e4) for s in range(5)]
     rows[-1] = failed("nonfinite", "1 of 32 estimates are not finite", stiffness=1e4, seed=4)
-    merged = tables.merge_seeds(table(rows))
+    merged = views.merge_seeds(table(rows))
     assert list(merged["bias_rel"]) == pytest.approx([0.2, 0.15])
     assert list(merged["lost"]) == [0, 1]
     panel = drawn(table(rows), ["stiffness"])["bias_variance_stiffness"].axes[0]
@@ -391,5 +396,5 @@ def test_odd_rows_break_nothing(rows, tmp_path, capsys):
     made.directory.mkdir()
     tables.write(table(rows), made.directory)
     charts.write(made, table(rows), ["sigma", "stiffness"], NAMES)
-    tables.show(made, table(rows), ["sigma", "stiffness"])
+    terminal.show(made, table(rows), ["sigma", "stiffness"])
     assert capsys.readouterr().out

@@ -12,12 +12,12 @@ import numpy as np
 from bench.conformance.kit import Skipped, require, verifies
 from bench.conformance.subjects import (
     Ops,
-    available,
     contact_of,
     distance,
     largest_jump,
     law_for,
     rng,
+    sound_scenes,
     stepping,
 )
 from bench.contracts import (
@@ -176,7 +176,7 @@ def needs_root_of_law_is_truthful(law: ContactLaw) -> str:
 def continuity_in_rollouts_is_as_declared(law: ContactLaw) -> str:
     """Costs of continuous scenes do not jump along theta if ``continuous``, and do in some scene if not."""
     values = {f.name: getattr(law, f.name) for f in dataclasses.fields(law) if getattr(law, f.name) != f.default}
-    scenes = [s() for s in available("scenes") if issubclass(s, MechanicalScene) and s.n_contacts and s.continuous]
+    scenes = [s for s in sound_scenes() if isinstance(s, MechanicalScene) and s.n_contacts and s.continuous]
     jumps: dict[bool, dict[str, float]] = {True: {}, False: {}}
     for scene in scenes:
         program = Program(scene, law_for(scene, type(law), values), stepping())

@@ -64,7 +64,7 @@ def main(names: Sequence[str]) -> int:
             results = check(entry.plugin)
         for result in results:
             tally[result.outcome] += 1
-            print(f"{result.outcome}  {result.plugin:<32} {result.check:<28} {result.detail}", flush=True)
+            print(f"{result.outcome}  {result.plugin:<38} {result.check:<38} {result.detail}", flush=True)
     seconds = time.perf_counter() - started
     counts = f"{tally['pass']} passed, {tally['fail']} failed, {tally['skip']} skipped"
     print(f"\n{plugins} plugin{'s' * (plugins != 1)}, {sum(tally.values())} checks: {counts} in {seconds:.1f} s")

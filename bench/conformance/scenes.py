@@ -26,6 +26,7 @@ from bench.conformance.subjects import (
     programs,
     rng,
     samples,
+    sound_laws,
     title,
 )
 from bench.contracts import (
@@ -138,7 +139,7 @@ def _all_combinations(scene: Scene) -> Iterator[Program]:
     if not isinstance(scene, MechanicalScene):
         yield Program(scene, None, None)
         return
-    laws = [law_for(scene, law) for law in available("contacts")] if scene.n_contacts else [None]
+    laws = [law_for(scene, law) for law in sound_laws()] if scene.n_contacts else [None]
     for law, integrator in itertools.product(laws, available("integrators")):
         if not isinstance(law, ImpulseLaw) or integrator.takes_impulses:
             yield Program(scene, law, integrator())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import zlib
 from collections.abc import Callable, Iterable
@@ -79,28 +80,50 @@ def law_for(scene: MechanicalScene, law: type[ContactLaw], values: dict[str, Any
 
 
 def programs(scene: Scene) -> list[Program]:
-    """The scene under every available contact law, if it has contacts."""
+    """The scene under every sound contact law, if it has contacts."""
     if not isinstance(scene, MechanicalScene):
         return [Program(scene, None, None)]
     if not scene.n_contacts:
         return [Program(scene, None, stepping())]
-    return [Program(scene, law_for(scene, law), stepping()) for law in available("contacts")]
+    return [Program(scene, law_for(scene, law), stepping()) for law in sound_laws()]
+
+
+@cache
+def sound_laws() -> tuple[type[ContactLaw], ...]:
+    """The available contact laws with which some available scene has finite costs; others fail their own checks."""
+    scenes = [s for s in available("scenes") if issubclass(s, MechanicalScene) and s.n_contacts]
+    return tuple(law for law in available("contacts") if any(_works(scene, law) for scene in scenes))
+
+
+def _works(scene: type[MechanicalScene], law: type[ContactLaw]) -> bool:
+    with contextlib.suppress(Exception):
+        return _is_sound(Program(scene(), law_for(scene(), law), stepping()))
+    return False
 
 
 @cache
 def all_programs() -> tuple[Program, ...]:
-    """Every available scene under every contact law; without scenes whose costs fail, which their own checks tell."""
+    """Every available scene under every sound contact law, where costs are finite; what fails does so in its own checks."""
     found: list[Program] = []
-    for scene in available("scenes"):
-        try:
-            tried = programs(scene())
-            runs = [program for program in tried if can_run(plain_backend(), program)]
-            costs = [plain_backend().compile(program).value(*samples(program)) for program in runs]
-        except Exception:
-            continue
-        if np.isfinite(costs).all():
-            found.extend(tried)
+    for scene_class in available("scenes"):
+        with contextlib.suppress(Exception):
+            found.extend(program for program in programs(scene_class()) if _is_sound(program))
     return tuple(found)
+
+
+def _is_sound(program: Program) -> bool:
+    """Whether the plain backend finds finite costs, or has no say."""
+    if not can_run(plain_backend(), program):
+        return True
+    try:
+        return bool(np.isfinite(plain_backend().compile(program).value(*samples(program))).all())
+    except Exception:
+        return False
+
+
+def sound_scenes() -> list[Scene]:
+    """The scenes of :func:`all_programs`."""
+    return list(dict.fromkeys(program.scene for program in all_programs()))
 
 
 def covering(found: Iterable[Program]) -> list[Program]:

@@ -8,7 +8,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,21 +33,22 @@ def write(
     rows: pd.DataFrame,
     axes: Sequence[str],
     names: Sequence[str],
+    smoothing: Mapping[str, str],
     words: list[str],
     seconds: float,
 ) -> list[Path]:
     """Write tables, charts and ``run.json`` from rows, print the table, and return the files' paths.
 
-    ``axes`` are the swept axes; ``names`` all registered estimators in the order that fixes their colours.
+    ``axes`` are the swept axes; ``names`` all registered estimators in the order that fixes their colours;
+    ``smoothing`` the parameter behind the ``smoothing`` column for each contact law.
     """
-    from bench.report import charts, tables
+    from bench.report import charts, tables, terminal
 
-    directory = experiment.directory
-    paths = tables.write(rows, directory)
-    paths += charts.write(experiment, rows, axes, names)
+    paths = tables.write(rows, experiment.directory)
+    paths += charts.write(experiment, rows, axes, names, smoothing)
     if seconds:
         paths.append(_record(experiment, rows, words, seconds))
-    tables.show(experiment, rows, axes)
+    terminal.show(experiment, rows, axes, smoothing)
     print("\nWritten:")
     for path in paths:
         print(f"  {path}")

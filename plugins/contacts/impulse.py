@@ -1,7 +1,6 @@
 """Rigid impacts resolved once per step."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from bench.contracts import Contact, ImpulseLaw, Ops, State, param
 

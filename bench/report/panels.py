@@ -1,0 +1,256 @@
+"""The three kinds of charts: bias and variance along an axis, error against time, and an overview."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.path import Path
+
+from bench.report.page import columns, page, shared
+from bench.report.scales import extent, log_axis, mark_values, scale_x, scale_y, shifts
+from bench.report.style import CROSS, DEVIANT, FRONT, GREY, MARKS, SHADE, TICK, Look, axis_name, plain, quantity, twin
+from bench.report.views import Family, Line, duration, lines, pareto, resolved, short_axis
+
+ALIKE = 0.03
+"""Backends within this relative difference are one line: less could not be seen."""
+FLOOR = 1e-4
+"""Relative biases below this, and variances below its square, are drawn at the lower edge."""
+DOWN, LEFT = (
+    Path(ends, [Path.MOVETO, Path.LINETO, Path.MOVETO, Path.LINETO, Path.LINETO])
+    for ends in (
+        [(0, -0.25), (0, -1), (-0.17, -0.78), (0, -1), (0.17, -0.78)],
+        [(-0.25, 0), (-1, 0), (-0.78, -0.17), (-1, 0), (-0.78, 0.17)],
+    )
+)
+"""Arrows from upper limits towards 0, of a fixed length on paper."""
+
+
+def bias_variance(
+    problems: Sequence[Family], notes: Sequence[str], look: Look, axis: str, marks: Mapping[str, float]
+) -> Figure:
+    """Relative bias above, relative variance below, against one axis; a column of panels per problem."""
+    drawn = [lines(problem.rows, ALIKE) for problem in problems]
+    across = columns(len(problems), 4)
+    figure, panels = page(
+        problems, across, 3.3, ("|bias| / |∇J|", "variance / |∇J|²"),
+        f"Relative bias and variance along {axis_name(axis)}", [*shared(problems, short_axis(axis)), *notes],
+        _line_legends(drawn, look, axis, marks),
+    )  # fmt: skip
+    for (upper, lower), found in zip(panels, drawn, strict=True):
+        values = np.array(sorted({x for line in found for x in line.at}))
+        for line, shift in zip(found, shifts(values, len(found), across), strict=True):
+            style = look.marked(line) | _deviation(line, found)
+            _draw_errors(upper, line, shift(line.rows.index.to_numpy(float)), style, "bias", 1)
+            _draw_errors(lower, line, shift(line.rows.index.to_numpy(float)), style, "variance", 2)
+        for panel in (upper, lower):
+            scale_x(panel, values)
+            mark_values(panel, marks)
+        upper.tick_params(labelbottom=False)
+        lower.set_xlabel(axis_name(axis))
+    together = len({problem.rows["scene"].iloc[0] for problem in problems}) == 1
+    step = across if together else 1
+    for start in range(0, len(panels), step):
+        for row in zip(*panels[start : start + step], strict=True):
+            scale_y(row)
+    return figure
+
+
+def _deviation(line: Line, found: Sequence[Line]) -> dict[str, Any]:
+    """The line style of backends that differ from the estimator's first."""
+    place = twin(line, found)
+    return {"linestyle": DEVIANT[(place - 1) % len(DEVIANT)]} if place else {}
+
+
+def _estimates(rows: pd.DataFrame, column: str, power: int) -> pd.DataFrame:
+    """Of rows with a bias or variance: it and its interval relative to |grad J|, and whether it is an upper limit."""
+    scale = _scale(rows, power)
+    ends = {"value": "", "low": "_low", "high": "_high"}
+    found = pd.DataFrame({name: rows[column + end] / scale for name, end in ends.items()})
+    limit = ~resolved(rows) & (column == "bias")
+    found["value"] = found["value"].where(~limit, found["high"])
+    floor = FLOOR**power
+    found["limit"] = limit | (found["value"] <= floor)
+    found = found[(rows["status"] == "ok") & np.isfinite(found["value"])]
+    return found.assign(value=found["value"].clip(lower=floor), low=found["low"].clip(lower=floor))
+
+
+def _scale(rows: pd.DataFrame, power: int) -> pd.Series:
+    """A power of |grad J|, or 1 where that is 0."""
+    norm = rows["reference_norm"]
+    return norm.where((norm > 0) & np.isfinite(norm), 1.0) ** power
+
+
+def _draw_errors(panel: Axes, line: Line, at: np.ndarray, style: Mapping[str, Any], column: str, power: int) -> None:
+    """One estimator's bias or variance at places of the axis, and crosses where cells were lost."""
+    found = _estimates(line.rows, column, power)
+    has = line.rows.index.isin(found.index)
+    panel.plot(at[has], found["value"], label=line.label, **{**style, "marker": "", "alpha": 0.75})
+    _draw_points(panel, at[has], found, style)
+    lost = at[~has | (line.rows["lost"] > 0)]
+    if len(lost):
+        height = 0.955 - 0.05 * (sum(other.get_marker() == "x" for other in panel.lines) % 4)
+        panel.plot(
+            lost, [height] * len(lost), transform=panel.get_xaxis_transform(), color=style["color"], clip_on=False,
+            zorder=4, **CROSS,
+        )  # fmt: skip
+
+
+def _draw_points(
+    panel: Axes, at: np.ndarray, found: pd.DataFrame, style: Mapping[str, Any], lying: bool = False
+) -> None:
+    """Full markers with intervals, hollow ones with arrows at upper limits; values upwards, or to the right if lying."""
+    mark: Any = {"color": style["color"], "linestyle": "none", "zorder": 3}
+    limit = found["limit"].to_numpy()
+    clear = found[~limit]
+    bars = np.array([clear["value"] - clear["low"], clear["high"] - clear["value"]])
+    bars = np.nan_to_num(bars, posinf=0.0).clip(min=0.0)
+    points: Any = (at[~limit], clear["value"])
+    limits: Any = (at[limit], found["value"][limit])
+    if lying:
+        points, limits = points[::-1], limits[::-1]
+    error: Any = {"xerr": bars} if lying else {"yerr": bars}
+    panel.errorbar(points[0], points[1], elinewidth=0.8, marker=style["marker"], **error, **mark)
+    panel.plot(*limits, marker=style["marker"], markerfacecolor="white", markeredgewidth=0.9, **mark)
+    panel.plot(*limits, marker=LEFT if lying else DOWN, markersize=18, markerfacecolor="none", **mark)
+
+
+def _line_legends(
+    drawn: Sequence[Sequence[Line]], look: Look, axis: str, marks: Mapping[str, float]
+) -> tuple[list[Any], list[Any]]:
+    """Legend handles: estimators, then the meaning of symbols."""
+    every = [(line, found) for found in drawn for line in found]
+    entries = {line.label: _handle(line.label, **look.marked(line)) for line, _ in every}
+    deviants: dict[Any, list[str]] = {}
+    for line, found in every:
+        if style := _deviation(line, found):
+            deviants.setdefault(style["linestyle"], []).extend(line.backends)
+    symbols: list[Any] = []
+    for dashes, names in deviants.items():
+        symbols.append(_handle(f"{', '.join(dict.fromkeys(names))}, where different", linestyle=dashes))
+    rows = pd.concat([line.rows for line, _ in every])
+    good = rows[rows["status"] == "ok"]
+    texts = ["bias not distinguishable from 0: 95% limit"] * bool((~resolved(good)).any())
+    texts += ["below the scale"] * bool(_estimates(rows, "variance", 2)["limit"].any())
+    if texts:
+        symbols.append(_handle(", or ".join(texts), marker="o", markerfacecolor="white", linestyle="none"))
+    if (rows["lost"] > 0).any():
+        symbols.append(_handle("cell failed", **CROSS))
+    symbols.append(Patch(label="error exceeds |∇J|", **SHADE))
+    for (text, value), dashes in zip(marks.items(), MARKS * len(marks), strict=False):
+        label = f"{plain(text)}, {quantity(short_axis(axis), value)}"
+        symbols.append(Line2D([], [], color="#595959", linewidth=0.9, linestyle=dashes, label=label))
+    return list(entries.values()), symbols
+
+
+def _handle(text: str, color: str = GREY, **style: Any) -> Line2D:
+    return Line2D([], [], label=plain(text), color=color, **style)
+
+
+def speed_accuracy(problems: Sequence[Family], notes: Sequence[str], look: Look) -> Figure:
+    """Relative RMSE of one estimate against its time, a panel per problem, a curve per estimator and backend."""
+    drawn = [lines(problem.rows, close=None) for problem in problems]
+    every = [line for found in drawn for line in found]
+    entries = {line.label: _handle(line.label, **look.line(line)) for line in every}
+    backends = dict.fromkeys(line.rows["backend"].iloc[0] for line in every)
+    symbols: list[Any] = [_handle(name, marker=look.backend(name), linestyle="none") for name in backends]
+    symbols += [Line2D([], [], **FRONT), Patch(label="worse than answering zero", **SHADE)]
+    samples = sorted({int(x) for line in every for x in line.at})
+    curve = [f"along a curve $N$ = {', '.join(map(str, samples))}"] if len(samples) > 1 else []
+    figure, panels = page(
+        problems, columns(len(problems), 3), 2.4, ("relative RMSE",),
+        "Relative RMSE of one estimate against the time it takes", [*shared(problems, "samples"), *notes, *curve],
+        (list(entries.values()), symbols),
+    )  # fmt: skip
+    for (panel,), problem, found in zip(panels, problems, drawn, strict=True):
+        for line in found:
+            _draw_curve(panel, line, {**look.line(line), "marker": look.backend(line.rows["backend"].iloc[0])})
+        _draw_front(panel, timed(problem.rows))
+        panel.set_xlabel("time of one estimate")
+    return figure
+
+
+def timed(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows that have a point in a chart of error against time."""
+    good = (rows["status"] == "ok") & np.isfinite(rows["rmse_rel"]) & np.isfinite(rows["time_s"])
+    return rows[good & (rows["rmse_rel"] > 0) & (rows["time_s"] > 0)]
+
+
+def _draw_curve(panel: Axes, line: Line, style: Mapping[str, Any]) -> None:
+    rows = timed(line.rows)
+    spread = rows["time_iqr_s"].fillna(0.0) / 2
+    bars = [np.minimum(spread, 0.9 * rows["time_s"]), spread]
+    panel.errorbar(rows["time_s"], rows["rmse_rel"], xerr=bars, elinewidth=0.7, label=line.label, **style)
+
+
+def _draw_front(panel: Axes, rows: pd.DataFrame) -> None:
+    """The Pareto front as a step line from the fastest point down to the most accurate, and the panel's scales."""
+    front = rows[pareto(rows["time_s"], rows["rmse_rel"])].sort_values(["time_s", "rmse_rel"])
+    low, high = rows["rmse_rel"].min(), rows["rmse_rel"].max()
+    spread = np.minimum(rows["time_iqr_s"].fillna(0.0) / 2, rows["time_s"] / 2)
+    first, last = (rows["time_s"] - spread).min(), (rows["time_s"] + spread).max()
+    tall, wide = max(high / low, 4.0) ** 0.08, max(last / first, 4.0) ** 0.08
+    log_axis(panel, "x", first / wide, last * wide, text=_seconds)
+    log_axis(panel, "y", low / tall, high * tall)
+    if high * tall > 1:
+        panel.axhspan(1.0, high * tall, zorder=0, **SHADE)
+    x = [front["time_s"].iloc[0], *front["time_s"], last * wide]
+    y = [high * tall, *front["rmse_rel"], front["rmse_rel"].iloc[-1]]
+    panel.step(x, y, where="post", zorder=0.5, solid_capstyle="butt", **FRONT)
+
+
+def _seconds(value: float) -> str:
+    return duration(value).replace("us", "µs").replace(".0 ", " ")
+
+
+def overview(problems: Sequence[Family], notes: Sequence[str], look: Look) -> Figure:
+    """Relative bias and RMSE of every estimator, a panel per problem."""
+    drawn = [{_row_label(line, found): line for line in found} for found in (lines(p.rows, ALIKE) for p in problems)]
+    labels = list(dict.fromkeys(label for found in drawn for label in found))
+    symbols: list[Any] = [
+        _handle("relative bias, 95% interval", marker="o", linestyle="none"),
+        _handle("not distinguishable from 0", marker="o", markerfacecolor="white", linestyle="none"),
+        _handle("relative RMSE", **TICK),
+        Patch(label="error exceeds |∇J|", **SHADE),
+    ]
+    if any(line.failed for found in drawn for line in found.values()):
+        symbols.append(_handle("cell failed", **CROSS))
+    figure, panels = page(
+        problems, columns(len(problems), 3), 0.55 + 0.24 * len(labels), ("",),
+        "Relative bias and RMSE of one estimate", [*shared(problems, ""), *notes], ([], symbols), sharey=True,
+    )  # fmt: skip
+    for (panel,), found in zip(panels, drawn, strict=True):
+        for label, line in found.items():
+            _draw_dot(panel, line, len(labels) - 1 - labels.index(label), look.line(line)["color"])
+        low, high = extent([panel], "x", 0.3, 2.0)
+        margin = (high / low) ** 0.08
+        log_axis(panel, "x", low / margin**2, high * margin)
+        panel.axvspan(1.0, high * margin, zorder=0, **SHADE)
+        panel.set_ylim(-0.6, len(labels) - 0.4)
+        panel.set_yticks(range(len(labels)), [plain(label) for label in reversed(labels)])
+        panel.tick_params(axis="y", length=0)
+        panel.set_xlabel("in units of |∇J|")
+    return figure
+
+
+def _row_label(line: Line, found: Sequence[Line]) -> str:
+    alone = sum(other.label == line.label for other in found) == 1
+    return line.label if alone else f"{line.label}, {'/'.join(line.backends)}"
+
+
+def _draw_dot(panel: Axes, line: Line, height: int, colour: str) -> None:
+    panel.axhline(height, color="#e5e5e5", linewidth=0.6, zorder=0)
+    rows = line.rows
+    error = rows["rmse"] / _scale(rows, 1)
+    good = (rows["status"] == "ok") & np.isfinite(error)
+    found = _estimates(rows[good], "bias", 1)
+    _draw_points(panel, np.full(len(found), height), found, {"color": colour, "marker": "o"}, lying=True)
+    panel.plot(error[good].clip(lower=FLOOR), [height] * good.sum(), color=colour, label=line.label, **TICK)
+    if not good.all() or (rows["lost"] > 0).any():
+        panel.plot([0.97], [height], transform=panel.get_yaxis_transform(), color=colour, **CROSS)

@@ -1,0 +1,111 @@
+"""The axes of panels: logarithmic scales with few labels, shading, marked values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from bench.report.style import MARKS, SHADE
+from bench.report.views import axis_value
+
+TICKS = (
+    (1, (1, 1.5, 2, 3, 5, 7)), (1, (1, 2, 5)), (1, (1, 3)), (1, (1,)), (2, (1,)), (3, (1,)), (4, (1,)), (6, (1,)), (10, (1,))
+)  # fmt: skip
+"""Choices of ticks on a logarithmic axis, finest first: every how many decades, and where in a decade."""
+
+
+def logarithmic(values: np.ndarray) -> bool:
+    """Whether the values of a swept axis ask for a logarithmic scale."""
+    return bool(values.min() > 0 and values.max() >= 8 * values.min())
+
+
+def shifts(values: np.ndarray, count: int, columns: int) -> list[Callable[[np.ndarray], np.ndarray]]:
+    """Moves the points of each of ``count`` lines sideways by a part of the smallest step, so that none hide others."""
+    positions = np.log10(values) if logarithmic(values) else values
+    step = min(0.4 * np.diff(positions).min(), 0.003 * columns * count * np.ptp(positions)) / max(count, 2)
+    offsets = step * (np.arange(count) - (count - 1) / 2)
+    return [partial(np.multiply, 10**o) if logarithmic(values) else partial(np.add, o) for o in offsets]
+
+
+def scale_x(panel: Axes, values: np.ndarray) -> None:
+    """The scale of a swept axis, labelled at its values where they are few."""
+    if logarithmic(values):
+        margin = (values.max() / values.min()) ** 0.07
+        log_axis(panel, "x", values.min() / margin, values.max() * margin, values if len(values) <= 6 else ())
+        return
+    panel.set_xlim(values.min() - 0.07 * np.ptp(values), values.max() + 0.07 * np.ptp(values))
+    if len(values) <= 6:
+        panel.xaxis.set_major_locator(FixedLocator(list(values)))
+
+
+def scale_y(panels: Sequence[Axes]) -> None:
+    """One logarithmic scale for panels, with room for crosses, and shade where the error exceeds the gradient."""
+    low, high = extent(panels, "y", 0.3, 3.0)
+    margin = (high / low) ** 0.12
+    for panel in panels:
+        log_axis(panel, "y", low / margin**1.5, high * margin)
+        panel.axhspan(1.0, high * margin, zorder=0, **SHADE)
+    for panel in panels[1:]:
+        panel.tick_params(labelleft=False)
+
+
+def log_axis(
+    panel: Axes,
+    which: str,
+    low: float,
+    high: float,
+    wanted: Sequence[float] | np.ndarray = (),
+    text: Callable[[float], str] | None = None,
+) -> None:
+    """A logarithmic axis from ``low`` to ``high`` with few labels: ``wanted`` ones if near each other, or round ones."""
+    axis = panel.xaxis if which == "x" else panel.yaxis
+    getattr(panel, f"set_{which}scale")("log")
+    getattr(panel, f"set_{which}lim")(low, high)
+    ticks = list(wanted)
+    if not ticks or high > 1e3 * low or np.diff(np.log10(ticks)).min() <= 0.15:
+        ticks = _round_ticks(low, high, 4 if which == "x" else 5)
+    if text is None:
+        powers = any(not 1e-3 <= t <= 1e3 for t in ticks) and all(f"{t:.1e}".startswith("1.0e") for t in ticks)
+        text = _power if powers else axis_value
+    axis.set_major_locator(FixedLocator(ticks))
+    axis.set_major_formatter(FuncFormatter(lambda t, _: text(t)))
+    axis.set_minor_locator(NullLocator())
+
+
+def _round_ticks(low: float, high: float, most: int) -> list[float]:
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    ticks: list[float] = []
+    for stride, parts in TICKS:
+        ticks = [part * 10.0**p for p in decades if p % stride == 0 for part in parts]
+        ticks = [t for t in ticks if low <= t <= high]
+        if len(ticks) <= most:
+            break
+    return ticks
+
+
+def _power(value: float) -> str:
+    return f"$10^{{{round(math.log10(value))}}}$"
+
+
+def extent(panels: Iterable[Axes], which: str, low: float, high: float) -> tuple[float, float]:
+    """The range of the points drawn in panels, widened to contain ``low`` to ``high``."""
+    for panel in panels:
+        for line in panel.lines:
+            if line.get_transform() == panel.transData:
+                data = np.asarray(line.get_xdata() if which == "x" else line.get_ydata(), dtype=float)
+                data = data[np.isfinite(data) & (data > 0)]
+                low, high = min([low, *data]), max([high, *data])
+    return float(low), float(high)
+
+
+def mark_values(panel: Axes, marks: Mapping[str, float]) -> None:
+    """Lines at named values of the horizontal axis that are in sight."""
+    low, high = panel.get_xlim()
+    for value, dashes in zip(marks.values(), MARKS * len(marks), strict=False):
+        if low < value < high:
+            panel.axvline(value, zorder=1, color="#595959", linewidth=0.9, linestyle=dashes)
