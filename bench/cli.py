@@ -76,11 +76,11 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _prepare(words: list[str]) -> tuple[Experiment, Store, list[Planned]]:
-    from bench import config, runner
+    from bench import config, runner, studies
     from bench.store import Store
 
     experiment = config.load(words)
-    store = Store(experiment.directory)
+    store = Store(experiment.directory, studies.find(experiment.study).COLUMNS)
     return experiment, store, runner.plan(experiment, store)
 
 
@@ -107,16 +107,16 @@ def _run(words: list[str]) -> int:
 
 
 def _report(words: list[str]) -> int:
-    from bench import config
+    from bench import config, studies
     from bench.store import Store
 
     experiment = config.load(words)
-    store = Store(experiment.directory)
+    store = Store(experiment.directory, studies.find(experiment.study).COLUMNS)
     return _write(experiment, store, words, 0.0, None)
 
 
 def _write(experiment: Experiment, store: Store, words: list[str], seconds: float, keys: list[str] | None) -> int:
-    from bench import grid, registry, report
+    from bench import grid, report, studies
 
     rows = store.load()
     if keys is not None:
@@ -126,10 +126,12 @@ def _write(experiment: Experiment, store: Store, words: list[str], seconds: floa
         rows = report.latest(rows)
     if rows.empty:
         raise UserError(f"no rows are stored in '{store.directory}': run the experiment first")
-    axes = grid.swept(experiment.sweep)
-    contacts = registry.entries()["contacts"].items()
-    smoothing = {name: getattr(entry.plugin, "smoothing", "") for name, entry in contacts}
-    report.write(experiment, rows, axes, sorted(registry.entries()["estimators"]), smoothing, words, seconds)
+    paths = studies.find(experiment.study).write(experiment, rows, grid.swept(experiment.sweep))
+    if seconds:
+        paths.append(report.record(experiment, rows, words, seconds))
+    print("\nWritten:")
+    for path in paths:
+        print(f"  {path}")
     return 1 if (rows["status"] == "error").any() else 0
 
 

@@ -76,11 +76,29 @@ def _prepared(override: str) -> str:
         raise UserError(f"'{override}': Hydra's own settings cannot be changed here")
     if head not in _known_keys():
         raise unknown("setting", bare, {*_known_keys(), "experiment"})
+    if head in LISTS:
+        return f"{bare}={_quoted(value)}"
     if head in AXES or head == "sweep":
         return f"++{bare}={value}"
     if bare != head and head != "reference":
         raise UserError(f"'{bare}' is not a setting: '{head}' has no parts")
     return f"{bare}={value}"
+
+
+def _quoted(value: str) -> str:
+    """A list of identity strings with each one quoted, since a shell eats the quotes that Hydra needs around brackets."""
+    inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
+    items, depth = [""], 0
+    for letter in inner:
+        depth += (letter == "[") - (letter == "]")
+        if letter == "," and depth == 0:
+            items.append("")
+        else:
+            items[-1] += letter
+    if depth != 0:
+        return value
+    names = [item.strip().strip("'\"") for item in items]
+    return "[" + ",".join(f"'{name}'" for name in names if name) + "]"
 
 
 def experiment(config: Mapping[str, Any]) -> Experiment:
@@ -115,6 +133,7 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         sweep=_table(config, "sweep"),
         results_dir=Path(str(config["results_dir"])).expanduser(),
         question=str(config["question"] or ""),
+        study=str(config["study"]),
         marks=_table(config, "marks"),
         reference_samples=budget,
         reference_tolerance=tolerance,

@@ -38,6 +38,7 @@ __all__ = [
     "FunctionScene",
     "ImpulseLaw",
     "Integrator",
+    "Jacobians",
     "MechanicalScene",
     "Ops",
     "Plugin",
@@ -174,6 +175,8 @@ class MechanicalScene(Scene):
     """A scene with dynamics ``q' = v``, ``v' = acceleration(q, v, u) + contact``, ``horizon`` steps of ``dt``."""
 
     n_q: ClassVar[int]
+    n_v: ClassVar[int | None] = None
+    """Length of v where it is not that of q: 0 and 1 make a first-order scene v' = acceleration(v)."""
     n_u: ClassVar[int] = 0
     n_contacts: ClassVar[int] = 0
     open_loop: ClassVar[bool] = False
@@ -222,6 +225,19 @@ class MechanicalScene(Scene):
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
         """M^-1 J^T force for normal forces ``(n_contacts, B)`` [N], linear in them: ``(n_v, B)``."""
+        raise NotImplementedError
+
+    friction = 0.0
+    """Coulomb coefficient of the contacts under a force law. A field in scenes that have friction."""
+    slip_speed = 1e-3
+    """Slip velocity [m/s] at which regularised friction has grown to tanh(1) of its bound: below it a contact sticks."""
+
+    def slip(self, xp: Any, q: Array, v: Array) -> Array | None:
+        """Tangential velocities at the contacts, ``(n_contacts, B)`` [m/s], or None without friction."""
+        return None
+
+    def friction_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+        """M^-1 J_t^T force for tangential forces ``(n_contacts, B)`` [N], linear in them: ``(n_v, B)``."""
         raise NotImplementedError
 
 
@@ -299,8 +315,32 @@ class Integrator(Plugin):
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: Any) -> State:
         """The state ``dt`` later under the constant control ``u (n_u, B)``."""
 
+    @abstractmethod
+    def amplification(self, z: complex) -> complex:
+        """The stability function: the factor of one step on v' = a v (no positions) with z = a dt."""
+
+    @abstractmethod
+    def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
+        """The matrix ``(2, 2)`` of one step on q' = v, v' = -stiffness q - damping v with that velocity factor.
+
+        The step is stable while the spectral radius is at most 1.
+        """
+
 
 # ----------------------------------------------------------------------------------------- backends and problems
+
+
+class Jacobians(NamedTuple):
+    """Derivatives of the step map x_{k+1} = F(x_k, u_k), x = (q, v), along rollouts."""
+
+    states: np.ndarray
+    """``(horizon + 1, n, B)``."""
+    controls: np.ndarray
+    """``(horizon, n_u, B)``."""
+    a: np.ndarray
+    """dF/dx, ``(horizon, n, n, B)``."""
+    b: np.ndarray
+    """dF/du, ``(horizon, n, n_u, B)``."""
 
 
 @dataclass
@@ -361,6 +401,10 @@ class Problem(ABC):
         if self.noise_on_theta:
             return w / self.sigma
         return self._blocks(self._score, theta, w)
+
+    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
+        """States, controls and step Jacobians along each rollout; raises :class:`Unsupported` where there are none."""
+        raise Unsupported("this backend gives no step Jacobians")
 
     def directions(self, w: np.ndarray) -> np.ndarray:
         """Standard normal directions in theta space made from ``w``, ``(d, B)``.

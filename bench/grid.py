@@ -53,6 +53,8 @@ class Experiment:
     seed: int = 0
     results_dir: Path = Path("results")
     question: str = ""
+    study: str = "bias_variance"
+    """What is measured of each cell."""
     marks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Per axis, named values to draw as lines in the charts."""
     reference_samples: int = 1 << 18

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -45,7 +46,24 @@ class Dynamics:
         if not isinstance(self._law, ForceLaw):
             return smooth
         force = self._law.force(xp, scene.gap(xp, q), scene.gap_rate(xp, q, v))
-        return smooth + scene.contact_acceleration(xp, q, force)
+        pushed = smooth + scene.contact_acceleration(xp, q, force)
+        slip = scene.slip(xp, q, v)
+        if slip is None:
+            return pushed
+        return pushed + scene.friction_acceleration(xp, q, -scene.friction * force * xp.tanh(slip / scene.slip_speed))
+
+    @property
+    def contact(self) -> Contact | None:
+        """The contact geometry, for integrators that resolve impacts themselves; None without an impulse law."""
+        if not isinstance(self._law, ImpulseLaw):
+            return None
+        xp, scene = self.ops.xp, self._scene
+        return Contact(
+            gap=lambda q: scene.gap(xp, q),
+            gap_rate=lambda q, v: scene.gap_rate(xp, q, v),
+            acceleration=lambda q, force: scene.contact_acceleration(xp, q, force),
+            restitution=scene.restitution,
+        )
 
     def carried(self, v: Array) -> Array:
         """The part of the velocity that a step carries over."""
@@ -53,15 +71,10 @@ class Dynamics:
 
     def with_impulse(self, before: State, free: State, dt: Any) -> State:
         """The contact-free end state ``free`` corrected by the impulse law, if there is one."""
-        if not isinstance(self._law, ImpulseLaw):
+        contact = self.contact
+        if contact is None:
             return free
-        xp, scene = self.ops.xp, self._scene
-        contact = Contact(
-            gap=lambda q: scene.gap(xp, q),
-            gap_rate=lambda q, v: scene.gap_rate(xp, q, v),
-            acceleration=lambda q, force: scene.contact_acceleration(xp, q, force),
-            restitution=scene.restitution,
-        )
+        assert isinstance(self._law, ImpulseLaw)
         change = self._law.impulse(self.ops, contact, before, free, dt)
         return State(free.q + dt * change.v + change.q, free.v + change.v)
 
@@ -177,44 +190,63 @@ class Program:
         assert self.integrator is not None
         return self.integrator.step(Dynamics(ops, self.scene, self.contact), state, u, self.scene.dt)
 
-    def _rollout(self, ops: Ops, theta: Array, w: Array, theta_scored: Array | None) -> tuple[Array, Array]:
+    def steps(self, ops: Ops, theta: Array, w: Array) -> Iterator[tuple[State, Array]]:
+        """The states before each step with the control applied, one by one; last the end state with that of the last step."""
+        theta, state, scanned = self.start(ops, theta, w)
+        assert isinstance(self.scene, MechanicalScene)
+        u = None
+        for t in range(self.scene.horizon):
+            u = self.control(ops, theta, state, tuple(x[t] for x in scanned))
+            yield state, u
+            state = self.step(ops, state, u)
+        yield state, u
+
+    def start(self, ops: Ops, theta: Array, w: Array) -> tuple[Array, State, tuple[Array, ...]]:
+        """Theta with parameter noise, the initial state, and what the control law takes from each step: (plan, noise)."""
         scene, xp = self.scene, ops.xp
         assert isinstance(scene, MechanicalScene)
-        batch, horizon, n_u = w.shape[1], scene.horizon, scene.n_u
-        noise = None
+        shape = (scene.horizon, scene.n_u, w.shape[1])
+        scanned = []
         if self.action_noise:
-            noise = xp.reshape(w, (horizon, n_u, batch))
+            scanned.append(xp.reshape(w, shape))
         else:
             theta = theta + scene.sigma * w
         planned = scene.planned_controls(xp, theta)
         if planned is not None:
-            planned = xp.broadcast_to(planned, (horizon, n_u, batch))
-        scanned: list[Array] = [a for a in (planned, noise) if a is not None]
-        planned_scored = None if theta_scored is None else scene.planned_controls(xp, theta_scored)
-        if planned_scored is not None:
-            scanned.append(planned_scored)
-
+            scanned.insert(0, xp.broadcast_to(planned, shape))
         start = scene.initial_state(xp, theta)
-        state = State(*(xp.broadcast_to(part, (part.shape[0], batch)) for part in start))
+        state = State(*(xp.broadcast_to(part, (part.shape[0], w.shape[1])) for part in start))
+        return theta, state, tuple(scanned)
+
+    def control(self, ops: Ops, theta: Array, state: State, slices: tuple[Array, ...]) -> Array:
+        """u_t = plan + feedback + sigma w_t, ``(n_u, B)``."""
+        scene, xp = self.scene, ops.xp
+        assert isinstance(scene, MechanicalScene)
+        parts = list(slices)
+        if self.action_noise:
+            parts[-1] = scene.sigma * parts[-1]
+        back = scene.feedback(xp, theta, state.q, state.v)
+        if back is not None:
+            parts.append(back)
+        return sum(parts[1:], parts[0]) if parts else xp.zeros((scene.n_u, state.v.shape[1]), dtype=state.v.dtype)
+
+    def _rollout(self, ops: Ops, theta: Array, w: Array, theta_scored: Array | None) -> tuple[Array, Array]:
+        scene, xp = self.scene, ops.xp
+        assert isinstance(scene, MechanicalScene)
+        theta, state, scanned = self.start(ops, theta, w)
+        planned_scored = None if theta_scored is None else scene.planned_controls(xp, theta_scored)
+        extra = () if planned_scored is None else (planned_scored,)
         zero = xp.zeros_like(w[0, :])
 
         def step(carry: tuple[State, Array, Array], slices: tuple[Array, ...]) -> tuple[State, Array, Array]:
             state, cost, logp = carry
-            rest = list(slices)
-            u = rest.pop(0) if planned is not None else xp.zeros_like(state.q[:1]) * xp.zeros((n_u, 1), dtype=w.dtype)
-            back = scene.feedback(xp, theta, state.q, state.v)
-            if back is not None:
-                u = u + back
-            if noise is not None:
-                w_t = rest.pop(0)
-                u = u + scene.sigma * w_t
-                if theta_scored is not None:
-                    scored = scene.feedback(xp, theta_scored, state.q, state.v)
-                    if planned_scored is not None:
-                        scored = rest.pop(0) if scored is None else scored + rest.pop(0)
-                    logp = logp + xp.sum(w_t * scored, axis=0)
+            drawn = slices[: len(scanned)]
+            u = self.control(ops, theta, state, drawn)
+            if theta_scored is not None:
+                scored = [*slices[len(scanned) :], scene.feedback(xp, theta_scored, state.q, state.v)]
+                logp = logp + sum(xp.sum(drawn[-1] * part, axis=0) for part in scored if part is not None)
             cost = cost + scene.stage_cost(xp, state.q, state.v, u)
             return self.step(ops, state, u), cost, logp
 
-        state, cost, logp = ops.scan(step, (state, zero, zero), tuple(scanned), horizon)
+        state, cost, logp = ops.scan(step, (state, zero, zero), scanned + extra, scene.horizon)
         return cost + scene.terminal_cost(xp, state.q, state.v), logp

@@ -7,8 +7,10 @@ are folded into ``rows.parquet``. Nothing is locked and nothing is pickled, so a
 from __future__ import annotations
 
 import json
+import math
 import os
 import uuid
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,17 +19,6 @@ from bench.errors import UserError
 if TYPE_CHECKING:
     import pandas as pd
 
-COLUMNS = [
-    "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise",
-    "horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats", "dim", "seed", "status", "reason",
-    "grad_norm", "reference_norm", "reference_method", "reference_se", "bias", "bias_low", "bias_high",
-    "bias_rel", "variance", "variance_per_sample", "rmse", "rmse_rel", "cosine", "sign_agreement",
-    "finite_fraction", "model_error", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients",
-    "peak_memory_mb", "dtype", "device", "versions", "key",
-]  # fmt: skip
-"""The columns of a row: a contract with people's scripts."""
-EXTRA_COLUMNS = ("variance_low", "variance_high")
-"""Columns of ``rows.parquet`` beyond the contract: the 95% interval of the variance."""
 IDENTITY = [
     "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise", "horizon", "dt",
     "stiffness", "sigma", "smoothing", "samples", "repeats", "seed", "dtype",
@@ -35,15 +26,71 @@ IDENTITY = [
 """The columns that say which cell a row is, whatever version of the code made it."""
 TEXT = [
     "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise", "status",
-    "reason", "reference_method", "dtype", "device", "versions", "key",
+    "reason", "dtype", "versions", "key",
 ]  # fmt: skip
+"""The columns of every study that are text."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of a study's rows, in order. Beside the texts and lists all are numbers."""
+
+    names: tuple[str, ...]
+    texts: tuple[str, ...] = ()
+    lists: tuple[str, ...] = ()
+    extra: tuple[str, ...] = ()
+    """Columns of ``rows.parquet`` that the table leaves out."""
+
+    @classmethod
+    def of(cls, *own: str, texts: tuple[str, ...] = (), lists: tuple[str, ...] = ()) -> Columns:
+        """Identity, status and reason, then a study's own columns: ``own`` numbers, texts, lists."""
+        names = ["experiment", *IDENTITY, "dim", "status", "reason", *own, *texts, *lists, "versions", "key"]
+        return cls(tuple(names), texts, lists)
+
+    @property
+    def stored(self) -> list[str]:
+        """All columns of ``rows.parquet``."""
+        return [*self.names, *self.extra]
+
+    def blank(self) -> dict[str, Any]:
+        """A row without any value."""
+        texts = {*TEXT, *self.texts}
+        return {n: "" if n in texts else [] if n in self.lists else math.nan for n in self.stored}
+
+    def typed(self, table: pd.DataFrame) -> pd.DataFrame:
+        """The columns in order: texts as text, lists as they are, the others as numbers."""
+        import pandas as pd
+
+        table = table.reindex(columns=self.stored).copy()
+        for name in self.stored:
+            if name in TEXT or name in self.texts:
+                table[name] = table[name].astype(object).fillna("").astype(str)
+            elif name not in self.lists:
+                table[name] = pd.to_numeric(table[name], errors="coerce").astype("float64")
+        return table
+
+
+BIAS_VARIANCE = Columns(
+    (
+        "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise",
+        "horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats", "dim", "seed", "status", "reason",
+        "grad_norm", "reference_norm", "reference_method", "reference_se", "bias", "bias_low", "bias_high",
+        "bias_rel", "variance", "variance_per_sample", "rmse", "rmse_rel", "cosine", "sign_agreement",
+        "finite_fraction", "model_error", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients",
+        "peak_memory_mb", "dtype", "device", "versions", "key",
+    ),
+    texts=("reference_method", "device"),
+    extra=("variance_low", "variance_high"),
+)  # fmt: skip
+"""The columns of the main table: a contract with people's scripts."""
 
 
 class Store:
     """The rows of one experiment. Raises :class:`UserError` when its directory cannot be written or read."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, columns: Columns = BIAS_VARIANCE) -> None:
         self.directory = directory
+        self._columns = columns
         self._table = directory / "rows.parquet"
         self._pending = directory / "pending"
 
@@ -79,11 +126,10 @@ class Store:
                 rows.append(json.loads(path.read_text()))
         if rows:
             frames.append(pd.DataFrame(rows))
-        columns = [*COLUMNS, *EXTRA_COLUMNS]
         if not frames:
-            return pd.DataFrame(columns=columns)
-        table = frames[0] if len(frames) == 1 else pd.concat([typed(f.reindex(columns=columns)) for f in frames])
-        return typed(table.reindex(columns=columns)).drop_duplicates("key", keep="last").reset_index(drop=True)
+            return pd.DataFrame(columns=self._columns.stored)
+        table = pd.concat([self._columns.typed(frame) for frame in frames])
+        return table.drop_duplicates("key", keep="last").reset_index(drop=True)
 
     def compact(self) -> None:
         """Fold the small files into ``rows.parquet``."""
@@ -98,19 +144,6 @@ class Store:
                 path.unlink(missing_ok=True)
         if self._pending.is_dir() and not any(self._pending.iterdir()):
             self._pending.rmdir()
-
-
-def typed(table: pd.DataFrame) -> pd.DataFrame:
-    """Text columns as text, the others as numbers."""
-    import pandas as pd
-
-    table = table.copy()
-    for name in table.columns:
-        if name in TEXT:
-            table[name] = table[name].astype(object).fillna("").astype(str)
-        else:
-            table[name] = pd.to_numeric(table[name], errors="coerce").astype("float64")
-    return table
 
 
 def write_whole(path: Path, content: bytes) -> None:

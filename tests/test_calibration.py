@@ -6,8 +6,9 @@ import pytest
 from bench import noise
 from bench.grid import Cell
 from bench.reference import certify
-from bench.runner import Problems, truth_of
+from bench.session import Problems
 from bench.statistics import summarise
+from bench.studies.bias_variance import truth_of
 from plugins.backends.numpy import Numpy
 from plugins.estimators.finite_difference import FiniteDifference
 from plugins.estimators.fobg import Fobg

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from bench.cli import main
-from bench.store import COLUMNS, IDENTITY
+from bench.store import BIAS_VARIANCE, IDENTITY
 
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny"]
 TIMES = ["time_s", "time_iqr_s", "compile_s", "peak_memory_mb"]
@@ -19,7 +19,7 @@ def test_run_then_report_then_plan(tmp_path, capsys):
     for name in ("rows.parquet", "bias_variance.csv", "bias_variance.md", "bias_variance.tex", "run.json"):
         assert (directory / name).stat().st_size > 0
     table = pd.read_csv(directory / "bias_variance.csv")
-    assert list(table.columns) == list(COLUMNS)
+    assert list(table.columns) == list(BIAS_VARIANCE.names)
     assert len(table) == 4
     assert (table["status"] == "ok").all()
     assert json.loads((directory / "run.json").read_text())["counts"] == {"ok": 4}
@@ -38,11 +38,11 @@ def test_run_then_report_then_plan(tmp_path, capsys):
 
 
 def test_only_missing_cells_run_and_rows_are_kept(tmp_path, monkeypatch):
-    from bench import runner
+    from bench.studies import bias_variance
 
     measured = []
-    real = runner.measure
-    monkeypatch.setattr(runner, "measure", lambda cell, *rest: (measured.append(cell.key), real(cell, *rest))[1])
+    real = bias_variance.measure
+    monkeypatch.setattr(bias_variance, "measure", lambda cell, *rest: (measured.append(cell.key), real(cell, *rest))[1])
     where = f"results_dir={tmp_path}"
     assert main([*TINY, where, "sweep.sigma=[0.1]"]) == 0
     assert main([*TINY, where, "sweep.sigma=[0.1,0.2]"]) == 0
@@ -86,6 +86,13 @@ def test_unsupported_combinations_are_rows(tmp_path):
     assert "explicit_euler has no place for the impulses" in reasons
 
 
+@pytest.mark.parametrize("value", ["[fobg,reinforce[baseline=none]]", "[fobg,'reinforce[baseline=none]']"])
+def test_identity_strings_survive_the_shell(value, tmp_path):
+    assert main([*TINY, f"estimators={value}", f"results_dir={tmp_path}"]) == 0
+    table = pd.read_csv(tmp_path / "tiny" / "bias_variance.csv")
+    assert list(table["estimator_params"].fillna("")) == ["", "baseline=none"]
+
+
 def test_identity_columns_tell_cells_apart(tmp_path):
     words = [
         "scenes=[pushing]", "contacts=[impulse,'impulse[time_of_impact=false]','softplus[beta=10,smooths=clip]',softplus]",
@@ -118,6 +125,7 @@ BAD = [
     (["sweep.samples=[8,0]"], ["samples=0", "at least 1"]),
     (["repeats=1"], ["repeats=1", "at least 2"]),
     (["samples=many"], ["samples='many'", "whole number"]),
+    (["study=bias"], ["bias", "'bias_variance'"]),
     (["sample=3"], ["sample", "'samples'"]),
     (["scene.pushing.mas=0.2"], ["mas", "'mass'"]),
     (["scene.pushing.mass=heavy"], ["pushing.mass='heavy'", "a number"]),

@@ -9,8 +9,9 @@ from scipy import stats
 from bench import noise
 from bench.grid import Cell
 from bench.reference import certify
-from bench.runner import Problems, truth_of
+from bench.session import Problems
 from bench.statistics import summarise
+from bench.studies.bias_variance import truth_of
 from plugins.backends.jax import Jax
 from plugins.backends.torch import Torch
 from plugins.estimators.alpha_order import AlphaOrder

@@ -16,7 +16,7 @@ import pytest
 
 from bench.grid import Experiment
 from bench.report import charts, tables, terminal, views
-from bench.store import COLUMNS, EXTRA_COLUMNS, TEXT, typed
+from bench.store import BIAS_VARIANCE
 
 NAMES = ("alpha_order", "finite_difference", "fobg", "inverse_variance", "randomized_smoothing", "reinforce")
 STIFFNESS = (1e1, 1e2, 1e3, 3e3, 1e4, 1e5, 1e6)
@@ -66,7 +66,7 @@ def row(**values):
         bias = 0.0
     norm = 4.0
     time = SPEED.get(given["backend"], 1e-3) * (n / 100) ** 0.9 * (1.0 if first else 0.4)
-    result = {name: "" if name in TEXT else math.nan for name in (*COLUMNS, *EXTRA_COLUMNS)}
+    result = BIAS_VARIANCE.blank()
     result |= {
         "experiment": "made_up", "reference_norm": norm, "grad_norm": norm * (1 + bias), "reference_method": "quadrature",
         "reference_se": 0.0, "bias": norm * bias, "bias_low": norm * low, "bias_high": norm * high, "bias_rel": bias,
@@ -84,14 +84,14 @@ def row(**values):
 def failed(status, reason, **values):
     """A row without results."""
     made = row(**values)
-    return {name: made[name] if name in IDENTITY else "" if name in TEXT else math.nan for name in made} | {
+    return {name: made[name] if name in IDENTITY else BIAS_VARIANCE.blank()[name] for name in made} | {
         "status": status,
         "reason": reason,
     }
 
 
 def table(rows):
-    return typed(pd.DataFrame(rows)[[*COLUMNS, *EXTRA_COLUMNS]])
+    return BIAS_VARIANCE.typed(pd.DataFrame(rows))
 
 
 def stiffness_rows(stiffness=STIFFNESS, sigmas=(0.1, 0.3), estimators=NAMES, backends=BACKENDS):
@@ -138,7 +138,7 @@ def test_csv_has_the_promised_columns_in_order_and_every_digit(tmp_path):
     rows = stiffness_rows()
     tables.write(rows, tmp_path)
     with open(tmp_path / "bias_variance.csv", newline="") as file:
-        assert next(csv.reader(file)) == COLUMNS
+        assert next(csv.reader(file)) == list(BIAS_VARIANCE.names)
     back = pd.read_csv(tmp_path / "bias_variance.csv")
     assert len(back) == len(rows)
     for name in ("bias", "variance", "time_s"):

@@ -235,6 +235,12 @@ class _Solving(Integrator):
 
         return State(dynamics.ops.root(residual, 0.0 * state.q, (state.q,)), state.v)
 
+    def amplification(self, z: complex) -> complex:
+        raise NotImplementedError
+
+    def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
+        raise NotImplementedError
+
 
 def _coupled(xp: Any, n: int, z: Array) -> Array:
     mixed = xp.stack([sum(COUPLING[i, j] * z[j] for j in range(n)) for i in range(n)])

@@ -8,7 +8,6 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,37 +27,12 @@ def latest(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.drop_duplicates(list(IDENTITY), keep="last").reset_index(drop=True)
 
 
-def write(
-    experiment: Experiment,
-    rows: pd.DataFrame,
-    axes: Sequence[str],
-    names: Sequence[str],
-    smoothing: Mapping[str, str],
-    words: list[str],
-    seconds: float,
-) -> list[Path]:
-    """Write tables, charts and ``run.json`` from rows, print the table, and return the files' paths.
-
-    ``axes`` are the swept axes; ``names`` all registered estimators in the order that fixes their colours;
-    ``smoothing`` the parameter behind the ``smoothing`` column for each contact law.
-    """
-    from bench.report import charts, tables, terminal
-
-    paths = tables.write(rows, experiment.directory)
-    paths += charts.write(experiment, rows, axes, names, smoothing)
-    if seconds:
-        paths.append(_record(experiment, rows, words, seconds))
-    terminal.show(experiment, rows, axes, smoothing)
-    print("\nWritten:")
-    for path in paths:
-        print(f"  {path}")
-    return paths
-
-
-def _record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds: float) -> Path:
-    record: dict[str, Any] = {
+def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds: float) -> Path:
+    """Write ``run.json``: what was run, with what, on what, and how it ended."""
+    content: dict[str, Any] = {
         "command": " ".join(["python -m bench", *words]),
         "experiment": experiment.name,
+        "study": experiment.study,
         "question": experiment.question,
         "config": {
             **{kind: [_identity(c) for c in chosen] for kind, chosen in experiment.choices.items()},
@@ -85,7 +59,7 @@ def _record(experiment: Experiment, rows: pd.DataFrame, words: list[str], second
         "argv": [Path(sys.argv[0]).name, *words],
     }
     path = experiment.directory / "run.json"
-    write_whole(path, (json.dumps(record, indent=1, default=str) + "\n").encode())
+    write_whole(path, (json.dumps(content, indent=1, default=str) + "\n").encode())
     return path
 
 

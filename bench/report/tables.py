@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from bench.report.views import NUMBERS, axis_value, bias_text, number, pareto
-from bench.store import COLUMNS, IDENTITY, write_whole
+from bench.store import BIAS_VARIANCE, IDENTITY, write_whole
 
 WHOLE = ("horizon", "samples", "repeats", "dim", "seed")
 PROBLEM = ("scene", "contact", "integrator", "horizon", "dt", "stiffness", "sigma", "smoothing", "noise")
@@ -31,7 +31,7 @@ def write(rows: pd.DataFrame, directory: Path) -> list[Path]:
     """Write ``bias_variance`` (.csv, .md, .tex) and ``speed_accuracy.csv``; returns their paths."""
     table = readable(rows)
     contents = {
-        "bias_variance.csv": _csv(rows.reindex(columns=COLUMNS)),
+        "bias_variance.csv": _csv(rows.reindex(columns=list(BIAS_VARIANCE.names))),
         "bias_variance.md": markdown(table),
         "bias_variance.tex": latex(table),
         "speed_accuracy.csv": _csv(speed_accuracy(rows)),

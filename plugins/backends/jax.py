@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, Backend, Ops, Problem, Program, Unsupported, param
+from bench.contracts import Array, Backend, Jacobians, MechanicalScene, Ops, Problem, Program, State, Unsupported, param
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,44 @@ class JaxProblem(Problem):
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._call(self._score_function, theta, w)
 
+    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
+        """States, controls and step Jacobians, by forward mode through each step."""
+        theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
+        return Jacobians(*(np.asarray(part, dtype=np.float64) for part in self._run(self._linearised, theta, w)))
+
+    def _linearised(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+        import jax
+        import jax.numpy as jnp
+
+        program = self.program.bind(parameters)
+        if not isinstance(program.scene, MechanicalScene):
+            raise Unsupported(f"scene {program.scene.name} has no steps")
+        n_q = program.scene.n_q
+
+        def step(x: Array, u: Array) -> Array:
+            return jnp.concatenate(program.step(self._ops, State(x[:n_q], x[n_q:]), u))
+
+        def derivative(function: Callable[[Array], Array], point: Array) -> Array:
+            basis = jnp.eye(point.shape[0], dtype=point.dtype)[:, :, None] + jnp.zeros_like(point)
+            return jax.vmap(lambda e: jax.jvp(function, (point,), (e,))[1], out_axes=1)(basis)
+
+        def advance(state: State, slices: Any) -> tuple[State, tuple[Array, Array]]:
+            u = program.control(self._ops, theta, state, slices)
+            return program.step(self._ops, state, u), (jnp.concatenate(state), u)
+
+        theta, first, scanned = program.start(self._ops, theta, w)
+        last, (before, controls) = jax.lax.scan(advance, first, scanned, program.scene.horizon)
+        states = jnp.concatenate([before, jnp.concatenate(last)[None]])
+        a, b = jax.lax.map(
+            lambda at: (derivative(lambda x: step(x, at[1]), at[0]), derivative(lambda u: step(at[0], u), at[1])),
+            (states[:-1], controls),
+        )
+        return states, controls, a, b
+
     def _call(self, function: Callable[..., Array], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return np.asarray(self._run(function, theta, w), dtype=np.float64)
+
+    def _run(self, function: Callable[..., Any], theta: np.ndarray, w: np.ndarray) -> Any:
         import jax
 
         args = (self._parameters, theta.astype(self._dtype), w.astype(self._dtype))
@@ -89,7 +126,7 @@ class JaxProblem(Problem):
         if key not in self._charged:
             self._charged.add(key)
             self.usage.compile_s += seconds
-        return np.asarray(compiled(*args), dtype=np.float64)
+        return compiled(*args)
 
     def _cost(self, parameters: Array, theta: Array, w: Array) -> Array:
         return self.program.bind(parameters).cost(self._ops, theta, w)

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from bench.contracts import Array, Dynamics, Integrator, State
 
 
@@ -19,3 +21,11 @@ class ExplicitEuler(Integrator):
         """One step, everything taken at its start."""
         v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)
         return State(state.q + dt * state.v, v)
+
+    def amplification(self, z: complex) -> complex:
+        """1 + z."""
+        return 1 + z
+
+    def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
+        """Both from the old state."""
+        return np.array([[1.0, dt], [-dt * stiffness, factor - dt * damping]])

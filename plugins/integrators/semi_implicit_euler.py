@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from bench.contracts import Array, Dynamics, Integrator, State
 
 
@@ -20,3 +22,12 @@ class SemiImplicitEuler(Integrator):
         """One step; impulses act on the new velocity."""
         v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)
         return dynamics.with_impulse(state, State(state.q + dt * v, v), dt)
+
+    def amplification(self, z: complex) -> complex:
+        """1 + z: without positions it is explicit Euler."""
+        return 1 + z
+
+    def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
+        """Velocity first, then position with the new velocity."""
+        row = np.array([-dt * stiffness, factor - dt * damping])
+        return np.array([[1.0, 0.0] + dt * row, row])
