@@ -1,7 +1,8 @@
-"""The verbs: run (the default), report, plan, list, check."""
+"""The verbs: run (the default), report, plan, list, check, gradcheck, trace."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -22,6 +23,8 @@ Compare gradient estimators through physics simulation.
   python -m bench plan +experiment=NAME [key=value ...]     cells, how many are stored, expected time
   python -m bench list [NAME ...]                           plugins: parameters, capabilities, availability
   python -m bench check [NAME ...]                          the conformance kit on some plugins, or all
+  python -m bench gradcheck SCENE ... [key=value ...]       gradients against differences of the cost, and what is wrong
+  python -m bench trace SCENE ... [key=value ...]           one rollout: do gradient spikes line up with contact switches?
 
 Experiments: {experiments}
 Settings: scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..]
@@ -56,6 +59,8 @@ def _dispatch(words: list[str]) -> int:
         "plan": _plan,
         "list": _list,
         "check": _check,
+        "gradcheck": _gradcheck,
+        "trace": _trace,
     }
     if not words or words[0] in ("-h", "--help", "help"):
         from bench import config
@@ -76,21 +81,29 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _prepare(words: list[str]) -> tuple[Experiment, Store, list[Planned]]:
-    from bench import config, runner, studies
+    from bench import config
+
+    return _planned(config.load(words))
+
+
+def _planned(experiment: Experiment) -> tuple[Experiment, Store, list[Planned]]:
+    from bench import runner, studies
     from bench.store import Store
 
-    experiment = config.load(words)
     store = Store(experiment.directory, studies.find(experiment.study).COLUMNS)
     return experiment, store, runner.plan(experiment, store)
 
 
 def _run(words: list[str]) -> int:
+    return _execute(*_prepare(words), words)
+
+
+def _execute(experiment: Experiment, store: Store, planned: list[Planned], words: list[str]) -> int:
     import time
 
     from bench import runner
     from bench.report import progress
 
-    experiment, store, planned = _prepare(words)
     started = time.time()
     waiting = [item for item in planned if not item.stored]
     store.prepare()
@@ -206,3 +219,48 @@ def _check(words: list[str]) -> int:
         if word not in known:
             raise unknown("plugin", word, known)
     return conformance.main(words)
+
+
+# ------------------------------------------------------------------------------------------------ gradcheck
+
+
+def _gradcheck(words: list[str]) -> int:
+    """The experiment ``gradient_check`` on the scenes named first, under the overrides that follow; 1 for a fault too."""
+    from dataclasses import replace
+
+    from bench import config, registry
+    from bench.report import gradient_check
+
+    scenes = list(itertools.takewhile(lambda word: "=" not in word.partition("[")[0], words))
+    chosen = [f"scenes=[{','.join(scenes)}]", "name=gradcheck"] if scenes else []
+    experiment = config.load(["experiment=gradient_check", *chosen, *words[len(scenes) :]])
+    plugins = [choice.entry.plugin for choice in experiment.choices["scenes"]]
+    if not any(plugin and "horizon" in registry.parameters(plugin) for plugin in plugins):
+        experiment = replace(experiment, sweep={k: v for k, v in experiment.sweep.items() if k != "horizon"})
+    experiment, store, planned = _planned(experiment)
+    status = _execute(experiment, store, planned, ["gradcheck", *words])
+    rows = store.load()
+    return 1 if status or gradient_check.failed(rows[rows["key"].isin([p.cell.key for p in planned])]) else 0
+
+
+# ---------------------------------------------------------------------------------------------------- trace
+
+
+def _trace(words: list[str]) -> int:
+    """One rollout of each scene named first: w = 0, or a sample of the noise where ``seed=`` is among the overrides."""
+    from bench import config, health
+    from bench.report import trace
+
+    scenes = list(itertools.takewhile(lambda word: "=" not in word.partition("[")[0], words))
+    if not scenes:
+        raise UserError("name a scene to trace: python -m bench trace SCENE ... [key=value ...]")
+    overrides = words[len(scenes) :]
+    experiment = config.load([f"scenes=[{','.join(scenes)}]", *overrides])
+    for found in health.run(experiment, any(word.startswith("seed=") for word in overrides)):
+        print(f"\n{found.title}")
+        for sentence in found.report():
+            print(f"  {sentence}")
+        print("Written:")
+        for path in trace.write(found, experiment.results_dir):
+            print(f"  {path}")
+    return 0

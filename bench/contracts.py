@@ -160,6 +160,10 @@ class Scene(Plugin):
         """Grad f at :meth:`theta0`, without noise, of the *physics* the scene stands for (rigid contact, dt -> 0), or None."""
         return None
 
+    def physical_cost(self) -> float | None:
+        """f at :meth:`theta0`, without noise, of the same physics, or None."""
+        return None
+
 
 @dataclass(frozen=True)
 class FunctionScene(Scene):
@@ -360,6 +364,8 @@ class Problem(ABC):
     """
 
     block: int = 1 << 16
+    device: str = "cpu"
+    """What the program runs on."""
 
     def __init__(self, program: Program) -> None:
         self.program = program

@@ -78,6 +78,7 @@ class Cell:
     samples: int
     repeats: int
     seed: int
+    study: str = "bias_variance"
 
     @property
     def parts(self) -> tuple[Plugin | None, ...]:
@@ -88,7 +89,7 @@ class Cell:
     def key(self) -> str:
         """Hash of everything that decides the cell's numbers; library versions are columns instead."""
         text = "|".join(["" if p is None else _fingerprint(p) for p in self.parts])
-        text += f"|{self.samples}|{self.repeats}|{self.seed}|{core_hash()}"
+        text += f"|{self.samples}|{self.repeats}|{self.seed}|{core_hash()}|{study_hash(self.study)}"
         return hashlib.sha256(text.encode()).hexdigest()[:32]
 
     @cached_property
@@ -185,6 +186,12 @@ def core_hash() -> str:
     for name in ("contracts", "noise", "program", "reference", "statistics"):
         digest.update(Path(__file__).with_name(f"{name}.py").read_bytes())
     return digest.hexdigest()
+
+
+@registry.remember
+def study_hash(study: str) -> str:
+    """Hash of the file that says what is measured."""
+    return hashlib.sha256((Path(__file__).parent / "studies" / f"{study}.py").read_bytes()).hexdigest()
 
 
 # ------------------------------------------------------------------------------------------------ expansion
@@ -311,7 +318,9 @@ def _cell(experiment: Experiment, point: Mapping[str, Any], choices: Iterable[Ch
         if count < low:
             raise UserError(f"{name}={count} must be at least {low}")
         counts[name] = count
-    return Cell(scene, contact, integrator, make(backend_choice), make(estimator_choice), **counts)  # type: ignore[arg-type]
+    return Cell(
+        scene, contact, integrator, make(backend_choice), make(estimator_choice), **counts, study=experiment.study
+    )  # type: ignore[arg-type]
 
 
 @registry.remember

@@ -30,11 +30,16 @@ from plugins.scenes.cartpole import Cartpole
 from plugins.scenes.constant import Constant
 from plugins.scenes.cubic import Cubic
 from plugins.scenes.double_integrator import DoubleIntegrator
+from plugins.scenes.friction_block import FrictionBlock
+from plugins.scenes.ground_wall import GroundWall
 from plugins.scenes.heaviside import Heaviside
+from plugins.scenes.hopper import Hopper
 from plugins.scenes.linear import Linear
+from plugins.scenes.mass_spring import MassSpring
 from plugins.scenes.pushing import Pushing
 from plugins.scenes.quadratic import Quadratic
 from plugins.scenes.soft_heaviside import SoftHeaviside
+from plugins.scenes.stiff_decay import StiffDecay
 from plugins.scenes.wall_penalty_1d import WallPenalty1d
 
 # -------------------------------------------------------------------------------------------- used throughout
@@ -113,6 +118,9 @@ def combinations(root):
             "bounce_once": [BounceOnce(horizon=96, dt=1 / 96)],
             "bouncing_ball": [BouncingBall(horizon=48 if root else 100, dt=0.01)],
             "wall_penalty_1d": [WallPenalty1d(horizon=100, dt=0.02)],
+            "ground_wall": [GroundWall(horizon=120 if root else 288)],
+            "hopper": [Hopper(horizon=400)],
+            "friction_block": [FrictionBlock(horizon=400)],
         }.get(name, [cls()])
         for scene in scenes:
             contacts = getattr(scene, "n_contacts", 0)
@@ -189,6 +197,8 @@ CLOSED = [
     Cubic(dimension=2, sigma=0.5),
     Constant(),
     DoubleIntegrator(),
+    StiffDecay(),
+    MassSpring(),
     BounceOnce(horizon=48, dt=1 / 48),
     BounceOnce(horizon=48, dt=1 / 48, velocity=-0.95),
     BounceOnce(horizon=48, dt=1 / 48, velocity=-0.95, restitution=0.5, mass=0.01, force=1.0),

@@ -1,8 +1,9 @@
-"""Checks of integrators, on a smooth motion."""
+"""Checks of integrators, on a smooth motion and on linear ones."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -76,6 +77,41 @@ class _Kicked(_Swing):
         return force
 
 
+@dataclass(frozen=True)
+class _Decay(MechanicalScene):
+    """v' = rate v, without positions."""
+
+    name = "conformance_decay"
+    n_q: ClassVar[int] = 0
+    n_v: ClassVar[int | None] = 1
+
+    rate: float = param(-1.0, "growth rate", "1/s")
+
+    def theta0(self) -> np.ndarray:
+        return np.array([1.0])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        return State(theta[:0], theta)
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        return self.rate * v
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        return v[0]
+
+
+@dataclass(frozen=True)
+class _Oscillator(_Swing):
+    """q'' = -stiffness q - friction v."""
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        return -self.stiffness * q - self.friction * v
+
+
+EXACT = 1e-9
+"""Relative difference allowed between numbers that are equal but for rounding, and for where a Newton iteration stops."""
+
+
 def _advance(integrator: Integrator, dynamics: Dynamics, steps: int, dt: float) -> State:
     state = State(np.array([[1.0, 0.3]]), np.array([[0.5, -1.0]]))
     for _ in range(steps):
@@ -121,6 +157,39 @@ def free_motion_is_exact(integrator: Integrator) -> str:
     off = distance(whole.q, state.q + 0.01 * state.v)
     require(off < 1e-9, f"the position is off by {off:.1e}")
     return f"to {off:.0e}"
+
+
+@verifies(Integrator)
+def amplification_is_that_of_the_step(integrator: Integrator) -> str:
+    """The factor of one step on v' = a v is ``amplification(a dt)``, for decay and growth, slow and stiff."""
+    worst = 0.0
+    for dt, rate in itertools.product((0.01, 0.5), (-50.0, -3.0, 0.0, 0.7)):
+        state = State(np.zeros((0, 1)), np.ones((1, 1)))
+        end = integrator.step(Dynamics(Ops(), _Decay(rate=rate), None), state, np.zeros((0, 1)), dt)
+        require(end.q.shape == (0, 1), f"without positions, q becomes {end.q.shape}")
+        stated = integrator.amplification(rate * dt)
+        off = abs(end.v[0, 0] - stated) / max(1.0, abs(stated))
+        require(
+            off < EXACT, f"a dt = {rate * dt:g}: the step's factor is {end.v[0, 0]:.6g}, the stated one {stated:.6g}"
+        )
+        worst = max(worst, off)
+    return f"to {worst:.0e} for a dt from -25 to 0.35"
+
+
+@verifies(Integrator)
+def transition_is_that_of_the_step(integrator: Integrator) -> str:
+    """One step on q' = v, v' = -stiffness q - damping v is ``transition``, with and without a velocity factor."""
+    worst = 0.0
+    for dt, stiffness, damping, factor in itertools.product((0.01, 0.3), (0.0, 4.0, 1e4), (0.0, 0.5, 20.0), (1.0, 0.6)):
+        scene = _Oscillator(stiffness=stiffness, friction=damping, velocity_factor=factor)
+        unit = State(np.array([[1.0, 0.0]]), np.array([[0.0, 1.0]]))
+        found = np.concatenate(integrator.step(Dynamics(Ops(), scene, None), unit, np.zeros((1, 2)), dt))
+        stated = integrator.transition(dt, stiffness, damping, factor)
+        off = distance(found, stated)
+        at = f"dt = {dt:g}, stiffness {stiffness:g}, damping {damping:g}, velocity factor {factor:g}"
+        require(off < EXACT, f"at {at} the step is {found.tolist()}, the stated matrix {stated.tolist()}")
+        worst = max(worst, off)
+    return f"to {worst:.0e} in 36 settings"
 
 
 @verifies(Integrator)

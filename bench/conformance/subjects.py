@@ -66,11 +66,11 @@ def can_run(backend: Backend, program: Program) -> bool:
 
 @cache
 def stepping() -> Integrator:
-    """An integrator that works with every contact law."""
+    """An integrator that works with every contact law, of first order: it leaves impacts to the law."""
     for plugin in available("integrators"):
-        if plugin.takes_impulses and not plugin.needs_root:
+        if plugin.takes_impulses and not plugin.needs_root and plugin.order == 1:
             return plugin()
-    raise Skipped("no explicit integrator that takes impulses is registered")
+    raise Skipped("no explicit first-order integrator that takes impulses is registered")
 
 
 def law_for(scene: MechanicalScene, law: type[ContactLaw], values: dict[str, Any] | None = None) -> ContactLaw:

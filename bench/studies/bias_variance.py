@@ -60,7 +60,7 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
         "rollouts": usage.rollouts / (calls + 1),
         "gradients": usage.gradients / (calls + 1),
         "peak_memory_mb": timing.peak_memory_mb(),
-        "device": "cpu",
+        "device": problem.device,
     }
     if not np.isfinite(truth.batches).all():
         return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}

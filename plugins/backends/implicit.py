@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -24,7 +25,12 @@ class Implicit(Jax):
     reference_rank: ClassVar[int | None] = 1
 
     def ops(self) -> Ops:
-        """JAX operations with a root finder."""
+        """JAX operations with a root finder.
+
+        Equinox, under optimistix and lineax, is asked for NaN instead of an exception where a solve in the adjoint fails,
+        so that it ends one rollout and not the batch.
+        """
+        os.environ.setdefault("EQX_ON_ERROR", "nan")
         import jax
 
         jax.config.update("jax_enable_x64", True)

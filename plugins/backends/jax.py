@@ -54,6 +54,12 @@ class JaxOps:
         raise Unsupported("no implicit solve on this backend; use backend implicit")
 
 
+def _platform() -> str:
+    import jax
+
+    return str(jax.default_backend())
+
+
 _compiled: dict[tuple[Any, ...], tuple[Any, float]] = {}
 """Compiled functions and their compile seconds, by program structure, function, mode, dtype and shapes."""
 
@@ -65,6 +71,7 @@ class JaxProblem(Problem):
         super().__init__(program)
         self._ops, self._dtype, self._mode = ops, np.dtype(dtype), mode
         self._parameters = program.parameters().astype(self._dtype)
+        self.device = _platform()
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._call(self._cost, theta, w)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.contracts import Problem, SampleMean, param
+from bench.contracts import Problem, Program, SampleMean, param
 
 
 @dataclass(frozen=True)
@@ -33,3 +33,9 @@ class RandomizedSmoothing(SampleMean):
         if self.variant == "antithetic":
             return (ahead - problem.displaced(-s * direction, theta, still)) * direction / (2 * s)
         return (ahead - problem.value(theta, still[:, :1])) * direction / s
+
+    def refuses(self, program: Program) -> str | None:
+        """A direction is made of a sample's normal numbers, so there must be d of them."""
+        if program.n_noise >= program.dim:
+            return None
+        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"

@@ -89,6 +89,11 @@ class BounceOnce(MechanicalScene):
         """-restitution (1, T, T dt / mass) after a rigid bounce, (1, T, T dt / mass) without."""
         return np.asarray(self._free_slope() * (1.0 if self._free_end() > 0 else -self.restitution))
 
+    def physical_cost(self) -> float:
+        """radius + z, or radius - restitution z after a rigid bounce."""
+        end = self._free_end()
+        return self.radius + (end if end > 0 else -self.restitution * end)
+
     def _free_end(self) -> float:
         """z, the final gap if there were no ground."""
         return self.height - self.radius + self.horizon * self.dt * (self.velocity + self.dt * self.force / self.mass)

@@ -68,6 +68,16 @@ class BouncingBall(MechanicalScene):
 
     def physical_gradient(self) -> np.ndarray | None:
         """Grad f of rigid bounces with the scene's restitution, from event to event; None if the ball comes to rest."""
+        final = self._rigid_end()
+        return None if final is None else np.asarray(2 * (final[0] - self.target) * final[1])
+
+    def physical_cost(self) -> float | None:
+        """f of the same bounces."""
+        final = self._rigid_end()
+        return None if final is None else (final[0] - self.target) ** 2
+
+    def _rigid_end(self) -> tuple[float, np.ndarray] | None:
+        """Height at T and its slope by theta, ``(2,)``."""
         g, end, e = self.gravity, self.horizon * self.dt, self.restitution
         start = np.array([0.0, self.velocity, self.height])  # time, velocity and height at the last take-off
         slopes = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])  # by theta
@@ -76,9 +86,8 @@ class BouncingBall(MechanicalScene):
             impact = math.sqrt(v * v + 2 * g * q)
             if time + (v + impact) / g > end:
                 rest = end - time
-                reached = q + v * rest - 0.5 * g * rest**2
                 slope = slopes[2] + slopes[1] * rest - (v - g * rest) * slopes[0]
-                return np.asarray(2 * (reached - self.target) * slope)
+                return q + v * rest - 0.5 * g * rest**2, slope
             if e * impact == 0.0:
                 return None
             impact_slope = (v * slopes[1] + g * slopes[2]) / impact

@@ -72,18 +72,26 @@ class WallPenalty1d(MechanicalScene):
 
     def physical_gradient(self) -> np.ndarray | None:
         """Exact for dt -> 0 under the penalty wall; None for a start inside the wall."""
-        end = self.horizon * self.dt
-        rate, duration, speed = self._wall()
         if self.start < 0.0:
             return None
-        inside = end - self.start  # time since first touch
+        reached, slope = self._soft_end()
+        return np.array([slope if reached > 1.0 else -slope])
+
+    def physical_cost(self) -> float | None:
+        """The same of f."""
+        return None if self.start < 0.0 else abs(self._soft_end()[0] - 1.0)
+
+    def _soft_end(self) -> tuple[float, float]:
+        """q_T and its slope by q0, for a start outside the wall."""
+        rate, duration, speed = self._wall()
+        inside = self.horizon * self.dt - self.start  # time since first touch
         if inside <= 0.0:
-            return np.array([-1.0 if -inside < 1.0 else 1.0])
+            return -inside, 1.0
         if inside < duration:
-            decay = math.exp(-0.5 * self.contact_values["damping"] * inside)
-            sine = 0.5 * self.contact_values["damping"] / rate * math.sin(rate * inside)
-            return np.array([-decay * (math.cos(rate * inside) - sine)])
-        return np.array([-speed if speed * (inside - duration) > 1.0 else speed])
+            half = 0.5 * self.contact_values["damping"]
+            decay, sine = math.exp(-half * inside), math.sin(rate * inside) / rate
+            return -decay * sine, decay * (math.cos(rate * inside) - half * sine)
+        return speed * (inside - duration), -speed
 
     def _wall(self) -> tuple[float, float, float]:
         """Angular frequency of a contact, its duration, and the speed after it."""

@@ -1,0 +1,121 @@
+"""A thrown ball meets the ground and a wall: two contacts, with gravity."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, MechanicalScene, State, param
+
+
+@dataclass(frozen=True)
+class GroundWall(MechanicalScene):
+    """A ball of mass 1 bounces off the ground, y = 0, and off a wall to its right; q = (x, y) is its centre.
+
+    State (q, v); theta = initial velocity (d = 2), with parameter noise; f = squared distance to the target at T.
+    Contacts are (ground, wall), both frictionless, so that x and y do not interact. Under gravity the impulse law has a
+    wrong derivative by vy at every dt (see ``bouncing_ball``), while its derivative by vx is right with the time of
+    impact and of the wrong sign without. The penalty's damper sets in at once at touch, so that the program jumps
+    by O(dt) wherever contact begins on a step boundary, and the mean of its gradients is not the gradient of its mean.
+    Source: Zhong, Han, Brikis 2022, task 2.
+    """
+
+    name = "ground_wall"
+    leaves_out: ClassVar[str] = "spin, friction, air, the corner of ground and wall"
+    n_q: ClassVar[int] = 2
+    n_contacts: ClassVar[int] = 2
+    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 10.0, "damping_mode": "approach"}
+
+    sigma: float = param(0.1, "standard deviation of the noise on the velocity", "m/s", positive=True)
+    horizon: int = param(288, "number of time steps", positive=True)
+    dt: float = param(0.6 / 288.0, "length of a time step", "s", positive=True)
+    mass: float = param(1.0, "mass of the ball", "kg", positive=True)
+    radius: float = param(0.1, "radius of the ball", "m", positive=True)
+    gravity: float = param(9.8, "gravitational acceleration", "m/s^2", low=0.0)
+    restitution: float = param(0.92, "restitution of impulse laws and of the physical gradient", low=0.0, high=1.0)
+    wall: float = param(1.75, "x of the wall", "m")
+    start_x: float = param(-0.5, "initial x of the centre", "m")
+    start_y: float = param(1.0, "initial y of the centre", "m")
+    velocity_x: float = param(5.0, "initial velocity at theta, to the right", "m/s")
+    velocity_y: float = param(-5.0, "initial velocity at theta, upwards", "m/s")
+    target_x: float = param(-2.0, "x of the target", "m")
+    target_y: float = param(1.5, "y of the target", "m")
+
+    def theta0(self) -> np.ndarray:
+        """(vx, vy)."""
+        return np.array([self.velocity_x, self.velocity_y])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """At the start, moving with theta."""
+        zero = 0.0 * theta[0]
+        return State(xp.stack([zero + self.start_x, zero + self.start_y]), theta)
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Gravity."""
+        return xp.stack([0.0 * v[0], 0.0 * v[1] - self.gravity])
+
+    def gap(self, xp: Any, q: Array) -> Array:
+        """From the ball's surface to the ground and to the wall."""
+        return xp.stack([q[1] - self.radius, self.wall - self.radius - q[0]])
+
+    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+        """(vy, -vx)."""
+        return xp.stack([v[1], -v[0]])
+
+    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+        """Up from the ground, left from the wall."""
+        return xp.stack([-force[1], force[0]]) / self.mass
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Squared distance to the target."""
+        return (q[0] - self.target_x) ** 2 + (q[1] - self.target_y) ** 2
+
+    def physical_gradient(self) -> np.ndarray | None:
+        """Grad f of rigid impacts with the scene's restitution, from event to event; None if the ball comes to rest."""
+        final = self._rigid_end()
+        if final is None:
+            return None
+        (x, x_slope), (y, y_slope) = final
+        return np.array([2 * (x - self.target_x) * x_slope, 2 * (y - self.target_y) * y_slope])
+
+    def physical_cost(self) -> float | None:
+        """f of the same impacts."""
+        final = self._rigid_end()
+        return None if final is None else (final[0][0] - self.target_x) ** 2 + (final[1][0] - self.target_y) ** 2
+
+    def _rigid_end(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
+        """x at T and its slope by vx, y at T and its slope by vy."""
+        end, e = self.horizon * self.dt, self.restitution
+        from_wall = _bounced(self.wall - self.radius - self.start_x, -self.velocity_x, 0.0, e, end)
+        from_ground = _bounced(self.start_y - self.radius, self.velocity_y, self.gravity, e, end)
+        if from_wall is None or from_ground is None:
+            return None
+        return (self.wall - self.radius - from_wall[0], from_wall[1]), (self.radius + from_ground[0], from_ground[1])
+
+
+def _bounced(gap: float, velocity: float, gravity: float, e: float, end: float) -> tuple[float, float] | None:
+    """Gap at time ``end`` and its derivative by the initial velocity; None if motion ends in infinitely many impacts.
+
+    A fall from gap s at velocity v lasts t with s + v t = g t^2 / 2 and ends at speed w = sqrt(v^2 + 2 g s), with
+    dt = t dv / w and dw = v dv / w.
+    """
+    left, slope, delay = end, 1.0, 0.0  # time left; derivatives of velocity and of the time of the last impact
+    for _ in range(1000):
+        impact = math.sqrt(velocity**2 + 2 * gravity * gap)
+        fall = _fall_time(gap, velocity, gravity, impact)
+        if fall > left:
+            reached = gap + velocity * left - 0.5 * gravity * left**2
+            return reached, slope * left - (velocity - gravity * left) * delay
+        if e * impact == 0.0:
+            return None
+        delay += fall * slope / impact
+        gap, velocity, slope, left = 0.0, e * impact, e * slope * velocity / impact, left - fall
+    return None
+
+
+def _fall_time(gap: float, velocity: float, gravity: float, impact: float) -> float:
+    if gravity > 0.0:
+        return (velocity + impact) / gravity
+    return -gap / velocity if velocity < 0.0 else math.inf

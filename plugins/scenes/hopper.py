@@ -1,0 +1,92 @@
+"""Hopping on one leg: contact made and broken many times, under feedback."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, MechanicalScene, State, param
+
+
+@dataclass(frozen=True)
+class Hopper(MechanicalScene):
+    """A body on a spring-damper leg with a point foot hops on the spot; q = (body height z, foot height y).
+
+    With the compression c = rest length - (z - y) the leg pushes body and foot apart with k c + b c' + u. The policy
+    u = c z' (theta_0 + theta_1 (target - h)) makes the leg stiffer while the body rises than while it falls, more so
+    where the energy height h = z + z'^2 / 2g + k c^2 / (2 M g), the apex to come, is below target. theta are the two
+    gains; f = mean of (h - target)^2 over the steps, plus ``effort`` times the mean of u^2, plus (h - target)^2 at the end.
+
+    The default lands and lifts off four times. Under a penalty the light foot rebounds within a stance, under
+    ``complementarity`` it stays down; the hops are the same. The ``impulse`` law is no ground to hop on: it follows the
+    velocity before the step, so that a pressed foot sinks at dt times the acceleration that presses it.
+    """
+
+    name = "hopper"
+    leaves_out: ClassVar[str] = "forward motion and pitch, the leg's angle and end stops, limits of the actuator"
+    noise = "action"
+    n_q: ClassVar[int] = 2
+    n_u: ClassVar[int] = 1
+    n_contacts: ClassVar[int] = 1
+    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
+
+    sigma: float = param(1.0, "standard deviation of the noise on the force of each step", "N", positive=True)
+    horizon: int = param(1000, "number of time steps", positive=True)
+    dt: float = param(0.002, "length of a time step", "s", positive=True)
+    body_mass: float = param(1.0, "M, mass of the body", "kg", positive=True)
+    foot_mass: float = param(0.1, "mass of the foot", "kg", positive=True)
+    leg: float = param(0.5, "rest length of the leg", "m", positive=True)
+    leg_stiffness: float = param(400.0, "k, stiffness of the leg", "N/m", positive=True)
+    leg_damping: float = param(6.0, "b, damping of the leg", "N s/m", low=0.0)
+    gravity: float = param(9.81, "g", "m/s^2", positive=True)
+    drop: float = param(0.15, "initial height of the foot", "m", positive=True)
+    target: float = param(0.7, "energy height wanted", "m", positive=True)
+    effort: float = param(1e-5, "weight of the mean squared force", "m^2/N^2", low=0.0)
+    restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
+
+    def theta0(self) -> np.ndarray:
+        """100 N s/m^2 and 400 N s/m^3: they keep the default body hopping, a little below target."""
+        return np.array([100.0, 400.0])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """At rest in the air, the leg at its rest length."""
+        zero = 0.0 * theta[0]
+        return State(xp.stack([zero + self.drop + self.leg, zero + self.drop]), xp.stack([zero, zero]))
+
+    def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
+        """c z' (theta_0 + theta_1 (target - h))."""
+        gain = theta[0] + theta[1] * (self.target - self._energy_height(q, v))
+        return xp.stack([self._compression(q) * v[0] * gain])
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Gravity and the leg."""
+        push = self.leg_stiffness * self._compression(q) + self.leg_damping * (v[1] - v[0]) + u[0]
+        return xp.stack([push / self.body_mass - self.gravity, -push / self.foot_mass - self.gravity])
+
+    def gap(self, xp: Any, q: Array) -> Array:
+        """Height of the foot."""
+        return q[1:2]
+
+    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+        """Velocity of the foot."""
+        return v[1:2]
+
+    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+        """Upwards on the foot."""
+        return xp.stack([0.0 * force[0], force[0] / self.foot_mass])
+
+    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """The step's share of error and effort."""
+        return (self.terminal_cost(xp, q, v) + self.effort * u[0] ** 2) / self.horizon
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Squared error of the energy height."""
+        return (self._energy_height(q, v) - self.target) ** 2
+
+    def _compression(self, q: Array) -> Array:
+        return self.leg - (q[0] - q[1])
+
+    def _energy_height(self, q: Array, v: Array) -> Array:
+        weight = self.body_mass * self.gravity
+        return q[0] + v[0] ** 2 / (2 * self.gravity) + self.leg_stiffness * self._compression(q) ** 2 / (2 * weight)

@@ -1,0 +1,91 @@
+"""Products of step Jacobians against closed forms, and the growth study end to end."""
+
+import math
+
+import numpy as np
+import pytest
+
+from bench.cli import main
+from bench.contracts import Jacobians
+from bench.program import Program
+from bench.store import Store
+from bench.studies.growth import COLUMNS, classify, products, rate
+from plugins.backends.jax import Jax
+from plugins.integrators.rk4 import Rk4
+from plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from plugins.scenes.double_integrator import DoubleIntegrator
+from plugins.scenes.double_pendulum import DoublePendulum
+
+
+def constant(matrix, horizon, batch=3):
+    n = len(matrix)
+    a = np.broadcast_to(np.asarray(matrix)[None, :, :, None], (horizon, n, n, batch))
+    return Jacobians(
+        np.zeros((horizon + 1, n, batch)), np.zeros((horizon, 0, batch)), a, np.zeros((horizon, n, 0, batch))
+    )
+
+
+def test_gain_of_the_double_integrator():
+    scene = DoubleIntegrator(horizon=30)
+    problem = Jax().compile(Program(scene, None, SemiImplicitEuler()))
+    found = products(problem.jacobians(scene.theta0(), np.zeros((30, 2))))
+    lag = np.arange(1, 31)
+    expected = scene.dt * np.hypot(scene.dt * lag, 1.0)  # dx_N/du_i = (dt^2 lag, dt)
+    assert np.exp(found.gain) == pytest.approx(np.repeat(expected[:, None], 2, axis=1), rel=1e-12)
+    assert found.spectral == pytest.approx(0.0, abs=1e-6)  # sqrt(eps) of a defective eigenvalue
+
+
+def test_products_beyond_the_range_of_floats():
+    found = products(constant([[10.0, 0.0], [0.0, 2.0]], 1000))
+    assert found.gain[-1] == pytest.approx(1000 * math.log(10.0))
+    assert found.spectral == pytest.approx(1000 * math.log(10.0))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "expected"),
+    [
+        ([[1.1, 0.0], [0.3, 0.5]], "exploding"),
+        ([[0.9, 0.1], [0.0, 0.5]], "vanishing"),
+        ([[1.0, 0.1], [0.0, 1.0]], "neutral"),
+        ([[math.cos(0.3), 2 * math.sin(0.3)], [-math.sin(0.3) / 2, math.cos(0.3)]], "neutral"),
+    ],
+)
+def test_classes_of_constant_maps(matrix, expected):
+    found = products(constant(matrix, 200))
+    stretch, spectral = rate(found.singular[:, 0], 200), rate(found.spectral, 200)
+    assert classify(stretch[2], spectral[1], 1e-6 / 200) == expected
+
+
+def test_rate_interval_covers():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(1000):
+        _, low, high = rate(10 * (0.3 + rng.standard_normal(16)), 10)
+        hits += low <= 0.3 <= high
+    assert abs(hits - 950) < 4 * math.sqrt(1000 * 0.95 * 0.05)
+
+
+def test_median_gradient_of_the_double_pendulum():
+    for horizon, median in ((100, 8.0), (250, 26.0), (500, 580.0), (1000, 3.1e5)):
+        scene = DoublePendulum(horizon=horizon)
+        problem = Jax().compile(Program(scene, None, Rk4()))
+        w = np.random.default_rng(0).standard_normal((4, 400))
+        found = np.median(np.linalg.norm(problem.grad(scene.theta0(), w), axis=0))
+        assert median / 1.5 < found < median * 1.5
+
+
+def test_from_the_command_line(tmp_path, capsys):
+    words = [
+        "study=growth", "name=small", "scenes=[double_integrator,double_pendulum]", "integrators=[rk4]",
+        "estimators=[fobg]", "sweep.horizon=[10,50]", "samples=16", "repeats=4", f"results_dir={tmp_path}",
+    ]  # fmt: skip
+    assert main(words) == 0
+    for name in ("csv", "md", "png", "svg"):
+        assert (tmp_path / "small" / f"growth.{name}").stat().st_size > 0
+    assert "spectral" in capsys.readouterr().out
+    rows = Store(tmp_path / "small", COLUMNS).load().set_index(["scene", "horizon"])
+    assert rows.loc[("double_integrator", 50.0), "growth"] == "neutral"
+    chaotic = rows.loc[("double_pendulum", 50.0)]
+    assert chaotic["growth"] == "exploding"
+    assert chaotic["gain_of"] == "states"
+    assert len(chaotic["lags"]) == len(chaotic["gain"])

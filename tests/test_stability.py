@@ -1,0 +1,205 @@
+"""The stability map: verdicts, boundaries against theory, and the files made from them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bench import config, registry, runner
+from bench.contracts import MechanicalScene, State
+from bench.grid import cells
+from bench.report import stability as report
+from bench.session import Session
+from bench.store import Store
+from bench.studies import stability
+
+STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
+HORIZON, DT = 40, 0.05
+
+
+def experiment(tmp_path, *words):
+    return config.load(
+        ["study=stability", "name=map", f"results_dir={tmp_path}", "estimators=[fobg]", "backends=[implicit]", *words]
+    )
+
+
+def swept(tmp_path, integrator, *words):
+    """Rows of mass_spring over STIFFNESS at one dt, which compiles once."""
+    given = experiment(
+        tmp_path, "scenes=[mass_spring]", f"integrators=[{integrator}]", f"sweep.stiffness={list(STIFFNESS)}",
+        f"scene.mass_spring.horizon={HORIZON}", f"scene.mass_spring.dt={DT}", *words,
+    )  # fmt: skip
+    store = Store(given.directory, stability.COLUMNS)
+    runner.run(given, runner.plan(given, store), store, lambda cell, row: None)
+    return given, store.load().sort_values("stiffness").reset_index(drop=True)
+
+
+@dataclass(frozen=True)
+class Drop(MechanicalScene):
+    """A mass thrown at unit speed; f = q_N. It has no physical gradient."""
+
+    name = "drop"
+    n_q = 1
+    slope: float = 1.0
+
+    def theta0(self):
+        return np.array([0.5, 1.0])
+
+    def initial_state(self, xp, theta):
+        return State(theta[0:1], theta[1:2])
+
+    def acceleration(self, xp, q, v, u):
+        return -0.1 * v
+
+    def terminal_cost(self, xp, q, v):
+        return self.slope * q[0]
+
+
+def cell(tmp_path, *words):
+    return cells(experiment(tmp_path, *words))[0]
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.5])
+def test_semi_implicit_euler_diverges_within_a_cell_of_its_limit(tmp_path, factor):
+    """h^2 2 k / m = 2 (1 + d) for two masses m on a spring k with velocity factor d."""
+    _, rows = swept(tmp_path, "semi_implicit_euler", f"scene.mass_spring.velocity_factor={factor}")
+    limit = (1 + factor) / DT**2
+    assert np.allclose(rows["stiffness_limit"], limit, rtol=1e-6)
+    lost = rows["verdict"].isin(["diverged", "nonfinite"]).to_numpy()
+    first = int(np.argmax(lost))
+    assert lost[first:].all()
+    assert 0 < first < len(STIFFNESS) - 1
+    assert STIFFNESS[first - 2] < limit < STIFFNESS[first + 1]
+    (panel,) = report.panels(rows)
+    assert panel.boundary["agrees"].all()
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "implicit_midpoint"])
+def test_implicit_steps_never_diverge(tmp_path, integrator):
+    _, rows = swept(tmp_path, integrator, "scene.mass_spring.mass=0.001")
+    assert np.isinf(rows["stiffness_limit"]).all()
+    assert (rows["spectral_radius"] <= stability.NEUTRAL).all()
+    assert (rows["status"] == "ok").all()
+    assert (rows["first_bad_step"].isna()).all()
+
+
+def test_explicit_euler_diverges_where_its_growth_is_large_enough_to_see(tmp_path):
+    """It is unstable everywhere, and seen to be where rho^T passes the criterion."""
+    _, rows = swept(tmp_path, "explicit_euler")
+    assert (rows["stiffness_limit"] == 0).all()
+    growth = rows["spectral_radius"] ** HORIZON
+    lost = rows["verdict"] == "diverged"
+    assert (growth > 1).all()
+    assert (growth[lost] > 3).all()
+    assert lost[growth > 100 * stability.LIMIT].all()
+
+
+def test_first_bad_step_and_its_state_are_told(tmp_path):
+    _, rows = swept(tmp_path, "semi_implicit_euler")
+    row = rows[rows["verdict"] == "diverged"].iloc[0]
+    assert row["status"] == "diverged"
+    assert f"step {int(row['first_bad_step'])} of {HORIZON}" in row["reason"]
+    k, theta = row["stiffness"], np.array([0.1, 0.0])
+    step = np.array([[1 - 2 * k * DT**2, DT], [-2 * k * DT, 1.0]])
+    states = np.array([np.linalg.matrix_power(step, n) @ theta for n in range(HORIZON + 1)])
+    scale = np.array([0.1, math.sqrt(2 * k * 0.1 * 0.1)])
+    expected = int(np.argmax((np.abs(states) > stability.LIMIT * scale).any(axis=1)))
+    assert row["first_bad_step"] == expected
+    # The powers above and the rollout round differently, by an ulp a step, amplified as the states are.
+    assert np.allclose(row["state_at_first_bad_step"], states[expected], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("gradient", "verdict"),
+    [
+        ([1.0, 2.0], "ok"),
+        ([1.05, 2.1], "ok"),
+        ([1.3, 2.0], "inaccurate"),
+        ([-1.0, -2.0], "wrong_sign"),
+        ([0.0, 2.0], "zero"),
+        ([0.0, 0.0], "zero"),
+    ],
+)
+def test_verdicts(gradient, verdict):
+    assert stability.compare(np.array(gradient), np.array([1.0, 2.0]))["verdict"] == verdict
+
+
+def test_a_truth_of_zero_is_no_disconnection():
+    assert stability.compare(np.zeros(2), np.zeros(2))["verdict"] == "ok"
+    assert stability.compare(np.array([1.0, 0.0]), np.array([1.0, 0.0]))["verdict"] == "ok"
+
+
+def test_impulse_without_time_of_impact_has_the_wrong_sign(tmp_path):
+    """The trap of bounce_once, here on the ball under gravity, where only resolved impacts are right."""
+    verdicts = {}
+    for integrator in ("semi_implicit_euler", "event_driven"):
+        found = cell(
+            tmp_path, "scenes=[bouncing_ball]", "contacts=[impulse]", f"integrators=[{integrator}]", "backends=[jax]"
+        )
+        verdicts[integrator] = stability.measure(found, Session(experiment(tmp_path)))
+    assert verdicts["semi_implicit_euler"]["verdict"] == "wrong_sign"
+    assert verdicts["semi_implicit_euler"]["truth"] == "physical"
+    assert verdicts["event_driven"]["verdict"] == "ok"
+
+
+def test_truth_is_refined_where_there_is_no_physical_gradient(tmp_path):
+    """q_N = q_0 + v_0 (1 - e^(-T/10)) 10, whose Euler error is about dt T / 20 of the second component."""
+    given = cell(tmp_path, "scenes=[mass_spring]", "integrators=[semi_implicit_euler]", "backends=[jax]")
+    row = stability.measure(replace(given, scene=Drop(horizon=10, dt=0.1)), Session(experiment(tmp_path)))
+    assert row["truth"] == "refined"
+    assert row["verdict"] == "ok"
+    truth = math.hypot(1.0, 10 * (1 - math.exp(-0.1)))
+    assert row["truth_norm"] == pytest.approx(truth, rel=1 / stability.FINE_STEPS)
+    assert row["truth_error"] < 1 / stability.FINE_STEPS
+
+
+def test_scenes_without_time_steps_are_unsupported(tmp_path):
+    given = experiment(tmp_path, "scenes=[quadratic]", "backends=[jax]")
+    row = runner.outcome(cells(given)[0], Session(given), stability)
+    assert row["status"] == "unsupported"
+    assert "no time steps" in row["reason"]
+
+
+def test_contact_springs_are_oscillators_while_they_last(tmp_path):
+    given = cell(
+        tmp_path, "scenes=[bouncing_ball]", "contacts=[penalty]", "integrators=[semi_implicit_euler]",
+        "scene.bouncing_ball.mass=2", "contact.penalty.damping=4", "contact.penalty.stiffness=100",
+    )  # fmt: skip
+    assert stability.oscillator(given) == (50.0, 2.0, 1.0)
+
+
+def test_limits_hold_what_is_known():
+    def limit(name):
+        entry = registry.find("integrators", name)
+        return stability.stiffness_limit(registry.build(entry.plugin, {}), 0.5, 0.0, 1.0) * 0.25
+
+    assert limit("semi_implicit_euler") == pytest.approx(4.0, rel=1e-6)
+    assert limit("stormer_verlet") == pytest.approx(4.0, rel=1e-6)
+    assert limit("rk4") == pytest.approx(8.0, rel=1e-6)  # |R(iz)| = 1 at z = 2 sqrt 2
+    assert limit("explicit_euler") == limit("midpoint") == 0.0
+    assert limit("implicit_euler") == limit("implicit_midpoint") == math.inf
+
+
+def test_files_and_the_printed_table(tmp_path, capsys):
+    given, rows = swept(tmp_path, "semi_implicit_euler")
+    coarse = rows.assign(dt=2 * DT, horizon=HORIZON / 2, stiffness_limit=rows["stiffness_limit"] / 4)
+    both = pd.concat([rows, coarse], ignore_index=True)
+    paths = stability.write(given, both, ["stiffness"])
+    names = {path.name for path in paths}
+    assert names == {
+        "stability_map.csv", "stability_map.md", "stability_map_semi_implicit_euler.png",
+        "stability_map_semi_implicit_euler.svg",
+    }  # fmt: skip
+    printed = capsys.readouterr().out
+    assert "semi_implicit_euler" in printed
+    assert "1 of 2" in printed  # the verdicts at twice the dt are copies, and its limit is a quarter
+    (panel,) = report.panels(both)
+    (axes,) = report.heat_map("semi_implicit_euler", [panel]).axes
+    (line,) = axes.get_lines()
+    drawn = dict(zip(np.round(line.get_xdata(), 9), line.get_ydata(), strict=True))
+    assert drawn[DT] == pytest.approx(2 / DT**2, rel=1e-6)
+    assert {text.get_text() for text in axes.texts} >= {"D"}

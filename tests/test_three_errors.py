@@ -1,0 +1,101 @@
+"""Program, model and estimator error kept apart: the impulse without time of impact, which only the model error betrays."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from bench.cli import main
+from bench.program import Program
+from bench.store import Store
+from bench.studies.three_errors import COLUMNS, difference_check
+from plugins.backends.jax import Jax
+from plugins.contacts.impulse import Impulse
+from plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from plugins.scenes.bounce_once import BounceOnce
+from plugins.scenes.bouncing_ball import BouncingBall
+from plugins.scenes.wall_penalty_1d import WallPenalty1d
+
+TRAP = Impulse(time_of_impact=False)
+
+
+def check(scene, law):
+    return difference_check(Jax().compile(Program(scene, law, SemiImplicitEuler())))
+
+
+def test_the_trap_is_exact_for_its_program_and_wrong_for_the_physics_at_every_step_size():
+    horizons = (64, 256, 1024)
+    forward = []
+    for horizon in horizons:
+        scene = BounceOnce(horizon=horizon, dt=1.0 / horizon)
+        found, physical = check(scene, TRAP), scene.physical_gradient()
+        assert np.linalg.norm(found.gradient - found.difference) < 1e-9  # rounding over the best step size
+        assert found.gradient[0] == pytest.approx(1.0, abs=1e-12)  # rounding; the physics says -1
+        assert physical[0] == -1.0
+        cosine = found.gradient @ physical / np.linalg.norm(found.gradient) / np.linalg.norm(physical)
+        assert -0.64 < cosine < -0.61  # df/dvy0 is -0.1 plus O(dt), so that of all of theta is (-1 + 0.1) / sqrt(2.02)
+        forward.append(abs(found.cost - scene.physical_cost()))
+    assert forward[0] > 2 * forward[1] > 4 * forward[2]
+    assert all(error <= 4.0 / n for error, n in zip(forward, horizons, strict=True))  # one step at 2 m/s, reversed
+
+
+def test_in_one_dimension_the_cosine_is_minus_one():
+    for horizon in (32, 128, 512):
+        scene = WallPenalty1d(start=0.15, horizon=horizon, dt=2.0 / horizon)
+        assert check(scene, TRAP).gradient == pytest.approx([1.0])
+        assert scene.physical_gradient()[0] < 0
+
+
+def test_time_of_impact_mends_bounce_once():
+    scene = BounceOnce(horizon=128, dt=1 / 128)
+    found = check(scene, Impulse())
+    assert found.gradient == pytest.approx(scene.physical_gradient(), rel=1e-9)
+    assert found.cost == pytest.approx(scene.physical_cost(), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("scene", "fields"),
+    [
+        (BounceOnce(), ("height", "velocity")),
+        (BouncingBall(restitution=0.8), ("height", "velocity")),
+        (WallPenalty1d(start=0.6), ("start",)),
+        (WallPenalty1d(start=0.2), ("start",)),
+        (WallPenalty1d(start=1.8), ("start",)),
+    ],
+)
+def test_physical_cost_has_the_physical_gradient(scene, fields):
+    eps = 1e-6
+    for i, name in enumerate(fields):
+        ahead, behind = (
+            dataclasses.replace(scene, **{name: getattr(scene, name) + e}).physical_cost() for e in (eps, -eps)
+        )
+        assert (ahead - behind) / (2 * eps) == pytest.approx(scene.physical_gradient()[i], rel=1e-6, abs=1e-8)
+
+
+def test_a_wrong_derivative_is_seen():
+    class Wrong:
+        def __init__(self, problem):
+            self.program, self.value = problem.program, problem.value
+            self.grad = lambda theta, w: -problem.grad(theta, w)
+
+    problem = Jax().compile(Program(BouncingBall(horizon=50), Impulse(), SemiImplicitEuler()))
+    found = difference_check(Wrong(problem))
+    assert np.linalg.norm(found.gradient - found.difference) == pytest.approx(2 * np.linalg.norm(found.gradient))
+
+
+def test_from_the_command_line(tmp_path, capsys):
+    words = [
+        "study=three_errors", "name=small", "scenes=[bounce_once]", "contacts=[impulse,impulse[time_of_impact=false]]",
+        "backends=[jax]", "estimators=[fobg,reinforce]", "sweep.zip.horizon=[16,32]", "sweep.zip.dt=[0.0625,0.03125]",
+        "samples=64", "repeats=16", "reference.samples=4096", f"results_dir={tmp_path}",
+    ]  # fmt: skip
+    assert main(words) == 0
+    for name in ("csv", "md", "png", "svg"):
+        assert (tmp_path / "small" / f"three_errors.{name}").stat().st_size > 0
+    assert "right signs" in capsys.readouterr().out
+    rows = Store(tmp_path / "small", COLUMNS).load()
+    trap = rows[rows["contact"].str.contains("false")]
+    assert (trap["program_error_rel"] < 1e-9).all()
+    assert (trap["model_error_rel"] > 1.5).all()
+    assert (trap[trap["estimator"] == "fobg"]["bias_low"] > 0).all()
+    assert (rows[rows["contact"] == "impulse"]["model_error_rel"] < 1e-9).all()
