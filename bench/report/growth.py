@@ -26,10 +26,10 @@ from bench.store import write_whole
 
 NORM: dict[str, Any] = {"color": "#000000", "marker": "o"}
 VARIANCES: dict[str, tuple[str, dict[str, Any]]] = {
-    "first_order": ("fobg", {"color": PALETTE[0], "marker": "o"}),
-    "zeroth_order": ("zeroth order", {"color": PALETTE[2], "marker": "s", "linestyle": (0, (4, 1.5))}),
+    "first_order": ("fobg", {"color": PALETTE[2], "marker": "D"}),
+    "zeroth_order": ("zeroth order", {"color": PALETTE[5], "marker": "P", "linestyle": (0, (4, 1.5))}),
 }
-CLASSES = {"exploding": PALETTE[2], "neutral": "#404040", "vanishing": PALETTE[0]}
+CLASSES = {"exploding": "#000000", "neutral": "#404040", "vanishing": PALETTE[0]}
 """Colours of the names of growth classes."""
 PROBLEM = ["scene", "contact", "integrator", "backend", "dt", "stiffness", "sigma", "smoothing"]
 NOTES = (

@@ -30,12 +30,12 @@ FLOOR, CEILING = 1e-14, 1e3
 ERRORS: dict[str, tuple[str, dict[str, Any]]] = {
     "forward_error_rel": ("forward error of the cost", {"color": GREY, "linestyle": (0, (4, 1.5)), "marker": "s"}),
     "program_error_rel": ("program error (against differences)", {"color": PALETTE[0], "marker": "D"}),
-    "model_error_rel": ("model error (against the physics)", {"color": PALETTE[2], "marker": "o"}),
+    "model_error_rel": ("model error (against the physics)", {"color": "#000000", "marker": "o"}),
 }
 """What is drawn of the program itself, with its name and look."""
-ESTIMATORS: tuple[dict[str, Any], ...] = ({"color": PALETTE[3], "marker": "^"}, {"color": PALETTE[4], "marker": "v"})
+ESTIMATORS: tuple[dict[str, Any], ...] = ({"color": PALETTE[2], "marker": "^"}, {"color": PALETTE[5], "marker": "v"})
 """The looks of the biases of estimators, in the order of the rows."""
-AWAY: dict[str, Any] = {"marker": "x", "markersize": 7, "markeredgewidth": 2, "color": PALETTE[2], "linestyle": "none"}
+AWAY: dict[str, Any] = {"marker": "x", "markersize": 7, "markeredgewidth": 2, "color": "#000000", "linestyle": "none"}
 HOLLOW: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 0.9}
 HEADERS = {
     "scene": "scene", "contact": "contact law", "x": "", "forward_error_rel": "forward", "program_error_rel": "program",
