@@ -103,10 +103,10 @@ def rigid_cost(scene, theta):
 @pytest.mark.parametrize(
     "scene",
     [GroundWall(), GroundWall(horizon=960), GroundWall(velocity_x=-1.0, gravity=3.0, restitution=0.6, horizon=700)],
-    ids=["sheet", "many_bounces", "no_wall"],
+    ids=["source", "many_bounces", "no_wall"],
 )
 def test_ground_wall_physical_gradient(scene):
-    """Against differences of a motion integrated in another way, and the sheet's number."""
+    """Against differences of a motion integrated in another way, and the checked number."""
     theta, eps = scene.theta0(), 1e-5
     difference = [
         (rigid_cost(scene, theta + eps * e) - rigid_cost(scene, theta - eps * e)) / (2 * eps) for e in np.eye(2)

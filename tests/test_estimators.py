@@ -99,7 +99,7 @@ def test_bias_and_variance_are_the_closed_form_ones(scene, estimator, mean, vari
 @pytest.mark.parametrize(
     ("theta", "baseline", "variance"), [(0.0, "center", 34.085), (0.1, "center", 34.208), (0.1, "none", 54.08)]
 )
-def test_heaviside_variances_of_the_sheet(theta, baseline, variance):
+def test_heaviside_zeroth_order_variances(theta, baseline, variance):
     summary = measured(Heaviside(theta=theta), Reinforce(baseline=baseline))
     assert summary.variance_low <= variance / SAMPLES <= summary.variance_high
 
