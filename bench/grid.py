@@ -312,15 +312,14 @@ def _cell(experiment: Experiment, point: Mapping[str, Any], choices: Iterable[Ch
         integrator = make(integrator_choice)
         if scene.n_contacts:
             contact = make(contact_choice, scene.contact_values)
-    counts = {}
+    counts: dict[str, int] = {}
     for name, low in (("samples", 1), ("repeats", 2), ("seed", 0)):
         count = registry.coerce(int, point.get(name, getattr(experiment, name)), name)
         if count < low:
             raise UserError(f"{name}={count} must be at least {low}")
         counts[name] = count
-    return Cell(
-        scene, contact, integrator, make(backend_choice), make(estimator_choice), **counts, study=experiment.study
-    )  # type: ignore[arg-type]
+    backend, estimator = make(backend_choice), make(estimator_choice)
+    return Cell(scene, contact, integrator, backend, estimator, study=experiment.study, **counts)  # type: ignore[arg-type]
 
 
 @registry.remember

@@ -9,13 +9,13 @@ import re
 import zlib
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
 
 from bench.grid import Experiment
 from bench.report import charts, tables, terminal, views
+from bench.report.figures import styled
 from bench.store import BIAS_VARIANCE
 
 NAMES = ("alpha_order", "finite_difference", "fobg", "inverse_variance", "randomized_smoothing", "reinforce")
@@ -260,7 +260,7 @@ def test_terminal_takes_names_literally(capsys):
 
 
 def drawn(rows, axes, sweep=None, names=NAMES):
-    with matplotlib.rc_context(charts.STYLE):
+    with styled():
         return charts.figures(experiment(sweep=sweep), rows, axes, names)
 
 

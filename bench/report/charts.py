@@ -6,7 +6,6 @@ agree are one line. Relative means in units of the reference gradient's norm.
 
 from __future__ import annotations
 
-import io
 import math
 import re
 from collections import Counter
@@ -14,15 +13,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.grid import Experiment
+from bench.report.figures import save, styled
 from bench.report.panels import bias_variance, overview, speed_accuracy, timed
-from bench.report.style import STYLE, SYMBOLS, Look
+from bench.report.style import SYMBOLS, Look
 from bench.report.views import CATEGORIES, Family, along, families, numeric_axes, ran, short_axis
-from bench.store import write_whole
 
 ROOM = 4
 """Problems beyond which a chart shows some of them."""
@@ -41,17 +39,11 @@ def write(
     ``smoothing`` the parameter behind that column for each contact law.
     """
     paths = []
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(STYLE)  # type: ignore[arg-type]
+    with styled():
         for name, figure in figures(experiment, rows, axes, names, smoothing).items():
             figure.canvas.draw()
             figure.set_layout_engine("none")
-            for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
-                buffer = io.BytesIO()
-                figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
-                paths.append(experiment.directory / f"{name}.{suffix}")
-                write_whole(paths[-1], buffer.getvalue())
+            paths += save(figure, experiment.directory / name)
     return paths
 
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -20,6 +18,7 @@ from matplotlib.lines import Line2D
 
 from bench.gradcheck import FAULTS, VERDICTS
 from bench.grid import Experiment
+from bench.report.figures import save, styled
 from bench.report.style import GREY, PALETTE, STYLE, plain
 from bench.report.tables import escape_markdown
 from bench.report.views import number
@@ -149,17 +148,8 @@ def _show(experiment: Experiment, rows: pd.DataFrame, summary: pd.DataFrame) -> 
 
 
 def _draw(directory: Path, table: pd.DataFrame) -> list[Path]:
-    paths = []
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(STYLE)  # type: ignore[arg-type]
-        drawn = figure(table)
-        for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
-            buffer = io.BytesIO()
-            drawn.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
-            paths.append(directory / f"gradient_check.{suffix}")
-            write_whole(paths[-1], buffer.getvalue())
-    return paths
+    with styled():
+        return save(figure(table), directory / "gradient_check")
 
 
 def figure(table: pd.DataFrame) -> Figure:

@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -17,10 +16,11 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
 
 from bench.grid import Experiment
+from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.scales import log_axis
-from bench.report.style import PALETTE, STYLE, plain
-from bench.report.three_errors import markdown, save
+from bench.report.style import PALETTE, plain
+from bench.report.tables import plain_markdown
 from bench.report.views import axis_value, number, ran
 from bench.store import write_whole
 
@@ -44,7 +44,7 @@ NOTES = (
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``growth`` (.csv, .md, .png, .svg) and print the table."""
     table = readable(rows)
-    texts = [f"# {experiment.name}: growth of gradients with the horizon", markdown(table), *NOTES]
+    texts = [f"# {experiment.name}: growth of gradients with the horizon", plain_markdown(table), *NOTES]
     contents = {
         "growth.csv": rows.to_csv(index=False, lineterminator="\n"),
         "growth.md": "\n\n".join(texts) + "\n",
@@ -52,7 +52,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     paths = [experiment.directory / name for name in contents]
     for path, content in zip(paths, contents.values(), strict=True):
         write_whole(path, content.encode())
-    with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
+    with styled():
         drawn = figure(ran(rows))
     if drawn is not None:
         paths += save(drawn, experiment.directory / "growth")

@@ -5,7 +5,6 @@ Knows no plugin: the theoretical boundary is the column ``stiffness_limit`` of t
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +12,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib import patheffects
@@ -28,8 +26,9 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.grid import Experiment
+from bench.report.figures import save, styled
 from bench.report.page import WIDTH, columns
-from bench.report.style import PALETTE, STYLE, axis_name, plain
+from bench.report.style import PALETTE, axis_name, plain
 from bench.report.tables import escape_markdown
 from bench.report.views import axis_value, ran
 from bench.store import Columns, write_whole
@@ -124,17 +123,11 @@ def write(experiment: Experiment, rows: pd.DataFrame, table: Columns) -> list[Pa
     paths = [directory / "stability_map.csv", directory / "stability_map.md"]
     write_whole(paths[0], text.encode())
     write_whole(paths[1], markdown(experiment, maps).encode())
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(STYLE)  # type: ignore[arg-type]
+    with styled():
         for integrator in dict.fromkeys(panel.integrator for panel in maps):
             figure = heat_map(integrator, [panel for panel in maps if panel.integrator == integrator])
-            for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
-                buffer = io.BytesIO()
-                figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
-                name = "".join(letter if letter.isalnum() else "_" for letter in integrator).strip("_")
-                paths.append(directory / f"stability_map_{name}.{suffix}")
-                write_whole(paths[-1], buffer.getvalue())
+            name = "".join(letter if letter.isalnum() else "_" for letter in integrator).strip("_")
+            paths += save(figure, directory / f"stability_map_{name}")
     show(experiment, rows, maps)
     return paths
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -152,6 +153,13 @@ def latex(table: Readable) -> str:
     out = [rf"% needs \usepackage{{{packages}}}", r"\begingroup\footnotesize", rf"\begin{{{kind}}}{{{spec}}}", *body]
     notes = (table.title + ".", *table.shared, *FOOTNOTES, *table.reasons)
     return "\n".join([*out, *(rf"\noindent {e(note)}\par" for note in notes), r"\endgroup"]) + "\n"
+
+
+def plain_markdown(table: pd.DataFrame, heads: Mapping[str, str] = MappingProxyType({})) -> str:
+    """A table of texts in Markdown; ``heads`` are columns' headings where their names do not say it."""
+    out = ["| " + " | ".join(heads.get(name, name) for name in table) + " |", "|" + "---|" * table.shape[1]]
+    out += ["| " + " | ".join(map(escape_markdown, map(str, row))) + " |" for row in table.fillna("").to_numpy()]
+    return "\n".join(out)
 
 
 def escape_markdown(text: str) -> str:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -18,10 +16,11 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from bench.grid import Experiment, swept
+from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.scales import log_axis
-from bench.report.style import GREY, PALETTE, SHADE, STYLE, SYMBOLS, axis_name, plain
-from bench.report.tables import escape_markdown
+from bench.report.style import GREY, PALETTE, SHADE, SYMBOLS, axis_name, plain
+from bench.report.tables import plain_markdown
 from bench.report.views import along, axis_value, number, ran, short_axis
 from bench.store import write_whole
 
@@ -52,7 +51,9 @@ NOTES = (
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``three_errors`` (.csv, .md) and a chart for the time step and for the laws' parameters; print the table."""
     tables = {axis: readable(part) for axis, part in _parts(experiment, rows).items()}
-    text = "\n\n".join(f"## Along {short_axis(axis)}\n\n{markdown(table)}" for axis, table in tables.items())
+    text = "\n\n".join(
+        f"## Along {short_axis(axis)}\n\n{plain_markdown(table, HEADERS)}" for axis, table in tables.items()
+    )
     title = f"# {experiment.name}: program, model and estimator error"
     contents = {
         "three_errors.csv": rows.to_csv(index=False, lineterminator="\n"),
@@ -121,17 +122,6 @@ def _bias(row: Any) -> str:
     return f"< {number(row['bias_high'] / row['reference_norm'])}"
 
 
-def _header(name: str) -> str:
-    return HEADERS.get(name, name)
-
-
-def markdown(table: pd.DataFrame) -> str:
-    """A table of texts in Markdown."""
-    out = ["| " + " | ".join(_header(name) for name in table) + " |", "|" + "---|" * table.shape[1]]
-    out += ["| " + " | ".join(map(escape_markdown, map(str, row))) + " |" for row in table.fillna("").to_numpy()]
-    return "\n".join(out)
-
-
 def _print(experiment: Experiment, rows: pd.DataFrame, tables: Mapping[str, pd.DataFrame]) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -145,7 +135,7 @@ def _print(experiment: Experiment, rows: pd.DataFrame, tables: Mapping[str, pd.D
         shown = Table(title=f"\nalong {short_axis(axis)}", title_justify="left", box=None, padding=(0, 2, 0, 0))
         for name in texts:
             shown.add_column(
-                _header(name) or short_axis(axis), justify="left" if name in ("scene", "contact") else "right"
+                HEADERS.get(name, name) or short_axis(axis), justify="left" if name in ("scene", "contact") else "right"
             )
         for row in texts.fillna("").to_numpy():
             shown.add_row(*map(str, row))
@@ -154,18 +144,6 @@ def _print(experiment: Experiment, rows: pd.DataFrame, tables: Mapping[str, pd.D
 
 
 # ------------------------------------------------------------------------------------------------------- charts
-
-
-def save(figure: Figure, stem: Path) -> list[Path]:
-    """A figure as PNG and SVG; returns their paths."""
-    paths = []
-    for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
-        buffer = io.BytesIO()
-        with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
-            figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
-        paths.append(stem.with_name(f"{stem.name}.{suffix}"))
-        write_whole(paths[-1], buffer.getvalue())
-    return paths
 
 
 def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
@@ -178,7 +156,7 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
         "three_errors": (steps, "Three errors of a gradient as the time step shrinks"),
         "three_errors_parameters": (laws, "Three errors of a gradient along the parameter of the contact law"),
     }
-    with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
+    with styled():
         return {name: _figure(chosen, estimators, title) for name, (chosen, title) in drawn.items() if chosen}
 
 

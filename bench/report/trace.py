@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -18,6 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from bench.errors import UserError
 from bench.health import MEASURES, Trace, align, number, spikes
+from bench.report.figures import save, styled
 from bench.report.style import GREY, PALETTE, SHADE, STYLE, plain, wrapped
 from bench.store import write_whole
 
@@ -45,15 +44,8 @@ def write(found: Trace, results_dir: Path) -> list[Path]:
         raise UserError(f"'{directory}' cannot be written: {error.strerror}") from None
     paths = [directory / "trace.csv"]
     write_whole(paths[0], found.table.to_csv(index=False).encode())
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(STYLE)  # type: ignore[arg-type]
-        figure = chart(found)
-        for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
-            paths.append(directory / f"trace.{suffix}")
-            write_whole(paths[-1], buffer.getvalue())
+    with styled():
+        paths += save(chart(found), directory / "trace")
     return paths
 
 
