@@ -94,8 +94,9 @@ class Cell:
 
     @cached_property
     def program_key(self) -> str:
-        """Hash of everything that decides the reference gradient."""
-        text = "|".join(["" if p is None else _fingerprint(p) for p in self.parts[:3]])
+        """Hash of everything that decides the reference gradient: the program, and a backend that has its own physics."""
+        parts = self.parts[: 4 if "physics" in self.backend.provides else 3]
+        text = "|".join(["" if p is None else _fingerprint(p) for p in parts])
         return hashlib.sha256(f"{text}|{core_hash()}".encode()).hexdigest()[:32]
 
     def program(self) -> Program:
@@ -146,6 +147,8 @@ class Cell:
         if program.needs_root and "root" not in backend.provides:
             part = next(p for p in (self.contact, self.integrator) if p is not None and p.needs_root)
             return "unsupported", f"{part.name} solves an equation each step, backend {backend.name} has no root finder"
+        if not program.needs <= backend.provides:
+            return "unsupported", f"{self.scene.name} runs in physics engines alone, backend {backend.name} is none"
         lacking = estimator.needs - backend.provides
         if lacking:
             return "unsupported", f"{estimator.name} needs {', '.join(sorted(lacking))}, which {backend.name} lacks"

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from bench import reference, registry
 from bench.contracts import Backend, Problem
 from bench.grid import Cell, Experiment
+from bench.program import Program
 from bench.reference import Reference
 
 
@@ -46,25 +49,46 @@ class References:
             if found is None:
                 backend = next(reference_backends(cell))
                 problem = self._problems.of(backend, cell)
-                found = reference.certify(problem, backend.provides, *self._budget)
+                found = reference.certify(problem, backend.provides, *self._budget, self._stood_for(cell))
                 reference.save(found, path)
             self._known[key] = found
         return self._known[key]
 
+    def _stood_for(self, cell: Cell) -> np.ndarray | None:
+        """The gradient that the program's own, at w = 0, should be: that of the physics, where the scene knows it.
+
+        For a backend with physics of its own and a scene that does not, that of the scene's program.
+        """
+        program, theta = cell.program(), cell.scene.theta0()
+        physical = cell.scene.physical_gradient()
+        if physical is None and "physics" in cell.backend.provides:
+            for backend in ranked_backends(program):
+                if "grad" in backend.provides:
+                    return self._problems.of(backend, cell).grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
+        return physical
+
 
 def reference_backends(cell: Cell) -> Iterator[Backend]:
-    """Backends able to run the cell's program for a reference, best first, the cell's own last."""
-    program = cell.program()
+    """Backends able to run the cell's program for a reference, best first, the cell's own last.
+
+    A backend with physics of its own runs a program of its own, for which it alone can speak.
+    """
+    if "physics" not in cell.backend.provides:
+        yield from ranked_backends(cell.program())
+    yield cell.backend
+
+
+def ranked_backends(program: Program) -> list[Backend]:
+    """The available backends that compute references and can run the program, best first."""
     ranked = []
     for entry in registry.entries()["backends"].values():
         plugin = entry.plugin
         if plugin is None or not entry.available or not issubclass(plugin, Backend) or plugin.reference_rank is None:
             continue
         backend = plugin()
-        if (not program.needs_root or "root" in backend.provides) and backend.refuses(program) is None:
+        if program.needs <= backend.provides and backend.refuses(program) is None:
             ranked.append(backend)
-    yield from sorted(ranked, key=lambda b: b.reference_rank or 0)
-    yield cell.backend
+    return sorted(ranked, key=lambda b: b.reference_rank or 0)
 
 
 class Session:
