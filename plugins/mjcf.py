@@ -99,3 +99,12 @@ def _disabled(bit: Any, model: Any, lean: bool) -> int:
         if not count:
             off |= flag
     return int(off)
+
+
+def has_friction(program: Program) -> bool:
+    """Whether a contact of the scene's twin has more than its normal direction."""
+    import mujoco
+
+    assert isinstance(program.scene, MechanicalScene)
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{program.scene.mjcf()}</mujoco>")
+    return bool((model.pair_dim > 1).any())
