@@ -81,12 +81,14 @@ def _disabled(bit: Any, model: Any, lean: bool) -> int:
     off = bit.mjDSBL_WARMSTART | bit.mjDSBL_EULERDAMP | bit.mjDSBL_AUTORESET | bit.mjDSBL_REFSAFE | bit.mjDSBL_CLAMPCTRL
     if not lean:
         return int(off)
+    springs = any(part.any() for part in (model.jnt_stiffness, model.tendon_stiffness))
+    dampers = any(part.any() for part in (model.dof_damping, model.tendon_damping))
     used = {
         bit.mjDSBL_CONSTRAINT: model.npair,
         bit.mjDSBL_CONTACT: model.npair,
         bit.mjDSBL_GRAVITY: model.opt.gravity.any(),
-        bit.mjDSBL_SPRING: model.jnt_stiffness.any() or model.tendon_stiffness.any(),
-        bit.mjDSBL_DAMPER: model.dof_damping.any() or model.tendon_damping.any(),
+        # together, for MJX takes either flag to switch off both
+        bit.mjDSBL_SPRING | bit.mjDSBL_DAMPER: springs or dampers,
         bit.mjDSBL_ACTUATION: model.nu,
         bit.mjDSBL_EQUALITY: model.neq,
         bit.mjDSBL_LIMIT: model.jnt_limited.any(),
