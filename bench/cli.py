@@ -130,6 +130,7 @@ def _report(words: list[str]) -> int:
 
 def _write(experiment: Experiment, store: Store, words: list[str], seconds: float, keys: list[str] | None) -> int:
     from bench import grid, report, studies
+    from bench.report import web
 
     rows = store.load()
     if keys is not None:
@@ -139,9 +140,11 @@ def _write(experiment: Experiment, store: Store, words: list[str], seconds: floa
         rows = report.latest(rows)
     if rows.empty:
         raise UserError(f"no rows are stored in '{store.directory}': run the experiment first")
-    paths = studies.find(experiment.study).write(experiment, rows, grid.swept(experiment.sweep))
+    axes = grid.swept(experiment.sweep)
+    paths = studies.find(experiment.study).write(experiment, rows, axes)
     if seconds:
         paths.append(report.record(experiment, rows, words, seconds))
+    paths.append(web.write(experiment, rows, axes))
     print("\nWritten:")
     for path in paths:
         print(f"  {path}")
