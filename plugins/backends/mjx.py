@@ -50,7 +50,9 @@ class Mjx(Jax):
         """What has no twin, and what MJX cannot differentiate."""
         reason = mjcf.refusal(self, program)
         if reason is None and self.mode == "reverse" and self.iterations > 1:
-            return f"MJX's solver has no reverse mode with iterations={self.iterations}: use mode=forward or iterations=1"
+            return (
+                f"MJX's solver has no reverse mode with iterations={self.iterations}: use mode=forward or iterations=1"
+            )
         if reason is None and self.cone == "elliptic" and mjcf.has_friction(program):
             return "MJX's derivatives are NaN with elliptic friction cones: use cone=pyramidal"
         return reason
@@ -85,7 +87,9 @@ class MjxProgram(Program):
 
     def parameters(self) -> np.ndarray:
         """The float parameters of the parts, then those of the model, ``(p,)``."""
-        return np.concatenate([super().parameters(), *(leaf.ravel() for leaf in self._leaves if leaf.dtype.kind == "f")])
+        return np.concatenate(
+            [super().parameters(), *(leaf.ravel() for leaf in self._leaves if leaf.dtype.kind == "f")]
+        )
 
     def bind(self, parameters: Any) -> Program:
         """This program, model included, with other values."""
