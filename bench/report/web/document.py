@@ -31,7 +31,7 @@ FILTERED = ("scene", "contact", "integrator", "backend", "estimator", "estimator
 MOST = 24
 
 
-def document(
+def assemble(
     experiment: Experiment, content: Content, commands: Sequence[Sequence[str]], record: Mapping[str, Any]
 ) -> str:
     """The page; ``commands`` are the words that run each row's cell, ``record`` what ``run.json`` says."""

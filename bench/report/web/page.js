@@ -325,7 +325,7 @@ function pointFigure(chart, panel, range) {
   if (range.y && chart.yAxis.log && chart.yAxis.above_one && range.y[1] > 0) {
     shapes.push({ type: "rect", xref: "paper", x0: 0, x1: 1, y0: 1, y1: 10 ** range.y[1], layer: "below",
       fillcolor: dark() ? "#ffffff14" : "#00000010", line: { width: 0 } });
-    annotations.push({ xref: "paper", x: 0.01, y: 0, yref: "y", yanchor: "bottom", xanchor: "left", showarrow: false,
+    annotations.push({ xref: "paper", x: 0.01, yref: "paper", y: 1, yanchor: "top", xanchor: "left", showarrow: false,
       text: chart.yAxis.above_one, font: { size: 10 } });
   }
   for (const [name, value] of Object.entries(chart.marks)) {
@@ -442,19 +442,20 @@ function mapFigure(chart, panel) {
   const [xs, ys] = [order(panel.x), order(panel.y)];
   const grid = (make) => ys.map((y) => xs.map((x) => {
     const found = panel.places.get(JSON.stringify([x, y]));
-    return found ? make(found, x, y) : null;
+    return found ? make(found, x, y) : "";
   }));
+  const worst = (found) => found.reduce((a, b) => (names.indexOf(b.level) > names.indexOf(a.level) ? b : a));
   const share = (found) => found.filter((one) => one.level === chart.share).length / found.length;
   const k = names.length;
   const scale = chart.share ? [[0, dark() ? "#14171a" : "#ffffff"], [1, "#0072B2"]]
     : names.flatMap((name, n) => [[n / k, colour(name)], [(n + 1) / k, colour(name)]]);
-  const text = (found) => (chart.share ? Math.round(100 * share(found)) + "%" : looks(found[0].level).letter || "");
-  const told = (found, x, y) => [`<b>${plotted(chart.share ? text(found) : found[0].level)}</b>`,
+  const text = (found) => (chart.share ? Math.round(100 * share(found)) + "%" : looks(worst(found).level).letter || "");
+  const told = (found, x, y) => [`<b>${plotted(chart.share ? text(found) : worst(found).level)}</b>`,
     `${plotted(chart.xAxis.label)} ${plotted(x)}`, `${plotted(chart.yAxis.label)} ${plotted(y)}`,
-    chart.share ? `${found.length} cells` : plotted(reader("rows", "reason")(found[0].row) || "")].join("<br>");
+    chart.share ? `${found.length} cells` : plotted(reader("rows", "reason")(worst(found).row) || "")].join("<br>");
   const made = {
-    type: "heatmap", x: xs.map(plotted), y: ys.map(plotted), z: grid((found) => (chart.share ? share(found) : names.indexOf(found[0].level))),
-    text: grid(text), texttemplate: "%{text}", customdata: grid((found) => (chart.share ? null : found[0].row)),
+    type: "heatmap", x: xs.map(plotted), y: ys.map(plotted), z: grid((found) => (chart.share ? share(found) : names.indexOf(worst(found).level))),
+    text: grid(text), texttemplate: "%{text}", customdata: grid((found) => (chart.share ? null : worst(found).row)),
     hovertext: grid(told), hovertemplate: "%{hovertext}<extra></extra>", colorscale: scale, showscale: false, xgap: 1, ygap: 1,
     zmin: chart.share ? 0 : -0.5, zmax: chart.share ? 1 : k - 0.5,
   };
@@ -519,6 +520,7 @@ function drawTable() {
     const line = element("tr", { tabIndex: 0, ariaSelected: String(i === state.selected) }, ...page.columns.map((column) => {
       const cell = element("td", { textContent: shownAs(column, i), className: column.kind === "text" ? "" : "number" });
       if (column.name === "status" && status(i) !== "ok") cell.className = "failed";
+      if (column.name === "reason") cell.className = "reason";
       return cell;
     }));
     line.dataset.row = i;
