@@ -167,7 +167,7 @@ def test_report_writes_the_page_again_with_machine_and_versions(ran):
 # -------------------------------------------------------------------------------------------------------- browser
 
 MARKS = "document.querySelectorAll('.scatterlayer .trace .point').length"
-FRAME = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+SETTLED = "settled()"
 WIDE = (1200, 3000)
 
 
@@ -195,7 +195,7 @@ def shown(opened):
     """That page with nothing filtered, sorted or selected; it never complains and never asks for anything."""
     opened.size(*WIDE)
     opened.do("document.getElementById('clear').click(); state.sort = null; applyTheme('auto'); select(-1)")
-    opened.do(FRAME)
+    opened.do(SETTLED)
     yield opened
     assert opened.said == []
     assert opened.requests == []
@@ -210,12 +210,13 @@ def test_charts_are_drawn_and_a_filter_takes_points_away(shown):
         const box = document.querySelector('#filters details[data-column="estimator"] input[data-value="fobg"]');
         box.checked = false;
         box.dispatchEvent(new Event('change'));
+        return settled();
         })()"""
     )
     left = rows[rows["estimator"] != "fobg"]
     assert 2 * int((left["status"] == "ok").sum()) <= shown.do(MARKS) < before
     assert f"{len(left)} of {len(rows)} cells" in shown.do("document.getElementById('shown').textContent")
-    shown.do("document.getElementById('clear').click()")
+    shown.do("document.getElementById('clear').click(); settled()")
     assert shown.do(MARKS) == before
 
 
@@ -260,7 +261,7 @@ def test_a_row_and_a_point_select_the_cell_and_show_its_command(shown):
     shown.press("Enter")
     assert shown.do("state.selected") == shown.do("Number(document.querySelectorAll('#table tbody tr')[1].dataset.row)")
     assert shown.do("document.getElementById('command').textContent") == "python -m bench name=one_cell a=1"
-    shown.do("document.querySelector('#cell button').click()")
+    shown.do("document.querySelector('#cell button').click(); settled()")
     assert shown.do("document.getElementById('cell').hidden")
     x, y = shown.do(
         """(() => {
@@ -307,7 +308,7 @@ def test_an_estimator_has_one_colour_in_every_chart(shown):
 
 def test_a_phone_needs_no_sideways_scrolling(shown):
     shown.size(390, 844)
-    shown.do(FRAME)
+    shown.do(SETTLED)
     assert shown.do("document.documentElement.scrollWidth") <= 390
 
 

@@ -25,6 +25,14 @@ function size(table) {
 
 /* A function from a line of a table to its value in a column, looked up in "rows" where the table has no such column. */
 function reader(table, name) {
+  const key = table + " " + name;
+  if (!readers.has(key)) readers.set(key, readerOf(table, name));
+  return readers.get(key);
+}
+
+const readers = new Map();
+
+function readerOf(table, name) {
   const column = page.tables[table][name];
   if (column) return column.index ? (i) => column.values[column.index[i]] : (i) => column[i];
   if (table === "rows") return () => null;
@@ -169,8 +177,8 @@ function buildCharts() {
     for (const entry of entries) {
       const chart = charts.find((one) => one.section === entry.target);
       chart.near = entry.isIntersecting;
-      if (chart.near && chart.dirty) drawChart(chart);
     }
+    requestAnimationFrame(drawNext);
   }, { rootMargin: "300px" });
   for (const chart of charts) {
     chart.section = element("section", { className: "chart" },
@@ -197,12 +205,17 @@ function choice(chart, label, property, axes) {
   return element("label", {}, label + " ", select);
 }
 
-/* Charts out of sight are drawn when they come into it. */
+/* Charts in sight are drawn one a frame, so that the page answers meanwhile; the others when they come into it. */
 function markDirty() {
-  for (const chart of charts) {
-    chart.dirty = true;
-    if (chart.near) drawChart(chart);
-  }
+  for (const chart of charts) chart.dirty = true;
+  requestAnimationFrame(drawNext);
+}
+
+function drawNext() {
+  const chart = charts.find((one) => one.near && one.dirty);
+  if (!chart || !window.Plotly) return;
+  drawChart(chart);
+  requestAnimationFrame(drawNext);
 }
 
 function dark() {
@@ -354,13 +367,15 @@ function trace(chart, points, joined) {
   return made;
 }
 
+const tellingColumns = page.columns.filter((column) => page.identity.includes(column.name) && !column.name.startsWith("estimator"));
+const told = []; // of each row, once it was drawn, which cell it is
+
 function hover(chart, point) {
   const { xAxis, yAxis } = chart;
   const interval = point.low !== null && point.high !== null && !point.limit
     ? ` [${number(point.low)}, ${number(point.high)}]` : "";
-  const facts = page.columns.filter((c) => page.identity.includes(c.name) && !c.name.startsWith("estimator"))
-    .map((c) => `${c.label} ${shownAs(c, point.row)}`);
-  return [`<b>${plotted(point.series)}</b>`, ...facts.map(plotted),
+  if (!told[point.row]) told[point.row] = tellingColumns.map((c) => plotted(`${c.label} ${shownAs(c, point.row)}`)).join("<br>");
+  return [`<b>${plotted(point.series)}</b>`, told[point.row],
     `${plotted(xAxis.label)}: ${number(point.x)}`,
     `${plotted(yAxis.label)}: ${point.limit ? "&lt; " : ""}${number(point.y)}${interval}`].join("<br>");
 }
@@ -536,10 +551,7 @@ function drawTable() {
 function select(row) {
   state.selected = row;
   for (const line of body.rows) line.ariaSelected = String(Number(line.dataset.row) === row);
-  for (const chart of charts) {
-    chart.dirty = true;
-    if (chart.near) drawChart(chart);
-  }
+  markDirty();
   const cell = document.getElementById("cell");
   cell.hidden = row < 0;
   if (row < 0) return;
@@ -615,6 +627,11 @@ async function inflated(id) {
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
 }
 
+/* When the charts in sight are drawn. */
+async function settled() {
+  do await new Promise(requestAnimationFrame); while (charts.some((chart) => chart.near && chart.dirty));
+}
+
 async function start() {
   buildTheme();
   buildFilters();
@@ -626,7 +643,8 @@ async function start() {
     return;
   }
   document.head.append(element("script", { textContent: await inflated("plotly") }));
-  for (const chart of charts) if (chart.near) drawChart(chart);
+  markDirty();
+  await settled();
   document.documentElement.dataset.loaded = performance.now().toFixed(0);
 }
 
