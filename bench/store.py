@@ -80,7 +80,8 @@ BIAS_VARIANCE = Columns(
         "peak_memory_mb", "dtype", "device", "versions", "key",
     ),
     texts=("reference_method", "device"),
-    extra=("variance_low", "variance_high"),
+    lists=("time_samples",),
+    extra=("variance_low", "variance_high", "time_samples"),
 )  # fmt: skip
 """The columns of the main table: a contract with people's scripts."""
 

@@ -573,7 +573,7 @@ function select(row) {
       ...results.map((column) => fact(column.label, shownAs(column, row)))),
     reason ? element("p", { className: "failed", textContent: reason }) : null,
     ...(command ? [element("p", { textContent: "It alone is run again, to the same numbers, by" }), copyable(command)]
-      : [element("p", { textContent: "The experiment as configured when this page was written has no such cell any more." })]),
+      : page.command.words.length ? [element("p", { textContent: "The experiment as configured when this page was written has no such cell any more." })] : []),
   );
   cell.focus({ preventScroll: true });
 }
