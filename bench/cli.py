@@ -26,6 +26,7 @@ Compare gradient estimators through physics simulation.
   python -m bench check [NAME ...]                          the conformance kit on some plugins, or all
   python -m bench gradcheck SCENE ... [key=value ...]       gradients against differences of the cost, and what is wrong
   python -m bench trace SCENE ... [key=value ...]           one rollout: do gradient spikes line up with contact switches?
+  python -m bench compare BEFORE AFTER [--timings]          two results, cell by cell: 1 when something got worse
 
 Experiments: {experiments}
 Settings: scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..]
@@ -69,6 +70,7 @@ def _dispatch(words: list[str]) -> int:
         "check": _check,
         "gradcheck": _gradcheck,
         "trace": _trace,
+        "compare": _compare,
     }
     if not words or words[0] in ("-h", "--help", "help"):
         from bench import config
@@ -298,3 +300,13 @@ def _trace(words: list[str]) -> int:
         for path in trace.write(found, experiment.results_dir):
             print(f"  {path}")
     return 0
+
+
+# ------------------------------------------------------------------------------------------------------ compare
+
+
+def _compare(words: list[str]) -> int:
+    """Two directories of results, or two revisions of them in git, cell by cell."""
+    from bench.report import compare
+
+    return compare.main(words)
