@@ -288,13 +288,13 @@ def test_fault_is_exit_status_1_and_its_line_repeats_it(tmp_path, monkeypatch, c
     right = NumpyProblem._grad
     monkeypatch.setattr(NumpyProblem, "_grad", lambda self, theta, w: -right(self, theta, w))
     words = ["gradcheck", "pushing[mass=0.2]", "contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[2]"]
-    assert main([*words, "scene.pushing.sigma=0.05", "seed=3", f"results_dir={tmp_path / 'a'}"]) == 1
+    assert main([*words, "scene.pushing.sigma=0.05", "seed=3", "workers=0", f"results_dir={tmp_path / 'a'}"]) == 1
     printed = capsys.readouterr().out
     assert "wrong_adjoint (start" in printed
     lines = (tmp_path / "a" / "gradcheck" / "gradient_check.md").read_text().splitlines()
     (line,) = [text.strip() for text in lines if "python -m bench gradcheck" in text]
     again = shlex.split(line)[3:]
-    assert main([*again, f"results_dir={tmp_path / 'b'}"]) == 1
+    assert main([*again, "workers=0", f"results_dir={tmp_path / 'b'}"]) == 1
     first, second = (pd.read_csv(tmp_path / run / "gradcheck" / "gradient_check.csv") for run in "ab")
     pd.testing.assert_frame_equal(first, second)
 
