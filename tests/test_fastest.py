@@ -86,6 +86,16 @@ def test_table_names_the_fastest_and_by_how_much(tmp_path):
     assert len(found) == 4
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_rollouts_are_those_of_the_cheapest_backend(tmp_path, order):
+    """A backend that fails, as one that differences across a jump, takes nothing from the estimator."""
+    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
+    parts = [rows(), rows(backend="other", status="nonfinite")]
+    found = table(given, pd.concat([parts[i] for i in order], ignore_index=True))
+    line = found[(found["by"] == "rollouts") & (found["relative error"] == "10%")].iloc[0]
+    assert (line["fastest"], line["cost"], line["how"]) == ("e", "800", "extrapolated")
+
+
 def test_nothing_is_told_where_samples_are_not_swept(tmp_path):
     given = config.load([f"results_dir={tmp_path}"])
     assert table(given, rows()[:1]).empty

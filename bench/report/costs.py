@@ -44,7 +44,7 @@ def _half_range(rows: pd.DataFrame) -> pd.Series:
 TIME = Cost("the time it takes", "time of one estimate", lambda rows: rows["time_s"], _half_range, _seconds)
 TIME_COMPILED = Cost(
     "the time it takes, compilation included",
-    "time of one estimate and of compilation",
+    "time with compilation",
     lambda rows: rows["time_s"] + rows["compile_s"].fillna(0.0),
     _half_range,
     _seconds,

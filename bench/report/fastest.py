@@ -87,8 +87,10 @@ def _line(problem: Family, target: float, kind: str, cost: Cost) -> dict[str, st
     """The fastest method, the next one, and those that are out."""
     reached: dict[str, Reached] = {}
     for line in lines(problem.rows, close=None):
-        backend = f" on {line.rows['backend'].iloc[0]}"
-        reached[line.label + backend] = reach(line, target, cost)
+        name = line.label if cost is ROLLOUTS else f"{line.label} on {line.rows['backend'].iloc[0]}"
+        found = reach(line, target, cost)
+        if name not in reached or found.cost < reached[name].cost or math.isnan(reached[name].cost):
+            reached[name] = found
     ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
     texts = dict.fromkeys(("fastest", "cost", "samples", "how", "next", "factor"), "-")
     if ranked:
@@ -99,6 +101,8 @@ def _line(problem: Family, target: float, kind: str, cost: Cost) -> dict[str, st
             "samples": axis_value(math.ceil(best.samples)),
             "how": best.how,
         }
+    else:
+        texts["how"] = "no bias known to be below" if any(r.how == "unknown" for r in reached.values()) else "never"
     if len(ranked) > 1:
         texts |= {"next": ranked[1][1], "factor": number(ranked[1][0] / ranked[0][0])}
     out = {how: ", ".join(name for name, r in reached.items() if r.how == how) or "-" for how in ("never", "unknown")}
