@@ -177,7 +177,8 @@ class _Run:
     def _pool(self, count: int, single: bool) -> Pool | Here:
         if not self._workers:
             return Here(Measure(self._experiment))
-        return Pool(count, Measure, self._experiment, self._limits, single)
+        lean = replace(self._experiment, choices={}, values={}, sweep={}, marks={})
+        return Pool(count, Measure, lean, self._limits, single)
 
     def _missing_references(self, waiting: list[Cell]) -> list[Cell]:
         """One cell for each reference that has to be computed; closed forms are left to the cells themselves."""
