@@ -21,6 +21,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
@@ -284,6 +285,7 @@ class Pool:
         output, printed = self._context.Pipe(duplex=False)
         os.set_blocking(output.fileno(), False)
         process = self._context.Process(target=_serve, args=(theirs, printed, self._make, self._argument))
+        resource_tracker.ensure_running()  # else it starts with the worker's mark, and ends with it
         mark = uuid.uuid4().hex
         with _environment({MARK: mark} | (SINGLE if self._single else {})):
             process.start()
