@@ -26,6 +26,7 @@ Compare gradient estimators through physics simulation.
   python -m bench check [NAME ...]                          the conformance kit on some plugins, or all
   python -m bench gradcheck SCENE ... [key=value ...]       gradients against differences of the cost, and what is wrong
   python -m bench trace SCENE ... [key=value ...]           one rollout: do gradient spikes line up with contact switches?
+  python -m bench compare BEFORE AFTER [--timings]          two results, cell by cell: 1 when something got worse
 
 Experiments: {experiments}
 Settings: scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..]
@@ -69,6 +70,7 @@ def _dispatch(words: list[str]) -> int:
         "check": _check,
         "gradcheck": _gradcheck,
         "trace": _trace,
+        "compare": _compare,
     }
     if not words or words[0] in ("-h", "--help", "help"):
         from bench import config
@@ -160,6 +162,7 @@ def _write(
 ) -> int:
     """Tables and charts, of the planned cells in their order or of all that is stored."""
     from bench import grid, report, studies
+    from bench.report import web
     from bench.store import ordered
 
     rows = store.load()
@@ -170,9 +173,11 @@ def _write(
         rows = ordered(rows[rows["key"].isin(keys)], keys)
     if rows.empty:
         raise UserError(f"no rows are stored in '{store.directory}': run the experiment first")
-    paths = studies.find(experiment.study).write(experiment, rows, grid.swept(experiment.sweep))
+    axes = grid.swept(experiment.sweep)
+    paths = studies.find(experiment.study).write(experiment, rows, axes)
     if seconds:
         paths.append(report.record(experiment, rows, words, seconds))
+    paths.append(web.write(experiment, rows, axes))
     print("\nWritten:")
     for path in paths:
         print(f"  {path}")
@@ -295,3 +300,13 @@ def _trace(words: list[str]) -> int:
         for path in trace.write(found, experiment.results_dir):
             print(f"  {path}")
     return 0
+
+
+# ------------------------------------------------------------------------------------------------------ compare
+
+
+def _compare(words: list[str]) -> int:
+    """Two directories of results, or two revisions of them in git, cell by cell."""
+    from bench.report import compare
+
+    return compare.main(words)

@@ -127,8 +127,8 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
             raise unknown("setting of reference", key, ("samples", "tolerance"))
     budget = registry.coerce(int, settings["samples"], "reference.samples")
     tolerance = registry.coerce(float, settings["tolerance"], "reference.tolerance")
-    if budget < 4096 or not tolerance > 0:
-        raise UserError("reference.samples must be at least 4096 and reference.tolerance greater than 0")
+    if budget < 256 or not tolerance > 0:
+        raise UserError("reference.samples must be at least 256 and reference.tolerance greater than 0")
     timing = config["timing"]
     return Experiment(
         name=name,

@@ -203,6 +203,8 @@ class Cell:
         if program.needs_root and "root" not in backend.provides:
             part = next(p for p in (self.contact, self.integrator) if p is not None and p.needs_root)
             return "unsupported", f"{part.name} solves an equation each step, backend {backend.name} has no root finder"
+        if not program.needs <= backend.provides:
+            return "unsupported", f"{self.scene.name} runs in physics engines alone, backend {backend.name} is none"
         lacking = estimator.needs - backend.provides
         if lacking:
             return "unsupported", f"{estimator.name} needs {', '.join(sorted(lacking))}, which {backend.name} lacks"
@@ -281,11 +283,20 @@ def study_hash(study: str) -> str:
 
 
 def reference_backends(cell: Cell) -> Iterator[Backend]:
-    """Backends able to run the cell's program for a reference, best first, the cell's own last."""
+    """Backends able to run the cell's program for a reference, best first, the cell's own last.
+
+    A backend with physics of its own runs a program of its own, for which it alone can speak.
+    """
+    if "physics" not in cell.backend.provides:
+        yield from ranked_backends(cell)
+    yield cell.backend
+
+
+def ranked_backends(cell: Cell) -> list[Backend]:
+    """The available backends that compute references and can run the scene's own program, best first."""
     if cell.program_key not in _ranked:
         _ranked[cell.program_key] = sorted(_able(cell), key=lambda b: b.reference_rank or 0)
-    yield from _ranked[cell.program_key]
-    yield cell.backend
+    return _ranked[cell.program_key]
 
 
 def _able(cell: Cell) -> Iterator[Backend]:
@@ -299,7 +310,7 @@ def _able(cell: Cell) -> Iterator[Backend]:
             continue
         backend = cast(Backend, _build(plugin, ()))
         with suppress(Exception):  # what cannot even be asked is not able
-            if (not program.needs_root or "root" in backend.provides) and backend.refuses(program) is None:
+            if program.needs <= backend.provides and backend.refuses(program) is None:
                 yield backend
 
 

@@ -11,6 +11,7 @@ import ast
 import dataclasses
 import hashlib
 import importlib
+import importlib.machinery
 import importlib.util
 import inspect
 import math
@@ -126,9 +127,20 @@ def _missing(plugin: type[Plugin]) -> str:
     missing = []
     for requirement in plugin.requires:
         module, _, distribution = requirement.partition("=")
-        if importlib.util.find_spec(module) is None:
+        if not _installed(module):
             missing.append(distribution or module)
     return f"not installed: {', '.join(missing)}; pip install {' '.join(missing)}" if missing else ""
+
+
+def _installed(module: str) -> bool:
+    """Whether a module can be imported, found without importing it or its parents."""
+    first, *inner = module.split(".")
+    spec = importlib.util.find_spec(first)
+    for part in inner:
+        if spec is None:
+            return False
+        spec = importlib.machinery.PathFinder.find_spec(f"{spec.name}.{part}", spec.submodule_search_locations)
+    return spec is not None
 
 
 def find(kind: str, name: str) -> Entry:

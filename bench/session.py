@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from bench import reference
 from bench.contracts import Backend, Problem
-from bench.grid import Cell, Experiment, reference_backends
+from bench.grid import Cell, Experiment, ranked_backends, reference_backends
 from bench.reference import Reference
 
 __all__ = ["Problems", "References", "Session", "reference_backends"]
@@ -51,13 +53,26 @@ class References:
             if found is None:
                 backend = cell.reference_backend
                 problem = self._problems.of(backend, cell)
-                found = reference.certify(problem, backend.provides, *self._budget)
+                found = reference.certify(problem, backend.provides, *self._budget, self._stood_for(cell))
                 reference.save(found, self._path(cell))
             self._known[key] = found
         return self._known[key]
 
     def _path(self, cell: Cell) -> Path:
         return self._directory / f"{cell.reference_key}.parquet"
+
+    def _stood_for(self, cell: Cell) -> np.ndarray | None:
+        """The gradient that the program's own, at w = 0, should be: that of the physics, where the scene knows it.
+
+        For a backend with physics of its own and a scene that does not, that of the scene's program.
+        """
+        program, theta = cell.program(), cell.scene.theta0()
+        physical = cell.scene.physical_gradient()
+        if physical is None and "physics" in cell.backend.provides:
+            for backend in ranked_backends(cell):
+                if "grad" in backend.provides:
+                    return self._problems.of(backend, cell).grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
+        return physical
 
 
 class Session:

@@ -97,8 +97,9 @@ BIAS_VARIANCE = Columns(
         "peak_memory_mb", "dtype", "device", "versions", "key",
     ),
     texts=("reference_method", "device"),
-    extra=("variance_low", "variance_high"),
-    measured=("time_s", "time_iqr_s", "compile_s", "peak_memory_mb"),
+    lists=("time_samples",),
+    extra=("variance_low", "variance_high", "time_samples"),
+    measured=("time_s", "time_iqr_s", "time_samples", "compile_s", "peak_memory_mb"),
 )  # fmt: skip
 """The columns of the main table: a contract with people's scripts."""
 
