@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import os
 import time
 from collections import defaultdict
@@ -122,7 +121,10 @@ def outcome(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
         raise
     except Exception as error:
         return dict(failure(error))
-    return result if cell.timing else result | dict.fromkeys(set(study.COLUMNS.measured) & set(result), math.nan)
+    if cell.timing:
+        return result
+    empty = study.COLUMNS.blank()
+    return result | {name: empty[name] for name in study.COLUMNS.measured}
 
 
 # ------------------------------------------------------------------------------------------------ a run
