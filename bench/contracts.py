@@ -361,11 +361,16 @@ class Jacobians(NamedTuple):
 
 @dataclass
 class Usage:
-    """What a stretch of work cost: rollouts, gradients, and seconds of compilation it stood on."""
+    """What a stretch of work cost: rollouts, gradients, and seconds of compilation it stood on.
+
+    ``compile_s`` includes ``trace_s``, running the Python code once, and ``lower_s``, turning it into the compiler's input.
+    """
 
     rollouts: int = 0
     gradients: int = 0
     compile_s: float = 0.0
+    trace_s: float = 0.0
+    lower_s: float = 0.0
 
 
 class Problem(ABC):
@@ -419,6 +424,10 @@ class Problem(ABC):
         if self.noise_on_theta:
             return w / self.sigma
         return self._blocks(self._score, theta, w)
+
+    def states(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """States along each rollout, ``(horizon + 1, n, B)``; raises :class:`Unsupported` where there are none."""
+        return self.jacobians(theta, w).states
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """States, controls and step Jacobians along each rollout; raises :class:`Unsupported` where there are none."""

@@ -60,8 +60,8 @@ def _platform() -> str:
     return str(jax.default_backend())
 
 
-_compiled: dict[tuple[Any, ...], tuple[Any, float]] = {}
-"""Compiled functions and their compile seconds, by program structure, function, mode, dtype and shapes."""
+_compiled: dict[tuple[Any, ...], tuple[Any, np.ndarray]] = {}
+"""Compiled functions and their seconds of tracing, lowering and compiling, by program structure, function, mode, dtype and shapes."""
 
 
 class JaxProblem(Problem):
@@ -87,6 +87,30 @@ class JaxProblem(Problem):
         theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
         return Jacobians(*(np.asarray(part, dtype=np.float64) for part in self._run(self._linearised, theta, w)))
 
+    def states(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """States along each rollout."""
+        theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
+        return self._call(self._states, theta, w)
+
+    def _states(self, parameters: Array, theta: Array, w: Array) -> Array:
+        return self._path(self.program.bind(parameters), theta, w)[0]
+
+    def _path(self, program: Program, theta: Array, w: Array) -> tuple[Array, Array]:
+        """States and controls along each rollout."""
+        import jax
+        import jax.numpy as jnp
+
+        if not isinstance(program.scene, MechanicalScene):
+            raise Unsupported(f"scene {program.scene.name} has no steps")
+        theta, first, scanned = program.start(self._ops, theta, w)
+
+        def advance(state: State, slices: Any) -> tuple[State, tuple[Array, Array]]:
+            u = program.control(self._ops, theta, state, slices)
+            return program.step(self._ops, state, u), (jnp.concatenate(state), u)
+
+        last, (before, controls) = jax.lax.scan(advance, first, scanned, program.scene.horizon)
+        return jnp.concatenate([before, jnp.concatenate(last)[None]]), controls
+
     def _linearised(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array, Array, Array]:
         import jax
         import jax.numpy as jnp
@@ -103,13 +127,7 @@ class JaxProblem(Problem):
             basis = jnp.eye(point.shape[0], dtype=point.dtype)[:, :, None] + jnp.zeros_like(point)
             return jax.vmap(lambda e: jax.jvp(function, (point,), (e,))[1], out_axes=1)(basis)
 
-        def advance(state: State, slices: Any) -> tuple[State, tuple[Array, Array]]:
-            u = program.control(self._ops, theta, state, slices)
-            return program.step(self._ops, state, u), (jnp.concatenate(state), u)
-
-        theta, first, scanned = program.start(self._ops, theta, w)
-        last, (before, controls) = jax.lax.scan(advance, first, scanned, program.scene.horizon)
-        states = jnp.concatenate([before, jnp.concatenate(last)[None]])
+        states, controls = self._path(program, theta, w)
         a, b = jax.lax.map(
             lambda at: (derivative(lambda x: step(x, at[1]), at[0]), derivative(lambda u: step(at[0], u), at[1])),
             (states[:-1], controls),
@@ -126,13 +144,20 @@ class JaxProblem(Problem):
         solver = type(self._ops) if self.program.needs_root else None
         key = (solver, self.program.structure, function.__name__, self._mode, self._dtype, theta.shape, w.shape)
         if key not in _compiled:
-            start = time.perf_counter()
-            compiled = jax.jit(function).lower(*args).compile()
-            _compiled[key] = (compiled, time.perf_counter() - start)
+            clock = [time.perf_counter()]
+            traced = jax.jit(function).trace(*args)
+            clock.append(time.perf_counter())
+            lowered = traced.lower()
+            clock.append(time.perf_counter())
+            compiled = lowered.compile()
+            clock.append(time.perf_counter())
+            _compiled[key] = (compiled, np.diff(clock))
         compiled, seconds = _compiled[key]
         if key not in self._charged:
             self._charged.add(key)
-            self.usage.compile_s += seconds
+            self.usage.compile_s += float(seconds.sum())
+            self.usage.trace_s += float(seconds[0])
+            self.usage.lower_s += float(seconds[1])
         return compiled(*args)
 
     def _cost(self, parameters: Array, theta: Array, w: Array) -> Array:

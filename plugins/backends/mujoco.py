@@ -77,6 +77,10 @@ class MujocoProblem(NumpyProblem):
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return _reverse(Recorded(self.program, self._rollout(theta, w)[0]), theta, w, scored=True)
 
+    def states(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """States along each rollout."""
+        return self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w)[0]
+
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """States, controls and finite-difference Jacobians of the steps (``mjd_transitionFD``)."""
         theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
