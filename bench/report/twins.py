@@ -31,7 +31,7 @@ STYLES: tuple[dict[str, Any], ...] = (
 HEADERS = {
     "state_difference": "states", "state_difference_rel": "relative", "cost_difference_rel": "cost",
     "gradient_difference_rel": "gradient", "gradient_cosine": "cosine", "value_s": "value [s]",
-    "gradient_s": "gradient [s]", "trace_s": "trace [s]", "lower_s": "lower [s]", "compile_s": "in all [s]",
+    "gradient_s": "gradient [s]", "trace_s": "trace [s]", "lower_s": "lower [s]", "compile_s": "compile, in all [s]",
 }  # fmt: skip
 PRINTED = ("scene", "backend", "state_difference", "gradient_difference_rel", "value_s", "gradient_s", "compile_s")
 """Columns that the terminal has room for."""

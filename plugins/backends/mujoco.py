@@ -115,6 +115,8 @@ class Engine:
         import mujoco
         from mujoco.rollout import Rollout
 
+        # a rollout that diverges ends in NaN, which says it; by default MuJoCo writes a log file where it is run
+        mujoco.set_mju_user_warning(lambda message: None)
         self._mujoco, self._model = mujoco, model
         self._data = [mujoco.MjData(model) for _ in range(_cores())]
         self._pool = Rollout(nthread=len(self._data))
