@@ -47,6 +47,7 @@ __all__ = [
     "SampleMean",
     "Scene",
     "State",
+    "Trajectory",
     "Unsupported",
     "Usage",
     "param",
@@ -346,6 +347,15 @@ class Integrator(Plugin):
 # ----------------------------------------------------------------------------------------- backends and problems
 
 
+class Trajectory(NamedTuple):
+    """What rollouts pass through, x = (q, v)."""
+
+    states: np.ndarray
+    """``(horizon + 1, n, B)``."""
+    controls: np.ndarray
+    """``(horizon, n_u, B)``."""
+
+
 class Jacobians(NamedTuple):
     """Derivatives of the step map x_{k+1} = F(x_k, u_k), x = (q, v), along rollouts."""
 
@@ -425,9 +435,9 @@ class Problem(ABC):
             return w / self.sigma
         return self._blocks(self._score, theta, w)
 
-    def states(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """States along each rollout, ``(horizon + 1, n, B)``; raises :class:`Unsupported` where there are none."""
-        return self.jacobians(theta, w).states
+    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
+        """States and controls along each rollout; raises :class:`Unsupported` where there are none."""
+        raise Unsupported("this backend shows no states")
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """States, controls and step Jacobians along each rollout; raises :class:`Unsupported` where there are none."""

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
-from bench import reference, registry
+from bench import reference
 from bench.contracts import Backend, Problem
-from bench.grid import Cell, Experiment
-from bench.program import Program
+from bench.grid import Cell, Experiment, ranked_backends, reference_backends
 from bench.reference import Reference
+
+__all__ = ["Problems", "References", "Session", "reference_backends"]
 
 
 class Problems:
@@ -40,19 +41,25 @@ class References:
         self._budget = (experiment.reference_samples, experiment.reference_tolerance)
         self._known: dict[str, Reference] = {}
 
+    def stored(self, cell: Cell) -> bool:
+        """Whether the reference of the cell's program is on disk."""
+        return self._path(cell).exists()
+
     def of(self, cell: Cell) -> Reference:
         """The reference of the cell's program, on the best backend that can run it."""
-        key = f"{cell.program_key}-{self._budget[0]}-{self._budget[1]:g}"
+        key = cell.reference_key
         if key not in self._known:
-            path = self._directory / f"{key}.parquet"
-            found = reference.load(path)
+            found = reference.load(self._path(cell))
             if found is None:
-                backend = next(reference_backends(cell))
+                backend = cell.reference_backend
                 problem = self._problems.of(backend, cell)
                 found = reference.certify(problem, backend.provides, *self._budget, self._stood_for(cell))
-                reference.save(found, path)
+                reference.save(found, self._path(cell))
             self._known[key] = found
         return self._known[key]
+
+    def _path(self, cell: Cell) -> Path:
+        return self._directory / f"{cell.reference_key}.parquet"
 
     def _stood_for(self, cell: Cell) -> np.ndarray | None:
         """The gradient that the program's own, at w = 0, should be: that of the physics, where the scene knows it.
@@ -62,33 +69,10 @@ class References:
         program, theta = cell.program(), cell.scene.theta0()
         physical = cell.scene.physical_gradient()
         if physical is None and "physics" in cell.backend.provides:
-            for backend in ranked_backends(program):
+            for backend in ranked_backends(cell):
                 if "grad" in backend.provides:
                     return self._problems.of(backend, cell).grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
         return physical
-
-
-def reference_backends(cell: Cell) -> Iterator[Backend]:
-    """Backends able to run the cell's program for a reference, best first, the cell's own last.
-
-    A backend with physics of its own runs a program of its own, for which it alone can speak.
-    """
-    if "physics" not in cell.backend.provides:
-        yield from ranked_backends(cell.program())
-    yield cell.backend
-
-
-def ranked_backends(program: Program) -> list[Backend]:
-    """The available backends that compute references and can run the program, best first."""
-    ranked = []
-    for entry in registry.entries()["backends"].values():
-        plugin = entry.plugin
-        if plugin is None or not entry.available or not issubclass(plugin, Backend) or plugin.reference_rank is None:
-            continue
-        backend = plugin()
-        if program.needs <= backend.provides and backend.refuses(program) is None:
-            ranked.append(backend)
-    return sorted(ranked, key=lambda b: b.reference_rank or 0)
 
 
 class Session:

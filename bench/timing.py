@@ -17,6 +17,8 @@ class Timing:
 
     median_s: float
     iqr_s: float
+    samples_s: tuple[float, ...] = ()
+    """Of each call, in order."""
 
 
 def timed(call: Callable[[int], np.ndarray], count: int) -> tuple[list[np.ndarray], Timing]:
@@ -31,7 +33,7 @@ def timed(call: Callable[[int], np.ndarray], count: int) -> tuple[list[np.ndarra
         results.append(call(index))
         seconds.append(time.perf_counter() - start)
     low, median, high = np.percentile(seconds, [25, 50, 75])
-    return results, Timing(float(median), float(high - low))
+    return results, Timing(float(median), float(high - low), tuple(seconds))
 
 
 def reset_peak_memory() -> None:

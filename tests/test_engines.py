@@ -190,12 +190,12 @@ def test_scene_for_engines_is_refused_elsewhere():
 def test_reference_of_an_engine_is_its_own():
     law = Penalty()
     own, engine, other = (
-        Cell(Pushing(), law, SemiImplicitEuler(), backend, Fobg(), 8, 2, 0)
+        Cell(Pushing(), law, SemiImplicitEuler(), backend, Fobg(), 8, 2, 0, budget=(4096, 0.01))
         for backend in (Jax(), Mujoco(), Mujoco(impedance=0.9))
     )
     numpy = dataclasses.replace(own, backend=Numpy())
-    assert own.program_key == numpy.program_key
-    assert len({own.program_key, engine.program_key, other.program_key}) == 3
+    assert own.reference_key == numpy.reference_key
+    assert len({own.reference_key, engine.reference_key, other.reference_key}) == 3
 
 
 def test_every_twin_is_listed_with_its_difference():

@@ -55,6 +55,7 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
         "model_error": truth.model_error,
         "time_s": clock.median_s,
         "time_iqr_s": clock.iqr_s,
+        "time_samples": list(clock.samples_s),
         "compile_s": usage.compile_s,
         "rollouts": usage.rollouts / (calls + 1),
         "gradients": usage.gradients / (calls + 1),

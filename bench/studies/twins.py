@@ -15,8 +15,8 @@ import numpy as np
 
 from bench import noise, timing
 from bench.contracts import MechanicalScene, Problem, Unsupported
-from bench.grid import Cell, Experiment
-from bench.session import Session, ranked_backends
+from bench.grid import Cell, Experiment, ranked_backends
+from bench.session import Session
 from bench.store import Columns
 
 if TYPE_CHECKING:
@@ -43,12 +43,12 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
     """
     if "physics" not in cell.backend.provides or not isinstance(cell.scene, MechanicalScene):
         raise Unsupported("has no twin to compare: its steps are the scene's own")
-    able = ranked_backends(cell.program())
+    able = ranked_backends(cell)
     if not able:
         raise Unsupported("has no program of its own to compare with: it runs in physics engines alone")
     twin, own = session.problem(cell), session.problems.of(able[0], cell)
     theta, still = cell.scene.theta0(), np.zeros((twin.program.n_noise, 1))
-    path, own_path = (problem.states(theta, still)[:, :, 0] for problem in (twin, own))
+    path, own_path = (problem.trajectory(theta, still).states[:, :, 0] for problem in (twin, own))
     gradient, own_gradient = (problem.grad(theta, still)[:, 0] for problem in (twin, own))
     cost, own_cost = (float(problem.value(theta, still)[0]) for problem in (twin, own))
     off = np.abs(path - own_path).max(axis=0)

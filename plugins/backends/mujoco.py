@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, Backend, Jacobians, MechanicalScene, Ops, Problem, Program, State, param
+from bench.contracts import Array, Backend, Jacobians, MechanicalScene, Ops, Problem, Program, State, Trajectory, param
 from plugins import mjcf
 from plugins.backends.numpy import NumpyOps, NumpyProblem
 from plugins.backends.torch import TorchOps
@@ -77,9 +77,9 @@ class MujocoProblem(NumpyProblem):
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return _reverse(Recorded(self.program, self._rollout(theta, w)[0]), theta, w, scored=True)
 
-    def states(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """States along each rollout."""
-        return self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w)[0]
+    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
+        """States and controls of the engine."""
+        return Trajectory(*self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w))
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """States, controls and finite-difference Jacobians of the steps (``mjd_transitionFD``)."""

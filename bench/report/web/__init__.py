@@ -18,7 +18,7 @@ import pandas as pd
 from bench.grid import Experiment
 from bench.report import reproduce
 from bench.report.web.content import Content
-from bench.report.web.document import document
+from bench.report.web.document import assemble
 from bench.store import write_whole
 
 
@@ -26,7 +26,7 @@ def write(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]) -> Pa
     """Write ``report.html`` from rows, and from ``run.json`` where there is one; returns its path."""
     rows = rows.reset_index(drop=True)
     path = experiment.directory / "report.html"
-    text = document(experiment, content(experiment, rows, axes), reproduce.commands(experiment, rows), _record(path))
+    text = assemble(experiment, content(experiment, rows, axes), reproduce.commands(experiment, rows), _record(path))
     write_whole(path, text.encode())
     return path
 

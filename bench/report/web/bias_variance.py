@@ -213,9 +213,9 @@ class Elsewhere:
         return worse / min(self.errors) if min(self.errors) > 0 else math.inf
 
     def told(self, main: str) -> str:
-        """``pushing, penalty, stiffness >=1e4: use reinforce (0.5; fobg has 300)``."""
+        """``pushing, penalty, stiffness >=1e4: use reinforce (0.5, where fobg has 300)``."""
         where = ", ".join(filter(None, [self.problem, self.where])) or "elsewhere"
-        return f"{where}: use {self.use} ({between(self.errors)}; {main} has {between(self.instead_of)})"
+        return f"{where}: use {self.use} ({between(self.errors)}, where {main} has {between(self.instead_of)})"
 
 
 def finding(told: Sequence[Told]) -> str:

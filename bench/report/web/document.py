@@ -26,12 +26,12 @@ HERE = Path(__file__).parent
 DIGITS = 6
 """Significant digits of the numbers in a page."""
 FILTERED = ("scene", "contact", "integrator", "backend", "estimator", "estimator_params", "stiffness", "sigma", "smoothing",
-            "horizon", "dt", "samples", "noise", "dtype", "seed", "status")  # fmt: skip
+            "horizon", "dt", "samples", "noise", "dtype", "seed", "verdict", "outcome", "experiment", "status")  # fmt: skip
 """Columns to filter by, where they vary and have at most MOST values."""
 MOST = 24
 
 
-def document(
+def assemble(
     experiment: Experiment, content: Content, commands: Sequence[Sequence[str]], record: Mapping[str, Any]
 ) -> str:
     """The page; ``commands`` are the words that run each row's cell, ``record`` what ``run.json`` says."""
@@ -74,7 +74,7 @@ def plotly() -> str:
 def data(content: Content, commands: Sequence[Sequence[str]]) -> dict[str, Any]:
     """What the script draws: tables as columns, and how to draw them."""
     rows = content.rows
-    filters = [c for c in FILTERED if 1 < rows[c].nunique(dropna=False) <= MOST]
+    filters = [c for c in FILTERED if c in rows and 1 < rows[c].nunique(dropna=False) <= MOST]
     wanted = {"rows": {*IDENTITY, "reason", "status", *filters, *(c.name for c in content.columns)}}
     wanted["rows"] |= {c.flag for c in content.columns}
     for chart in content.charts:

@@ -25,6 +25,14 @@ function size(table) {
 
 /* A function from a line of a table to its value in a column, looked up in "rows" where the table has no such column. */
 function reader(table, name) {
+  const key = table + " " + name;
+  if (!readers.has(key)) readers.set(key, readerOf(table, name));
+  return readers.get(key);
+}
+
+const readers = new Map();
+
+function readerOf(table, name) {
   const column = page.tables[table][name];
   if (column) return column.index ? (i) => column.values[column.index[i]] : (i) => column[i];
   if (table === "rows") return () => null;
@@ -169,8 +177,8 @@ function buildCharts() {
     for (const entry of entries) {
       const chart = charts.find((one) => one.section === entry.target);
       chart.near = entry.isIntersecting;
-      if (chart.near && chart.dirty) drawChart(chart);
     }
+    requestAnimationFrame(drawNext);
   }, { rootMargin: "300px" });
   for (const chart of charts) {
     chart.section = element("section", { className: "chart" },
@@ -197,12 +205,17 @@ function choice(chart, label, property, axes) {
   return element("label", {}, label + " ", select);
 }
 
-/* Charts out of sight are drawn when they come into it. */
+/* Charts in sight are drawn one a frame, so that the page answers meanwhile; the others when they come into it. */
 function markDirty() {
-  for (const chart of charts) {
-    chart.dirty = true;
-    if (chart.near) drawChart(chart);
-  }
+  for (const chart of charts) chart.dirty = true;
+  requestAnimationFrame(drawNext);
+}
+
+function drawNext() {
+  const chart = charts.find((one) => one.near && one.dirty);
+  if (!chart || !window.Plotly) return;
+  drawChart(chart);
+  requestAnimationFrame(drawNext);
 }
 
 function dark() {
@@ -325,7 +338,7 @@ function pointFigure(chart, panel, range) {
   if (range.y && chart.yAxis.log && chart.yAxis.above_one && range.y[1] > 0) {
     shapes.push({ type: "rect", xref: "paper", x0: 0, x1: 1, y0: 1, y1: 10 ** range.y[1], layer: "below",
       fillcolor: dark() ? "#ffffff14" : "#00000010", line: { width: 0 } });
-    annotations.push({ xref: "paper", x: 0.01, y: 0, yref: "y", yanchor: "bottom", xanchor: "left", showarrow: false,
+    annotations.push({ xref: "paper", x: 0.01, yref: "paper", y: 1, yanchor: "top", xanchor: "left", showarrow: false,
       text: chart.yAxis.above_one, font: { size: 10 } });
   }
   for (const [name, value] of Object.entries(chart.marks)) {
@@ -354,13 +367,15 @@ function trace(chart, points, joined) {
   return made;
 }
 
+const tellingColumns = page.columns.filter((column) => page.identity.includes(column.name) && !column.name.startsWith("estimator"));
+const told = []; // of each row, once it was drawn, which cell it is
+
 function hover(chart, point) {
   const { xAxis, yAxis } = chart;
   const interval = point.low !== null && point.high !== null && !point.limit
     ? ` [${number(point.low)}, ${number(point.high)}]` : "";
-  const facts = page.columns.filter((c) => page.identity.includes(c.name) && !c.name.startsWith("estimator"))
-    .map((c) => `${c.label} ${shownAs(c, point.row)}`);
-  return [`<b>${plotted(point.series)}</b>`, ...facts.map(plotted),
+  if (!told[point.row]) told[point.row] = tellingColumns.map((c) => plotted(`${c.label} ${shownAs(c, point.row)}`)).join("<br>");
+  return [`<b>${plotted(point.series)}</b>`, told[point.row],
     `${plotted(xAxis.label)}: ${number(point.x)}`,
     `${plotted(yAxis.label)}: ${point.limit ? "&lt; " : ""}${number(point.y)}${interval}`].join("<br>");
 }
@@ -442,19 +457,20 @@ function mapFigure(chart, panel) {
   const [xs, ys] = [order(panel.x), order(panel.y)];
   const grid = (make) => ys.map((y) => xs.map((x) => {
     const found = panel.places.get(JSON.stringify([x, y]));
-    return found ? make(found, x, y) : null;
+    return found ? make(found, x, y) : "";
   }));
+  const worst = (found) => found.reduce((a, b) => (names.indexOf(b.level) > names.indexOf(a.level) ? b : a));
   const share = (found) => found.filter((one) => one.level === chart.share).length / found.length;
   const k = names.length;
   const scale = chart.share ? [[0, dark() ? "#14171a" : "#ffffff"], [1, "#0072B2"]]
     : names.flatMap((name, n) => [[n / k, colour(name)], [(n + 1) / k, colour(name)]]);
-  const text = (found) => (chart.share ? Math.round(100 * share(found)) + "%" : looks(found[0].level).letter || "");
-  const told = (found, x, y) => [`<b>${plotted(chart.share ? text(found) : found[0].level)}</b>`,
+  const text = (found) => (chart.share ? Math.round(100 * share(found)) + "%" : looks(worst(found).level).letter || "");
+  const told = (found, x, y) => [`<b>${plotted(chart.share ? text(found) : worst(found).level)}</b>`,
     `${plotted(chart.xAxis.label)} ${plotted(x)}`, `${plotted(chart.yAxis.label)} ${plotted(y)}`,
-    chart.share ? `${found.length} cells` : plotted(reader("rows", "reason")(found[0].row) || "")].join("<br>");
+    chart.share ? `${found.length} cells` : plotted(reader("rows", "reason")(worst(found).row) || "")].join("<br>");
   const made = {
-    type: "heatmap", x: xs.map(plotted), y: ys.map(plotted), z: grid((found) => (chart.share ? share(found) : names.indexOf(found[0].level))),
-    text: grid(text), texttemplate: "%{text}", customdata: grid((found) => (chart.share ? null : found[0].row)),
+    type: "heatmap", x: xs.map(plotted), y: ys.map(plotted), z: grid((found) => (chart.share ? share(found) : names.indexOf(worst(found).level))),
+    text: grid(text), texttemplate: "%{text}", customdata: grid((found) => (chart.share ? null : worst(found).row)),
     hovertext: grid(told), hovertemplate: "%{hovertext}<extra></extra>", colorscale: scale, showscale: false, xgap: 1, ygap: 1,
     zmin: chart.share ? 0 : -0.5, zmax: chart.share ? 1 : k - 0.5,
   };
@@ -519,6 +535,7 @@ function drawTable() {
     const line = element("tr", { tabIndex: 0, ariaSelected: String(i === state.selected) }, ...page.columns.map((column) => {
       const cell = element("td", { textContent: shownAs(column, i), className: column.kind === "text" ? "" : "number" });
       if (column.name === "status" && status(i) !== "ok") cell.className = "failed";
+      if (column.name === "reason") cell.className = "reason";
       return cell;
     }));
     line.dataset.row = i;
@@ -534,10 +551,7 @@ function drawTable() {
 function select(row) {
   state.selected = row;
   for (const line of body.rows) line.ariaSelected = String(Number(line.dataset.row) === row);
-  for (const chart of charts) {
-    chart.dirty = true;
-    if (chart.near) drawChart(chart);
-  }
+  markDirty();
   const cell = document.getElementById("cell");
   cell.hidden = row < 0;
   if (row < 0) return;
@@ -559,7 +573,7 @@ function select(row) {
       ...results.map((column) => fact(column.label, shownAs(column, row)))),
     reason ? element("p", { className: "failed", textContent: reason }) : null,
     ...(command ? [element("p", { textContent: "It alone is run again, to the same numbers, by" }), copyable(command)]
-      : [element("p", { textContent: "The experiment as configured when this page was written has no such cell any more." })]),
+      : page.command.words.length ? [element("p", { textContent: "The experiment as configured when this page was written has no such cell any more." })] : []),
   );
   cell.focus({ preventScroll: true });
 }
@@ -613,6 +627,11 @@ async function inflated(id) {
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
 }
 
+/* When the charts in sight are drawn. */
+async function settled() {
+  do await new Promise(requestAnimationFrame); while (charts.some((chart) => chart.near && chart.dirty));
+}
+
 async function start() {
   buildTheme();
   buildFilters();
@@ -624,7 +643,8 @@ async function start() {
     return;
   }
   document.head.append(element("script", { textContent: await inflated("plotly") }));
-  for (const chart of charts) if (chart.near) drawChart(chart);
+  markDirty();
+  await settled();
   document.documentElement.dataset.loaded = performance.now().toFixed(0);
 }
 
