@@ -237,6 +237,11 @@ def test_twins_study_measures_writes_and_draws(tmp_path):
         assert row["gradient_s"] > 0
 
 
+def test_scene_for_engines_cannot_be_traced(capsys):
+    assert main(["trace", "tossed_box", "backends=[mujoco]"]) == 2
+    assert "physics engines alone" in capsys.readouterr().err
+
+
 def test_study_is_found():
     assert "twins" in studies.names()
 
