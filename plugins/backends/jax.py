@@ -72,8 +72,8 @@ def _platform() -> str:
     return str(jax.default_backend())
 
 
-_compiled: dict[tuple[Any, ...], tuple[Any, float]] = {}
-"""Compiled functions and their compile seconds, by program structure, function, mode, dtype and shapes."""
+_compiled: dict[tuple[Any, ...], tuple[Any, np.ndarray]] = {}
+"""Compiled functions and their seconds of tracing, lowering and compiling, by program structure, function, mode, dtype and shapes."""
 
 
 class JaxProblem(Problem):
@@ -154,13 +154,20 @@ class JaxProblem(Problem):
         solver = type(self._ops) if self.program.needs_root else None
         key = (solver, self.program.structure, function.__name__, self._mode, self._dtype, theta.shape, w.shape)
         if key not in _compiled:
-            start = time.perf_counter()
-            compiled = jax.jit(function).lower(*args).compile()
-            _compiled[key] = (compiled, time.perf_counter() - start)
+            clock = [time.perf_counter()]
+            traced = jax.jit(function).trace(*args)
+            clock.append(time.perf_counter())
+            lowered = traced.lower()
+            clock.append(time.perf_counter())
+            compiled = lowered.compile()
+            clock.append(time.perf_counter())
+            _compiled[key] = (compiled, np.diff(clock))
         compiled, seconds = _compiled[key]
         if key not in self._charged:
             self._charged.add(key)
-            self.usage.compile_s += seconds
+            self.usage.compile_s += float(seconds.sum())
+            self.usage.trace_s += float(seconds[0])
+            self.usage.lower_s += float(seconds[1])
         return compiled(*args)
 
     def _cost(self, parameters: Array, theta: Array, w: Array) -> Array:
