@@ -25,6 +25,7 @@ Compare gradient estimators through physics simulation.
   python -m bench check [NAME ...]                          the conformance kit on some plugins, or all
   python -m bench gradcheck SCENE ... [key=value ...]       gradients against differences of the cost, and what is wrong
   python -m bench trace SCENE ... [key=value ...]           one rollout: do gradient spikes line up with contact switches?
+  python -m bench bench-self [quick=true]                   the harness's own speed, beside a NumPy loop and native code
 
 Experiments: {experiments}
 Settings: scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..]
@@ -61,6 +62,7 @@ def _dispatch(words: list[str]) -> int:
         "check": _check,
         "gradcheck": _gradcheck,
         "trace": _trace,
+        "bench-self": _bench_self,
     }
     if not words or words[0] in ("-h", "--help", "help"):
         from bench import config
@@ -101,10 +103,13 @@ def _run(words: list[str]) -> int:
 def _execute(experiment: Experiment, store: Store, planned: list[Planned], words: list[str]) -> int:
     import time
 
-    from bench import runner
+    from bench import runner, timing
     from bench.report import progress
 
     started = time.time()
+    timing.load_at_start()
+    if experiment.compile_cache:
+        os.environ["BENCH_COMPILE_CACHE"] = str(experiment.compile_cache)
     waiting = [item for item in planned if not item.stored]
     store.prepare()
     with progress.bar(experiment.name, len(planned), len(planned) - len(waiting)) as advance:
@@ -209,6 +214,12 @@ def _facts(entry: Any) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------- check
+
+
+def _bench_self(words: list[str]) -> int:
+    from bench import benchself
+
+    return benchself.main(words)
 
 
 def _check(words: list[str]) -> int:

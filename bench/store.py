@@ -79,8 +79,8 @@ BIAS_VARIANCE = Columns(
         "finite_fraction", "model_error", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients",
         "peak_memory_mb", "dtype", "device", "versions", "key",
     ),
-    texts=("reference_method", "device"),
-    extra=("variance_low", "variance_high"),
+    texts=("reference_method", "device", "shapes"),
+    extra=("variance_low", "variance_high", "compilations", "shapes"),
 )  # fmt: skip
 """The columns of the main table: a contract with people's scripts."""
 
