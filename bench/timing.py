@@ -31,8 +31,13 @@ class Timing:
 
     median_s: float
     iqr_s: float
-    calls: int
-    """Calls made, the warm-up included."""
+    samples_s: tuple[float, ...] = ()
+    """Of each call, in order."""
+
+    @property
+    def calls(self) -> int:
+        """Calls made, the warm-up included."""
+        return len(self.samples_s) + 1
 
     @property
     def spread(self) -> float:
@@ -58,7 +63,7 @@ def timed(
         if len(results) < count:
             results.append(result)
     low, median, high = np.percentile(seconds, [25, 50, 75])
-    return results, Timing(float(median), float(high - low), len(seconds) + 1)
+    return results, Timing(float(median), float(high - low), tuple(seconds))
 
 
 def conditions() -> dict[str, Any]:

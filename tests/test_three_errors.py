@@ -3,10 +3,14 @@
 import dataclasses
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from bench import config
 from bench.cli import main
+from bench.grid import cells
 from bench.program import Program
+from bench.report.three_errors import traps
 from bench.store import Store
 from bench.studies.three_errors import COLUMNS, difference_check
 from plugins.backends.jax import Jax
@@ -86,16 +90,53 @@ def test_a_wrong_derivative_is_seen():
 def test_from_the_command_line(tmp_path, capsys):
     words = [
         "study=three_errors", "name=small", "scenes=[bounce_once]", "contacts=[impulse,impulse[time_of_impact=false]]",
-        "backends=[jax]", "estimators=[fobg,reinforce]", "sweep.zip.horizon=[16,32]", "sweep.zip.dt=[0.0625,0.03125]",
+        "backends=[jax]", "estimators=[fobg,reinforce]", "sweep.zip.horizon=[64,256]", "sweep.zip.dt=[0.015625,0.00390625]",
         "samples=64", "repeats=16", "reference.samples=4096", f"results_dir={tmp_path}",
     ]  # fmt: skip
     assert main(words) == 0
     for name in ("csv", "md", "png", "svg"):
         assert (tmp_path / "small" / f"three_errors.{name}").stat().st_size > 0
-    assert "right signs" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "right signs" in printed
+    assert printed.count("Trap: ") == 1
+    assert "Trap: bounce_once, impulse[time_of_impact=false]" in printed
     rows = Store(tmp_path / "small", COLUMNS).load()
     trap = rows[rows["contact"].str.contains("false")]
     assert (trap["program_error_rel"] < 1e-9).all()
     assert (trap["model_error_rel"] > 1.5).all()
     assert (trap[trap["estimator"] == "fobg"]["bias_low"] > 0).all()
     assert (rows[rows["contact"] == "impulse"]["model_error_rel"] < 1e-9).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "trapped"),
+    [
+        ({}, True),
+        ({"program_error_rel": [1e-12, 1e-3]}, False),
+        ({"model_cosine": [-0.5, 0.1]}, False),
+        ({"forward_error_rel": [0.4, 0.3]}, False),
+    ],
+)
+def test_a_trap_is_exact_convergent_and_turned_away_at_every_step(tmp_path, change, trapped):
+    words = [
+        "study=three_errors",
+        "scenes=[bounce_once]",
+        "contacts=[impulse]",
+        "backends=[jax]",
+        "sweep.dt=[0.1,0.05]",
+    ]
+    given = config.load([*words, "estimators=[fobg]", f"results_dir={tmp_path}"])
+    rows = pd.DataFrame([cell.columns() for cell in cells(given)]).assign(status="ok", reason="")
+    values = {"program_error_rel": [1e-12, 1e-13], "model_cosine": [-0.5, -0.4], "forward_error_rel": [0.4, 0.1]}
+    assert len(traps(given, rows.assign(**(values | change)))) == trapped
+
+
+LAWS = [("impulse", True), ("impulse", False), ("penalty", True), ("softplus", True), ("complementarity", True)]
+
+
+def test_the_standard_experiment_covers_four_scenes_and_all_laws():
+    found = cells(config.load(["+experiment=three_errors"]))
+    scenes = {"bounce_once", "wall_penalty_1d", "ground_wall", "bouncing_ball"}
+    assert {cell.scene.name for cell in found} == scenes
+    laws = {(cell.scene.name, cell.contact.name, getattr(cell.contact, "time_of_impact", True)) for cell in found}
+    assert laws == {(scene, *law) for scene in scenes for law in LAWS}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -15,29 +14,24 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.grid import Experiment
+from bench.report.findings import TIE, lowest, problems, span, winners
 from bench.report.tables import one_line
 from bench.report.views import (
     UNSTEADY,
     Family,
     Line,
-    along,
     axis_text,
     axis_value,
     bias_text,
     duration,
-    families,
     lines,
     number,
-    numeric_axes,
-    ran,
     relative,
     resolved,
     short_axis,
     unsteady,
 )
 
-TIE = 1.1
-"""Relative RMSEs within this factor of the lowest share the first place: R repeats do not resolve less."""
 GOALS = (0.3, 0.1, 0.03)
 """Relative RMSEs to which the fastest way is named."""
 NEGLIGIBLE = 0.01
@@ -60,7 +54,7 @@ def show(
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
     console.print(f"{len(rows)} cells: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
-    parts = _parts(experiment, rows, axes, smoothing)
+    parts = problems(experiment, rows, axes, smoothing)
     condensed = len(rows) > FULL_ROWS
     for axis, group in parts:
         if condensed and axis is not None:
@@ -74,22 +68,6 @@ def show(
         _show_verdict(console, group, axis)
 
 
-def _parts(
-    experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str], smoothing: Mapping[str, str] | None
-) -> list[tuple[str | None, Family]]:
-    """The problems to print, each along the longest axis that it was swept along; every cell that ran is in one."""
-    found = numeric_axes(experiment, rows, axes)
-    parts: list[tuple[str | None, Family]] = []
-    seen: set[str] = set()
-    for axis in (*sorted(found, key=lambda a: -found[a]), None):
-        for group in families(along(rows, axis, experiment), ("scene", "contact"), smoothing):
-            cells = ran(group.rows)
-            if set(cells["key"]) - seen and (axis is None or cells["x"].nunique() > 1):
-                seen |= set(cells["key"])
-                parts.append((axis, group))
-    return parts
-
-
 def _show_rows(console: Console, group: Family, axis: str | None, merge: bool) -> None:
     """One printed line per cell or, to ``merge``, per estimator and the backends that agree."""
     table = _table(group.title())
@@ -100,7 +78,7 @@ def _show_rows(console: Console, group: Family, axis: str | None, merge: bool) -
     for name in ("rel. bias [95%]", "variance", "rel. RMSE", "cosine", "time"):
         table.add_column(name, justify="right")
     found = lines(group.rows) if merge else lines(group.rows, close=None)
-    best = _best(found)
+    best = lowest(found)
     for x, line in ((x, line) for x in _values(found) for line in found if x in line.at):
         row = line.at[x]
         cells = [] if axis is None else [axis_value(x)]
@@ -120,7 +98,7 @@ def _show_rows(console: Console, group: Family, axis: str | None, merge: bool) -
 def _show_pivot(console: Console, group: Family, axis: str) -> None:
     """Two printed lines per estimator and agreeing backends, a column per value of the axis."""
     found = lines(group.rows)
-    best = _best(found)
+    best = lowest(found)
     values = _values(found)
     room = max(1, (console.width - 44) // 8)
     for start in range(0, len(values), room):
@@ -184,13 +162,6 @@ def _values(found: Sequence[Line]) -> list[float]:
     return sorted({x for line in found for x in line.at})
 
 
-def _best(found: Sequence[Line]) -> dict[float, float]:
-    """The lowest relative RMSE at each ``x`` where there is one, in increasing order."""
-    rows = pd.concat([line.rows for line in found])
-    good = rows[(rows["status"] == "ok") & np.isfinite(rows["rmse_rel"])]
-    return good.groupby(level=0)["rmse_rel"].min().to_dict()
-
-
 def _show_legend(console: Console, condensed: bool) -> None:
     bias = (
         "'<u' when it cannot be told from 0 and lies below u" if condensed else "0 (< u) when it cannot be told from 0"
@@ -231,7 +202,7 @@ def _show_verdict(console: Console, group: Family, axis: str | None) -> None:
             there = where.setdefault(line.label, {})
             for x, row in line.at.items():
                 there[x] = there.get(x, False) or (row["status"] == "ok" and test(row))
-        parts = [f"{label} {_range(holds)}".strip() for label, holds in where.items() if any(holds.values())]
+        parts = [f"{label} {span(holds)}".strip() for label, holds in where.items() if any(holds.values())]
         if parts:
             _print_wrapped(console, f"{text}: {', '.join(parts)}", 4)
     if axis is not None and short_axis(axis) == "samples":
@@ -244,11 +215,8 @@ def _show_verdict(console: Console, group: Family, axis: str | None) -> None:
 
 def _winners(found: Sequence[Line]) -> str:
     """The estimators of lowest error, and where along the axis they are."""
-    winners = {}
-    for x, lowest in _best(found).items():
-        good = [line for line in found if x in line.at and line.at[x]["status"] == "ok"]
-        winners[x] = ", ".join(dict.fromkeys(i.label for i in good if i.at[x]["rmse_rel"] <= TIE * lowest))
-    ranges = {text: _range({x: names == text for x, names in winners.items()}) for text in winners.values()}
+    named = {x: ", ".join(labels) for x, labels in winners(found).items()}
+    ranges = {text: span({x: names == text for x, names in named.items()}) for text in named.values()}
     return "; ".join(f"{where}: {text}" if where else text for text, where in ranges.items())
 
 
@@ -268,18 +236,3 @@ def _first(rows: pd.DataFrame, goal: float) -> str:
     row = good.loc[good["time_s"].idxmin()]
     label = f"{row['estimator']}[{row['estimator_params']}]" if row["estimator_params"] else row["estimator"]
     return f"{label} on {row['backend']} in {duration(row['time_s'])} with {row['x']:g} samples"
-
-
-def _range(where: Mapping[float, bool]) -> str:
-    """Where a finding holds along an axis: nothing for everywhere, ``<=1000``, ``>=1e4``, ``at 10 and 100..3000``."""
-    if all(where.values()):
-        return ""
-    values = list(where)
-    runs = [[x for x, _ in run] for holds, run in itertools.groupby(where.items(), lambda item: item[1]) if holds]
-    if len(runs) == 1 and len(runs[0]) > 1:
-        if runs[0][0] == values[0]:
-            return f"<={axis_value(runs[0][-1])}"
-        if runs[0][-1] == values[-1]:
-            return f">={axis_value(runs[0][0])}"
-    texts = [axis_value(r[0]) if len(r) == 1 else f"{axis_value(r[0])}..{axis_value(r[-1])}" for r in runs]
-    return f"at {' and '.join(texts)}"

@@ -305,3 +305,12 @@ def bias_text(row: Any, norm: float = 1.0, interval: bool = True) -> str:
         return f"0 (< {number(high, 3)})" if high > 0 else "0"
     text = number(value, 3)
     return f"{text} [{number(low, 3)}, {number(high, 3)}]" if interval and math.isfinite(low + high) else text
+
+
+def smoothing_parameters() -> dict[str, str]:
+    """The parameter behind the column ``smoothing`` for each contact law that has one."""
+    from bench import registry
+    from bench.contracts import ContactLaw
+
+    laws = [entry.plugin for entry in registry.entries()["contacts"].values()]
+    return {law.name: law.smoothing for law in laws if law is not None and issubclass(law, ContactLaw)}

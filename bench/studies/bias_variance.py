@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench import noise, registry, statistics, timing
-from bench.contracts import ContactLaw, compilations
+from bench.contracts import compilations
 from bench.grid import Cell, Experiment
 from bench.reference import Reference
 from bench.session import Session
@@ -57,6 +57,7 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
         "model_error": truth.model_error,
         "time_s": clock.median_s,
         "time_iqr_s": clock.iqr_s,
+        "time_samples": list(clock.samples_s),
         "compile_s": usage.compile_s,
         "rollouts": usage.rollouts / clock.calls,
         "gradients": usage.gradients / clock.calls,
@@ -85,11 +86,10 @@ def truth_of(found: Reference) -> statistics.Truth:
 
 def write(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]) -> list[Path]:
     """Tables, charts and the printed table."""
-    from bench.report import charts, tables, terminal
+    from bench.report import charts, tables, terminal, views
 
     names = sorted(registry.entries()["estimators"])
-    laws = [entry.plugin for entry in registry.entries()["contacts"].values()]
-    smoothing = {law.name: law.smoothing for law in laws if law is not None and issubclass(law, ContactLaw)}
+    smoothing = views.smoothing_parameters()
     paths = tables.write(rows, experiment.directory) + charts.write(experiment, rows, axes, names, smoothing)
     terminal.show(experiment, rows, axes, smoothing)
     return paths

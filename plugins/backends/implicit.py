@@ -27,10 +27,10 @@ class Implicit(Jax):
     def ops(self) -> Ops:
         """JAX operations with a root finder.
 
-        Equinox, under optimistix and lineax, is asked for NaN instead of an exception where a solve in the adjoint fails,
-        so that it ends one rollout and not the batch.
+        Equinox, under optimistix and lineax, is asked to leave a failed solve in the adjoint as it is, not finite in its
+        own column: its other answers, an exception or NaN, would end the whole batch.
         """
-        os.environ.setdefault("EQX_ON_ERROR", "nan")
+        os.environ.setdefault("EQX_ON_ERROR", "off")
         import jax
 
         jax.config.update("jax_enable_x64", True)
@@ -41,7 +41,7 @@ class ImplicitOps(JaxOps):
     """JAX operations, and ``root`` through optimistix."""
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Newton's method, all columns at once: one unknown a column is a diagonal system, more are solved by column.
+        """Newton's method, each column on its own: one that fails spoils neither values nor gradients of the others.
 
         Residuals are met to a relative and absolute 1e-12 in the unknown (1e-6 in float32). Columns that do not
         converge in 64 iterations come back as NaN, which makes their rollouts ``nonfinite`` instead of wrong.
@@ -52,26 +52,21 @@ class ImplicitOps(JaxOps):
         import optimistix
 
         tolerance = 1e-12 if guess.dtype == jnp.float64 else 1e-6
-        guess = jax.lax.stop_gradient(guess)
-
-        def solve(function: Callable[..., Array], start: Array, args: Any, diagonal: bool) -> Array:
-            linear = lineax.Diagonal() if diagonal else lineax.LU()
-            tags = frozenset({lineax.diagonal_tag}) if diagonal else frozenset()
-            solution: Any = optimistix.root_find(
-                function, optimistix.Newton(rtol=tolerance, atol=tolerance, linear_solver=linear), start, args,
-                max_steps=64, throw=False, tags=tags,
-            )  # fmt: skip
-            return jnp.where(solution.result == optimistix.RESULTS.successful, solution.value, jnp.nan)
-
-        if guess.shape[0] == 1:
-            return solve(residual, guess, args, diagonal=True)
+        scalar = guess.shape[0] == 1
+        linear: Any = lineax.Diagonal(well_posed=True) if scalar else lineax.LU()
+        newton: Any = optimistix.Newton(rtol=tolerance, atol=tolerance, linear_solver=linear)
 
         def column(start: Array, args: Any) -> Array:
             def function(z: Array, args: Any) -> Array:
                 widened = jax.tree.map(lambda a: a[..., None] if jnp.ndim(a) else a, args)
                 return residual(z[:, None], widened)[:, 0]
 
-            return solve(function, start, args, diagonal=False)
+            solution: Any = optimistix.root_find(
+                function, newton, start, args, max_steps=64, throw=False,
+                adjoint=optimistix.ImplicitAdjoint(linear),
+                tags=frozenset({lineax.diagonal_tag} if scalar else ()),
+            )  # fmt: skip
+            return jnp.where(solution.result == optimistix.RESULTS.successful, solution.value, jnp.nan)
 
         axes = jax.tree.map(lambda a: -1 if jnp.ndim(a) else None, args)
-        return jax.vmap(column, in_axes=(-1, axes), out_axes=-1)(guess, args)
+        return jax.vmap(column, in_axes=(-1, axes), out_axes=-1)(jax.lax.stop_gradient(guess), args)

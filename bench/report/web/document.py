@@ -1,0 +1,165 @@
+"""The file itself: texts escaped, numbers as columns, and script, style and Plotly inside."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from functools import cache
+from html import escape
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from bench.grid import Experiment
+from bench.report import reproduce
+from bench.report.web.content import Axis, Chart, Content
+from bench.store import IDENTITY
+
+HERE = Path(__file__).parent
+DIGITS = 6
+"""Significant digits of the numbers in a page."""
+FILTERED = ("scene", "contact", "integrator", "backend", "estimator", "estimator_params", "stiffness", "sigma", "smoothing",
+            "horizon", "dt", "samples", "noise", "dtype", "seed", "verdict", "outcome", "experiment", "status")  # fmt: skip
+"""Columns to filter by, where they vary and have at most MOST values."""
+MOST = 24
+
+
+def assemble(
+    experiment: Experiment, content: Content, commands: Sequence[Sequence[str]], record: Mapping[str, Any]
+) -> str:
+    """The page; ``commands`` are the words that run each row's cell, ``record`` what ``run.json`` says."""
+    counts = content.rows["status"].value_counts()
+    statuses = "".join(f'<li class="{escape(str(s))}"><b>{n}</b> {escape(str(s))}</li>' for s, n in counts.items())
+    parts = {
+        "title": escape(experiment.name),
+        "question": escape(experiment.question),
+        "finding": _finding(content.finding),
+        "counts": f"<li><b>{len(content.rows)}</b> cells</li>{statuses}",
+        "answers": _answers(content),
+        "made": _made(record),
+        "style": (HERE / "page.css").read_text(),
+        "script": (HERE / "page.js").read_text(),
+        "data": in_script(json.dumps(data(content, commands), separators=(",", ":"), allow_nan=False)),
+        "plotly": plotly(),
+    }
+    template = (HERE / "page.html").read_text()
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template)
+
+
+def in_script(text: str) -> str:
+    """JSON that no browser takes for the end of the script it stands in."""
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+@cache
+def plotly() -> str:
+    """Plotly's script, compressed: base64 of gzip, a third of its size."""
+    found = find_spec("plotly")
+    assert found is not None
+    assert found.origin is not None
+    script = (Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes()
+    return base64.b64encode(gzip.compress(script, mtime=0)).decode()
+
+
+# --------------------------------------------------------------------------------------------------------- data
+
+
+def data(content: Content, commands: Sequence[Sequence[str]]) -> dict[str, Any]:
+    """What the script draws: tables as columns, and how to draw them."""
+    rows = content.rows
+    filters = [c for c in FILTERED if c in rows and 1 < rows[c].nunique(dropna=False) <= MOST]
+    wanted = {"rows": {*IDENTITY, "reason", "status", *filters, *(c.name for c in content.columns)}}
+    wanted["rows"] |= {c.flag for c in content.columns}
+    for chart in content.charts:
+        wanted.setdefault(chart.table, {"row"}).update(_columns_of(chart))
+        wanted["rows"] |= _columns_of(chart)
+    sources = {"rows": rows, **content.tables}
+    tables = {name: {c: column(sources[name][c]) for c in sources[name] if c in wanted[name]} for name in wanted}
+    longest = max(map(len, commands), default=0)
+    words = [[line[i] if i < len(line) else "" for line in commands] for i in range(longest)]
+    return {
+        "tables": tables,
+        "columns": [asdict(c) for c in content.columns],
+        "charts": [asdict(chart) for chart in content.charts],
+        "looks": content.looks,
+        "filters": filters,
+        "identity": [c for c in IDENTITY if c in rows],
+        "command": {"head": reproduce.HEAD, "words": [column(pd.Series(part, dtype=object)) for part in words]},
+    }
+
+
+def _columns_of(chart: Chart) -> set[str]:
+    axes: list[Axis] = [*chart.x, *chart.y]
+    names = {name for axis in axes for name in (axis.column, axis.low, axis.high, axis.limit)}
+    return names | {chart.series, chart.facet, chart.line, chart.front, chart.level}
+
+
+def column(values: pd.Series) -> Any:
+    """Numbers as they are, None where there is none; texts as a list of the different ones and the place in it of each."""
+    if pd.api.types.is_bool_dtype(values) or not pd.api.types.is_numeric_dtype(values):
+        codes, unique = pd.factorize(values.astype(str))
+        return {"values": list(unique), "index": codes.tolist()}
+    return [_short(value) for value in values.tolist()]
+
+
+def _short(value: float) -> float | int | None:
+    if value is None or not math.isfinite(value):
+        return None
+    value = float(f"{value:.{DIGITS}g}")
+    return int(value) if value.is_integer() and abs(value) < 1e15 else value
+
+
+# -------------------------------------------------------------------------------------------------------- texts
+
+
+def _finding(text: str) -> str:
+    """The finding, each further part of it on a line of its own, in smaller letters."""
+    first, *rest = text.split("; ")
+    return escape(first) + "".join(f"<span>{escape(part)}</span>" for part in rest)
+
+
+def _answers(content: Content) -> str:
+    """What to use where, as a table."""
+    table = content.answers
+    if table.empty:
+        return ""
+    head = "".join(f'<th scope="col">{escape(str(name))}</th>' for name in table)
+    lines = (f"<tr>{''.join(f'<td>{escape(str(v))}</td>' for v in row)}</tr>" for row in table.to_numpy())
+    return (
+        f'<section id="answers"><h2>{escape(content.answers_title)}</h2><div class="scroll" tabindex="0">'
+        f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div></section>"
+    )
+
+
+def _made(record: Mapping[str, Any]) -> str:
+    """Machine, versions and configuration, as far as they are recorded."""
+    if not record:
+        return "<p>There is no run.json beside this page, so machine and versions are not known.</p>"
+    machine = record.get("machine") or {}
+    facts = {
+        "command": record.get("command"),
+        "finished": record.get("finished"),
+        "duration": f"{record.get('duration_s')} s",
+        "machine": ", ".join(_texts(machine.get("processor"), f"{machine.get('cores')} cores", machine.get("system"))),
+        "load average": ", ".join(f"{load:.2f}" for load in machine.get("load_average") or []),
+        "commit": record.get("git_commit"),
+        "versions": ", ".join(
+            _texts(
+                f"python {record.get('python')}", *(f"{k} {v}" for k, v in (record.get("versions") or {}).items() if v)
+            )
+        ),
+    }
+    terms = "".join(f"<dt>{escape(k)}</dt><dd>{escape(str(v))}</dd>" for k, v in facts.items() if v)
+    config = escape(json.dumps(record.get("config"), indent=1))
+    return f'<dl>{terms}</dl><h3>Configuration</h3><pre tabindex="0">{config}</pre>'
+
+
+def _texts(*values: Any) -> Iterable[str]:
+    return (str(value) for value in values if value)

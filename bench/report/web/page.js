@@ -1,0 +1,651 @@
+/* Filters, charts, the table and the selected cell of a page, drawn from the columns in #data.
+
+   A table is columns by name: a list of numbers (null where there is none), or texts as {values, index}. The table
+   "rows" has a line per cell; the others have a column "row" with the place there that each of their lines is from.
+   Texts reach the page through textContent or plotted() alone, so that none is taken for HTML. */
+"use strict";
+
+const page = JSON.parse(document.getElementById("data").textContent);
+const rowCount = size("rows");
+const PANELS = 4; // most panels of a chart that are drawn at once
+const FIRST = 60, MORE = 240; // rows of the table at first, and with every "Show more"
+const GLYPHS = {
+  circle: "●", square: "■", diamond: "◆", "triangle-up": "▲", "triangle-down": "▼", cross: "✚", x: "✖", star: "★",
+};
+const state = { chosen: {}, find: "", sort: null, limit: FIRST, selected: -1, theme: "auto" };
+let visible = new Uint8Array(rowCount).fill(1);
+let searchable = null;
+
+// ------------------------------------------------------------------------------------------------------ columns
+
+function size(table) {
+  const column = Object.values(page.tables[table])[0];
+  return (column.index || column).length;
+}
+
+/* A function from a line of a table to its value in a column, looked up in "rows" where the table has no such column. */
+function reader(table, name) {
+  const key = table + " " + name;
+  if (!readers.has(key)) readers.set(key, readerOf(table, name));
+  return readers.get(key);
+}
+
+const readers = new Map();
+
+function readerOf(table, name) {
+  const column = page.tables[table][name];
+  if (column) return column.index ? (i) => column.values[column.index[i]] : (i) => column[i];
+  if (table === "rows") return () => null;
+  const row = page.tables[table].row;
+  const read = reader("rows", name);
+  return (i) => read(row[i]);
+}
+
+const rowOf = (table) => (table === "rows" ? (i) => i : (i) => page.tables[table].row[i]);
+
+function element(tag, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children.filter((child) => child !== null));
+  return made;
+}
+
+// ------------------------------------------------------------------------------------------------------ numbers
+
+function number(value) {
+  if (value === null || value === undefined) return "-";
+  if (value === 0) return "0";
+  const size = Math.abs(value);
+  if (size >= 1e-3 && size < 1e5) return String(Number(value.toPrecision(3)));
+  return value.toExponential(2).replace(/\.?0+e/, "e").replace("e+", "e");
+}
+
+function exact(value) {
+  if (value === null || value === undefined) return "-";
+  if (typeof value !== "number" || value === 0) return String(value);
+  const size = Math.abs(value);
+  return size >= 1e-3 && size < 1e5 ? String(value) : value.toExponential().replace("e+", "e");
+}
+
+function duration(seconds) {
+  if (seconds === null) return "-";
+  if (seconds < 0.9995e-3) return number(seconds * 1e6) + " µs";
+  return seconds < 0.9995 ? number(seconds * 1e3) + " ms" : number(seconds) + " s";
+}
+
+function shownAs(column, row) {
+  const value = reader("rows", column.name)(row);
+  if (column.kind === "text") return value === null ? "" : String(value);
+  if (column.kind === "seconds") return duration(value);
+  if (column.kind === "limit" && value !== null && reader("rows", column.flag)(row)) return "0 (< " + number(value) + ")";
+  return page.identity.includes(column.name) ? exact(value) : number(value);
+}
+
+/* A text as Plotly shows it literally: it takes a few tags for markup. */
+const plotted = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+
+// ------------------------------------------------------------------------------------------------------ filters
+
+function buildFilters() {
+  const place = document.getElementById("filters");
+  for (const name of page.filters) {
+    const read = reader("rows", name);
+    const counts = new Map();
+    for (let i = 0; i < rowCount; i++) counts.set(read(i), (counts.get(read(i)) || 0) + 1);
+    const values = [...counts.keys()];
+    if (typeof values.find((value) => value !== null) === "number") values.sort((a, b) => a - b);
+    const summary = element("summary", { textContent: name.replace(/_/g, " ") });
+    const box = element("details", {}, summary);
+    const inputs = values.map((value) => element("input", { type: "checkbox", checked: true }));
+    const update = () => {
+      const kept = values.filter((_, k) => inputs[k].checked);
+      const all = kept.length === values.length;
+      if (all) delete state.chosen[name];
+      else state.chosen[name] = new Set(kept);
+      box.classList.toggle("active", !all);
+      summary.textContent = name.replace(/_/g, " ") + (all ? "" : ` ${kept.length}/${values.length}`);
+      refresh();
+    };
+    const all = element("button", { type: "button", textContent: "all" });
+    const none = element("button", { type: "button", textContent: "none" });
+    const set = (checked) => () => { inputs.forEach((input) => (input.checked = checked)); update(); };
+    all.addEventListener("click", set(true));
+    none.addEventListener("click", set(false));
+    const labels = values.map((value, k) => {
+      inputs[k].addEventListener("change", update);
+      inputs[k].dataset.value = String(value);
+      const text = element("span", { textContent: value === "" ? "(default)" : exact(value) });
+      return element("label", {}, inputs[k], text, element("small", { textContent: counts.get(value) }));
+    });
+    box.dataset.column = name;
+    box.reset = () => inputs.forEach((input) => (input.checked = true));
+    box.update = update;
+    box.append(element("fieldset", { ariaLabel: name }, all, none, ...labels));
+    place.append(box);
+  }
+  document.addEventListener("click", (event) => {
+    for (const box of place.children) if (!box.contains(event.target)) box.open = false;
+  });
+  document.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape") return;
+    for (const box of place.children) {
+      if (box.open) { box.open = false; box.querySelector("summary").focus(); }
+    }
+  });
+  document.getElementById("clear").addEventListener("click", () => {
+    state.chosen = {};
+    state.find = document.getElementById("find").value = "";
+    for (const box of place.children) box.reset();
+    for (const box of place.children) box.update();
+  });
+  document.getElementById("find").addEventListener("input", (event) => {
+    state.find = event.target.value.trim().toLowerCase();
+    refresh();
+  });
+}
+
+function applyFilters() {
+  const tests = Object.entries(state.chosen).map(([name, kept]) => [reader("rows", name), kept]);
+  if (state.find && !searchable) {
+    searchable = Array.from({ length: rowCount }, (_, i) =>
+      page.columns.map((column) => shownAs(column, i)).join(" ").toLowerCase());
+  }
+  let count = 0;
+  for (let i = 0; i < rowCount; i++) {
+    visible[i] = tests.every(([read, kept]) => kept.has(read(i))) && (!state.find || searchable[i].includes(state.find));
+    count += visible[i];
+  }
+  document.getElementById("shown").textContent = `${count} of ${rowCount} cells shown`;
+}
+
+function refresh() {
+  const started = performance.now();
+  applyFilters();
+  state.limit = FIRST;
+  drawTable();
+  markDirty();
+  document.documentElement.dataset.filtered = (performance.now() - started).toFixed(1);
+}
+
+// ------------------------------------------------------------------------------------------------------- charts
+
+const charts = page.charts.map((chart) => ({ ...chart, xAxis: chart.x[0], yAxis: chart.y[0], only: "", dirty: true }));
+let observer = null;
+
+function buildCharts() {
+  const place = document.getElementById("charts");
+  observer = new IntersectionObserver((entries) => {
+    for (const entry of entries) {
+      const chart = charts.find((one) => one.section === entry.target);
+      chart.near = entry.isIntersecting;
+    }
+    requestAnimationFrame(drawNext);
+  }, { rootMargin: "300px" });
+  for (const chart of charts) {
+    chart.section = element("section", { className: "chart" },
+      element("h2", { textContent: chart.title }), element("p", { textContent: chart.text }));
+    chart.options = element("div", { className: "options" });
+    chart.legend = element("ul", { className: "legend" });
+    chart.panels = element("div", { className: "panels" });
+    if (chart.x.length > 1) chart.options.append(choice(chart, "x axis", "xAxis", chart.x));
+    if (chart.y.length > 1) chart.options.append(choice(chart, "y axis", "yAxis", chart.y));
+    chart.note = element("span", { className: "hint" });
+    chart.picker = element("select");
+    chart.picker.addEventListener("change", () => { chart.only = chart.picker.value; drawChart(chart); });
+    chart.pick = element("label", { hidden: true }, "panel ", chart.picker);
+    chart.options.append(chart.pick, chart.note);
+    chart.section.append(chart.options, chart.legend, chart.panels);
+    place.append(chart.section);
+    observer.observe(chart.section);
+  }
+}
+
+function choice(chart, label, property, axes) {
+  const select = element("select", {}, ...axes.map((axis, k) => element("option", { value: k, textContent: axis.label })));
+  select.addEventListener("change", () => { chart[property] = axes[Number(select.value)]; drawChart(chart); });
+  return element("label", {}, label + " ", select);
+}
+
+/* Charts in sight are drawn one a frame, so that the page answers meanwhile; the others when they come into it. */
+function markDirty() {
+  for (const chart of charts) chart.dirty = true;
+  requestAnimationFrame(drawNext);
+}
+
+function drawNext() {
+  const chart = charts.find((one) => one.near && one.dirty);
+  if (!chart || !window.Plotly) return;
+  drawChart(chart);
+  requestAnimationFrame(drawNext);
+}
+
+function dark() {
+  if (state.theme !== "auto") return state.theme === "dark";
+  return matchMedia("(prefers-color-scheme: dark)").matches;
+}
+
+const LOST = { colour: ["#757575", "#9a9a9a"], symbol: "circle", dash: "solid" };
+const looks = (name) => page.looks[name] || LOST;
+const colour = (name) => looks(name).colour[dark() ? 1 : 0];
+
+function drawChart(chart) {
+  if (!window.Plotly) return;
+  chart.dirty = false;
+  const facets = chart.level ? mapPanels(chart) : pointPanels(chart);
+  const names = [...facets.keys()];
+  chart.pick.hidden = names.length <= PANELS;
+  if (!chart.pick.hidden) {
+    const label = `the first ${PANELS} of ${names.length}`;
+    chart.picker.replaceChildren(element("option", { value: "", textContent: label }),
+      ...names.map((name) => element("option", { value: name, textContent: name })));
+    if (!facets.has(chart.only)) chart.only = "";
+    chart.picker.value = chart.only;
+  } else chart.only = "";
+  const drawn = chart.only ? [chart.only] : names.slice(0, PANELS);
+  chart.note.textContent = names.length ? "" : "nothing to draw among the cells shown";
+  chart.panels.dataset.count = drawn.length;
+  const range = chart.level ? null : ranges(chart, drawn.map((name) => facets.get(name)));
+  while (chart.panels.children.length > drawn.length) {
+    Plotly.purge(chart.panels.lastChild.lastChild);
+    chart.panels.lastChild.remove();
+  }
+  drawn.forEach((name, k) => {
+    if (!chart.panels.children[k]) {
+      const plot = element("div", { className: "plot" });
+      chart.panels.append(element("div", {}, element("h3"), plot));
+    }
+    const [title, plot] = chart.panels.children[k].children;
+    title.textContent = name;
+    const [traces, layout] = chart.level ? mapFigure(chart, facets.get(name)) : pointFigure(chart, facets.get(name), range);
+    Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true });
+    plot.removeAllListeners("plotly_click");
+    plot.on("plotly_click", (event) => {
+      const row = event.points[0].customdata;
+      if (Number.isInteger(row)) select(row);
+    });
+  });
+  drawLegend(chart, drawn.map((name) => facets.get(name)));
+}
+
+function drawLegend(chart, panels) {
+  const names = new Set();
+  for (const panel of panels) for (const name of panel.names) names.add(name);
+  const ordered = Object.keys(page.looks).filter((name) => names.has(name));
+  chart.legend.replaceChildren(...(chart.share ? [] : ordered).map((name) => {
+    const look = looks(name);
+    const mark = element("b", { textContent: chart.level ? look.letter || " " : GLYPHS[look.symbol] });
+    if (chart.level) { mark.className = "level"; mark.style.background = colour(name); mark.style.color = inkOn(colour(name)); }
+    else mark.style.color = colour(name);
+    return element("li", {}, mark, " " + (look.meaning || name));
+  }));
+}
+
+const inkOn = (ground) => {
+  const [r, g, b] = [1, 3, 5].map((k) => parseInt(ground.slice(k, k + 2), 16));
+  return 0.3 * r + 0.59 * g + 0.11 * b > 130 ? "#000000" : "#ffffff";
+};
+
+/* The points to draw: panels by name, in each the points of a line or series, and all its points by what they compete in. */
+function pointPanels(chart) {
+  const [x, y] = [chart.xAxis, chart.yAxis];
+  const read = (name) => (name ? reader(chart.table, name) : () => null);
+  const [X, Y, low, high, limit] = [x.column, y.column, y.low, y.high, y.limit].map(read);
+  const [series, facet, line, front] = [chart.series, chart.facet, chart.line, chart.front].map(read);
+  const row = rowOf(chart.table);
+  const panels = new Map();
+  for (let i = 0, count = size(chart.table); i < count; i++) {
+    const point = { row: row(i), x: X(i), y: Y(i) };
+    if (!visible[point.row] || point.x === null || point.y === null) continue;
+    if ((x.log && point.x <= 0) || (y.log && point.y <= 0)) continue;
+    Object.assign(point, { low: low(i), high: high(i), limit: limit(i), series: series(i) });
+    const name = facet(i) || "";
+    if (!panels.has(name)) panels.set(name, { lines: new Map(), fronts: new Map(), names: new Set() });
+    const panel = panels.get(name);
+    panel.names.add(point.series);
+    append(panel.lines, chart.line ? line(i) : point.series, point);
+    if (chart.front) append(panel.fronts, front(i), point);
+  }
+  return panels;
+}
+
+function append(map, key, value) {
+  if (map.has(key)) map.get(key).push(value);
+  else map.set(key, [value]);
+}
+
+/* One range of each axis for all panels that are drawn. */
+function ranges(chart, panels) {
+  const find = (axis, values) => {
+    if (!values.length) return undefined;
+    const scaled = axis.log ? values.map(Math.log10) : values;
+    const [first, last] = [scaled.reduce((a, b) => Math.min(a, b)), scaled.reduce((a, b) => Math.max(a, b))];
+    const margin = Math.max(0.05 * (last - first), axis.log ? 0.08 : 1e-9);
+    return [first - margin, last + margin];
+  };
+  const points = panels.flatMap((panel) => [...panel.lines.values()].flat());
+  const marks = points.length ? Object.values(chart.marks) : [];
+  return { x: find(chart.xAxis, [...points.map((p) => p.x), ...marks]), y: find(chart.yAxis, points.map((p) => p.y)) };
+}
+
+function pointFigure(chart, panel, range) {
+  const traces = [];
+  const joined = Boolean(chart.line);
+  for (const points of panel.lines.values()) traces.push(trace(chart, points, joined));
+  if (chart.front) traces.push(...frontTraces(panel));
+  const chosen = [...panel.lines.values()].flat().filter((point) => point.row === state.selected);
+  if (chosen.length) traces.push(rings(chosen, 17, 3, colour("")));
+  const ink = dark() ? "#e9ecef" : "#16191d";
+  const shapes = [], annotations = [];
+  if (range.y && chart.yAxis.log && chart.yAxis.above_one && range.y[1] > 0) {
+    shapes.push({ type: "rect", xref: "paper", x0: 0, x1: 1, y0: 1, y1: 10 ** range.y[1], layer: "below",
+      fillcolor: dark() ? "#ffffff14" : "#00000010", line: { width: 0 } });
+    annotations.push({ xref: "paper", x: 0.01, yref: "paper", y: 1, yanchor: "top", xanchor: "left", showarrow: false,
+      text: chart.yAxis.above_one, font: { size: 10 } });
+  }
+  for (const [name, value] of Object.entries(chart.marks)) {
+    shapes.push({ type: "line", x0: value, x1: value, yref: "paper", y0: 0, y1: 1, line: { dash: "dash", width: 1, color: ink } });
+    annotations.push({ x: chart.xAxis.log ? Math.log10(value) : value, yref: "paper", y: 1, yanchor: "bottom",
+      text: plotted(name), showarrow: false, font: { size: 10 } });
+  }
+  return [traces, { ...frame(chart.xAxis, chart.yAxis, range), shapes, annotations }];
+}
+
+function trace(chart, points, joined) {
+  const look = looks(points[0].series);
+  const ink = colour(points[0].series);
+  const symbol = points.some((p) => p.limit) ? points.map((p) => look.symbol + (p.limit ? "-open" : "")) : look.symbol;
+  const made = {
+    type: "scatter", mode: joined ? "lines+markers" : "markers", x: points.map((p) => p.x), y: points.map((p) => p.y),
+    customdata: points.map((p) => p.row), text: points.map((p) => hover(chart, p)), hovertemplate: "%{text}<extra></extra>",
+    marker: { color: ink, symbol, size: points.length > 500 ? 6 : 8 }, line: { color: ink, dash: look.dash, width: 1.5 },
+    opacity: joined ? 1 : 0.85,
+  };
+  if (joined && chart.yAxis.high) {
+    const bar = (p, end) => (p.limit || p[end] === null ? 0 : Math.abs(p[end] - p.y));
+    made.error_y = { type: "data", array: points.map((p) => bar(p, "high")), arrayminus: points.map((p) => bar(p, "low")),
+      color: ink, thickness: 1, width: 0 };
+  }
+  return made;
+}
+
+const tellingColumns = page.columns.filter((column) => page.identity.includes(column.name) && !column.name.startsWith("estimator"));
+const told = []; // of each row, once it was drawn, which cell it is
+
+function hover(chart, point) {
+  const { xAxis, yAxis } = chart;
+  const interval = point.low !== null && point.high !== null && !point.limit
+    ? ` [${number(point.low)}, ${number(point.high)}]` : "";
+  if (!told[point.row]) told[point.row] = tellingColumns.map((c) => plotted(`${c.label} ${shownAs(c, point.row)}`)).join("<br>");
+  return [`<b>${plotted(point.series)}</b>`, told[point.row],
+    `${plotted(xAxis.label)}: ${number(point.x)}`,
+    `${plotted(yAxis.label)}: ${point.limit ? "&lt; " : ""}${number(point.y)}${interval}`].join("<br>");
+}
+
+function rings(points, size, width, ink) {
+  return { type: "scatter", mode: "markers", x: points.map((p) => p.x), y: points.map((p) => p.y), hoverinfo: "skip",
+    marker: { symbol: "circle-open", size, color: ink, line: { width } } };
+}
+
+/* Of each problem the points that no other beats in both; joined where there are few problems. */
+function frontTraces(panel) {
+  const grey = dark() ? "#9aa3ab" : "#8a8a8a";
+  const found = [];
+  const all = [];
+  for (const points of panel.fronts.values()) {
+    let best = Infinity;
+    const kept = [...points].sort((a, b) => a.x - b.x || a.y - b.y).filter((p) => p.y < best && ((best = p.y), true));
+    all.push(...kept);
+    if (panel.fronts.size > 3) continue;
+    found.push({ type: "scatter", mode: "lines", x: kept.map((p) => p.x), y: kept.map((p) => p.y), hoverinfo: "skip",
+      line: { shape: "hv", color: grey, width: 2 } });
+  }
+  return [...found, rings(all, 13, 1, grey)];
+}
+
+function frame(x, y, range) {
+  const style = (axis, limits) => ({
+    title: { text: plotted(axis.label), standoff: 6 }, type: axis.log ? "log" : "linear", range: limits, automargin: true,
+    gridcolor: dark() ? "#363c43" : "#e3e6e9", zeroline: false, ...ticks(axis, limits),
+  });
+  return { ...ground(), xaxis: style(x, range.x), yaxis: style(y, range.y) };
+}
+
+/* Of a log axis: whole decades, or 1, 2 and 5 of each where there are few. */
+function ticks(axis, limits) {
+  if (!axis.log || !limits) return {};
+  const [first, last] = limits;
+  const step = Math.max(1, Math.round((last - first) / 5));
+  const within = last - first > 1.6 ? [1] : [1, 2, 5];
+  const tickvals = [];
+  for (let decade = Math.floor(first); decade <= last; decade++) {
+    if (decade % step === 0) for (const k of within) tickvals.push(Number((k * 10 ** decade).toPrecision(3)));
+  }
+  const ticktext = tickvals.map((value) => number(value).replace(/^1e(.*)$/, "10<sup>$1</sup>"));
+  return { tickvals, ticktext };
+}
+
+function ground() {
+  return {
+    paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", showlegend: false, margin: { l: 10, r: 14, t: 18, b: 10 },
+    font: { family: "system-ui, sans-serif", size: 12, color: dark() ? "#e9ecef" : "#16191d" }, hovermode: "closest",
+    dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom", hoverlabel: { align: "left" },
+  };
+}
+
+/* Maps: panels by name with their lines' places, sorted. */
+function mapPanels(chart) {
+  const [X, Y, level, facet] = [chart.xAxis.column, chart.yAxis.column, chart.level, chart.facet].map((name) =>
+    name ? reader(chart.table, name) : () => "");
+  const row = rowOf(chart.table);
+  const panels = new Map();
+  for (let i = 0, count = size(chart.table); i < count; i++) {
+    if (!visible[row(i)] || !level(i)) continue;
+    const name = facet(i) || "";
+    if (!panels.has(name)) panels.set(name, { places: new Map(), names: new Set(), x: new Set(), y: new Set() });
+    const panel = panels.get(name);
+    const [x, y] = [exact(X(i)), exact(Y(i))];
+    panel.x.add(x);
+    panel.y.add(y);
+    panel.names.add(level(i));
+    append(panel.places, JSON.stringify([x, y]), { row: row(i), level: level(i) });
+  }
+  return panels;
+}
+
+function mapFigure(chart, panel) {
+  const names = Object.keys(page.looks);
+  const order = (values) => [...values].sort((a, b) => a - b || (a < b ? -1 : 1));
+  const [xs, ys] = [order(panel.x), order(panel.y)];
+  const grid = (make) => ys.map((y) => xs.map((x) => {
+    const found = panel.places.get(JSON.stringify([x, y]));
+    return found ? make(found, x, y) : "";
+  }));
+  const worst = (found) => found.reduce((a, b) => (names.indexOf(b.level) > names.indexOf(a.level) ? b : a));
+  const share = (found) => found.filter((one) => one.level === chart.share).length / found.length;
+  const k = names.length;
+  const scale = chart.share ? [[0, dark() ? "#14171a" : "#ffffff"], [1, "#0072B2"]]
+    : names.flatMap((name, n) => [[n / k, colour(name)], [(n + 1) / k, colour(name)]]);
+  const text = (found) => (chart.share ? Math.round(100 * share(found)) + "%" : looks(worst(found).level).letter || "");
+  const told = (found, x, y) => [`<b>${plotted(chart.share ? text(found) : worst(found).level)}</b>`,
+    `${plotted(chart.xAxis.label)} ${plotted(x)}`, `${plotted(chart.yAxis.label)} ${plotted(y)}`,
+    chart.share ? `${found.length} cells` : plotted(reader("rows", "reason")(worst(found).row) || "")].join("<br>");
+  const made = {
+    type: "heatmap", x: xs.map(plotted), y: ys.map(plotted), z: grid((found) => (chart.share ? share(found) : names.indexOf(worst(found).level))),
+    text: grid(text), texttemplate: "%{text}", customdata: grid((found) => (chart.share ? null : worst(found).row)),
+    hovertext: grid(told), hovertemplate: "%{hovertext}<extra></extra>", colorscale: scale, showscale: false, xgap: 1, ygap: 1,
+    zmin: chart.share ? 0 : -0.5, zmax: chart.share ? 1 : k - 0.5,
+  };
+  const axis = (from) => ({ title: { text: plotted(from.label), standoff: 6 }, type: "category", automargin: true, showgrid: false });
+  return [[made], { ...ground(), xaxis: axis(chart.xAxis), yaxis: axis(chart.yAxis) }];
+}
+
+// -------------------------------------------------------------------------------------------------------- table
+
+const [head, body] = document.querySelectorAll("#table thead, #table tbody");
+
+function buildTable() {
+  head.append(element("tr", {}, ...page.columns.map((column) => {
+    const button = element("button", { type: "button", textContent: column.label });
+    button.addEventListener("click", () => sortBy(column.name));
+    return element("th", { scope: "col", className: column.kind === "text" ? "" : "number" }, button);
+  })));
+  document.getElementById("more").addEventListener("click", () => { state.limit += MORE; drawTable(); });
+  body.addEventListener("click", (event) => {
+    const line = event.target.closest("tr");
+    if (line && !getSelection().toString()) select(Number(line.dataset.row));
+  });
+  body.addEventListener("keydown", (event) => {
+    const line = event.target.closest("tr");
+    const next = { ArrowDown: line.nextElementSibling, ArrowUp: line.previousElementSibling }[event.key];
+    if (next) next.focus();
+    if (event.key === "Enter" || event.key === " ") select(Number(line.dataset.row));
+    if (next || event.key === " ") event.preventDefault();
+  });
+}
+
+function sortBy(name) {
+  const again = state.sort && state.sort.name === name;
+  state.sort = { name, up: again ? !state.sort.up : true };
+  page.columns.forEach((column, k) => {
+    const mine = column.name === name;
+    if (mine) head.rows[0].cells[k].ariaSort = state.sort.up ? "ascending" : "descending";
+    else head.rows[0].cells[k].removeAttribute("aria-sort");
+  });
+  drawTable();
+}
+
+function order() {
+  const found = [];
+  for (let i = 0; i < rowCount; i++) if (visible[i]) found.push(i);
+  if (!state.sort) return found;
+  const read = reader("rows", state.sort.name);
+  const sign = state.sort.up ? 1 : -1;
+  const values = found.map((i) => [read(i), i]);
+  values.sort(([a, i], [b, j]) => {
+    if (a === b) return i - j;
+    if (a === null || b === null) return a === null ? 1 : -1; // what has no value comes last either way
+    return sign * (a < b ? -1 : 1);
+  });
+  return values.map(([, i]) => i);
+}
+
+function drawTable() {
+  const found = order();
+  const status = reader("rows", "status");
+  body.replaceChildren(...found.slice(0, state.limit).map((i) => {
+    const line = element("tr", { tabIndex: 0, ariaSelected: String(i === state.selected) }, ...page.columns.map((column) => {
+      const cell = element("td", { textContent: shownAs(column, i), className: column.kind === "text" ? "" : "number" });
+      if (column.name === "status" && status(i) !== "ok") cell.className = "failed";
+      if (column.name === "reason") cell.className = "reason";
+      return cell;
+    }));
+    line.dataset.row = i;
+    return line;
+  }));
+  const more = document.getElementById("more");
+  more.hidden = found.length <= state.limit;
+  more.textContent = `Show more (${Math.min(state.limit, found.length)} of ${found.length} shown)`;
+}
+
+// --------------------------------------------------------------------------------------------- the selected cell
+
+function select(row) {
+  state.selected = row;
+  for (const line of body.rows) line.ariaSelected = String(Number(line.dataset.row) === row);
+  markDirty();
+  const cell = document.getElementById("cell");
+  cell.hidden = row < 0;
+  if (row < 0) return;
+  const close = element("button", { type: "button", textContent: "Close" });
+  close.addEventListener("click", () => {
+    select(-1);
+    const line = body.querySelector(`tr[data-row="${row}"]`);
+    if (line) line.focus({ preventScroll: true });
+  });
+  const fact = (label, value) => element("div", {}, element("dt", { textContent: label }), element("dd", { textContent: value }));
+  const identity = page.identity.map((name) => [name, reader("rows", name)(row)])
+    .filter(([, value]) => value !== null && value !== "" && value !== "none");
+  const results = page.columns.filter((column) => !page.identity.includes(column.name) && column.name !== "reason");
+  const reason = reader("rows", "reason")(row);
+  const command = commandOf(row);
+  cell.replaceChildren(
+    element("div", { className: "top" }, element("h2", { textContent: "The selected cell" }), close),
+    element("dl", {}, ...identity.map(([name, value]) => fact(name.replace(/_/g, " "), exact(value))),
+      ...results.map((column) => fact(column.label, shownAs(column, row)))),
+    reason ? element("p", { className: "failed", textContent: reason }) : null,
+    ...(command ? [element("p", { textContent: "It alone is run again, to the same numbers, by" }), copyable(command)]
+      : page.command.words.length ? [element("p", { textContent: "The experiment as configured when this page was written has no such cell any more." })] : []),
+  );
+  cell.focus({ preventScroll: true });
+}
+
+function commandOf(row) {
+  const words = page.command.words.map((column) => column.values[column.index[row]]).filter(Boolean);
+  return words.length ? [page.command.head, ...words].join(" ") : "";
+}
+
+function copyable(text) {
+  const code = element("pre", { textContent: text, id: "command", tabIndex: 0 });
+  const button = element("button", { type: "button", textContent: "Copy" });
+  button.addEventListener("click", () => {
+    getSelection().selectAllChildren(code);
+    button.textContent = document.execCommand("copy") ? "Copied" : "Press Ctrl+C";
+  });
+  return element("div", {}, code, button);
+}
+
+// --------------------------------------------------------------------------------------------------------- theme
+
+function applyTheme(theme) {
+  state.theme = theme;
+  if (theme === "auto") delete document.documentElement.dataset.theme;
+  else document.documentElement.dataset.theme = theme;
+  document.getElementById("theme").textContent = `Theme: ${theme}`;
+  markDirty();
+}
+
+function buildTheme() {
+  const next = { auto: "dark", dark: "light", light: "auto" };
+  document.getElementById("theme").addEventListener("click", () => applyTheme(next[state.theme]));
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", markDirty);
+  let before = state.theme;
+  addEventListener("beforeprint", () => {
+    before = state.theme;
+    applyTheme("light");
+    for (const chart of charts) if (chart.dirty) drawChart(chart);
+    document.querySelector("#made details").open = true;
+  });
+  addEventListener("afterprint", () => applyTheme(before));
+}
+
+// --------------------------------------------------------------------------------------------------------- start
+
+/* Plotly's script out of the page: base64 of gzip. */
+async function inflated(id) {
+  const letters = atob(document.getElementById(id).textContent);
+  const bytes = new Uint8Array(letters.length);
+  for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
+  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
+}
+
+/* When the charts in sight are drawn. */
+async function settled() {
+  do await new Promise(requestAnimationFrame); while (charts.some((chart) => chart.near && chart.dirty));
+}
+
+async function start() {
+  buildTheme();
+  buildFilters();
+  buildTable();
+  refresh();
+  buildCharts();
+  if (!window.DecompressionStream) {
+    document.getElementById("charts").prepend(element("p", { textContent: "Charts need a browser of 2023 or later." }));
+    return;
+  }
+  document.head.append(element("script", { textContent: await inflated("plotly") }));
+  markDirty();
+  await settled();
+  document.documentElement.dataset.loaded = performance.now().toFixed(0);
+}
+
+start();
