@@ -78,6 +78,8 @@ class Experiment:
     """Per axis, named values to draw as lines in the charts."""
     reference_samples: int = 1 << 18
     reference_tolerance: float = 0.005
+    compile_cache: Path | None = None
+    """Where compiled programs are kept between runs."""
     timing: bool | None = None
     """Whether cells are timed, each alone on the machine; None for what the study asks for."""
     referenced: bool = True
