@@ -169,6 +169,7 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         question=str(config["question"] or ""),
         study=str(config["study"]),
         marks=_table(config, "marks"),
+        compile_time=registry.coerce(bool, config["compile_time"], "compile_time"),
         reference_samples=budget,
         reference_tolerance=tolerance,
         compile_cache=_compile_cache(config["compile_cache"]),

@@ -101,10 +101,10 @@ def truth_of(found: Reference) -> statistics.Truth:
 
 def write(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]) -> list[Path]:
     """Tables, charts and the printed table."""
-    from bench.report import charts, tables, terminal, views
+    from bench.report import charts, fastest, tables, terminal, views
 
     names = sorted(registry.entries()["estimators"])
     smoothing = views.smoothing_parameters()
     paths = tables.write(rows, experiment.directory) + charts.write(experiment, rows, axes, names, smoothing)
     terminal.show(experiment, rows, axes, smoothing)
-    return paths
+    return paths + fastest.write(experiment, rows)
