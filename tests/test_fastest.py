@@ -35,7 +35,7 @@ def rows(bias=0.0, resolved=None, **values):
 
 def line(**values):
     found = rows(**values)
-    return Line("e", "", {"b": True}, found.set_index("samples"), {"b": 1.0}, 0)
+    return Line("e", "", {"b": True}, found.set_index("samples"), {"b": 1.0}, frozenset(), 0)
 
 
 @pytest.mark.parametrize(
