@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import itertools
 import os
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from bench.errors import UserError, unknown
+from bench.errors import StorageError, UserError, unknown
 
 if TYPE_CHECKING:
-    from bench.grid import Cell, Experiment
+    from bench.grid import Experiment
     from bench.runner import Planned
     from bench.store import Store
 
@@ -32,8 +33,12 @@ Settings: scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[.
   sweep.AXIS=[..]  scene.NAME.PARAMETER=..  (also contact. integrator. backend. estimator.)
   samples=N repeats=R seed=S results_dir=DIR name=FOLDER
 
+  workers=N timeout=10m memory=4g on_error=stop timing=false retry=[timeout]    --quiet: no progress
+
 Exit status: 0 every cell has a row that is not 'error'; 1 some cell failed unexpectedly; 2 bad input.
 """
+
+QUIET = "--quiet"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -47,9 +52,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, the reader has gone; nothing may be written at exit
         return 0
+    except OSError as error:
+        where = f"'{error.filename}': " if error.filename else ""
+        print(f"bench: {where}{error.strerror or error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
-        again = " ".join(["python -m bench", *words])
-        print(f"\nbench: stopped; finished cells are stored, go on with: {again}", file=sys.stderr)
+        print("\nbench: stopped", file=sys.stderr)
         return 130
 
 
@@ -85,7 +93,7 @@ def _dispatch(words: list[str]) -> int:
 def _prepare(words: list[str]) -> tuple[Experiment, Store, list[Planned]]:
     from bench import config
 
-    return _planned(config.load(words))
+    return _planned(config.load([word for word in words if word != QUIET]))
 
 
 def _planned(experiment: Experiment) -> tuple[Experiment, Store, list[Planned]]:
@@ -107,18 +115,37 @@ def _execute(experiment: Experiment, store: Store, planned: list[Planned], words
     from bench.report import progress
 
     started = time.time()
-    waiting = [item for item in planned if not item.stored]
+    progress.print_versions(planned, experiment.execution.versions)
     store.prepare()
-    with progress.bar(experiment.name, len(planned), len(planned) - len(waiting)) as advance:
-
-        def watch(cell: Cell, row: dict[str, Any]) -> None:
-            advance(row)
-
+    with progress.of(experiment.name, planned, QUIET in words) as shown:
         try:
-            runner.run(experiment, planned, store, watch)
+            runner.run(experiment, planned, store, shown.finished, shown.working)
+        except (KeyboardInterrupt, runner.Stopped) as end:
+            return _ended(end, store, planned, words)
         finally:
-            store.compact()
-    return _write(experiment, store, words, time.time() - started, [item.cell.key for item in planned])
+            _compact(store, planned)
+    return _write(experiment, store, words, time.time() - started, planned)
+
+
+def _ended(end: BaseException, store: Store, planned: list[Planned], words: list[str]) -> int:
+    """Say why a run has ended early, what is stored and how to go on."""
+    keys = {item.cell.key for item in planned}
+    stored = int(store.load()["key"].isin(keys).sum())
+    why = "stopped" if isinstance(end, KeyboardInterrupt) else f"stopped after a failed cell ({end})"
+    again = shlex.join(["python", "-m", "bench", *words])
+    print(
+        f"\nbench: {why}; {stored} of {len(keys)} cells are stored in '{store.directory}', go on with: {again}",
+        file=sys.stderr,
+    )
+    return 130 if isinstance(end, KeyboardInterrupt) else 1
+
+
+def _compact(store: Store, planned: list[Planned]) -> None:
+    """Fold small files; a full disk is no reason to hide why a run has ended, and the rows are read from them as well."""
+    try:
+        store.compact([item.cell.key for item in planned])
+    except StorageError as error:
+        print(f"bench: {error}; every finished cell is stored all the same", file=sys.stderr)
 
 
 def _report(words: list[str]) -> int:
@@ -130,16 +157,20 @@ def _report(words: list[str]) -> int:
     return _write(experiment, store, words, 0.0, None)
 
 
-def _write(experiment: Experiment, store: Store, words: list[str], seconds: float, keys: list[str] | None) -> int:
+def _write(
+    experiment: Experiment, store: Store, words: list[str], seconds: float, planned: list[Planned] | None
+) -> int:
+    """Tables and charts, of the planned cells in their order or of all that is stored."""
     from bench import grid, report, studies
     from bench.report import web
+    from bench.store import ordered
 
     rows = store.load()
-    if keys is not None:
-        order = {key: index for index, key in enumerate(keys)}
-        rows = rows[rows["key"].isin(keys)].sort_values("key", key=lambda k: k.map(order)).reset_index(drop=True)
-    else:
+    if planned is None:
         rows = report.latest(rows)
+    else:
+        keys = [item.cell.key for item in planned]
+        rows = ordered(rows[rows["key"].isin(keys)], keys)
     if rows.empty:
         raise UserError(f"no rows are stored in '{store.directory}': run the experiment first")
     axes = grid.swept(experiment.sweep)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bench import registry
-from bench.errors import UserError, unknown
-from bench.grid import AXES, Choice, Experiment
+from bench.errors import STATUSES, UserError, unknown
+from bench.grid import AXES, Choice, Execution, Experiment
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 LISTS = tuple(AXES.values())
+SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+BYTES = {"k": 2.0**10, "m": 2.0**20, "g": 2.0**30}
 
 
 def config_dir() -> Path:
@@ -124,10 +127,13 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
             raise unknown("setting of reference", key, ("samples", "tolerance"))
     budget = registry.coerce(int, settings["samples"], "reference.samples")
     tolerance = registry.coerce(float, settings["tolerance"], "reference.tolerance")
-    if budget < 4096 or not tolerance > 0:
-        raise UserError("reference.samples must be at least 4096 and reference.tolerance greater than 0")
+    if budget < 256 or not tolerance > 0:
+        raise UserError("reference.samples must be at least 256 and reference.tolerance greater than 0")
+    timing = config["timing"]
     return Experiment(
         name=name,
+        timing=None if timing is None else registry.coerce(bool, timing, "timing"),
+        execution=_execution(config),
         choices=choices,
         values={group: _table(config, group) for group in AXES},
         sweep=_table(config, "sweep"),
@@ -139,6 +145,46 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         reference_tolerance=tolerance,
         **counts,
     )
+
+
+def _execution(config: Mapping[str, Any]) -> Execution:
+    workers = config["workers"]
+    if workers is not None and registry.coerce(int, workers, "workers") < 0:
+        raise UserError(f"workers={workers} must be at least 0, or null for the number of cores")
+    retry = config["retry"] if isinstance(config["retry"], list) else [config["retry"]]
+    return Execution(
+        workers=None if workers is None else registry.coerce(int, workers, "workers"),
+        timeout=_amount("timeout", config["timeout"], SECONDS, "600, 10m"),
+        memory=_whole(_amount("memory", config["memory"], BYTES, "4g, 500m")),
+        stop=_one_of("on_error", config["on_error"], ("continue", "stop")) == "stop",
+        versions=_one_of("versions", config["versions"], ("ignore", "warn", "rerun")),
+        retry=tuple(_one_of("retry", status, STATUSES) for status in retry if status is not None),
+    )
+
+
+def _one_of(key: str, value: Any, allowed: Sequence[str]) -> str:
+    if value not in allowed:
+        raise unknown(f"value for {key}:", value, allowed)
+    return str(value)
+
+
+def _amount(key: str, value: Any, units: Mapping[str, float], example: str) -> float | None:
+    """A positive number with one of the units, or None for no limit."""
+    if value is None:
+        return None
+    text = str(value).strip().lower()
+    number, unit = (text[:-1], text[-1:]) if text[-1:] in units else (text, "")
+    try:
+        amount = float(number) * units.get(unit, 1.0)
+    except ValueError:
+        amount = math.nan
+    if isinstance(value, bool) or not 0 < amount < math.inf:
+        raise UserError(f"{key}={value!r} must be an amount such as {example}, greater than 0, or null for no limit")
+    return amount
+
+
+def _whole(amount: float | None) -> int | None:
+    return None if amount is None else math.ceil(amount)
 
 
 def _table(config: Mapping[str, Any], key: str) -> dict[str, Any]:

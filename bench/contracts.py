@@ -47,6 +47,7 @@ __all__ = [
     "SampleMean",
     "Scene",
     "State",
+    "Trajectory",
     "Unsupported",
     "Usage",
     "param",
@@ -191,6 +192,10 @@ class MechanicalScene(Scene):
     """Factor on the velocity carried over each step (numerical damping). A field in scenes that have it."""
     restitution = 1.0
     """Normal velocity after an impact over that before, for impulse laws. A field in scenes that have it."""
+    needs_physics: ClassVar[bool] = False
+    """Whether the scene has no accelerations of its own, only a :meth:`mjcf` twin for backends that provide ``physics``."""
+    twin_difference: ClassVar[float] = 1e-9
+    """Relative difference that the costs of the twin may have from those of the scene's own program under ``penalty``."""
 
     horizon: int = param(100, "number of time steps", positive=True)
     dt: float = param(0.01, "length of a time step", "s", positive=True)
@@ -230,6 +235,14 @@ class MechanicalScene(Scene):
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
         """M^-1 J^T force for normal forces ``(n_contacts, B)`` [N], linear in them: ``(n_v, B)``."""
         raise NotImplementedError
+
+    def mjcf(self) -> str | None:
+        """The scene's twin for physics engines, as the content of an MJCF ``<mujoco>`` element, or None.
+
+        Its joints, slides and hinges, are q in order, its motors take u, and its contact pairs are the contacts. Time
+        step, solver and contact springs are the backend's to set; gravity is zero unless an ``<option>`` says otherwise.
+        """
+        return None
 
     friction = 0.0
     """Coulomb coefficient of the contacts under a force law. A field in scenes that have friction."""
@@ -334,6 +347,15 @@ class Integrator(Plugin):
 # ----------------------------------------------------------------------------------------- backends and problems
 
 
+class Trajectory(NamedTuple):
+    """What rollouts pass through, x = (q, v)."""
+
+    states: np.ndarray
+    """``(horizon + 1, n, B)``."""
+    controls: np.ndarray
+    """``(horizon, n_u, B)``."""
+
+
 class Jacobians(NamedTuple):
     """Derivatives of the step map x_{k+1} = F(x_k, u_k), x = (q, v), along rollouts."""
 
@@ -408,6 +430,10 @@ class Problem(ABC):
             return w / self.sigma
         return self._blocks(self._score, theta, w)
 
+    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
+        """States and controls along each rollout; raises :class:`Unsupported` where there are none."""
+        raise Unsupported("this backend shows no states")
+
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """States, controls and step Jacobians along each rollout; raises :class:`Unsupported` where there are none."""
         raise Unsupported("this backend gives no step Jacobians")
@@ -453,7 +479,11 @@ class Backend(Plugin):
 
     kind: ClassVar[str] = "backends"
     provides: ClassVar[frozenset[str]] = frozenset({"value", "grad", "score"})
-    """Capabilities, out of ``value``, ``grad``, ``score`` and ``root``."""
+    """Capabilities, out of ``value``, ``grad``, ``score``, ``root`` and ``physics``.
+
+    With ``physics`` the backend steps a scene's :meth:`~MechanicalScene.mjcf` twin by an integrator and a contact solver of
+    its own: its programs are not those of other backends, and have reference gradients of their own.
+    """
     compiles: ClassVar[bool] = False
     """Whether each new batch shape costs a compilation, so that estimates are best made one by one."""
     reference_rank: ClassVar[int | None] = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Literal, get_args
@@ -12,6 +13,10 @@ STATUSES: tuple[str, ...] = get_args(Status)
 
 class UserError(Exception):
     """Bad input. Its message says what was given, what is allowed and the nearest valid name."""
+
+
+class StorageError(UserError):
+    """Results that cannot be written or read; what was stored before stays."""
 
 
 class Unsupported(Exception):
@@ -25,3 +30,19 @@ def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:
     near = get_close_matches(text.lower(), [n.lower() for n in names], n=1, cutoff=0.4)
     hint = f"; did you mean '{next(n for n in names if n.lower() == near[0])}'?" if near else ""
     return UserError(f"unknown {what} '{text}'{hint} (allowed: {', '.join(names) or 'none'})")
+
+
+def failure(error: BaseException) -> dict[str, str]:
+    """Status and reason of an exception that a plugin raised: its message and the last lines of its traceback."""
+    if isinstance(error, Unsupported):
+        return {"status": "unsupported", "reason": str(error)}
+    lines, step = [], error.__traceback__
+    while step is not None:
+        code = step.tb_frame.f_code
+        lines.append(f"{os.path.basename(code.co_filename)}:{step.tb_lineno} in {code.co_name}")
+        step = step.tb_next
+    try:
+        said = " ".join(str(error).split())[:1000]
+    except Exception:
+        said = "(a message that cannot be printed)"
+    return {"status": "error", "reason": f"{type(error).__name__}: {said} ({' < '.join(reversed(lines[-3:]))})"}

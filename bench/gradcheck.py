@@ -20,6 +20,8 @@ RISE = 0.01
 """Relative error from which an end of the curve counts as risen."""
 WINDOW = 7
 """Neighbouring steps, three decades of them, along which a jump or a kink has to stay the same."""
+BRIEFLY = 4
+"""Neighbouring steps along which a one-sided slope has to stay the same in an exploding rollout."""
 ALIKE = 0.1
 """Relative spread of what counts as the same."""
 FAULTS = ("nondeterministic", "wrong_adjoint", "disconnected")
@@ -87,7 +89,8 @@ def diagnose(sample: Sample) -> str:
     - ``nondeterministic``: the same call gives another cost. ``nonfinite``: a cost is no number.
     - ``zero``: derivative and differences are exactly 0. ``disconnected``: the derivative alone is.
     - ``jump``, ``kink``: plus and minus side differ by a constant in the cost, or in their one-sided slopes, over three
-      decades of steps. A kink's derivative must lie between the two slopes.
+      decades of steps. A kink's derivative must lie between the two slopes. Where the slopes are the same over
+      fewer steps, as in an exploding rollout, and the sides meet different contacts, it must be one of the two.
     - ``unsettled``: the differences agree at no step, so that they tell nothing.
     - ``wrong_adjoint``: they settle, on another value than the derivative.
     - the derivative is right, and its differences err at small steps by more than ten times what float64 explains
@@ -114,13 +117,32 @@ def _diagnose(sample: Sample) -> str:
         return "kink" if _between(sample, rounding) else _wrong(sample)
     index, spread = plateau(sample, rounding)
     if spread > max(ALIKE * sample.size(index), rounding[index]):
-        return "unsettled"
+        return _sided(sample, rounding) if sample.crossing[index] else "unsettled"
     # ten times the spread, since the best of many spreads is a lucky one
     tolerance = 10.0 * spread + rounding[index] + _resolution(sample, index)
     right = abs(sample.differences[index] - sample.derivative) <= tolerance
-    if not right and not (sample.crossing[index] and _between(sample, rounding)):
-        return _wrong(sample)
-    return _ends(sample, index)
+    if right:
+        return _ends(sample, index)
+    return _sided(sample, rounding) if sample.crossing[index] else _wrong(sample)
+
+
+def _sided(sample: Sample, rounding: np.ndarray) -> str:
+    """The verdict by one-sided slopes, where the two sides of every difference meet different contacts.
+
+    A slope settles where it is the same over BRIEFLY neighbouring steps. In an exploding rollout that is only at the
+    smallest steps, with rounding amplified as the state is, and too short for the window of a kink.
+    """
+    settled = False
+    for slopes in (_left(sample), _right(sample)):
+        for window, noise in zip(_windows(slopes, BRIEFLY), _windows(rounding, BRIEFLY)[:, -1], strict=True):
+            middle, spread = float(np.median(window)), float(np.ptp(window))
+            if spread + noise > ALIKE * abs(middle):
+                continue
+            settled = True
+            tolerance = 2.0 * spread + noise + float(np.cbrt(sample.unit)) * abs(middle)
+            if abs(middle - sample.derivative) <= tolerance:
+                return "kink"
+    return _wrong(sample) if settled else "unsettled"
 
 
 def plateau(sample: Sample, rounding: np.ndarray) -> tuple[int, float]:
@@ -174,11 +196,16 @@ def _between(sample: Sample, rounding: np.ndarray) -> bool:
 
 def _settled(values: np.ndarray, noise: np.ndarray) -> bool:
     """Whether some window of values is the same but for ``ALIKE`` of its middle and stands clear of the noise."""
-    windows = np.lib.stride_tricks.sliding_window_view(values, WINDOW)
+    windows = _windows(values, WINDOW)
     middle = np.abs(np.median(windows, axis=1))
-    noises = np.lib.stride_tricks.sliding_window_view(noise, WINDOW).max(axis=1)
+    noises = _windows(noise, WINDOW).max(axis=1)
     same = np.ptp(windows, axis=1) <= ALIKE * middle
     return bool((same & (middle > noises)).any())
+
+
+def _windows(values: np.ndarray, size: int) -> np.ndarray:
+    """Each run of that many neighbouring values, ``(K - size + 1, size)``."""
+    return np.lib.stride_tricks.sliding_window_view(values, size)
 
 
 def _ends(sample: Sample, index: int) -> str:

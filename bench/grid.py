@@ -6,15 +6,16 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from bench import registry
 from bench.contracts import Backend, ContactLaw, Estimator, Integrator, MechanicalScene, Plugin, Scene, Unsupported
-from bench.errors import UserError, unknown
+from bench.errors import UserError, failure, unknown
 from bench.program import Program
 
 AXES = {
@@ -40,6 +41,24 @@ class Choice:
 
 
 @dataclass(frozen=True)
+class Execution:
+    """How cells are run; decides none of their numbers."""
+
+    workers: int | None = None
+    """Processes at once; None for the number of cores, 0 for none beside this one."""
+    timeout: float | None = None
+    """Seconds that a cell may take."""
+    memory: int | None = None
+    """Bytes that a worker may hold."""
+    stop: bool = False
+    """Whether the first failed cell ends the run."""
+    versions: str = "warn"
+    """What is done about stored rows that other library versions have made: ``ignore``, ``warn`` or ``rerun``."""
+    retry: tuple[str, ...] = ()
+    """Statuses of stored rows that are run again."""
+
+
+@dataclass(frozen=True)
 class Experiment:
     """A named sweep, resolved from configuration."""
 
@@ -59,6 +78,16 @@ class Experiment:
     """Per axis, named values to draw as lines in the charts."""
     reference_samples: int = 1 << 18
     reference_tolerance: float = 0.005
+    timing: bool | None = None
+    """Whether cells are timed, each alone on the machine; None for what the study asks for."""
+    referenced: bool = True
+    """Whether the study holds its cells to the reference gradient."""
+    execution: Execution = Execution()
+
+    @property
+    def budget(self) -> tuple[int, float] | None:
+        """Most samples of a reference and the tolerance at which it stops; None where the study has no reference."""
+        return (self.reference_samples, self.reference_tolerance) if self.referenced else None
 
     @property
     def directory(self) -> Path:
@@ -79,6 +108,10 @@ class Cell:
     repeats: int
     seed: int
     study: str = "bias_variance"
+    timing: bool = True
+    """Whether the times it takes are numbers of its row."""
+    budget: tuple[int, float] | None = None
+    """Most samples of its reference and the tolerance at which it stops; None where there is no reference."""
 
     @property
     def parts(self) -> tuple[Plugin | None, ...]:
@@ -88,15 +121,26 @@ class Cell:
     @cached_property
     def key(self) -> str:
         """Hash of everything that decides the cell's numbers; library versions are columns instead."""
-        text = "|".join(["" if p is None else _fingerprint(p) for p in self.parts])
-        text += f"|{self.samples}|{self.repeats}|{self.seed}|{core_hash()}|{study_hash(self.study)}"
-        return hashlib.sha256(text.encode()).hexdigest()[:32]
+        counts = [self.samples, self.repeats, self.seed, self.timing]
+        reference = None if self.budget is None else self.reference_key
+        return _hashed([fingerprint(p) for p in self.parts], counts, reference, core_hash(), study_hash(self.study))
 
     @cached_property
     def program_key(self) -> str:
-        """Hash of everything that decides the reference gradient."""
-        text = "|".join(["" if p is None else _fingerprint(p) for p in self.parts[:3]])
-        return hashlib.sha256(f"{text}|{core_hash()}".encode()).hexdigest()[:32]
+        """Hash of everything that decides the program."""
+        return _program_key(*(fingerprint(p) for p in self.parts[:3]))
+
+    @cached_property
+    def reference_key(self) -> str:
+        """Hash of everything that decides the reference gradient; raises ValueError for a cell without reference."""
+        if self.budget is None:
+            raise ValueError("a study that is held to references has a column reference_method")
+        return _reference_key(self.program_key, self.budget, fingerprint(self.reference_backend))
+
+    @cached_property
+    def reference_backend(self) -> Backend:
+        """The backend that computes the reference gradient."""
+        return next(reference_backends(self))
 
     def program(self) -> Program:
         """The program; raises :class:`Unsupported` for a combination without meaning."""
@@ -125,14 +169,27 @@ class Cell:
             "smoothing": smoothing,
             "samples": self.samples,
             "repeats": self.repeats,
-            "dim": int(self.scene.theta0().size),
+            "dim": self._dim(),
             "seed": self.seed,
             "dtype": self.backend.dtype,
             "key": self.key,
         }
 
+    def _dim(self) -> float:
+        try:
+            return int(self.scene.theta0().size)
+        except Exception:  # the cell's own row will say so
+            return math.nan
+
     def refusal(self) -> tuple[str, str] | None:
         """Status and reason why this cell cannot run, or None."""
+        try:
+            return self._refusal()
+        except Exception as error:
+            found = failure(error)
+            return found["status"], found["reason"]
+
+    def _refusal(self) -> tuple[str, str] | None:
         for part in self.parts:
             if part is not None:
                 entry = registry.find(part.kind, part.name)
@@ -146,6 +203,8 @@ class Cell:
         if program.needs_root and "root" not in backend.provides:
             part = next(p for p in (self.contact, self.integrator) if p is not None and p.needs_root)
             return "unsupported", f"{part.name} solves an equation each step, backend {backend.name} has no root finder"
+        if not program.needs <= backend.provides:
+            return "unsupported", f"{self.scene.name} runs in physics engines alone, backend {backend.name} is none"
         lacking = estimator.needs - backend.provides
         if lacking:
             return "unsupported", f"{estimator.name} needs {', '.join(sorted(lacking))}, which {backend.name} lacks"
@@ -172,26 +231,87 @@ def label(plugin: Plugin | None, given: Mapping[str, Any] | None = None) -> str:
     return registry.identity(plugin.name, values)
 
 
+_fingerprints: dict[int, tuple[Plugin, str]] = {}
+"""By identity, since equal plugins may differ in their numbers: -0.0 equals 0.0, and False 0."""
+_ranked: dict[str, list[Backend]] = {}
+
+
+def fingerprint(plugin: Plugin | None) -> str:
+    """Kind, name, parameters and hash of the source of a plugin, as JSON: floats to their last bit, texts in quotes."""
+    if plugin is None:
+        return ""
+    if id(plugin) not in _fingerprints:
+        values = {name: getattr(plugin, name) for name in sorted(registry.parameters(type(plugin)))}
+        text = json.dumps([plugin.kind, plugin.name, values, registry.source_hash(type(plugin))], default=repr)
+        _fingerprints[id(plugin)] = (plugin, text)
+    return _fingerprints[id(plugin)][1]
+
+
+def _hashed(*parts: Any) -> str:
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
+
+
 @registry.remember
-def _fingerprint(plugin: Plugin) -> str:
-    table = registry.parameters(type(plugin))
-    values = {name: getattr(plugin, name) for name in sorted(table)}
-    return json.dumps([plugin.kind, plugin.name, values, registry.source_hash(type(plugin))], default=repr)
+def _program_key(scene: str, contact: str, integrator: str) -> str:
+    return _hashed(scene, contact, integrator, core_hash())
+
+
+@registry.remember
+def _reference_key(program: str, budget: tuple[int, float], backend: str) -> str:
+    return _hashed(program, budget, backend)
 
 
 @registry.remember
 def core_hash() -> str:
-    """Hash of the harness's own files that decide numbers."""
-    digest = hashlib.sha256()
-    for name in ("contracts", "noise", "program", "reference", "statistics"):
-        digest.update(Path(__file__).with_name(f"{name}.py").read_bytes())
-    return digest.hexdigest()
+    """Hash of the harness's own files that decide numbers whatever is measured."""
+    names = ("contracts", "noise", "program", "reference", "statistics")
+    return registry.hash_of(Path(__file__).with_name(f"{name}.py") for name in names)
+
+
+BOOKKEEPING = tuple(
+    f"bench.{name}" for name in ("errors", "registry", "store", "grid", "session", "config", "studies", "report")
+)
+"""What a study imports and that decides none of its numbers."""
 
 
 @registry.remember
 def study_hash(study: str) -> str:
-    """Hash of the file that says what is measured."""
-    return hashlib.sha256((Path(__file__).parent / "studies" / f"{study}.py").read_bytes()).hexdigest()
+    """Hash of the file that says what is measured, and of what it imports."""
+    found = registry.sources(f"bench.studies.{study}", BOOKKEEPING)
+    report = Path(__file__).parent / "report"
+    return registry.hash_of(path for path in found if report not in path.parents)
+
+
+def reference_backends(cell: Cell) -> Iterator[Backend]:
+    """Backends able to run the cell's program for a reference, best first, the cell's own last.
+
+    A backend with physics of its own runs a program of its own, for which it alone can speak.
+    """
+    if "physics" not in cell.backend.provides:
+        yield from ranked_backends(cell)
+    yield cell.backend
+
+
+def ranked_backends(cell: Cell) -> list[Backend]:
+    """The available backends that compute references and can run the scene's own program, best first."""
+    if cell.program_key not in _ranked:
+        _ranked[cell.program_key] = sorted(_able(cell), key=lambda b: b.reference_rank or 0)
+    return _ranked[cell.program_key]
+
+
+def _able(cell: Cell) -> Iterator[Backend]:
+    try:
+        program = cell.program()
+    except Unsupported:
+        return
+    for entry in registry.entries()["backends"].values():
+        plugin = entry.plugin
+        if plugin is None or not entry.available or not issubclass(plugin, Backend) or plugin.reference_rank is None:
+            continue
+        backend = cast(Backend, _build(plugin, ()))
+        with suppress(Exception):  # what cannot even be asked is not able
+            if program.needs <= backend.provides and backend.refuses(program) is None:
+                yield backend
 
 
 # ------------------------------------------------------------------------------------------------ expansion
@@ -303,15 +423,15 @@ def _cell(experiment: Experiment, point: Mapping[str, Any], choices: Iterable[Ch
                     )
                 used[axis] = plugin.name
                 values[parameter] = value
-        return _build(plugin, tuple(sorted(values.items())))
+        return _build(plugin, sorted(values.items()))
 
-    scene = make(scene_choice)
-    assert isinstance(scene, Scene)
-    contact = integrator = None
+    scene = cast(Scene, make(scene_choice))
+    contact: ContactLaw | None = None
+    integrator: Integrator | None = None
     if isinstance(scene, MechanicalScene):
-        integrator = make(integrator_choice)
+        integrator = cast(Integrator, make(integrator_choice))
         if scene.n_contacts:
-            contact = make(contact_choice, scene.contact_values)
+            contact = cast(ContactLaw, make(contact_choice, scene.contact_values))
     counts: dict[str, int] = {}
     for name, low in (("samples", 1), ("repeats", 2), ("seed", 0)):
         count = registry.coerce(int, point.get(name, getattr(experiment, name)), name)
@@ -319,9 +439,18 @@ def _cell(experiment: Experiment, point: Mapping[str, Any], choices: Iterable[Ch
             raise UserError(f"{name}={count} must be at least {low}")
         counts[name] = count
     backend, estimator = make(backend_choice), make(estimator_choice)
-    return Cell(scene, contact, integrator, backend, estimator, study=experiment.study, **counts)  # type: ignore[arg-type]
+    return Cell(
+        scene, contact, integrator, cast(Backend, backend), cast(Estimator, estimator), **counts,
+        study=experiment.study, timing=bool(experiment.timing), budget=experiment.budget,
+    )  # fmt: skip
 
 
-@registry.remember
-def _build(plugin: type[Plugin], values: tuple[tuple[str, Any], ...]) -> Plugin:
-    return registry.build(plugin, dict(values))
+_built: dict[tuple[type[Plugin], str], Plugin] = {}
+
+
+def _build(plugin: type[Plugin], values: Sequence[tuple[str, Any]]) -> Plugin:
+    """The one instance with these values; 1, 1.0 and True are three values, of which a parameter may refuse some."""
+    key = (plugin, repr(values))
+    if key not in _built:
+        _built[key] = registry.build(plugin, dict(values))
+    return _built[key]

@@ -109,6 +109,14 @@ class Program:
         return any(part is not None and part.needs_root for part in (self.contact, self.integrator))
 
     @property
+    def needs(self) -> frozenset[str]:
+        """Capabilities that a backend must provide to run the program: ``root``, ``physics`` or neither."""
+        needs = {"root"} if self.needs_root else set()
+        if isinstance(self.scene, MechanicalScene) and self.scene.needs_physics:
+            needs.add("physics")
+        return frozenset(needs)
+
+    @property
     def continuous(self) -> bool:
         """Whether the cost is continuous in theta."""
         return self.scene.continuous and (self.contact is None or self.contact.continuous)

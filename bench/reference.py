@@ -17,9 +17,10 @@ from bench.store import write_whole
 BATCHES = 64
 """Independent batch means that a sampled reference is stored as."""
 COLUMNS = 4096
-"""Columns of every batch that is evaluated, so that a compiling backend compiles once."""
-PILOT = COLUMNS
-"""Samples spent on choosing the estimator of a sampled reference."""
+"""Columns of every batch that is evaluated, so that a compiling backend compiles once; fewer where few samples are allowed.
+
+One batch is also what choosing the estimator of a sampled reference is given.
+"""
 QUADRATURE_POINTS = 1 << 20
 QUADRATURE_TOLERANCE = 1e-3
 """Relative error above which quadrature gives way to sampling."""
@@ -51,22 +52,31 @@ class Reference:
         return float(np.linalg.norm(self.plain - self.physical)) if self.physical.size else math.nan
 
 
-def certify(problem: Problem, provides: frozenset[str], samples: int, tolerance: float) -> Reference:
+def certify(
+    problem: Problem,
+    provides: frozenset[str],
+    samples: int,
+    tolerance: float,
+    physical: np.ndarray | None = None,
+) -> Reference:
     """The reference of a problem, by the best method that applies.
 
     Sampling stops at a standard error of ``tolerance`` times the gradient's norm, or after ``samples`` samples.
+    ``physical (d,)`` is what the program's gradient stands for, if that is known. A closed form is of the scene's own
+    program, and so is not taken from a backend that ``provides`` physics of its own.
     """
     scene, program = problem.program.scene, problem.program
     theta = scene.theta0()
-    closed = scene.closed_form_gradient(program.contact, program.integrator)
+    closed = None
+    if "physics" not in provides:
+        closed = scene.closed_form_gradient(program.contact, program.integrator)
     if closed is not None:
         found = Reference(np.asarray(closed, dtype=np.float64).reshape(1, -1), "closed_form")
     else:
         quadrature = None
         if program.n_noise <= 2 and program.noise_on_theta:
-            quadrature = _quadrature(problem, theta)
+            quadrature = _quadrature(problem, theta, min(QUADRATURE_POINTS, 64 * samples))
         found = quadrature or _sampled(problem, theta, provides, samples, tolerance)
-    physical = scene.physical_gradient()
     if physical is None or "grad" not in provides:
         return found
     plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
@@ -76,7 +86,7 @@ def certify(problem: Problem, provides: frozenset[str], samples: int, tolerance:
 # ---------------------------------------------------------------------------------------------- quadrature
 
 
-def _quadrature(problem: Problem, theta: np.ndarray) -> Reference | None:
+def _quadrature(problem: Problem, theta: np.ndarray, points: int) -> Reference | None:
     """E[(f(w) - f(0)) w] / sigma on Gauss-Legendre panels between the scene's breakpoints, refined until it settles.
 
     The error is the change under the last halving of the panels. None when it stays above 0.1%.
@@ -89,7 +99,7 @@ def _quadrature(problem: Problem, theta: np.ndarray) -> Reference | None:
         edges.append(np.unique([-9.0, *(b for b in inner if abs(b) < 9.0), 9.0]))
     centre = problem.value(theta, np.zeros((width, 1)))[0]
     panels, previous, error = 16, None, math.inf
-    while (panels * 8) ** width <= QUADRATURE_POINTS:
+    while (panels * 8) ** width <= points:
         rules = [_panels(e, panels) for e in edges]
         nodes = np.stack([axis.ravel() for axis in np.meshgrid(*(r[0] for r in rules), indexing="ij")])
         weights = np.ones(1)
@@ -104,8 +114,7 @@ def _quadrature(problem: Problem, theta: np.ndarray) -> Reference | None:
             if error <= 1e-10 * np.linalg.norm(gradient):
                 break
         previous, panels = gradient, panels * 2
-    assert previous is not None
-    if error > QUADRATURE_TOLERANCE * np.linalg.norm(gradient):
+    if previous is None or error > QUADRATURE_TOLERANCE * np.linalg.norm(gradient):
         return None
     return Reference(gradient[None, :], f"quadrature[points={nodes.shape[1]}]", error)
 
@@ -130,13 +139,14 @@ def _sampled(
     problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float
 ) -> Reference:
     """The valid estimator of lowest variance for its cost, in independent batches, cross-checked by zeroth order."""
+    columns = min(COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
     centre = problem.value(theta, np.zeros((problem.program.n_noise, 1)))
     estimators: dict[str, Callable[[np.ndarray], np.ndarray]] = {
         "zeroth_order": lambda w: _antithetic(problem, theta, w, centre)
     }
     if problem.program.continuous and "grad" in provides:
         estimators["first_order"] = lambda w: problem.grad(theta, w)
-    pilots = {name: terms(_draw(problem, "pilot", PILOT, 0)) for name, terms in estimators.items()}
+    pilots = {name: terms(_draw(problem, "pilot", columns, 0)) for name, terms in estimators.items()}
     spread = {name: float(p.var(axis=1, ddof=1).sum()) for name, p in pilots.items() if np.isfinite(p).all()}
     if not spread:
         return Reference(np.full((1, problem.dim), math.nan), "sampling[failed: rollouts are not finite]", math.nan)
@@ -144,12 +154,12 @@ def _sampled(
     if chosen == "first_order" and _disagree(pilots["first_order"], pilots["zeroth_order"]) > 5.0:
         chosen = "zeroth_order"
 
-    size = 64
+    size = columns // BATCHES
     batches = np.zeros((BATCHES, problem.dim))
     count = 0
     while True:
         w = _draw(problem, "reference", BATCHES * size, count)
-        terms = _in_columns(estimators[chosen], w).reshape(problem.dim, BATCHES, size).mean(axis=2).T
+        terms = _in_columns(estimators[chosen], w, columns).reshape(problem.dim, BATCHES, size).mean(axis=2).T
         batches = (batches * count + terms * size) / (count + size)
         count += size
         se = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)
@@ -158,8 +168,8 @@ def _sampled(
         size = count
     note = ""
     if chosen == "first_order":
-        w = _draw(problem, "check", max(PILOT, count * BATCHES // 4 // COLUMNS * COLUMNS), 0)
-        check = _in_columns(estimators["zeroth_order"], w)
+        w = _draw(problem, "check", max(columns, count * BATCHES // 4 // columns * columns), 0)
+        check = _in_columns(estimators["zeroth_order"], w, columns)
         z = _disagree(batches.T, check)
         note = f",check_z={z:.1f}"
     return Reference(batches, f"sampling[{chosen},n={count * BATCHES}{note}]")
@@ -172,8 +182,8 @@ def _draw(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
     return np.moveaxis(drawn, -1, 0).reshape(program.n_noise, count)
 
 
-def _in_columns(terms: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> np.ndarray:
-    return np.concatenate([terms(w[:, i : i + COLUMNS]) for i in range(0, w.shape[1], COLUMNS)], axis=1)
+def _in_columns(terms: Callable[[np.ndarray], np.ndarray], w: np.ndarray, columns: int) -> np.ndarray:
+    return np.concatenate([terms(w[:, i : i + columns]) for i in range(0, w.shape[1], columns)], axis=1)
 
 
 def _antithetic(problem: Problem, theta: np.ndarray, w: np.ndarray, centre: np.ndarray) -> np.ndarray:

@@ -7,17 +7,18 @@ in ``requires`` and imported by the plugin when it is used.
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import hashlib
 import importlib
+import importlib.machinery
 import importlib.util
 import inspect
 import math
 import pkgutil
-import sys
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
@@ -126,9 +127,20 @@ def _missing(plugin: type[Plugin]) -> str:
     missing = []
     for requirement in plugin.requires:
         module, _, distribution = requirement.partition("=")
-        if importlib.util.find_spec(module) is None:
+        if not _installed(module):
             missing.append(distribution or module)
     return f"not installed: {', '.join(missing)}; pip install {' '.join(missing)}" if missing else ""
+
+
+def _installed(module: str) -> bool:
+    """Whether a module can be imported, found without importing it or its parents."""
+    first, *inner = module.split(".")
+    spec = importlib.util.find_spec(first)
+    for part in inner:
+        if spec is None:
+            return False
+        spec = importlib.machinery.PathFinder.find_spec(f"{spec.name}.{part}", spec.submodule_search_locations)
+    return spec is not None
 
 
 def find(kind: str, name: str) -> Entry:
@@ -248,21 +260,49 @@ def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
 @remember
 def source_hash(plugin: type[Plugin]) -> str:
     """Hash of the files a plugin is written in: its own module and those it imports from its own package."""
+    return hash_of(sources(plugin.__module__))
+
+
+def hash_of(paths: Iterable[Path]) -> str:
+    """Hash of the contents of files, whatever their names."""
     digest = hashlib.sha256()
-    for path in sorted(_sources(plugin.__module__, set())):
-        digest.update(Path(path).read_bytes())
+    for path in sorted(paths):
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()
 
 
-def _sources(module_name: str, seen: set[str]) -> set[str]:
-    module = sys.modules[module_name]
-    path = getattr(module, "__file__", None)
-    if path is None or path in seen:
-        return seen
-    seen.add(path)
-    package = module_name.partition(".")[0]
-    for value in vars(module).values():
-        origin = value.__name__ if isinstance(value, types.ModuleType) else getattr(value, "__module__", None)
-        if isinstance(origin, str) and origin.partition(".")[0] == package and origin in sys.modules:
-            _sources(origin, seen)
-    return seen
+def sources(module: str, without: Collection[str] = ()) -> set[Path]:
+    """Files of a module and of all it imports from its own package, at its top or later, but for those named ``without``."""
+    found: dict[str, Path] = {}
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        path = None if name in found or name in without else _file(name)
+        if path is not None:
+            found[name] = path
+            waiting.extend(_imports(name, path))
+    return set(found.values())
+
+
+def _imports(module: str, path: Path) -> Iterator[str]:
+    """What a file imports from its own package; ``from a import b`` may mean the module ``a.b`` or a name in ``a``."""
+    package = module.partition(".")[0]
+    parent = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text())):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), parent)
+            names = [base, *(f"{base}.{alias.name}" for alias in node.names)]
+        yield from (name for name in names if name.partition(".")[0] == package)
+
+
+@remember
+def _file(module: str) -> Path | None:
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        return None
+    origin = spec.origin if spec is not None else None
+    return Path(origin) if origin is not None and origin.endswith(".py") else None

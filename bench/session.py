@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from pathlib import Path
 
-from bench import reference, registry
+import numpy as np
+
+from bench import reference
 from bench.contracts import Backend, Problem
-from bench.grid import Cell, Experiment
+from bench.grid import Cell, Experiment, ranked_backends, reference_backends
 from bench.reference import Reference
+
+__all__ = ["Problems", "References", "Session", "reference_backends"]
 
 
 class Problems:
@@ -37,34 +41,38 @@ class References:
         self._budget = (experiment.reference_samples, experiment.reference_tolerance)
         self._known: dict[str, Reference] = {}
 
+    def stored(self, cell: Cell) -> bool:
+        """Whether the reference of the cell's program is on disk."""
+        return self._path(cell).exists()
+
     def of(self, cell: Cell) -> Reference:
         """The reference of the cell's program, on the best backend that can run it."""
-        key = f"{cell.program_key}-{self._budget[0]}-{self._budget[1]:g}"
+        key = cell.reference_key
         if key not in self._known:
-            path = self._directory / f"{key}.parquet"
-            found = reference.load(path)
+            found = reference.load(self._path(cell))
             if found is None:
-                backend = next(reference_backends(cell))
+                backend = cell.reference_backend
                 problem = self._problems.of(backend, cell)
-                found = reference.certify(problem, backend.provides, *self._budget)
-                reference.save(found, path)
+                found = reference.certify(problem, backend.provides, *self._budget, self._stood_for(cell))
+                reference.save(found, self._path(cell))
             self._known[key] = found
         return self._known[key]
 
+    def _path(self, cell: Cell) -> Path:
+        return self._directory / f"{cell.reference_key}.parquet"
 
-def reference_backends(cell: Cell) -> Iterator[Backend]:
-    """Backends able to run the cell's program for a reference, best first, the cell's own last."""
-    program = cell.program()
-    ranked = []
-    for entry in registry.entries()["backends"].values():
-        plugin = entry.plugin
-        if plugin is None or not entry.available or not issubclass(plugin, Backend) or plugin.reference_rank is None:
-            continue
-        backend = plugin()
-        if (not program.needs_root or "root" in backend.provides) and backend.refuses(program) is None:
-            ranked.append(backend)
-    yield from sorted(ranked, key=lambda b: b.reference_rank or 0)
-    yield cell.backend
+    def _stood_for(self, cell: Cell) -> np.ndarray | None:
+        """The gradient that the program's own, at w = 0, should be: that of the physics, where the scene knows it.
+
+        For a backend with physics of its own and a scene that does not, that of the scene's program.
+        """
+        program, theta = cell.program(), cell.scene.theta0()
+        physical = cell.scene.physical_gradient()
+        if physical is None and "physics" in cell.backend.provides:
+            for backend in ranked_backends(cell):
+                if "grad" in backend.provides:
+                    return self._problems.of(backend, cell).grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
+        return physical
 
 
 class Session:

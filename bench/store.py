@@ -1,7 +1,9 @@
-"""Rows and references on disk.
+"""Rows on disk.
 
-A finished cell is one small JSON file, written whole and renamed into place; at the end of a run the small files
-are folded into ``rows.parquet``. Nothing is locked and nothing is pickled, so a run can be killed at any moment.
+Rows that finish together are one small JSON file under ``pending/``; at the end of a run the small files are folded into
+``rows.parquet``. Every file is written whole under a name of its own and renamed into place, and is deleted only by
+who has read it and written its rows into another. So nothing is locked, a run can be killed at any moment, and
+several can write to one directory: what is stored is the union of all files, the newest row of each key.
 """
 
 from __future__ import annotations
@@ -9,12 +11,15 @@ from __future__ import annotations
 import json
 import math
 import os
+import time
 import uuid
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.errors import UserError
+from bench.errors import StorageError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,6 +35,11 @@ TEXT = [
 ]  # fmt: skip
 """The columns of every study that are text."""
 
+ATTEMPTS = 100
+"""Times that a directory is read anew while other runs change it."""
+STALE_S = 3600.0
+"""Age at which a half written file belongs to no run."""
+
 
 @dataclass(frozen=True)
 class Columns:
@@ -40,6 +50,8 @@ class Columns:
     lists: tuple[str, ...] = ()
     extra: tuple[str, ...] = ()
     """Columns of ``rows.parquet`` that the table leaves out."""
+    measured: tuple[str, ...] = ()
+    """Columns that depend on the machine and its load: NaN where cells are not timed."""
 
     @classmethod
     def of(cls, *own: str, texts: tuple[str, ...] = (), lists: tuple[str, ...] = ()) -> Columns:
@@ -49,8 +61,13 @@ class Columns:
 
     @property
     def stored(self) -> list[str]:
-        """All columns of ``rows.parquet``."""
-        return [*self.names, *self.extra]
+        """All columns of ``rows.parquet``: beside the table's, seconds in all and when it was stored, since 1970."""
+        return [*self.names, *self.extra, "wall_s", "stored_at"]
+
+    @property
+    def referenced(self) -> bool:
+        """Whether rows name a reference gradient that they are held to."""
+        return "reference_method" in self.names
 
     def blank(self) -> dict[str, Any]:
         """A row without any value."""
@@ -82,12 +99,13 @@ BIAS_VARIANCE = Columns(
     texts=("reference_method", "device"),
     lists=("time_samples",),
     extra=("variance_low", "variance_high", "time_samples"),
+    measured=("time_s", "time_iqr_s", "time_samples", "compile_s", "peak_memory_mb"),
 )  # fmt: skip
 """The columns of the main table: a contract with people's scripts."""
 
 
 class Store:
-    """The rows of one experiment. Raises :class:`UserError` when its directory cannot be written or read."""
+    """The rows of one experiment. Raises :class:`StorageError` when its directory cannot be written or read."""
 
     def __init__(self, directory: Path, columns: Columns = BIAS_VARIANCE) -> None:
         self.directory = directory
@@ -103,52 +121,155 @@ class Store:
             probe.write_text("")
             probe.unlink()
         except OSError as error:
-            raise UserError(f"results directory '{self.directory}' cannot be written: {error.strerror}") from None
+            raise StorageError(f"results directory '{self.directory}' cannot be written: {error.strerror}") from None
 
-    def append(self, row: dict[str, Any]) -> None:
-        """Store one finished cell."""
-        write_whole(self._pending / f"{row['key']}.json", json.dumps(row).encode())
+    def append(self, *rows: dict[str, Any]) -> None:
+        """Store finished cells: when this returns they outlast a power cut."""
+        stamped = [row | {"stored_at": time.time()} for row in rows]
+        self._add("json", json.dumps(stamped).encode())
 
     def load(self) -> pd.DataFrame:
-        """All stored rows, the last one of each key."""
+        """All stored rows, the newest of each key, those of ``rows.parquet`` first."""
+        return self._read_all()[0]
+
+    def compact(self, order: Sequence[str] = ()) -> None:
+        """Fold the small files into ``rows.parquet``, rows of the keys in ``order`` last and in that order."""
+        for _ in range(ATTEMPTS):
+            table, files = self._read_all()
+            known = files.pop(self._table, None)
+            if not files or self._fold(ordered(table, order), list(files), known):
+                break
+        self._tidy()
+
+    # ------------------------------------------------------------------------------------------- reading
+
+    def _files(self) -> dict[Path, tuple[int, int]]:
+        """The files that hold rows, each with what tells it from another of its name."""
+        pending = sorted(self._pending.glob("[!.]*")) if self._pending.is_dir() else []
+        found = {}
+        for path in [self._table, *pending]:
+            with suppress(FileNotFoundError, NotADirectoryError):
+                found[path] = _mark(path)
+        return found
+
+    def _read_all(self) -> tuple[pd.DataFrame, dict[Path, tuple[int, int]]]:
+        """All rows, and the files they were read from; again when a run nearby folds files meanwhile."""
+        for _ in range(ATTEMPTS):
+            files = self._files()
+            try:
+                frames = [self._columns.typed(frame) for frame in _frames(files)]
+            except FileNotFoundError:
+                continue
+            if files.items() <= self._files().items():
+                return self._union(frames), files
+        raise StorageError(f"'{self.directory}' changes faster than it can be read: too many runs write to it")
+
+    def _union(self, frames: list[pd.DataFrame]) -> pd.DataFrame:
         import pandas as pd
 
-        frames = []
-        if self._table.exists():
-            try:
-                frames.append(pd.read_parquet(self._table))
-            except Exception as error:
-                raise UserError(
-                    f"'{self._table}' cannot be read as Parquet ({error}); move it away to start afresh"
-                ) from None
-        rows = []
-        if self._pending.is_dir():
-            for path in sorted(self._pending.glob("*.json"), key=lambda p: (p.stat().st_mtime_ns, p.name)):
-                rows.append(json.loads(path.read_text()))
-        if rows:
-            frames.append(pd.DataFrame(rows))
         if not frames:
             return pd.DataFrame(columns=self._columns.stored)
-        table = pd.concat([self._columns.typed(frame) for frame in frames])
-        return table.drop_duplicates("key", keep="last").reset_index(drop=True)
+        table = pd.concat(frames, ignore_index=True)
+        newest = table.sort_values("stored_at", kind="stable", na_position="first").drop_duplicates("key", keep="last")
+        return newest.sort_index().reset_index(drop=True)
 
-    def compact(self) -> None:
-        """Fold the small files into ``rows.parquet``."""
+    # ------------------------------------------------------------------------------------------- writing
+
+    def _add(self, suffix: str, content: bytes) -> Path:
+        """A new file under ``pending/``, which a run nearby may be removing because it is empty."""
+        path = self._pending / f"{uuid.uuid4().hex}.{suffix}"
+        for _ in range(ATTEMPTS):
+            try:
+                self._pending.mkdir(exist_ok=True)
+                _write(path, content)
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                raise StorageError(f"'{self._pending}' cannot be made: {error.strerror}") from None
+            return path
+        raise StorageError(f"'{self._pending}' cannot be made")
+
+    def _fold(self, table: pd.DataFrame, read: list[Path], known: tuple[int, int] | None) -> bool:
+        """Write the rows of the files that were read into one, and make it ``rows.parquet``.
+
+        False where another run has put its own there meanwhile: its rows have to be read too.
+        """
         import io
 
-        taken = list(self._pending.glob("*.json")) if self._pending.is_dir() else []
-        if taken:
-            buffer = io.BytesIO()
-            self.load().to_parquet(buffer, index=False)
-            write_whole(self._table, buffer.getvalue())
-            for path in taken:
-                path.unlink(missing_ok=True)
-        if self._pending.is_dir() and not any(self._pending.iterdir()):
+        buffer = io.BytesIO()
+        table.to_parquet(buffer, index=False)
+        part = self._add("parquet", buffer.getvalue())
+        for path in read:
+            path.unlink(missing_ok=True)
+        aside = self._pending / f"{uuid.uuid4().hex}.parquet"
+        try:
+            with suppress(FileNotFoundError):
+                os.rename(self._table, aside)
+                if _mark(aside) != known:
+                    return False
+            os.link(part, self._table)  # fails where there is one, as a rename would not
+            _sync(self.directory)
+        except FileExistsError:
+            return False
+        except OSError as error:
+            raise StorageError(
+                f"'{self._table}' cannot be written: {error.strerror}; its rows are in '{part}'"
+            ) from None
+        part.unlink(missing_ok=True)
+        aside.unlink(missing_ok=True)
+        return True
+
+    def _tidy(self) -> None:
+        """Remove what killed runs have left half written, and the directory of small files when it is empty."""
+        with suppress(OSError):
+            for path in self._pending.glob(".*"):
+                if time.time() - path.stat().st_mtime > STALE_S:
+                    path.unlink()
             self._pending.rmdir()
 
 
+def ordered(table: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:
+    """The table with the rows of these keys in their order, after all others."""
+    place = {key: index for index, key in enumerate(keys)}
+    position = table["key"].map(lambda key: place.get(key, -1))
+    return table.iloc[position.argsort(kind="stable")].reset_index(drop=True)
+
+
+def _mark(path: Path) -> tuple[int, int]:
+    found = path.stat()
+    return found.st_ino, found.st_mtime_ns
+
+
+def _frames(paths: Iterable[Path]) -> Iterator[pd.DataFrame]:
+    import pandas as pd
+
+    rows: list[dict[str, Any]] = []
+    for path in paths:
+        try:
+            if path.suffix == ".parquet":
+                yield pd.read_parquet(path)
+            else:
+                read = json.loads(path.read_text())
+                rows.extend(read if isinstance(read, list) else [read])
+        except FileNotFoundError:
+            raise
+        except Exception as error:
+            said = " ".join(str(error).split())
+            what = "Parquet" if path.suffix == ".parquet" else "JSON"
+            raise StorageError(f"'{path}' cannot be read as {what} ({said}); move it away to start afresh") from None
+    if rows:
+        yield pd.DataFrame(rows)
+
+
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that it is either the old one or the new one, never a part; raises :class:`UserError` if it cannot."""
+    """Write a file so that it is the old one or the new one, never a part; raises :class:`StorageError` if it cannot."""
+    try:
+        _write(path, content)
+    except OSError as error:
+        raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
+
+
+def _write(path: Path, content: bytes) -> None:
     temporary = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
     try:
         with open(temporary, "wb") as file:
@@ -156,6 +277,18 @@ def write_whole(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+        _sync(path.parent)
+    except FileNotFoundError:
+        raise
     except OSError as error:
         temporary.unlink(missing_ok=True)
-        raise UserError(f"'{path}' cannot be written: {error.strerror}") from None
+        raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
+
+
+def _sync(directory: Path) -> None:
+    """Make renames in a directory outlast a power cut."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

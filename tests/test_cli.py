@@ -44,10 +44,11 @@ def test_only_missing_cells_run_and_rows_are_kept(tmp_path, monkeypatch):
     real = bias_variance.measure
     monkeypatch.setattr(bias_variance, "measure", lambda cell, *rest: (measured.append(cell.key), real(cell, *rest))[1])
     where = f"results_dir={tmp_path}"
-    assert main([*TINY, where, "sweep.sigma=[0.1]"]) == 0
-    assert main([*TINY, where, "sweep.sigma=[0.1,0.2]"]) == 0
+    here = [*TINY, where, "workers=0"]
+    assert main([*here, "sweep.sigma=[0.1]"]) == 0
+    assert main([*here, "sweep.sigma=[0.1,0.2]"]) == 0
     assert len(measured) == len(set(measured)) == 4
-    assert main([*TINY, where, "sweep.sigma=[0.2]"]) == 0
+    assert main([*here, "sweep.sigma=[0.2]"]) == 0
     assert len(pd.read_parquet(tmp_path / "tiny" / "rows.parquet")) == 4
     assert len(pd.read_csv(tmp_path / "tiny" / "bias_variance.csv")) == 2
 

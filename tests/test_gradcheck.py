@@ -138,6 +138,32 @@ def test_switch_of_a_penalty_contact_is_a_kink_between_two_crossings(bounce):
     assert not told["start"] & set(FAULTS)
 
 
+@pytest.fixture(scope="module")
+def exploding():
+    """Bodies pushed together with a spring so stiff that each step in contact multiplies the state."""
+    return compiled(plugin("scenes", "pushing", horizon=50), plugin("contacts", "penalty", stiffness=1e4))
+
+
+def test_switch_in_an_exploding_rollout_is_no_fault(exploding):
+    """Its one-sided slopes settle at the smallest steps alone, and the gradient is one of them."""
+    told = verdicts(exploding)
+    assert told["at"] <= {"kink", "unsettled"}
+    assert "kink" in told["at"]
+    assert not set.union(*told.values()) & set(FAULTS)
+
+
+@pytest.mark.parametrize(("factor", "name"), [(-1.0, "wrong_adjoint"), (0.5, "wrong_adjoint"), (0.0, "disconnected")])
+def test_faults_are_seen_at_the_switch_of_an_exploding_rollout(exploding, factor, name):
+    told = verdicts(Planted(exploding, grad=lambda g, _: factor * g))
+    assert told["at"] == {name}
+
+
+def test_rollout_that_explodes_beyond_differences_tells_nothing():
+    """Over 100 steps the gradient is 3e18 and no step is small enough to see it: not a fault, and not trusted either."""
+    problem = compiled(plugin("scenes", "pushing", horizon=100), plugin("contacts", "penalty", stiffness=1e4))
+    assert verdicts(problem)["at"] == {"unsettled"}
+
+
 def test_switch_of_a_damped_contact_is_a_jump():
     law = plugin("contacts", "penalty", stiffness=50.0, damping=1.0, damping_mode="linear")
     told = verdicts(compiled(plugin("scenes", "wall_penalty_1d", horizon=10, start=0.05), law))
@@ -262,13 +288,13 @@ def test_fault_is_exit_status_1_and_its_line_repeats_it(tmp_path, monkeypatch, c
     right = NumpyProblem._grad
     monkeypatch.setattr(NumpyProblem, "_grad", lambda self, theta, w: -right(self, theta, w))
     words = ["gradcheck", "pushing[mass=0.2]", "contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[2]"]
-    assert main([*words, "scene.pushing.sigma=0.05", "seed=3", f"results_dir={tmp_path / 'a'}"]) == 1
+    assert main([*words, "scene.pushing.sigma=0.05", "seed=3", "workers=0", f"results_dir={tmp_path / 'a'}"]) == 1
     printed = capsys.readouterr().out
     assert "wrong_adjoint (start" in printed
     lines = (tmp_path / "a" / "gradcheck" / "gradient_check.md").read_text().splitlines()
     (line,) = [text.strip() for text in lines if "python -m bench gradcheck" in text]
     again = shlex.split(line)[3:]
-    assert main([*again, f"results_dir={tmp_path / 'b'}"]) == 1
+    assert main([*again, "workers=0", f"results_dir={tmp_path / 'b'}"]) == 1
     first, second = (pd.read_csv(tmp_path / run / "gradcheck" / "gradient_check.csv") for run in "ab")
     pd.testing.assert_frame_equal(first, second)
 

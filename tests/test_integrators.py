@@ -202,10 +202,11 @@ def test_stiff_implicit_rollouts_stay_bounded():
         assert gradient(problem) == pytest.approx(scene.closed_form_gradient(None, integrator), rel=1e-6, abs=1e-12)
 
 
+@pytest.mark.parametrize("damping", [0.0, 1.0, 10.0, 15.0], ids=["undamped", "damped", "critical", "overdamped"])
 @pytest.mark.parametrize("integrator", EXPLICIT, ids=named)
-def test_mass_spring_gradient(integrator):
+def test_mass_spring_gradient(integrator, damping):
     """The closed form of the program, and that of the physics up to the integrator's order."""
-    scene = MassSpring()
+    scene = MassSpring(damping=damping)
     problem = compiled(scene, integrator, backend=Torch())
     assert gradient(problem) == pytest.approx(scene.closed_form_gradient(None, integrator), rel=1e-9)
     errors = []

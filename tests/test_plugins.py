@@ -232,7 +232,7 @@ LAYERS = [
     ["errors"],
     ["contracts"],
     ["program"],
-    ["registry", "noise", "statistics", "store", "timing", "gradcheck"],
+    ["registry", "noise", "statistics", "store", "timing", "gradcheck", "workers"],
     ["reference", "grid"],
     ["config", "session"],
     ["health"],

@@ -52,8 +52,9 @@ def plain_backend() -> Backend:
 
 
 def able_backend(program: Program) -> Backend:
-    """The plain backend if it can run the program, else the first that can."""
-    for backend in (plain_backend(), *(plugin() for plugin in available("backends"))):
+    """The plain backend if it can run the program, else the first that can; those that compile come last."""
+    others = sorted((plugin() for plugin in available("backends")), key=lambda backend: backend.compiles)
+    for backend in (plain_backend(), *others):
         if can_run(backend, program):
             return backend
     raise Skipped("no available backend can run it")
@@ -61,7 +62,7 @@ def able_backend(program: Program) -> Backend:
 
 def can_run(backend: Backend, program: Program) -> bool:
     """Whether the backend has what the program needs and does not refuse it."""
-    return (not program.needs_root or "root" in backend.provides) and backend.refuses(program) is None
+    return program.needs <= backend.provides and backend.refuses(program) is None
 
 
 @cache
@@ -80,12 +81,18 @@ def law_for(scene: MechanicalScene, law: type[ContactLaw], values: dict[str, Any
 
 
 def programs(scene: Scene) -> list[Program]:
-    """The scene under every sound contact law, if it has contacts."""
+    """The scene under every sound contact law, if it has contacts; raises :class:`Skipped` where only absent engines run it."""
     if not isinstance(scene, MechanicalScene):
         return [Program(scene, None, None)]
     if not scene.n_contacts:
         return [Program(scene, None, stepping())]
-    return [Program(scene, law_for(scene, law), stepping()) for law in sound_laws()]
+    found = [Program(scene, law_for(scene, law), stepping()) for law in sound_laws()]
+    if scene.needs_physics:
+        engines = [plugin() for plugin in available("backends") if "physics" in plugin.provides]
+        found = [program for program in found if any(can_run(engine, program) for engine in engines)]
+        if not found:
+            raise Skipped("no available physics engine can run it")
+    return found
 
 
 @cache

@@ -1,4 +1,4 @@
-"""What is shown before and during a run."""
+"""What is shown before and during a run: plain text, since names may hold what a terminal or rich would take for markup."""
 
 from __future__ import annotations
 
@@ -6,65 +6,127 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import pandas as pd
+    import rich.progress
 
-    from bench.grid import Experiment
+    from bench.grid import Cell, Experiment
     from bench.runner import Planned
 
 
+SPEAK_S = 10.0
+"""Seconds between lines where the output is no terminal."""
+FINE = ("ok", "unsupported")
+"""Statuses that are not counted as failures."""
+
+
+class Progress:
+    """Cells done, failed and stored before, the expected time left, and what is being worked on: written by subclasses."""
+
+    def __init__(self, name: str, planned: Sequence[Planned]) -> None:
+        self._name, self._total = name, len(planned)
+        self._stored = sum(item.stored for item in planned)
+        self._done = 0
+        self._failed: Counter[str] = Counter()
+        self._started = time.monotonic()
+
+    def finished(self, cell: Cell, row: dict[str, Any]) -> None:
+        """One cell is finished and stored."""
+        self._done += 1
+        if row["status"] not in FINE:
+            self._failed[row["status"]] += 1
+        self.show()
+
+    def working(self, on: str) -> None:
+        """What the workers are at."""
+
+    def show(self) -> None:
+        """Tell how far the run has come."""
+
+    def _counts(self) -> str:
+        failed = "".join(f", {count} {status}" for status, count in self._failed.items())
+        return f"{self._stored + self._done}/{self._total} cells ({self._stored} stored before{failed})"
+
+    def _left(self) -> str:
+        if not self._done:
+            return ""
+        left = (time.monotonic() - self._started) / self._done * (self._total - self._stored - self._done)
+        return f"about {left:.0f} s left"
+
+
+class Lines(Progress):
+    """A plain line every 10 s."""
+
+    def __init__(self, name: str, planned: Sequence[Planned]) -> None:
+        super().__init__(name, planned)
+        self._spoken, self._on = self._started, ""
+        if self._stored:
+            print(f"{name}: {self._stored} of {self._total} cells are stored", file=sys.stderr)
+
+    def working(self, on: str) -> None:
+        """Kept for the next line."""
+        self._on = on
+        self.show()
+
+    def show(self) -> None:
+        """A line, unless there was one just now."""
+        if time.monotonic() - self._spoken > SPEAK_S:
+            self._spoken = time.monotonic()
+            parts = [self._counts(), self._left(), self._on and f"now {self._on}"]
+            print(f"{self._name}: {', '.join(part for part in parts if part)}", file=sys.stderr)
+
+
+class Bar(Progress):
+    """A bar on a terminal."""
+
+    def __init__(self, name: str, planned: Sequence[Planned], shown: rich.progress.Progress) -> None:
+        super().__init__(name, planned)
+        self._shown, self._on = shown, ""
+        self._task = shown.add_task(name, total=self._total, completed=self._stored, note="")
+
+    def working(self, on: str) -> None:
+        """Shown beside the bar."""
+        if on != self._on:
+            self._on = on
+            self.show()
+
+    def show(self) -> None:
+        """The bar moves."""
+        note = ", ".join(part for part in (self._counts(), self._left(), self._on) if part)
+        self._shown.update(self._task, completed=self._stored + self._done, note=note)
+
+
 @contextmanager
-def bar(name: str, total: int, stored: int) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """A progress bar with the expected time left; a line every 10 s where the output is no terminal."""
+def of(name: str, planned: Sequence[Planned], quiet: bool = False) -> Iterator[Progress]:
+    """Progress on stderr: a bar on a terminal, lines elsewhere, nothing where it is to be quiet."""
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Shown
 
     console = Console(stderr=True)
-    failed: Counter[str] = Counter()
-    if not console.is_terminal:
-        started = spoken = time.monotonic()
-        done = 0
-
-        def say(row: dict[str, Any]) -> None:
-            nonlocal spoken, done
-            done += 1
-            failed[row["status"]] += row["status"] not in ("ok", "unsupported")
-            now = time.monotonic()
-            if now - spoken > 10:
-                spoken = now
-                left = (now - started) / done * (total - stored - done)
-                print(f"{name}: {stored + done}/{total} cells, about {left:.0f} s left", file=sys.stderr)
-
-        if stored:
-            print(f"{name}: {stored} of {total} cells are stored", file=sys.stderr)
-        yield say
+    if quiet or not console.is_terminal:
+        yield Progress(name, planned) if quiet else Lines(name, planned)
         return
+    name_column = TextColumn("{task.description}", markup=False)
+    with Shown(
+        name_column, BarColumn(20), TimeElapsedColumn(), TextColumn("{task.fields[note]}", markup=False),
+        console=console, transient=True,
+    ) as shown:  # fmt: skip
+        yield Bar(name, planned, shown)
 
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
-        TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
-    )  # fmt: skip
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task(name, total=total, completed=stored, note="")
 
-        def step(row: dict[str, Any]) -> None:
-            if row["status"] not in ("ok", "unsupported"):
-                failed[row["status"]] += 1
-            bad = ", ".join(f"{count} {status}" for status, count in failed.items())
-            progress.update(task, advance=1, note=f"{row['scene']} {row['backend']} {row['estimator']} {bad}")
-
-        yield step
+def print_versions(planned: Sequence[Planned], policy: str) -> None:
+    """Say which stored rows other library versions have made, and what is done about it."""
+    aged = Counter(item.aged for item in planned if item.aged)
+    for versions, count in aged.most_common():
+        done = (
+            "they are run again" if policy == "rerun" else "versions=rerun runs them again, versions=ignore keeps quiet"
+        )
+        print(f"bench: {count} stored rows were made with {versions}: {done}", file=sys.stderr)
 
 
 def print_plan(experiment: Experiment, planned: list[Planned], rows: pd.DataFrame) -> None:
@@ -79,20 +141,18 @@ def print_plan(experiment: Experiment, planned: list[Planned], rows: pd.DataFram
     seconds = expected_seconds(runs, rows)
     if runs:
         known = "unknown until some cells have run" if math.isnan(seconds) else f"about {seconds:.0f} s"
-        print(f"expected time: {known}, references and compilation not counted")
+        print(f"expected time: {known} of one worker, new references not counted")
 
 
-def expected_seconds(runs: list[Planned], rows: pd.DataFrame) -> float:
-    """Seconds the cells should take, from the stored time per estimate of like cells scaled to their samples."""
+def expected_seconds(runs: Sequence[Planned], rows: pd.DataFrame) -> float:
+    """Seconds the cells should take, from the stored seconds of like cells scaled to their samples; NaN without any."""
     if not runs:
         return 0.0
-    ok = rows[rows["status"] == "ok"]
-    if ok.empty:
+    known = rows[(rows["status"] == "ok") & (rows["wall_s"] > 0)]
+    if known.empty:
         return math.nan
-    per_sample = ok["time_s"] / ok["samples"]
-    like = per_sample.groupby([ok["backend"], ok["estimator"]]).median().to_dict()
-    typical = float(per_sample.median())
-    return sum(
-        like.get((item.cell.backend.name, item.cell.estimator.name), typical) * item.cell.samples * item.cell.repeats
-        for item in runs
-    )
+    rate = known["wall_s"] / (known["samples"] * known["repeats"])
+    like = rate.groupby([known["backend"].str.partition("[")[0], known["estimator"]]).median().to_dict()
+    typical = float(rate.median())
+    cells = [item.cell for item in runs]
+    return sum(like.get((c.backend.name, c.estimator.name), typical) * c.samples * c.repeats for c in cells)

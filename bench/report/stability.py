@@ -20,7 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import FixedLocator, NullLocator
 from rich.console import Console
 from rich.table import Table
@@ -36,7 +36,7 @@ from bench.store import Columns, write_whole
 BLUE, BLACK, RED, GREEN, PINK, ORANGE, SKY, _ = PALETTE
 VERDICTS = {
     "ok": ("ok", "#cfe8df", "within 10% of the truth"),
-    "inaccurate": ("I", ORANGE, "off by more than 10%"),
+    "inaccurate": ("x", ORANGE, "off by more than 10%"),
     "wrong_sign": ("S", PINK, "wrong sign"),
     "zero": ("0", SKY, "exactly 0 where the truth is not"),
     "diverged": ("D", RED, "state diverged"),
@@ -49,7 +49,9 @@ DARK = ("nonfinite", "diverged")
 """Verdicts whose cells take white letters."""
 LOST = ("diverged", "nonfinite")
 """Verdicts on the far side of the measured stability boundary."""
-ACROSS = 4
+GROWING = 1 + 1e-9
+"""Measured growth per step above which a state counts as growing: 1 and rounding."""
+ACROSS = 3
 """Most panels beside each other."""
 
 
@@ -68,17 +70,29 @@ class Panel:
         """``bouncing_ball, penalty``; the contact law is left out where there is none."""
         return self.scene if self.contact == "none" else f"{self.scene}, {self.contact}"
 
+    @property
+    def measured(self) -> str:
+        """``jax, torch; truth: physical``."""
+        truth = ", ".join(text for text in self.rows["truth"].unique() if text)
+        return ", ".join(self.backends) + (f"; truth: {truth}" if truth else "")
+
+    @property
+    def kind(self) -> tuple[str, str, str]:
+        """Integrator, scene and law without parameters."""
+        return self.integrator, self.scene.partition("[")[0], self.contact.partition("[")[0]
+
     @cached_property
     def boundary(self) -> pd.DataFrame:
-        """By dt: the theoretical ``limit``, and the largest stiffness before the first that is lost, and that one.
+        """By dt: the theoretical ``limit``, and the largest stiffness before the first that is unstable, and that one.
 
+        Unstable is what diverged or was measured to grow.
         ``low`` is 0 where even the softest is lost and ``high`` infinite where none is. ``agrees`` where the limit lies
         between them, widened by one cell of the grid.
         """
         found = {}
         for dt, part in self.rows.dropna(subset=["stiffness", "stiffness_limit"]).groupby("dt"):
             part = part.sort_values("stiffness")
-            k, lost = part["stiffness"].to_numpy(), part["verdict"].isin(LOST).to_numpy()
+            k, lost = part["stiffness"].to_numpy(), unstable(part).to_numpy()
             first = int(np.argmax(lost)) if lost.any() else len(k)
             padded = np.concatenate([[0.0, 0.0], k, [math.inf, math.inf]])
             limit = float(part["stiffness_limit"].median())
@@ -88,9 +102,14 @@ class Panel:
         return pd.DataFrame([list(row.values()) for row in found.values()], list(found), columns).astype(float)
 
 
+def unstable(rows: pd.DataFrame) -> pd.Series:
+    """Mask of the cells that diverged, or whose state grows however slowly where that was measured."""
+    return rows["verdict"].isin(LOST) | (rows["growth_factor"] > GROWING)
+
+
 def panels(rows: pd.DataFrame) -> list[Panel]:
-    """The maps in order of appearance; backends that refused all of a problem are left out, the others merged if alike."""
-    found = []
+    """The maps, those of a scene and law together; backends that refused all of a problem are left out, the others merged if alike."""
+    found: list[Panel] = []
     for (integrator, scene, contact), part in rows.groupby(["integrator", "scene", "contact"], sort=False):
         groups: list[tuple[pd.DataFrame, list[str]]] = []
         for backend, mine in part.groupby("backend", sort=False):
@@ -103,7 +122,8 @@ def panels(rows: pd.DataFrame) -> list[Panel]:
             else:
                 alike[1].append(str(backend))
         found += [Panel(str(integrator), str(scene), str(contact), tuple(names), table) for table, names in groups]
-    return found
+    kinds = list(dict.fromkeys(panel.kind for panel in found))
+    return sorted(found, key=lambda panel: kinds.index(panel.kind))
 
 
 def _same(a: pd.DataFrame, b: pd.DataFrame) -> bool:
@@ -133,14 +153,15 @@ def write(experiment: Experiment, rows: pd.DataFrame, table: Columns) -> list[Pa
 
 
 def shares(maps: Sequence[Panel]) -> dict[str, float]:
-    """The share of each verdict among the cells of some maps that ran."""
-    verdicts = pd.concat([ran(panel.rows)["verdict"] for panel in maps])
-    return {name: float((verdicts == name).mean()) for name in VERDICTS if name}
+    """The share of each verdict among the cells of some maps that ran, and of those that are unstable."""
+    cells = pd.concat([ran(panel.rows) for panel in maps])
+    found = {name: float((cells["verdict"] == name).mean()) for name in VERDICTS if name}
+    return found | {"unstable": float(unstable(cells).mean())}
 
 
 def markdown(experiment: Experiment, maps: Sequence[Panel]) -> str:
     """Every map as a line: shares of the verdicts, and the measured against the theoretical boundary."""
-    names = [name for name in VERDICTS if name]
+    names = [*(name for name in VERDICTS if name), "unstable"]
     heads = ["integrator", "scene", "contact", "backends", "cells", *names, "dt", "theory", "measured", "agree"]
     out = [f"# {escape_markdown(experiment.name)}: shares of verdicts and stability limits", ""]
     out += ["| " + " | ".join(map(escape_markdown, heads)) + " |", "|" + "---|" * 4 + "--:|" * (len(heads) - 4)]
@@ -154,8 +175,10 @@ def markdown(experiment: Experiment, maps: Sequence[Panel]) -> str:
 
 NOTES = (
     "ok: " + ", ".join(f"{name}: {VERDICTS[name][2]}" for name in VERDICTS if name).removeprefix("ok: ") + ".",
+    "unstable: diverged, or, without contact, a state measured to grow by more than 1e-9 a step: it diverges at a longer "
+    "horizon, whatever the verdict on the gradient at this one.",
     "theory: stiffness at which the step's spectral radius on the oscillator leaves 1, at that dt; for a contact, while it "
-    "lasts. measured: the largest stiffness before the first that diverges, and that one.",
+    "lasts. measured: the largest stiffness before the first that is unstable, and that one.",
     "agree: step sizes at which theory and measurement are within one cell of the grid.",
 )
 
@@ -193,7 +216,7 @@ def show(experiment: Experiment, rows: pd.DataFrame, maps: Sequence[Panel]) -> N
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
     console.print(f"{len(rows)} cells: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
-    table = _table(["integrator", "scene"], ["cells", *(name for name in VERDICTS if name)])
+    table = _table(["integrator", "scene"], ["cells", *(name for name in VERDICTS if name), "unstable"])
     kinds = list(dict.fromkeys((panel.integrator, panel.scene.partition("[")[0]) for panel in maps))
     for integrator, scene in kinds:
         mine = [p for p in maps if (p.integrator, p.scene.partition("[")[0]) == (integrator, scene)]
@@ -205,7 +228,9 @@ def show(experiment: Experiment, rows: pd.DataFrame, maps: Sequence[Panel]) -> N
         if panel.contact == "none" and not panel.boundary.empty:
             limits.add_row(panel.integrator, panel.scene, *_limits(panel))
     if limits.row_count:
-        console.print("\nStability limit as a stiffness: where the spectral radius leaves 1, and where states diverge.")
+        console.print(
+            "\nStability limit as a stiffness: where the spectral radius leaves 1, and where states grow or diverge."
+        )
         console.print(limits)
     reasons = rows[rows["status"].isin(("unsupported", "unavailable", "error"))].groupby(["status", "reason"]).size()
     for (status, reason), count in reasons.items():
@@ -234,9 +259,12 @@ def heat_map(integrator: str, maps: Sequence[Panel]) -> Figure:
     figure = Figure(figsize=(width, 0.75 + down * (0.75 + 0.22 * max(len(levels), 4)) + 0.3), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(down, across, squeeze=False)
-    figure.suptitle(f"Is the gradient right? {plain(integrator)}", fontsize=9, fontweight="bold")
+    measured = {panel.measured for panel in maps}
+    common = len(measured) == 1
+    head = f"Is the gradient right? {plain(integrator)}" + "".join(f" on {text}" for text in measured if common)
+    figure.suptitle(head, fontsize=9, fontweight="bold")
     for axes, panel in zip(grid.flat, maps, strict=False):
-        _draw(axes, panel, steps, levels)
+        _draw(axes, panel, steps, levels, common)
     for spare in grid.flat[len(maps) :]:
         spare.remove()
     for i, axes in enumerate(grid.flat[: len(maps)]):
@@ -250,11 +278,15 @@ def heat_map(integrator: str, maps: Sequence[Panel]) -> Figure:
             axes.set_xticklabels([])
     present = [name for name in VERDICTS if name in set(rows["verdict"])]
     legend: list[Any] = [_swatch(name) for name in present]
-    legend.append(Line2D([], [], **BOUNDARY, label="theory: spectral radius 1"))
+    if (unstable(rows) & ~rows["verdict"].isin(LOST)).any():
+        legend.append(Patch(label="striped: state grows, slowly", facecolor="white", **STRIPES))
+    if any(axes.lines for axes in grid.flat[: len(maps)]):
+        legend.append(Line2D([], [], **BOUNDARY, label="theory: spectral radius 1"))
     figure.legend(handles=legend, loc="outside lower center", ncols=min(3, len(legend)), columnspacing=1.2)
     return figure
 
 
+STRIPES: dict[str, Any] = {"hatch": "////", "edgecolor": "#9a9a9a", "linewidth": 0.0}
 HALO = [patheffects.withStroke(linewidth=3, foreground="white")]
 BOUNDARY: dict[str, Any] = {"color": BLUE, "linewidth": 1.3, "linestyle": (0, (4, 1.5)), "path_effects": HALO}
 
@@ -265,7 +297,7 @@ def _swatch(name: str) -> Patch:
     return Patch(facecolor=colour, edgecolor="#808080", linewidth=0.4, label=label)
 
 
-def _draw(axes: Axes, panel: Panel, steps: np.ndarray, levels: np.ndarray) -> None:
+def _draw(axes: Axes, panel: Panel, steps: np.ndarray, levels: np.ndarray, common: bool) -> None:
     """Cells with their letters, and the boundary."""
     x, y = _edges(steps), _edges(levels)
     whole = panel.rows["stiffness"].isna().all()
@@ -278,35 +310,36 @@ def _draw(axes: Axes, panel: Panel, steps: np.ndarray, levels: np.ndarray) -> No
         codes[line, column] = names.index(row["verdict"] if row["verdict"] in VERDICTS else "")
         colour = "white" if row["verdict"] in DARK else "black"
         middle = math.sqrt(heights[line] * heights[line + 1])
-        axes.text(steps[column], middle, VERDICTS[names[codes[line, column]]][0], color=colour, **LETTER)
+        letter, fill, _ = VERDICTS[names[codes[line, column]]]
+        halo = [patheffects.withStroke(linewidth=2.5, foreground=fill)]
+        axes.text(steps[column], middle, letter, color=colour, path_effects=halo, **LETTER)
     colours = ListedColormap([colour for _, colour, _ in VERDICTS.values()])
     axes.pcolormesh(
         x, heights, codes, cmap=colours, vmin=-0.5, vmax=len(names) - 0.5, edgecolors="white", linewidth=0.4
     )
+    for row in panel.rows[unstable(panel.rows) & ~panel.rows["verdict"].isin(LOST)].to_dict("records"):
+        i, j = int(np.searchsorted(steps, row["dt"])), int(np.searchsorted(levels, row["stiffness"]))
+        axes.add_patch(Rectangle((x[i], y[j]), x[i + 1] - x[i], y[j + 1] - y[j], fill=False, zorder=2, **STRIPES))
     axes.set(xscale="log", yscale="log", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     axes.xaxis.set_major_locator(FixedLocator(list(steps[:: -1 if len(steps) <= 4 else -2])))
     axes.xaxis.set_major_formatter(lambda value, _: axis_value(float(f"{value:.3g}")))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.set_title("\n".join(_title(panel, whole)), pad=4)
+    axes.set_title("\n".join(_title(panel, whole, common)), pad=4)
     _draw_boundary(axes, panel, x)
 
 
 LETTER: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6.5, "zorder": 5}
 
 
-def _title(panel: Panel, whole: bool) -> list[str]:
-    """The problem, its backends, and what the boundary is where it is no line."""
-    lines = (
-        [plain(panel.scene), plain(panel.contact)] if panel.contact != "none" else [plain(panel.scene), "no contact"]
-    )
+def _title(panel: Panel, whole: bool, common: bool) -> list[str]:
+    """The problem, how it was measured unless that is common to all panels, and what the boundary is where it is no line."""
+    lines = [plain(panel.scene), plain(panel.contact) if panel.contact != "none" else "no contact"]
     limits = set(panel.boundary["limit"])
     theory = {"": limits - {0.0, math.inf} or not limits, "never stable": limits == {0.0}, "always stable": True}
     note = next(text for text, holds in theory.items() if holds)
-    truth = ", ".join(text for text in panel.rows["truth"].unique() if text)
-    lines.append(", ".join(panel.backends) + (f"; truth: {truth}" if truth else ""))
     parts = ["theory: " + note if note else "", "has no stiffness" if whole else ""]
-    return [*lines, "; ".join(filter(None, parts))]
+    return [*lines, *filter(None, ["" if common else panel.measured, "; ".join(filter(None, parts))])]
 
 
 def _draw_boundary(axes: Axes, panel: Panel, x: np.ndarray) -> None:

@@ -271,8 +271,7 @@ def _followed(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.nd
 def _asked(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same from the backend, for programs that solve equations."""
     theta = np.ascontiguousarray(np.broadcast_to(theta, (theta.shape[0], w.shape[1])))
-    found = problem.jacobians(theta, w)
-    return found.states, found.controls
+    return problem.trajectory(theta, w)
 
 
 def active(program: Program, states: np.ndarray, controls: np.ndarray) -> np.ndarray:

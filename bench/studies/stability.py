@@ -2,7 +2,8 @@
 
 Each cell simulates one rollout without noise and holds its gradient to the truth at the same duration. The truth is
 the scene's physical gradient or, where it has none, the gradient of the same program at a much finer step.
-Estimators play no part: the gradient is the backend's own at w = 0.
+Estimators play no part: the gradient is the backend's own at w = 0. Where the motion is linear the growth of the state
+is measured as well, so that an instability too slow to show within the rollout is seen all the same.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from bench import registry
-from bench.contracts import Backend, ContactLaw, ForceLaw, Integrator, Jacobians, MechanicalScene, Ops, Unsupported
+from bench.contracts import Backend, ContactLaw, ForceLaw, Integrator, MechanicalScene, Ops, Trajectory, Unsupported
 from bench.grid import Cell, Experiment
 from bench.program import Dynamics, Program
 from bench.session import Session, reference_backends
@@ -28,11 +29,13 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COLUMNS = Columns.of(
-    "first_bad_step", "spectral_radius", "stiffness_limit", "relative_error", "cosine", "grad_norm", "truth_norm",
+    "first_bad_step", "growth_factor", "spectral_radius", "stiffness_limit", "relative_error", "cosine", "grad_norm", "truth_norm",
     "truth_error", texts=("verdict", "truth"), lists=("state_at_first_bad_step",),
 )  # fmt: skip
 LIMIT = 10.0
 """Multiple of the initial scale beyond which a state component counts as diverged: 100 times the energy."""
+GROWN = 1.1
+"""Growth over the rollout of a state that cannot grow, from which it counts as diverged."""
 INACCURATE = 0.1
 """Relative error of the gradient above which it counts as wrong."""
 FINE_STEPS = 1 << 14
@@ -44,7 +47,7 @@ RESOLVED = INACCURATE / 2
 NEGLIGIBLE = 1e-9
 """Part of the truth's norm below which one of its components counts as 0."""
 NEUTRAL = 1 + 1e-9
-"""Spectral radius up to which a step counts as stable: 1 and rounding."""
+"""Spectral radius up to which a step counts as stable, in theory and as measured: 1 and rounding."""
 REACH = np.logspace(-3, 4, 141)
 """Values of dt^2 stiffness among which the stability limit is looked for."""
 
@@ -61,17 +64,16 @@ def _measured(cell: Cell, scene: MechanicalScene, session: Session) -> dict[str,
     problem = session.problem(cell)
     theta, still = scene.theta0(), np.zeros((problem.program.n_noise, 1))
     gradient = problem.grad(theta, still)[:, 0]
-    found = problem.jacobians(theta, still)
+    found = problem.trajectory(theta, still)
     states, limits = found.states[:, :, 0], bounds(problem.program, found)
-    result = {"status": "ok", "grad_norm": float(np.linalg.norm(gradient)), **theory(cell)}
-    step = first_bad_step(states, limits)
-    if step is not None:
-        verdict = "diverged" if np.isfinite(states[step]).all() else "nonfinite"
-        result |= {"status": verdict, "verdict": verdict, "first_bad_step": step}
-        beyond = LIMIT * float((np.abs(states[step]) / limits).max())
-        what = f"{beyond:.3g} times the initial scale" if verdict == "diverged" else "not finite"
-        reason = f"state at step {step} of {scene.horizon} is {what}"
-        return result | {"state_at_first_bad_step": states[step].tolist(), "reason": reason}
+    growth = growth_factor(states) if hasattr(scene, "oscillator") else math.nan
+    result = {"status": "ok", "grad_norm": float(np.linalg.norm(gradient)), "growth_factor": growth, **theory(cell)}
+    bad = first_bad_step(states, limits, growth)
+    if bad is not None:
+        step, verdict, what = bad
+        reason = f"state at step {step} of {scene.horizon} {what}"
+        result |= {"status": verdict, "verdict": verdict, "first_bad_step": step, "reason": reason}
+        return result | {"state_at_first_bad_step": states[step].tolist()}
     if not np.isfinite(gradient).all():
         return result | {"status": "nonfinite", "verdict": "nonfinite", "reason": "the gradient of a finite rollout"}
     kind, truth, error = truth_of(cell)
@@ -85,13 +87,46 @@ def _measured(cell: Cell, scene: MechanicalScene, session: Session) -> dict[str,
 # ---------------------------------------------------------------------------------------------- trajectories
 
 
-def first_bad_step(states: np.ndarray, limits: np.ndarray) -> int | None:
-    """The first step after which a component of ``states (T + 1, n)`` is not within its limit ``(n,)``, or None."""
-    inside = (np.abs(states) <= limits).all(axis=1)
-    return None if inside.all() else int(np.argmin(inside))
+def first_bad_step(states: np.ndarray, limits: np.ndarray, growth: float) -> tuple[int, str, str] | None:
+    """The first bad step of ``states (T + 1, n)``, whether it ``diverged`` or is ``nonfinite``, and why; None if none is.
+
+    A step is bad when a component is not within its limit ``(n,)``, or when growing by the factor ``growth`` at every
+    step has come to GROWN, whichever is first.
+    """
+    steps = len(states)
+    outside = ~(np.abs(states) <= limits).all(axis=1)
+    left = int(np.argmax(outside)) if outside.any() else steps
+    slow = math.ceil(math.log(GROWN) / math.log(growth)) if growth > NEUTRAL else steps
+    step = min(left, slow)
+    if step >= steps:
+        return None
+    if not np.isfinite(states[step]).all():
+        return step, "nonfinite", "is not finite"
+    if slow < left:
+        return step, "diverged", f"has grown by {GROWN - 1:.0%}, {growth - 1:.2g} a step"
+    beyond = LIMIT * float((np.abs(states[step]) / limits).max())
+    return step, "diverged", f"is {beyond:.3g} times the initial scale"
 
 
-def bounds(program: Program, found: Jacobians) -> np.ndarray:
+def growth_factor(states: np.ndarray) -> float:
+    """Growth per step of ``states (T + 1, n)`` that one linear map leads through: its spectral radius.
+
+    The map is fitted to all pairs of neighbouring states by least squares, each pair scaled to the size of its first
+    state (dynamic mode decomposition; Schmid 2010).
+    """
+    finite = np.isfinite(states).all(axis=1)
+    count = len(states) if finite.all() else int(np.argmin(finite))
+    if count < 3:
+        return math.nan
+    scaled = states[:count] / np.maximum(np.abs(states[:count]).max(axis=0), np.finfo(float).tiny)
+    size = np.linalg.norm(scaled[:-1], axis=1, keepdims=True)
+    moving = size[:, 0] > 0
+    before, after = (part[moving] / size[moving] for part in (scaled[:-1], scaled[1:]))
+    fitted = np.linalg.lstsq(before, after, rcond=None)[0]
+    return float(np.abs(np.linalg.eigvals(fitted)).max())
+
+
+def bounds(program: Program, found: Trajectory) -> np.ndarray:
     """LIMIT times the initial scale of each component, ``(n,)``.
 
     Positions: |q_0| + T |v_0|, how far the start reaches. Velocities: |v_0| + sqrt(|a_0| times that length), the speed

@@ -9,7 +9,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, Backend, Jacobians, MechanicalScene, Ops, Problem, Program, State, Unsupported, param
+from bench.contracts import (
+    Array,
+    Backend,
+    Jacobians,
+    MechanicalScene,
+    Ops,
+    Problem,
+    Program,
+    State,
+    Trajectory,
+    Unsupported,
+    param,
+)
 
 
 @dataclass(frozen=True)
@@ -82,18 +94,37 @@ class JaxProblem(Problem):
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._call(self._score_function, theta, w)
 
+    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
+        """States and controls, from a scan that keeps them."""
+        return Trajectory(*self._parts(self._followed, theta, w))
+
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """States, controls and step Jacobians, by forward mode through each step."""
-        theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
-        return Jacobians(*(np.asarray(part, dtype=np.float64) for part in self._run(self._linearised, theta, w)))
+        return Jacobians(*self._parts(self._linearised, theta, w))
 
-    def _linearised(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+    def _followed(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array]:
         import jax
         import jax.numpy as jnp
 
         program = self.program.bind(parameters)
         if not isinstance(program.scene, MechanicalScene):
             raise Unsupported(f"scene {program.scene.name} has no steps")
+
+        def advance(state: State, slices: Any) -> tuple[State, tuple[Array, Array]]:
+            u = program.control(self._ops, theta, state, slices)
+            return program.step(self._ops, state, u), (jnp.concatenate(state), u)
+
+        theta, first, scanned = program.start(self._ops, theta, w)
+        last, (before, controls) = jax.lax.scan(advance, first, scanned, program.scene.horizon)
+        return jnp.concatenate([before, jnp.concatenate(last)[None]]), controls
+
+    def _linearised(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+        import jax
+        import jax.numpy as jnp
+
+        states, controls = self._followed(parameters, theta, w)
+        program = self.program.bind(parameters)
+        assert isinstance(program.scene, MechanicalScene)
         n_q = program.scene.n_q
 
         def step(x: Array, u: Array) -> Array:
@@ -103,18 +134,15 @@ class JaxProblem(Problem):
             basis = jnp.eye(point.shape[0], dtype=point.dtype)[:, :, None] + jnp.zeros_like(point)
             return jax.vmap(lambda e: jax.jvp(function, (point,), (e,))[1], out_axes=1)(basis)
 
-        def advance(state: State, slices: Any) -> tuple[State, tuple[Array, Array]]:
-            u = program.control(self._ops, theta, state, slices)
-            return program.step(self._ops, state, u), (jnp.concatenate(state), u)
-
-        theta, first, scanned = program.start(self._ops, theta, w)
-        last, (before, controls) = jax.lax.scan(advance, first, scanned, program.scene.horizon)
-        states = jnp.concatenate([before, jnp.concatenate(last)[None]])
         a, b = jax.lax.map(
             lambda at: (derivative(lambda x: step(x, at[1]), at[0]), derivative(lambda u: step(at[0], u), at[1])),
             (states[:-1], controls),
         )
         return states, controls, a, b
+
+    def _parts(self, function: Callable[..., Any], theta: np.ndarray, w: np.ndarray) -> list[np.ndarray]:
+        theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
+        return [np.asarray(part, dtype=np.float64) for part in self._run(function, theta, w)]
 
     def _call(self, function: Callable[..., Array], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return np.asarray(self._run(function, theta, w), dtype=np.float64)

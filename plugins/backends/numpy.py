@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, Backend, Problem, Program, Unsupported, param
+from bench.contracts import Array, Backend, Problem, Program, Trajectory, Unsupported, param
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,14 @@ class NumpyProblem(Problem):
         with np.errstate(all="ignore"):
             cost = self._bound.cost(self._ops, theta.astype(self._dtype), w.astype(self._dtype))
         return np.asarray(cost, dtype=np.float64)
+
+    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
+        """States and controls, step by step."""
+        theta = np.reshape(theta, (self.dim, -1)).astype(self._dtype)
+        with np.errstate(all="ignore"):
+            steps = list(self._bound.steps(self._ops, theta, w.astype(self._dtype)))
+        states, controls = [np.concatenate(x) for x, _ in steps], [u for _, u in steps[:-1]]
+        return Trajectory(np.stack(states).astype(np.float64), np.stack(controls).astype(np.float64))
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         self.usage.rollouts += 2 * self.dim * w.shape[1]

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, Backend, Problem, Program, Unsupported
+from bench.contracts import Array, Backend, Problem, Program, Trajectory, Unsupported
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,15 @@ class TorchProblem(Problem):
         with self._torch.no_grad():
             cost = self.program.cost(self._ops, self._tensor(theta), self._tensor(w))
         return cost.to(self._torch.float64).numpy()
+
+    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
+        """States and controls, step by step."""
+        theta = np.reshape(theta, (self.dim, -1))
+        with self._torch.no_grad():
+            steps = list(self.program.steps(self._ops, self._tensor(theta), self._tensor(w)))
+            states = self._torch.stack([self._torch.cat(list(x)) for x, _ in steps])
+            controls = self._torch.stack([u for _, u in steps[:-1]])
+        return Trajectory(*(part.to(self._torch.float64).numpy() for part in (states, controls)))
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._derivative(lambda full, w: self.program.cost(self._ops, full, w), theta, w)

@@ -72,6 +72,19 @@ class BounceOnce(MechanicalScene):
         """The final height."""
         return q[0]
 
+    def mjcf(self) -> str:
+        """A sphere on a vertical slide, over a plane."""
+        return f"""
+            <worldbody>
+              <geom name="ground" type="plane" size="1 1 1"/>
+              <body>
+                <joint name="height" type="slide" axis="0 0 1"/>
+                <geom name="ball" type="sphere" size="{self.radius}" mass="{self.mass}"/>
+              </body>
+            </worldbody>
+            <contact><pair geom1="ground" geom2="ball" condim="1"/></contact>
+            <actuator><motor joint="height"/></actuator>"""
+
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray | None:
         """With impulses corrected for the time of impact: (P(z > 0) - restitution P(z < 0)) dz/dtheta, z being normal.
 

@@ -26,6 +26,7 @@ class BouncingBall(MechanicalScene):
     leaves_out: ClassVar[str] = "horizontal motion, spin, air, the ball's shape"
     n_q: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1
+    twin_difference: ClassVar[float] = 1e-3
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
 
     sigma: float = param(0.05, "standard deviation of the noise on height and velocity", "m and m/s", positive=True)
@@ -65,6 +66,19 @@ class BouncingBall(MechanicalScene):
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         """Squared distance to the target."""
         return (q[0] - self.target) ** 2
+
+    def mjcf(self) -> str:
+        """A sphere on a vertical slide, over a plane; its own position is that of its lowest point."""
+        return f"""
+            <option gravity="0 0 {-self.gravity}"/>
+            <worldbody>
+              <geom name="ground" type="plane" size="1 1 1"/>
+              <body>
+                <joint name="height" type="slide" axis="0 0 1"/>
+                <geom name="ball" type="sphere" size="0.1" pos="0 0 0.1" mass="{self.mass}"/>
+              </body>
+            </worldbody>
+            <contact><pair geom1="ground" geom2="ball" condim="1"/></contact>"""
 
     def physical_gradient(self) -> np.ndarray | None:
         """Grad f of rigid bounces with the scene's restitution, from event to event; None if the ball comes to rest."""

@@ -54,6 +54,22 @@ class Cartpole(MechanicalScene):
         cart = (u[0] + self.pole_mass * sine * swing) / (self.cart_mass + self.pole_mass * sine * sine)
         return xp.stack([cart, (self.gravity * sine - cart * cosine) / self.length])
 
+    def mjcf(self) -> str:
+        """A point mass above a hinge on a cart."""
+        return f"""
+            <option gravity="0 0 {-self.gravity}"/>
+            <worldbody>
+              <body>
+                <joint name="track" type="slide" axis="1 0 0"/>
+                <inertial pos="0 0 0" mass="{self.cart_mass}" diaginertia="1 1 1"/>
+                <body>
+                  <joint name="pole" type="hinge" axis="0 1 0"/>
+                  <inertial pos="0 0 {self.length}" mass="{self.pole_mass}" diaginertia="1e-12 1e-12 1e-12"/>
+                </body>
+              </body>
+            </worldbody>
+            <actuator><motor joint="track"/></actuator>"""
+
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """Distance from the origin and effort of one step."""
         return self.dt * (q[0] ** 2 + 10.0 * q[1] ** 2 + 0.01 * u[0] ** 2)

@@ -45,6 +45,17 @@ class DoubleIntegrator(MechanicalScene):
         """Half the squared distance to q = 1."""
         return 0.5 * (q[0] - 1.0) ** 2
 
+    def mjcf(self) -> str:
+        """A mass of 1 kg on a slide."""
+        return """
+            <worldbody>
+              <body>
+                <joint name="track" type="slide" axis="1 0 0"/>
+                <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+              </body>
+            </worldbody>
+            <actuator><motor joint="track"/></actuator>"""
+
     def sensitivity(self, integrator: Integrator | None) -> np.ndarray | None:
         """c = d q_N / d u, ``(horizon,)``, or None for an integrator it is not written down for."""
         steps = {"semi_implicit_euler": 0, "explicit_euler": 1}

@@ -29,6 +29,7 @@ class Hopper(MechanicalScene):
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1
+    twin_difference: ClassVar[float] = 1e-3
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
 
     sigma: float = param(1.0, "standard deviation of the noise on the force of each step", "N", positive=True)
@@ -75,6 +76,30 @@ class Hopper(MechanicalScene):
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
         """Upwards on the foot."""
         return xp.stack([0.0 * force[0], force[0] / self.foot_mass])
+
+    def mjcf(self) -> str:
+        """Body and foot on vertical slides, a tendon between them for the leg; the foot a sphere over a plane."""
+        return f"""
+            <option gravity="0 0 {-self.gravity}"/>
+            <worldbody>
+              <geom name="ground" type="plane" size="1 1 1"/>
+              <body>
+                <joint name="body" type="slide" axis="0 0 1"/>
+                <inertial pos="0 0 0" mass="{self.body_mass}" diaginertia="1 1 1"/>
+              </body>
+              <body>
+                <joint name="foot" type="slide" axis="0 0 1"/>
+                <geom name="foot" type="sphere" size="0.05" pos="0 0 0.05" mass="{self.foot_mass}"/>
+              </body>
+            </worldbody>
+            <tendon>
+              <fixed name="leg" springlength="{self.leg}" stiffness="{self.leg_stiffness}" damping="{self.leg_damping}">
+                <joint joint="body" coef="1"/>
+                <joint joint="foot" coef="-1"/>
+              </fixed>
+            </tendon>
+            <contact><pair geom1="ground" geom2="foot" condim="1"/></contact>
+            <actuator><motor tendon="leg"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """The step's share of error and effort."""

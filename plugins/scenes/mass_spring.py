@@ -1,5 +1,6 @@
 """Two masses on a stiff spring: stability and energy of every integrator."""
 
+import cmath
 import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -11,7 +12,7 @@ from bench.contracts import Array, ContactLaw, Integrator, MechanicalScene, Stat
 
 @dataclass(frozen=True)
 class MassSpring(MechanicalScene):
-    """Two equal masses joined by a spring, reduced to the spring's stretch: q'' = -(2 k / m) q.
+    """Two equal masses joined by a spring and damper, reduced to the spring's stretch: m q'' = -2 k q - 2 c q'.
 
     State (q, v), stretch and its rate; theta = their initial values, with parameter noise; f = q_N^2. With r the first
     row of the N-th power of the integrator's transition matrix, q_N = r . theta and grad J = 2 (r . theta) r whatever
@@ -20,13 +21,14 @@ class MassSpring(MechanicalScene):
     """
 
     name = "mass_spring"
-    leaves_out = "the centre of mass (moves uniformly), damping in the spring"
+    leaves_out = "the centre of mass (moves uniformly)"
     n_q: ClassVar[int] = 1
 
     sigma: float = param(0.01, "standard deviation of the noise on stretch and rate", "m and m/s", positive=True)
     horizon: int = param(100, "number of time steps", positive=True)
     dt: float = param(0.01, "length of a time step", "s", positive=True)
     stiffness: float = param(50.0, "k of the spring", "N/m", low=0.0)
+    damping: float = param(0.0, "c of the damper beside the spring", "N s/m", low=0.0)
     mass: float = param(1.0, "m, mass of each body", "kg", positive=True)
     velocity_factor: float = param(1.0, "factor on the velocity each step", low=0.0)
     stretch: float = param(0.1, "initial stretch at theta", "m")
@@ -41,8 +43,8 @@ class MassSpring(MechanicalScene):
         return State(theta[0:1], theta[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """The spring's, on both masses."""
-        return -2.0 * self.stiffness / self.mass * q
+        """The spring's and the damper's, on both masses."""
+        return -2.0 / self.mass * (self.stiffness * q + self.damping * v)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         """Squared stretch."""
@@ -53,23 +55,27 @@ class MassSpring(MechanicalScene):
         return 0.5 * self.stiffness * q[0] * q[0] + 0.25 * self.mass * v[0] * v[0]
 
     def oscillator(self) -> tuple[float, float, float]:
-        """Stiffness 2 k / m [1/s^2], damping [1/s] and velocity factor, as integrators' transition matrices take them."""
-        return 2.0 * self.stiffness / self.mass, 0.0, self.velocity_factor
+        """Stiffness 2 k / m [1/s^2], damping 2 c / m [1/s] and velocity factor, as transition matrices take them."""
+        return 2.0 * self.stiffness / self.mass, 2.0 * self.damping / self.mass, self.velocity_factor
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray | None:
         """2 (r . theta) r."""
         if integrator is None:
             return None
-        step = integrator.transition(self.dt, 2.0 * self.stiffness / self.mass, 0.0, self.velocity_factor)
+        step = integrator.transition(self.dt, *self.oscillator())
         return self._gradient(np.linalg.matrix_power(step, self.horizon)[0])
 
     def physical_gradient(self) -> np.ndarray | None:
-        """r = (cos w T, sin w T / w) with w^2 = 2 k / m; None with a velocity factor, which is no physics of its own."""
+        """r = the first row of exp(T A), A the oscillator's matrix; None with a velocity factor, no physics of its own."""
         if self.velocity_factor != 1.0:
             return None
-        end, frequency = self.horizon * self.dt, math.sqrt(2.0 * self.stiffness / self.mass)
-        phase = frequency * end
-        return self._gradient(np.array([math.cos(phase), math.sin(phase) / frequency if frequency else end]))
+        stiffness, damping, _ = self.oscillator()
+        half, end = 0.5 * damping, self.horizon * self.dt
+        rate = cmath.sqrt(half * half - stiffness)  # imaginary where it swings
+        even = 0.5 * (cmath.exp((rate - half) * end) + cmath.exp((-rate - half) * end))
+        odd = 0.5 * (cmath.exp((rate - half) * end) - cmath.exp((-rate - half) * end))
+        odd = odd / rate if rate else end * math.exp(-half * end)
+        return self._gradient(np.array([(even + half * odd).real, complex(odd).real]))
 
     def _gradient(self, row: np.ndarray) -> np.ndarray:
         return np.asarray(2.0 * (row @ self.theta0()) * row)

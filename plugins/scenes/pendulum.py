@@ -47,6 +47,18 @@ class Pendulum(MechanicalScene):
         inertia = self.mass * self.length * self.length
         return (u - self.damping * v) / inertia - self.gravity / self.length * xp.sin(q)
 
+    def mjcf(self) -> str:
+        """A point mass below a hinge; q is the angle from the lowest point."""
+        return f"""
+            <option gravity="0 0 {-self.gravity}"/>
+            <worldbody>
+              <body>
+                <joint name="pivot" type="hinge" axis="0 1 0" damping="{self.damping}"/>
+                <inertial pos="0 0 {-self.length}" mass="{self.mass}" diaginertia="1e-12 1e-12 1e-12"/>
+              </body>
+            </worldbody>
+            <actuator><motor joint="pivot"/></actuator>"""
+
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """Effort of one step."""
         return self.effort * self.dt * u[0] * u[0]

@@ -26,6 +26,7 @@ class Pushing(MechanicalScene):
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1
+    twin_difference: ClassVar[float] = 1e-6
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e3}
 
     sigma: float = param(0.3, "standard deviation of the noise on each force", "N", positive=True)
@@ -61,6 +62,23 @@ class Pushing(MechanicalScene):
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
         """Equal and opposite."""
         return xp.stack([-force[0] / self.mass, force[0] / self.mass])
+
+    def mjcf(self) -> str:
+        """Two spheres of radius 0.5 m on one line; joint damping of (1 - velocity_factor) m / dt is the numerical damping."""
+        damping = (1.0 - self.velocity_factor) * self.mass / self.dt
+        bodies = "".join(
+            f"""
+              <body>
+                <joint name="{name}" type="slide" axis="1 0 0" damping="{damping}"/>
+                <geom name="{name}" type="sphere" size="0.5" mass="{self.mass}"/>
+              </body>"""
+            for name in ("first", "second")
+        )
+        return f"""
+            <worldbody>{bodies}
+            </worldbody>
+            <contact><pair geom1="first" geom2="second" condim="1"/></contact>
+            <actuator><motor joint="first"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """Distance to the goal before the step, and effort."""

@@ -25,6 +25,7 @@ class WallPenalty1d(MechanicalScene):
     leaves_out: ClassVar[str] = "gravity, the second and third dimension, shapes"
     n_q: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1
+    twin_difference: ClassVar[float] = 1e-3
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 50.0, "damping": 1.0, "damping_mode": "linear"}
 
     sigma: float = param(0.1, "standard deviation of the noise on q0", "m", positive=True)
@@ -60,6 +61,21 @@ class WallPenalty1d(MechanicalScene):
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         """Distance to q = 1."""
         return xp.abs(q[0] - 1.0)
+
+    def mjcf(self) -> str:
+        """A sphere on a slide, in front of a plane; its own position is that of the point that touches.
+
+        An engine's contact never pulls, so that this is the twin with ``damping_mode=clipped`` and not of the default wall.
+        """
+        return """
+            <worldbody>
+              <geom name="wall" type="plane" size="1 1 1" zaxis="1 0 0"/>
+              <body>
+                <joint name="track" type="slide" axis="1 0 0"/>
+                <geom name="point" type="sphere" size="0.1" pos="0.1 0 0" mass="1"/>
+              </body>
+            </worldbody>
+            <contact><pair geom1="wall" geom2="point" condim="1"/></contact>"""
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
         """Of the physics: start in touch; end at q = 1 after a bounce, when leaving, when touching, at q = 1 untouched.

@@ -1,0 +1,353 @@
+"""Work in processes that can be killed: one item at a time, with limits on its time and memory.
+
+A worker is a spawned process in a session of its own. It builds a handler once, then handles items as they come, so that
+imports and compilations are paid once. It answers in JSON, and what it prints comes back through a pipe: nothing that
+a worker does is executed here. Pools of the standard library lose all their items with one that dies.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, Protocol
+
+import psutil
+
+from bench.errors import StorageError, failure
+
+TICK = 0.05
+"""Seconds between looks at the time and memory that items take."""
+AHEAD_S = 0.05
+"""Seconds of work that a worker is given ahead, so that it need not wait while results are written."""
+AHEAD = 16
+"""Most items that a worker is given ahead."""
+STEAL_S = 5.0
+"""Seconds of work that must be left in a group before an idle worker takes half of it: it has to compile again."""
+START_S = 60.0
+"""Seconds granted to a worker for starting, and for importing what an item needs, beyond the item's own time."""
+TAIL = 4000
+"""Bytes of a worker's output that are kept."""
+SINGLE = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NPROC": "1",
+}
+"""What keeps numerical libraries to one thread, when it is set before they are imported."""
+
+
+class Handler(Protocol):
+    """What handles items in a worker."""
+
+    def prepare(self, item: Any) -> None:
+        """Import what the item needs; not counted as its time."""
+
+    def __call__(self, item: Any) -> dict[str, Any]:
+        """The item's result, to be sent as JSON."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one item may take; None for any amount."""
+
+    timeout: float | None = None
+    """Seconds."""
+    memory: int | None = None
+    """Bytes of resident memory, libraries included."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What became of an item: its result, or why there is none."""
+
+    item: Any
+    result: dict[str, Any]
+    """The handler's result; ``status`` and ``reason`` where the worker was killed or died."""
+    seconds: float
+    output: str = ""
+    """The last lines that were printed meanwhile."""
+
+
+# ------------------------------------------------------------------------------------------------ in a worker
+
+
+def _serve(connection: Connection, output: Connection, make: Callable[[Any], Handler], argument: Any) -> None:
+    os.setsid()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.dup2(output.fileno(), 1)
+    os.dup2(output.fileno(), 2)
+    faulthandler.enable()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    own, handle = os.getpid(), make(argument)
+    while True:
+        try:
+            message = connection.recv_bytes()
+        except EOFError:
+            return
+        answer = _answered(connection, handle, message)
+        if os.getpid() != own:
+            os._exit(0)  # the child of a plugin that forked
+        _end_children()
+        with suppress(Exception):
+            sys.stdout.flush()
+        connection.send_bytes(answer)
+
+
+def _answered(connection: Connection, handle: Handler, message: bytes) -> bytes:
+    own, started = os.getpid(), time.perf_counter()
+    try:
+        item = pickle.loads(message)
+        handle.prepare(item)
+        connection.send_bytes(b"")
+        started = time.perf_counter()
+        text = json.dumps({"result": handle(item), "seconds": time.perf_counter() - started})
+    except StorageError as error:
+        text = json.dumps({"storage": str(error)})
+    except BaseException as error:
+        if os.getpid() != own:
+            os._exit(0)
+        text = json.dumps({"result": failure(error), "seconds": time.perf_counter() - started})
+    return text.encode()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.killpg(0, signal.SIGKILL)
+
+
+def _end_children() -> None:
+    """Kill what a plugin has started and left running."""
+    try:
+        os.waitpid(-1, os.WNOHANG)
+    except ChildProcessError:
+        return
+    children = psutil.Process().children(recursive=True)
+    for child in children:
+        with suppress(psutil.Error):
+            child.kill()
+    for child in children:
+        with suppress(ChildProcessError):
+            os.waitpid(child.pid, 0)
+
+
+# ------------------------------------------------------------------------------------------------ the pool
+
+
+@dataclass(eq=False)
+class _Worker:
+    process: BaseProcess
+    connection: Connection
+    output: Connection
+    memory: psutil.Process
+    group: deque[Any] = field(default_factory=deque)
+    """What it will be given next."""
+    given: deque[Any] = field(default_factory=deque)
+    """What it has been given and has not answered; the first is what it works on."""
+    since: float = field(default_factory=time.monotonic)
+    begun: bool = False
+    """Whether it has imported what the item needs."""
+    pace: float = 1.0
+    """Seconds the last item took."""
+    tail: bytes = b""
+
+    @property
+    def room(self) -> int:
+        """How many more items it should be given."""
+        return 1 + min(AHEAD, int(AHEAD_S / max(self.pace, 1e-6))) - len(self.given)
+
+    def listen(self) -> None:
+        """Keep the end of what has been printed."""
+        with suppress(OSError):
+            while chunk := os.read(self.output.fileno(), 1 << 16):
+                self.tail = (self.tail + chunk)[-TAIL:]
+                if len(chunk) < 1 << 16:
+                    return
+
+    def take_output(self) -> str:
+        """The last lines printed since this was last asked, on one line."""
+        lines = self.tail.decode(errors="replace").split("\n")
+        self.tail = b""
+        printable = ("".join(letter for letter in line if letter.isprintable()).strip() for line in lines)
+        return " | ".join([line for line in printable if line][-4:])[-600:]
+
+
+class Pool:
+    """Workers that share groups of items; a context manager, at whose end no process is left.
+
+    ``make(argument)`` builds the handler in each worker. With ``single`` numerical libraries keep to one thread.
+    """
+
+    def __init__(
+        self, count: int, make: Callable[[Any], Handler], argument: Any, limits: Limits, single: bool = True
+    ) -> None:
+        self._count, self._make, self._argument, self._limits, self._single = count, make, argument, limits, single
+        self._workers: list[_Worker] = []
+        self._context = multiprocessing.get_context("spawn")
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        while self._workers:
+            _end(self._workers.pop())
+
+    def run(self, groups: Sequence[Sequence[Any]]) -> Iterator[list[Answer]]:
+        """Answers as they come, each item once, and an empty list now and then. The items of a group go to one worker, in order, while that pays."""
+        waiting = deque(deque(group) for group in groups if group)
+        while True:
+            self._share(waiting)
+            busy = [worker for worker in self._workers if worker.given]
+            if not busy:
+                return
+            wait([end for worker in busy for end in (worker.connection, worker.output)], TICK)
+            yield [answer for worker in busy for answer in self._look_after(worker, waiting)]
+
+    @property
+    def current(self) -> list[Any]:
+        """The items that are being worked on."""
+        return [worker.given[0] for worker in self._workers if worker.given]
+
+    def _share(self, waiting: deque[deque[Any]]) -> None:
+        """Give every worker something to do, and start workers while there is more."""
+        for worker in self._workers:
+            if not worker.group and not worker.given:
+                worker.group = waiting.popleft() if waiting else self._half()
+        while waiting and len(self._workers) < self._count:
+            worker = self._start()
+            worker.group = waiting.popleft()
+            self._workers.append(worker)
+        for worker in self._workers:
+            while worker.group and worker.room > 0:
+                self._give(worker)
+
+    def _half(self) -> deque[Any]:
+        """The second half of the longest group that another worker has left."""
+        longest = max(self._workers, key=lambda worker: len(worker.group) * worker.pace)
+        taken: deque[Any] = deque()
+        if len(longest.group) * longest.pace > STEAL_S:
+            for _ in range(len(longest.group) // 2):
+                taken.appendleft(longest.group.pop())
+        return taken
+
+    def _give(self, worker: _Worker) -> None:
+        if not worker.given:
+            worker.since, worker.begun = time.monotonic(), False
+        worker.given.append(worker.group.popleft())
+        with suppress(OSError):  # a worker that has died is found so when it is looked after
+            worker.connection.send_bytes(pickle.dumps(worker.given[-1]))
+
+    def _start(self) -> _Worker:
+        connection, theirs = self._context.Pipe()
+        output, printed = self._context.Pipe(duplex=False)
+        os.set_blocking(output.fileno(), False)
+        process = self._context.Process(target=_serve, args=(theirs, printed, self._make, self._argument))
+        with _environment(SINGLE if self._single else {}):
+            process.start()
+        theirs.close()
+        printed.close()
+        return _Worker(process, connection, output, psutil.Process(process.pid))
+
+    def _look_after(self, worker: _Worker, waiting: deque[deque[Any]]) -> list[Answer]:
+        answers = _received(worker)
+        verdict = self._verdict(worker)
+        if verdict is None:
+            return answers
+        _end(worker)
+        answers += _received(worker)  # what it answered before it died
+        self._workers.remove(worker)
+        if worker.given:
+            guilty, seconds = worker.given.popleft(), time.monotonic() - worker.since
+            result = {"status": verdict[0], "reason": verdict[1]}
+            answers.append(Answer(guilty, result, seconds, worker.take_output()))
+        left = deque([*worker.given, *worker.group])
+        if left:
+            waiting.appendleft(left)
+        return answers
+
+    def _verdict(self, worker: _Worker) -> tuple[str, str] | None:
+        """Why a worker has to be given up, or None."""
+        code = worker.process.exitcode
+        if code is not None:
+            return "crashed", died(code)
+        if not worker.given:
+            return None
+        timeout, memory = self._limits.timeout, self._limits.memory
+        if timeout is not None and time.monotonic() - worker.since > timeout + (0 if worker.begun else START_S):
+            return "timeout", f"no result within {timeout:g} s"
+        if memory is not None:
+            with suppress(psutil.Error):
+                if worker.memory.memory_info().rss > memory:
+                    return "crashed", f"stopped for using more than {memory / 2**30:.3g} GiB of memory"
+        return None
+
+
+def died(code: int) -> str:
+    """What an exit code says of a process that ended by itself."""
+    if code >= 0:
+        return f"the process ended with exit status {code}"
+    name = signal.Signals(-code).name
+    return f"killed by {name}" + (" (out of memory?)" if name == "SIGKILL" else "")
+
+
+def _received(worker: _Worker) -> list[Answer]:
+    answers: list[Answer] = []
+    with suppress(EOFError, OSError):
+        while worker.given and worker.connection.poll():
+            message = worker.connection.recv_bytes()
+            if not message:
+                worker.since, worker.begun = time.monotonic(), True
+                continue
+            content = json.loads(message)
+            if "storage" in content:
+                raise StorageError(content["storage"])
+            worker.listen()
+            worker.pace, item = content["seconds"], worker.given.popleft()
+            answers.append(Answer(item, content["result"], worker.pace, worker.take_output()))
+            worker.since, worker.begun = time.monotonic(), False
+    worker.listen()
+    return answers
+
+
+def _end(worker: _Worker) -> None:
+    """Kill a worker and all that it has started."""
+    family: list[psutil.Process] = []
+    with suppress(psutil.Error):
+        family = worker.memory.children(recursive=True)
+    with suppress(ProcessLookupError):
+        os.killpg(worker.memory.pid, signal.SIGKILL)
+    for process in family:
+        with suppress(psutil.Error):
+            process.kill()
+    worker.process.kill()
+    worker.process.join()
+    worker.listen()
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Environment variables for processes started meanwhile."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

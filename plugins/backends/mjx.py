@@ -1,0 +1,130 @@
+"""MJX: the scene's MJCF twin in JAX, differentiated by JAX through MuJoCo's step."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, Backend, Ops, Problem, Program, State, param
+from plugins import mjcf
+from plugins.backends.jax import Jax, JaxProblem
+
+FORWARD_UP_TO = 8
+"""Length of theta up to which forward mode is the cheaper one: reverse costs as much as that many directions."""
+
+
+@dataclass(frozen=True)
+class Mjx(Jax):
+    """Gradients: exact derivative of MJX's steps, forward or reverse mode; float64 or float32.
+
+    Steps the scene's MJCF twin with MJX's own integrator and contact solver, compiled by XLA. The whole model is traced:
+    stiffness, damping, masses, sizes and time step change without compiling anew. Costs, policy and noise are the scene's.
+    """
+
+    name = "mjx"
+    requires: ClassVar[tuple[str, ...]] = ("jax", "mujoco", "mujoco.mjx=mujoco-mjx")
+    provides = Backend.provides | {"physics"}
+    reference_rank: ClassVar[int | None] = None
+
+    mode: str = param(
+        "auto", "direction of differentiation; auto: the cheaper one", choices=("auto", "reverse", "forward")
+    )
+    impedance: float = param(1e-4, "share of other forces that a contact hides; 0 is a spring", low=1e-4, high=0.9999)
+    integrator: str = param("euler", "MJX's integrator", choices=("euler", "implicitfast", "rk4"))
+    solver: str = param("newton", "MJX's constraint solver", choices=("newton", "cg"))
+    cone: str = param("pyramidal", "friction cone", choices=("pyramidal", "elliptic"))
+    iterations: int = param(1, "most iterations of the constraint solver; 1 is exact for springs", positive=True)
+    ls_iterations: int = param(4, "most iterations of its line search", positive=True)
+    lean: bool = param(True, "switch off every feature of the engine that the scene does not use")
+
+    def compile(self, program: Program) -> Problem:
+        """The twin's steps as jitted functions, compiled at the first call with each batch shape."""
+        ops = self.ops()
+        return JaxProblem(MjxProgram(program, self), ops, self.dtype, self._direction(program))
+
+    def refuses(self, program: Program) -> str | None:
+        """What has no twin, and what MJX cannot differentiate."""
+        reason = mjcf.refusal(self, program)
+        if reason is None and self.mode == "reverse" and self.iterations > 1:
+            return (
+                f"MJX's solver has no reverse mode with iterations={self.iterations}: use mode=forward or iterations=1"
+            )
+        if reason is None and self.cone == "elliptic" and mjcf.has_friction(program):
+            return "MJX's derivatives are NaN with elliptic friction cones: use cone=pyramidal"
+        return reason
+
+    def _direction(self, program: Program) -> str:
+        if self.mode != "auto":
+            return self.mode
+        return "reverse" if self.iterations == 1 and program.dim > FORWARD_UP_TO else "forward"
+
+
+class MjxProgram(Program):
+    """A program whose steps MJX takes: its parameters are the scene's and, after them, all numbers of the MJX model."""
+
+    def __init__(self, program: Program, backend: Mjx) -> None:
+        import jax
+
+        mjx = _library()
+        super().__init__(program.scene, program.contact, program.integrator)
+        model = mjcf.build(backend, program)
+        leaves, self._tree = jax.tree.flatten(mjx.put_model(model))
+        self._leaves = [np.asarray(leaf) for leaf in leaves]
+        self._model: Any = None
+        self._data = mjx.make_data(model)
+        options = tuple(getattr(backend, name) for name in ("integrator", "solver", "cone", "lean"))
+        self._settings = (*options, backend.iterations, backend.ls_iterations, int(model.opt.disableflags))
+
+    @property
+    def structure(self) -> tuple[Any, ...]:  # type: ignore[override]
+        """The program's, the engine's settings, and what of the model is no number to trace."""
+        fixed = tuple(leaf.tobytes() for leaf in self._leaves if leaf.dtype.kind != "f")
+        return (*super().structure, self._settings, self._tree, fixed)
+
+    def parameters(self) -> np.ndarray:
+        """The float parameters of the parts, then those of the model, ``(p,)``."""
+        return np.concatenate(
+            [super().parameters(), *(leaf.ravel() for leaf in self._leaves if leaf.dtype.kind == "f")]
+        )
+
+    def bind(self, parameters: Any) -> Program:
+        """This program, model included, with other values."""
+        import jax
+        import jax.numpy as jnp
+
+        start = super().parameters().size
+        bound = super().bind(parameters[:start])
+        assert isinstance(bound, MjxProgram)
+        leaves: list[Any] = []
+        for leaf in self._leaves:
+            if leaf.dtype.kind == "f":
+                leaves.append(parameters[start : start + leaf.size].reshape(leaf.shape))
+                start += leaf.size
+            else:
+                leaves.append(jnp.asarray(leaf))
+        bound._model = jax.tree.unflatten(self._tree, leaves)
+        return bound
+
+    def step(self, ops: Ops, state: State, u: Array) -> State:
+        """MJX's step of each column."""
+        import jax
+
+        mjx, kind = _library(), state.q.dtype
+        data = jax.tree.map(lambda leaf: leaf.astype(kind) if leaf.dtype.kind == "f" else leaf, self._data)
+
+        def column(q: Array, v: Array, u: Array) -> State:
+            after = mjx.step(self._model, data.replace(qpos=q, qvel=v, ctrl=u))
+            return State(after.qpos, after.qvel)
+
+        return jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)
+
+
+def _library() -> Any:
+    """``mujoco.mjx``, without what it prints when optional parts of it are missing."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        from mujoco import mjx
+    return mjx

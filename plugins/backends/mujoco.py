@@ -1,0 +1,209 @@
+"""MuJoCo: the scene's MJCF twin in the C engine, differentiated by chained finite differences of its step."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, Backend, Jacobians, MechanicalScene, Ops, Problem, Program, State, param
+from plugins import mjcf
+from plugins.backends.numpy import NumpyOps, NumpyProblem
+from plugins.backends.torch import TorchOps
+
+
+@dataclass(frozen=True)
+class Mujoco(Backend):
+    """Gradients: an adjoint pass over finite-difference Jacobians of each step (or differences of rollouts); float64.
+
+    Steps the scene's MJCF twin with MuJoCo's own integrator and contact solver, on all cores. Costs, policy and noise
+    are the scene's.
+    """
+
+    name = "mujoco"
+    requires: ClassVar[tuple[str, ...]] = ("mujoco", "torch")
+    provides = Backend.provides | {"physics"}
+
+    gradient: str = param(
+        "chain", "chained Jacobians of single steps, or differences of whole rollouts", choices=("chain", "rollouts")
+    )
+    differences: str = param("central", "finite differences of a step", choices=("central", "forward"))
+    step: float = param(1e-6, "step of the finite differences, in units of the state, or of theta", positive=True)
+    impedance: float = param(1e-4, "share of other forces that a contact hides; 0 is a spring", low=1e-4, high=0.9999)
+    integrator: str = param("euler", "MuJoCo's integrator", choices=("euler", "implicitfast"))
+    solver: str = param("newton", "MuJoCo's constraint solver", choices=("newton", "cg", "pgs"))
+    cone: str = param("pyramidal", "friction cone", choices=("pyramidal", "elliptic"))
+    iterations: int = param(100, "most iterations of the constraint solver", positive=True)
+    ls_iterations: int = param(50, "most iterations of its line search", positive=True)
+    lean: bool = param(True, "switch off every feature of the engine that the scene does not use")
+
+    def compile(self, program: Program) -> Problem:
+        """The twin's model; nothing is compiled."""
+        return MujocoProblem(program, self)
+
+    def refuses(self, program: Program) -> str | None:
+        """Single precision, and what has no twin."""
+        if self.dtype != "float64":
+            return "MuJoCo computes in double precision"
+        return mjcf.refusal(self, program)
+
+
+class MujocoProblem(NumpyProblem):
+    """A program whose steps MuJoCo takes."""
+
+    block = 1 << 10
+
+    def __init__(self, program: Program, backend: Mujoco) -> None:
+        super().__init__(program, backend.dtype, backend.step)
+        assert isinstance(program.scene, MechanicalScene)
+        self._backend = backend
+        self._engine = Engine(mjcf.build(backend, program))
+        self._open_loop = _is_open_loop(program.scene, self.dim)
+
+    def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        states, _ = self._rollout(theta, w)
+        return np.asarray(Recorded(self.program, states).cost(NumpyOps(), theta, w))
+
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        if self._backend.gradient == "rollouts":
+            return super()._grad(theta, w)
+        path = self.jacobians(theta, w)
+        return _reverse(Recorded(self.program, *path), theta, w, scored=False)
+
+    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return _reverse(Recorded(self.program, self._rollout(theta, w)[0]), theta, w, scored=True)
+
+    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
+        """States, controls and finite-difference Jacobians of the steps (``mjd_transitionFD``)."""
+        theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
+        states, controls = self._rollout(theta, w)
+        central = self._backend.differences == "central"
+        return Jacobians(states, controls, *self._engine.jacobians(states, controls, self._backend.step, central))
+
+    def _rollout(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)``; NaN from where the engine gives up."""
+        ops = NumpyOps()
+        moved, state, scanned = self.program.start(ops, theta, w)
+        horizon = self.program.scene.horizon  # type: ignore[attr-defined]
+
+        def control(t: int) -> np.ndarray:
+            return self.program.control(ops, moved, state, tuple(x[t] for x in scanned))
+
+        if self._open_loop:
+            controls = np.stack([control(t) for t in range(horizon)])
+            return self._engine.rollout(np.concatenate(state), controls), controls
+        states, controls_ = [np.concatenate(state)], []
+        for t in range(horizon):
+            controls_.append(control(t))
+            states.append(self._engine.rollout(states[-1], controls_[-1][None])[1])
+            state = State(*np.split(states[-1], 2))
+        return np.stack(states), np.stack(controls_)
+
+
+class Engine:
+    """A MuJoCo model, and a thread with data of its own for each core."""
+
+    def __init__(self, model: Any) -> None:
+        import mujoco
+        from mujoco.rollout import Rollout
+
+        self._mujoco, self._model = mujoco, model
+        self._data = [mujoco.MjData(model) for _ in range(_cores())]
+        self._pool = Rollout(nthread=len(self._data))
+
+    def rollout(self, first: np.ndarray, controls: np.ndarray) -> np.ndarray:
+        """States ``(T + 1, n, B)`` from ``first (n, B)`` under controls ``(T, n_u, B)``.
+
+        MuJoCo stops a rollout at the first bad number (beyond 1e10), where its clock stops too; those states are NaN.
+        """
+        start = np.concatenate([np.zeros((1, first.shape[1])), first]).T
+        controls = np.ascontiguousarray(np.moveaxis(controls, -1, 0))
+        kind = int(self._mujoco.mjtState.mjSTATE_CTRL)
+        states, _ = self._pool.rollout(
+            self._model, self._data, start, controls, control_spec=kind, nstep=controls.shape[1]
+        )
+        time = self._model.opt.timestep * np.arange(1, controls.shape[1] + 1)
+        states[states[:, :, 0] < time - 0.5 * self._model.opt.timestep] = np.nan
+        return np.concatenate([first[None], np.moveaxis(states[:, :, 1:], 0, -1)])
+
+    def jacobians(
+        self, states: np.ndarray, controls: np.ndarray, eps: float, central: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of each step by the state ``(T, n, n, B)`` and by the control ``(T, n_u, n, B)``, columns on threads."""
+        horizon, n_u, batch = controls.shape
+        n = states.shape[1]
+        a, b = np.full((batch, horizon, n, n), np.nan), np.full((batch, horizon, n, n_u), np.nan)
+        points = np.ascontiguousarray(np.moveaxis(states[:-1], -1, 0))
+        inputs = np.ascontiguousarray(np.moveaxis(controls, -1, 0))
+
+        def work(data: Any, columns: np.ndarray) -> None:
+            nq = self._model.nq
+            for c in columns:
+                for t in range(horizon):
+                    if not np.isfinite(points[c, t]).all():
+                        break
+                    data.qpos, data.qvel, data.ctrl = points[c, t, :nq], points[c, t, nq:], inputs[c, t]
+                    self._mujoco.mjd_transitionFD(self._model, data, eps, central, a[c, t], b[c, t], None, None)
+
+        shares = np.array_split(np.arange(batch), len(self._data))
+        with ThreadPoolExecutor(len(self._data)) as threads:
+            list(threads.map(work, self._data, shares))
+        return np.moveaxis(a, 0, -1), np.moveaxis(b, 0, -1)
+
+
+class Recorded(Program):
+    """A program along states that an engine went through; with Jacobians, its linearisation about them.
+
+    Its cost has the value and, by any differentiation of the rest, the gradient of the engine's rollouts: reverse mode
+    through it is the adjoint pass lambda_t = A_t^T lambda_{t+1} + ..., feedback and stage costs included.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        states: np.ndarray,
+        controls: np.ndarray | None = None,
+        a: np.ndarray | None = None,
+        b: np.ndarray | None = None,
+    ) -> None:
+        super().__init__(program.scene, program.contact, program.integrator)
+        self._states, self._controls, self._a, self._b = states, controls, a, b
+        self._times: Iterator[int] = iter(range(len(states) - 1))
+
+    def step(self, ops: Ops, state: State, u: Array) -> State:
+        """From each recorded state to the next; a rollout can be taken once."""
+        t, xp = next(self._times), ops.xp
+        after = xp.asarray(self._states[t + 1])
+        if self._a is not None and self._b is not None and self._controls is not None:
+            moved = xp.concat([state.q, state.v]) - xp.asarray(self._states[t])
+            after = after + xp.sum(xp.asarray(self._a[t]) * moved[None], axis=1)
+            pushed = u - xp.asarray(self._controls[t])
+            after = after + xp.sum(xp.asarray(self._b[t]) * pushed[None], axis=1)
+        n_q = state.q.shape[0]
+        return State(after[:n_q], after[n_q:])
+
+
+def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -> np.ndarray:
+    """Derivative of column b of the cost, or of the log-probability, by column b of theta, ``(d, B)``."""
+    import torch
+
+    fixed, noise = torch.tensor(theta.copy()), torch.tensor(w.copy())
+    free = torch.tensor(np.broadcast_to(theta, (theta.shape[0], w.shape[1])).copy(), requires_grad=True)
+    ops = TorchOps()
+    result = program.log_probability(ops, fixed, free, noise) if scored else program.cost(ops, free, noise)
+    (gradient,) = torch.autograd.grad(result.sum(), free, materialize_grads=True)
+    return np.asarray(gradient)
+
+
+def _is_open_loop(scene: MechanicalScene, dim: int) -> bool:
+    """Whether the control law looks at no state."""
+    zero = np.zeros((scene.n_q, 1))
+    return scene.feedback(np, np.zeros((dim, 1)), zero, zero) is None
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,112 @@
+"""From a scene's MJCF twin to a MuJoCo model: what the engine backends share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bench.contracts import MechanicalScene, Program, Unsupported
+from plugins.contacts.penalty import Penalty
+
+MATCH = {"euler": "semi_implicit_euler", "implicitfast": "semi_implicit_euler", "rk4": "rk4"}
+"""The engine's integrators, and those of the scene's program whose place they take.
+
+``euler`` is the same map. ``implicitfast`` takes joint and tendon damping at the end of the step, else it is the same.
+"""
+
+
+def refusal(backend: Any, program: Program) -> str | None:
+    """Why an engine cannot run the program, or None."""
+    scene, law = program.scene, program.contact
+    if not isinstance(scene, MechanicalScene) or scene.mjcf() is None:
+        return f"scene {scene.name} has no MJCF twin"
+    if program.integrator is None or program.integrator.name != MATCH[backend.integrator]:
+        name = program.integrator.name if program.integrator else "none"
+        return f"{backend.name} steps by its own {backend.integrator}, which stands for {MATCH[backend.integrator]}, not {name}"
+    if law is not None and not isinstance(law, Penalty):
+        return f"{backend.name} has its own contact, which stands for penalty, not {law.name}"
+    if law is not None and law.damping and law.damping_mode != "clipped":
+        return (
+            f"{backend.name}'s contacts never pull: of the dampers it stands for clipped alone, not {law.damping_mode}"
+        )
+    return None
+
+
+def build(backend: Any, program: Program) -> Any:
+    """The twin as an ``mujoco.MjModel`` with the scene's time step, the law's springs and the backend's solver.
+
+    Raises :class:`Unsupported` for what the backend refuses.
+    """
+    import mujoco
+
+    reason = backend.refuses(program)
+    if reason:
+        raise Unsupported(reason)
+    scene, law = program.scene, program.contact
+    assert isinstance(scene, MechanicalScene)
+    model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/>{scene.mjcf()}</mujoco>')
+    if (model.nq, model.nv, model.nu) != (scene.n_q, scene.n_q, scene.n_u):
+        raise ValueError(f"the twin of {scene.name} has {model.nq} coordinates and {model.nu} motors")
+    option = model.opt
+    option.timestep = scene.dt
+    option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{backend.integrator.upper()}")
+    option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{backend.solver.upper()}")
+    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{backend.cone.upper()}")
+    option.iterations, option.ls_iterations = backend.iterations, backend.ls_iterations
+    option.disableflags = _disabled(mujoco.mjtDisableBit, model, backend.lean)
+    if isinstance(law, Penalty):
+        _set_springs(model, law, backend.impedance)
+    return model
+
+
+def _set_springs(model: Any, law: Penalty, impedance: float) -> None:
+    """Each contact pair's solref and solimp such that its force is that of ``law``, for an impedance near 0.
+
+    The engine gives a contact the acceleration a = (1 - d) a_free - (k r + c r') A, with the impedance d and the inverse
+    mass A that it takes for the pair: a spring of k [N/m] that hides the share d of all other forces.
+    """
+    bodies = model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2])]
+    inverse_mass = model.body_invweight0[bodies, 0].sum(axis=0)
+    model.pair_solref[:] = -np.array([law.stiffness, law.damping]) * inverse_mass[:, None]
+    model.pair_solimp[:, :2] = impedance
+
+
+def _disabled(bit: Any, model: Any, lean: bool) -> int:
+    """Flags of what no twin may do, and with ``lean`` of what this one has no use for.
+
+    Steps must depend on the state alone (no warm start), damp as the scene does (not implicitly), diverge where they
+    diverge (no reset) and take any spring (no refsafe).
+    """
+    off = bit.mjDSBL_WARMSTART | bit.mjDSBL_EULERDAMP | bit.mjDSBL_AUTORESET | bit.mjDSBL_REFSAFE | bit.mjDSBL_CLAMPCTRL
+    if not lean:
+        return int(off)
+    springs = any(part.any() for part in (model.jnt_stiffness, model.tendon_stiffness))
+    dampers = any(part.any() for part in (model.dof_damping, model.tendon_damping))
+    used = {
+        bit.mjDSBL_CONSTRAINT: model.npair,
+        bit.mjDSBL_CONTACT: model.npair,
+        bit.mjDSBL_GRAVITY: model.opt.gravity.any(),
+        # together, for MJX takes either flag to switch off both
+        bit.mjDSBL_SPRING | bit.mjDSBL_DAMPER: springs or dampers,
+        bit.mjDSBL_ACTUATION: model.nu,
+        bit.mjDSBL_EQUALITY: model.neq,
+        bit.mjDSBL_LIMIT: model.jnt_limited.any(),
+        bit.mjDSBL_FRICTIONLOSS: model.dof_frictionloss.any(),
+        bit.mjDSBL_SENSOR: model.nsensor,
+        bit.mjDSBL_MIDPHASE: False,
+        bit.mjDSBL_ISLAND: False,
+    }
+    for flag, count in used.items():
+        if not count:
+            off |= flag
+    return int(off)
+
+
+def has_friction(program: Program) -> bool:
+    """Whether a contact of the scene's twin has more than its normal direction."""
+    import mujoco
+
+    assert isinstance(program.scene, MechanicalScene)
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{program.scene.mjcf()}</mujoco>")
+    return bool((model.pair_dim > 1).any())

@@ -1,0 +1,81 @@
+"""A box tossed on the ground: four corners that slide, stick and bounce, for physics engines alone."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.contracts import Array, MechanicalScene, State, param
+
+
+@dataclass(frozen=True)
+class TossedBox(MechanicalScene):
+    """A square box in a vertical plane lands on its corners, tumbles and slides; q = (x, height, pitch) of its centre.
+
+    State (q, v); theta is the first velocity (m/s, m/s, rad/s), with parameter noise; f = (x_T - target)^2. Four contacts
+    with friction are coupled through one body: only a physics engine runs it, from the MJCF twin.
+    """
+
+    name = "tossed_box"
+    leaves_out: ClassVar[str] = "the third dimension, edges and faces (corners are small spheres)"
+    needs_physics: ClassVar[bool] = True
+    n_q: ClassVar[int] = 3
+    n_contacts: ClassVar[int] = 4
+    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 50.0, "damping_mode": "clipped"}
+
+    sigma: float = param(0.1, "standard deviation of the noise on the first velocity", "m/s and rad/s", positive=True)
+    horizon: int = param(250, "number of time steps", positive=True)
+    dt: float = param(0.002, "length of a time step", "s", positive=True)
+    mass: float = param(1.0, "mass of the box", "kg", positive=True)
+    side: float = param(0.2, "length of a side", "m", positive=True)
+    friction: float = param(0.5, "Coulomb coefficient", low=0.0)
+    gravity: float = param(9.81, "gravitational acceleration", "m/s^2", positive=True)
+    height: float = param(0.3, "initial height of the centre", "m", positive=True)
+    speed: float = param(1.5, "initial horizontal velocity at theta", "m/s")
+    spin: float = param(2.0, "initial angular velocity at theta", "rad/s")
+    target: float = param(0.5, "horizontal position wanted at the end", "m")
+
+    def theta0(self) -> np.ndarray:
+        """Thrown forwards, spinning."""
+        return np.array([self.speed, 0.0, self.spin])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Level, at ``height``, with velocity theta."""
+        zero = 0.0 * theta[0]
+        return State(xp.stack([zero, zero + self.height, zero]), theta)
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """None of its own: the engine's."""
+        raise NotImplementedError
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Squared distance to the target."""
+        return (q[0] - self.target) ** 2
+
+    def mjcf(self) -> str:
+        """A box's mass with a small sphere in each corner, over a plane."""
+        inertia = self.mass * self.side**2 / 6
+        radius, half = 0.05 * self.side, 0.45 * self.side
+        corners = {f"corner{i}{j}": (i * half, j * half) for i in (-1, 1) for j in (-1, 1)}
+        geoms = "".join(
+            f'<geom name="{name}" type="sphere" size="{radius}" pos="{x} 0 {z}" mass="0"/>'
+            for name, (x, z) in corners.items()
+        )
+        pairs = "".join(
+            f'<pair geom1="ground" geom2="{name}" condim="3" friction="{self.friction} {self.friction} 1 1 1"/>'
+            for name in corners
+        )
+        return f"""
+            <option gravity="0 0 {-self.gravity}"/>
+            <worldbody>
+              <geom name="ground" type="plane" size="1 1 1"/>
+              <body>
+                <joint name="x" type="slide" axis="1 0 0"/>
+                <joint name="height" type="slide" axis="0 0 1"/>
+                <joint name="pitch" type="hinge" axis="0 1 0"/>
+                <inertial pos="0 0 0" mass="{self.mass}" diaginertia="{inertia} {inertia} {inertia}"/>
+                {geoms}
+              </body>
+            </worldbody>
+            <contact>{pairs}</contact>"""
