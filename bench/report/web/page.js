@@ -569,11 +569,11 @@ function select(row) {
   const command = commandOf(row);
   cell.replaceChildren(
     element("div", { className: "top" }, element("h2", { textContent: "The selected cell" }), close),
-    element("dl", {}, ...identity.map(([name, value]) => fact(name.replace(/_/g, " "), exact(value))),
-      ...results.map((column) => fact(column.label, shownAs(column, row)))),
     reason ? element("p", { className: "failed", textContent: reason }) : null,
     ...(command ? [element("p", { textContent: "It alone is run again, to the same numbers, by" }), copyable(command)]
       : page.command.words.length ? [element("p", { textContent: "The experiment as configured when this page was written has no such cell any more." })] : []),
+    element("dl", {}, ...identity.map(([name, value]) => fact(name.replace(/_/g, " "), exact(value))),
+      ...results.map((column) => fact(column.label, shownAs(column, row)))),
   );
   cell.focus({ preventScroll: true });
 }
