@@ -278,6 +278,7 @@ def test_a_row_and_a_point_select_the_cell_and_show_its_command(shown):
     shown.press("Enter")
     assert shown.do("state.selected") == shown.do("Number(document.querySelectorAll('#table tbody tr')[1].dataset.row)")
     assert shown.do("document.getElementById('command').textContent") == "python -m bench name=one_cell a=1"
+    assert "null" not in shown.do("document.getElementById('cell').innerText")
     shown.do("document.querySelector('#cell button').click(); settled()")
     assert shown.do("document.getElementById('cell').hidden")
     x, y = shown.do(
