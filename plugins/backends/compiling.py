@@ -63,7 +63,8 @@ def _compile(function: Callable[..., Any], arguments: tuple[Any, ...], folder: s
     clock.append(time.perf_counter())
     call = lowered.compile(options)
     clock.append(time.perf_counter())
-    return Compiled(call, *np.diff(clock).tolist(), loaded=compilations.made == before)
+    trace_s, lower_s, compile_s = np.diff(clock)
+    return Compiled(call, float(trace_s), float(lower_s), float(compile_s), loaded=compilations.made == before)
 
 
 def _use(folder: str | None) -> None:
