@@ -95,7 +95,11 @@ def _dispatch(words: list[str]) -> int:
 def _prepare(words: list[str]) -> tuple[Experiment, Store, list[Planned]]:
     from bench import config
 
-    return _planned(config.load([word for word in words if word != QUIET]))
+    overrides = [word for word in words if word != QUIET]
+    experiment = config.load(overrides)
+    for note in config.notes(overrides):
+        print(f"bench: {note}", file=sys.stderr)
+    return _planned(experiment)
 
 
 def _planned(experiment: Experiment) -> tuple[Experiment, Store, list[Planned]]:

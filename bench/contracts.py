@@ -375,11 +375,16 @@ class Jacobians(NamedTuple):
 
 @dataclass
 class Usage:
-    """What a stretch of work cost: rollouts, gradients, and seconds of compilation it stood on."""
+    """What a stretch of work cost: rollouts, gradients, and seconds of compilation it stood on.
+
+    ``compile_s`` includes ``trace_s``, running the Python code once, and ``lower_s``, turning it into the compiler's input.
+    """
 
     rollouts: int = 0
     gradients: int = 0
     compile_s: float = 0.0
+    trace_s: float = 0.0
+    lower_s: float = 0.0
 
 
 @dataclass

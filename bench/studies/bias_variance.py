@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench import noise, registry, statistics, timing
-from bench.contracts import compilations
+from bench.contracts import Problem, compilations
 from bench.grid import Cell, Experiment
 from bench.reference import Reference
 from bench.session import Session
@@ -73,8 +73,23 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
     bad = ~np.isfinite(estimates).all(axis=1)
     if bad.any():
         result["status"] = "nonfinite"
-        result["reason"] += f", the first in repeat {int(np.argmax(bad))} of seed {cell.seed}"
+        result["reason"] += f"; {first_bad(cell, problem, w, int(np.argmax(bad)))}"
     return result
+
+
+def first_bad(cell: Cell, problem: Problem, w: np.ndarray, repeat: int) -> str:
+    """Where an estimate that is not finite comes from, so that it can be repeated: theta, seed and sample.
+
+    The sample is the first of the repeat ``w[repeat]`` whose own cost or gradient is not finite; an estimator may
+    also spoil finite ones, or displace theta.
+    """
+    theta, samples = cell.scene.theta0(), w[repeat].T
+    spoilt = ~np.isfinite(problem.value(theta, samples))
+    if "grad" in cell.backend.provides:
+        spoilt |= ~np.isfinite(problem.grad(theta, samples)).all(axis=0)
+    sample = f"sample {int(np.argmax(spoilt))}" if spoilt.any() else "no single sample, costs and gradients are finite"
+    text = np.array2string(theta, precision=17, threshold=8, separator=", ").replace("\n", "")
+    return f"the first at seed {cell.seed}, repeat {repeat}, {sample}, theta {text}"
 
 
 def truth_of(found: Reference) -> statistics.Truth:

@@ -17,10 +17,10 @@ _busy = threading.Lock()
 
 @dataclass(frozen=True)
 class Compiled:
-    """An executable, and the seconds that it took; ``loaded`` from the folder rather than compiled."""
+    """An executable, and the seconds of its tracing, lowering and compiling; ``loaded`` from the folder for the last."""
 
     call: Callable[..., Any]
-    seconds: float
+    seconds: tuple[float, float, float]
     loaded: bool
 
 
@@ -43,13 +43,18 @@ def _compile(function: Callable[..., Any], arguments: tuple[Any, ...], folder: s
     _use(folder)
     _listen()
     before = compilations.made
-    start = time.perf_counter()
     # blocks run beside each other, one thread each
     options: dict[str, str | bool] | None = None
     if jax.default_backend() == "cpu":
         options = {"xla_cpu_multi_thread_eigen": False}
-    call = jax.jit(function).lower(*arguments).compile(options)
-    return Compiled(call, time.perf_counter() - start, loaded=compilations.made == before)
+    started = time.perf_counter()
+    traced = jax.jit(function).trace(*arguments)
+    after_trace = time.perf_counter()
+    lowered = traced.lower()
+    after_lowering = time.perf_counter()
+    call = lowered.compile(options)
+    seconds = (after_trace - started, after_lowering - after_trace, time.perf_counter() - after_lowering)
+    return Compiled(call, seconds, loaded=compilations.made == before)
 
 
 def _use(folder: str | None) -> None:

@@ -185,7 +185,9 @@ class JaxProblem(Problem):
         executable = compiled(key, function, args, self._measured)
         if key not in self._charged:
             self._charged.add(key)
-            self.usage.compile_s += executable.seconds
+            self.usage.compile_s += sum(executable.seconds)
+            self.usage.trace_s += executable.seconds[0]
+            self.usage.lower_s += executable.seconds[1]
         return executable.call(*args)
 
     def _cost(self, parameters: Array, theta: Array, w: Array) -> Array:
