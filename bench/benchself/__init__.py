@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from bench.benchself import harness, lines, rollouts, sweep
@@ -21,17 +22,22 @@ def main(words: Sequence[str]) -> int:
         raise UserError(f"quick={given['quick']} must be true or false")
     quick = given.get("quick") == "true"
     before = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
-    found = [*measure(quick)]
+    found = []
+    for line in measure(quick):
+        print(f"{line.what}: {line.value:.3g} {line.unit}", file=sys.stderr, flush=True)
+        found.append(line)
     lines.show(found)
     for path in lines.write(found, Path(given.get("results_dir", "results")).expanduser() / "bench_self", before):
         print(f"  {path}")
     return 0
 
 
-def measure(quick: bool) -> list[lines.Line]:
-    """All lines, each group told when it is done."""
+def measure(quick: bool) -> Iterator[lines.Line]:
+    """All lines, one after the other."""
     import yaml
 
     settings = yaml.safe_load((config_dir() / "bench_self.yaml").read_text())
-    found = [*rollouts.backends(settings, quick), *rollouts.references(settings, quick)]
-    return [*found, *sweep.lines(settings), *harness.lines(quick)]
+    yield from rollouts.backends(settings, quick)
+    yield from rollouts.references(settings, quick)
+    yield from sweep.lines(settings)
+    yield from harness.lines(quick)

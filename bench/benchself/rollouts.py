@@ -21,7 +21,7 @@ QUICK_SIZES = (64, 512)
 MEMORY_SIZES = SIZES[1:]
 SECONDS, CALLS = 1.0, 100
 """Seconds that the timed calls of one line should fill, and a third of the most calls."""
-LONGEST = 60.0
+LONGEST = 20.0
 """Seconds of a call beyond which larger batches are left out."""
 AGREEMENT = 1e-9
 """Largest relative difference of the native gradient."""

@@ -9,8 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from bench.contracts import compilations
 
 _known: dict[tuple[Any, ...], Compiled] = {}
@@ -19,18 +17,11 @@ _busy = threading.Lock()
 
 @dataclass(frozen=True)
 class Compiled:
-    """An executable, and the seconds of making it; ``loaded`` from the folder rather than compiled."""
+    """An executable, and the seconds of its tracing, lowering and compiling; ``loaded`` from the folder for the last."""
 
     call: Callable[..., Any]
-    trace_s: float
-    lower_s: float
-    compile_s: float
+    seconds: tuple[float, float, float]
     loaded: bool
-
-    @property
-    def seconds(self) -> float:
-        """Tracing, lowering and compiling together."""
-        return self.trace_s + self.lower_s + self.compile_s
 
 
 def compiled(key: tuple[Any, ...], function: Callable[..., Any], arguments: tuple[Any, ...], fresh: bool) -> Compiled:
@@ -52,19 +43,18 @@ def _compile(function: Callable[..., Any], arguments: tuple[Any, ...], folder: s
     _use(folder)
     _listen()
     before = compilations.made
-    clock = [time.perf_counter()]
     # blocks run beside each other, one thread each
     options: dict[str, str | bool] | None = None
     if jax.default_backend() == "cpu":
         options = {"xla_cpu_multi_thread_eigen": False}
+    started = time.perf_counter()
     traced = jax.jit(function).trace(*arguments)
-    clock.append(time.perf_counter())
+    after_trace = time.perf_counter()
     lowered = traced.lower()
-    clock.append(time.perf_counter())
+    after_lowering = time.perf_counter()
     call = lowered.compile(options)
-    clock.append(time.perf_counter())
-    trace_s, lower_s, compile_s = np.diff(clock)
-    return Compiled(call, float(trace_s), float(lower_s), float(compile_s), loaded=compilations.made == before)
+    seconds = (after_trace - started, after_lowering - after_trace, time.perf_counter() - after_lowering)
+    return Compiled(call, seconds, loaded=compilations.made == before)
 
 
 def _use(folder: str | None) -> None:

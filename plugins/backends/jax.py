@@ -57,10 +57,7 @@ class JaxOps:
         self.xp = jax.numpy
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """lax.scan over rows, keeping the carry.
-
-        The backward pass keeps the carries alone and repeats each step, unless the step iterates.
-        """
+        """lax.scan over rows, keeping the carry; the backward pass stores the carries alone and repeats each step."""
         import jax
 
         leaves, tree = jax.tree.flatten(carry)
@@ -75,9 +72,8 @@ class JaxOps:
         def body(state: list[Any], x: list[Any]) -> tuple[list[Any], None]:
             return rows.evaluate(traced.jaxpr, traced.consts, [*state, *x]), None
 
-        if not rows.iterates(traced.jaxpr):
-            body = jax.checkpoint(body, prevent_cse=False)
-        last, _ = jax.lax.scan(body, [rows.split(x) for x in leaves], [rows.split(x, axis=1) for x in slices], length)
+        kept = jax.checkpoint(body, prevent_cse=False)
+        last, _ = jax.lax.scan(kept, [rows.split(x) for x in leaves], [rows.split(x, axis=1) for x in slices], length)
         return jax.tree.unflatten(tree, [rows.join(x) for x in last])
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
@@ -185,9 +181,9 @@ class JaxProblem(Problem):
         executable = compiled(key, function, args, self._measured)
         if key not in self._charged:
             self._charged.add(key)
-            self.usage.trace_s += executable.trace_s
-            self.usage.lower_s += executable.lower_s
-            self.usage.compile_s += executable.seconds
+            self.usage.compile_s += sum(executable.seconds)
+            self.usage.trace_s += executable.seconds[0]
+            self.usage.lower_s += executable.seconds[1]
         return executable.call(*args)
 
     def _cost(self, parameters: Array, theta: Array, w: Array) -> Array:

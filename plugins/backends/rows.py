@@ -90,10 +90,3 @@ def _repeated(value: Any, count: int) -> tuple[Any, ...]:
         value = split(value)
     rows = value if isinstance(value, tuple) else (value,)
     return rows if len(rows) == count else rows * count
-
-
-def iterates(jaxpr: Any) -> bool:
-    """Whether it holds a loop, at any depth."""
-    from jax.extend.core import subjaxprs
-
-    return any(e.primitive.name in ("while", "scan") for e in jaxpr.eqns) or any(map(iterates, subjaxprs(jaxpr)))
