@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -168,10 +169,21 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         question=str(config["question"] or ""),
         study=str(config["study"]),
         marks=_table(config, "marks"),
+        compile_time=registry.coerce(bool, config["compile_time"], "compile_time"),
         reference_samples=budget,
         reference_tolerance=tolerance,
+        compile_cache=_compile_cache(config["compile_cache"]),
         **counts,
     )
+
+
+def _compile_cache(value: Any) -> Path | None:
+    if value is None:
+        return None
+    if str(value) != "default":
+        return Path(str(value)).expanduser().absolute()
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "diffsim-bench" / "jax"
 
 
 def _execution(config: Mapping[str, Any]) -> Execution:

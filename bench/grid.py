@@ -76,8 +76,12 @@ class Experiment:
     """What is measured of each cell."""
     marks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Per axis, named values to draw as lines in the charts."""
+    compile_time: bool = False
+    """Whether charts of error against time add compilation to it."""
     reference_samples: int = 1 << 18
     reference_tolerance: float = 0.005
+    compile_cache: Path | None = None
+    """Where compiled programs are kept between runs."""
     timing: bool | None = None
     """Whether cells are timed, each alone on the machine; None for what the study asks for."""
     referenced: bool = True

@@ -96,10 +96,10 @@ BIAS_VARIANCE = Columns(
         "finite_fraction", "model_error", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients",
         "peak_memory_mb", "dtype", "device", "versions", "key",
     ),
-    texts=("reference_method", "device"),
+    texts=("reference_method", "device", "shapes"),
     lists=("time_samples",),
-    extra=("variance_low", "variance_high", "time_samples"),
-    measured=("time_s", "time_iqr_s", "time_samples", "compile_s", "peak_memory_mb"),
+    extra=("variance_low", "variance_high", "time_samples", "compilations", "shapes"),
+    measured=("time_s", "time_iqr_s", "time_samples", "compile_s", "peak_memory_mb", "compilations", "shapes"),
 )  # fmt: skip
 """The columns of the main table: a contract with people's scripts."""
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench import noise, registry, statistics, timing
-from bench.contracts import Problem
+from bench.contracts import Problem, compilations
 from bench.grid import Cell, Experiment
 from bench.reference import Reference
 from bench.session import Session
@@ -27,6 +27,7 @@ TIMED_CALLS = 5
 
 def measure(cell: Cell, session: Session) -> dict[str, Any]:
     """Estimates of one cell held against the reference."""
+    compilations.restart()
     program = cell.program()
     theta = cell.scene.theta0()
     truth = session.references.of(cell)
@@ -58,10 +59,12 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
         "time_iqr_s": clock.iqr_s,
         "time_samples": list(clock.samples_s),
         "compile_s": usage.compile_s,
-        "rollouts": usage.rollouts / (calls + 1),
-        "gradients": usage.gradients / (calls + 1),
+        "rollouts": usage.rollouts / clock.calls,
+        "gradients": usage.gradients / clock.calls,
         "peak_memory_mb": timing.peak_memory_mb(),
         "device": problem.device,
+        "compilations": compilations.made,
+        "shapes": " ".join(sorted(compilations.shapes)),
     }
     if not np.isfinite(truth.batches).all():
         return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}
@@ -98,10 +101,10 @@ def truth_of(found: Reference) -> statistics.Truth:
 
 def write(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]) -> list[Path]:
     """Tables, charts and the printed table."""
-    from bench.report import charts, tables, terminal, views
+    from bench.report import charts, fastest, tables, terminal, views
 
     names = sorted(registry.entries()["estimators"])
     smoothing = views.smoothing_parameters()
     paths = tables.write(rows, experiment.directory) + charts.write(experiment, rows, axes, names, smoothing)
     terminal.show(experiment, rows, axes, smoothing)
-    return paths
+    return paths + fastest.write(experiment, rows)
