@@ -28,7 +28,7 @@ from typing import Any, Protocol
 
 import psutil
 
-from bench.errors import StorageError, failure
+from bench.errors import StorageError, UserError, failure
 
 TICK = 0.05
 """Seconds between looks at the time and memory that items take."""
@@ -42,6 +42,8 @@ START_S = 60.0
 """Seconds granted to a worker for starting, and for importing what an item needs, beyond the item's own time."""
 TAIL = 16000
 """Bytes of a worker's output that are kept."""
+READY = b"ready"
+"""What a worker sends once it can take items."""
 MARK = "BENCH_WORKER"
 """Environment variable by which what a worker has started is known, wherever it has gone."""
 SINGLE = {
@@ -96,6 +98,7 @@ def _serve(connection: Connection, output: Connection, make: Callable[[Any], Han
     faulthandler.enable(all_threads=False)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     own, handle = os.getpid(), make(argument)
+    connection.send_bytes(READY)
     while True:
         try:
             message = connection.recv_bytes()
@@ -179,6 +182,8 @@ class _Worker:
     given: deque[Any] = field(default_factory=deque)
     """What it has been given and has not answered; the first is what it works on."""
     since: float = field(default_factory=time.monotonic)
+    ready: bool = False
+    """Whether it has built its handler."""
     begun: bool = False
     """Whether it has imported what the item needs."""
     pace: float = 1.0
@@ -301,6 +306,8 @@ class Pool:
         _end(worker)
         answers += _received(worker)  # what it answered before it died
         self._workers.remove(worker)
+        if not worker.ready:
+            raise UserError(f"a worker cannot start: {verdict[1]}; last output: {worker.take_output() or 'none'}")
         if worker.given:
             guilty, seconds = worker.given.popleft(), time.monotonic() - worker.since
             result = {"status": verdict[0], "reason": verdict[1]}
@@ -340,6 +347,9 @@ def _received(worker: _Worker) -> list[Answer]:
     with suppress(EOFError, OSError):
         while worker.given and worker.connection.poll():
             message = worker.connection.recv_bytes()
+            if message == READY:
+                worker.ready = True
+                continue
             if not message:
                 worker.since, worker.begun = time.monotonic(), True
                 continue

@@ -12,6 +12,9 @@ import psutil
 import pytest
 from test_plugins import Tree
 
+from bench.errors import UserError
+from bench.workers import Limits, Pool
+
 FAULTS = '''
 """Estimators that misbehave."""
 
@@ -272,3 +275,12 @@ def test_stopping_a_run_leaves_rows_and_no_process(tree, sent, status):
     wait_for(lambda: not descendants_of(tree), 10.0)
     done = tree.run("plan", *words)
     assert "2 cells, 1 stored, 1 to run" in done.stdout
+
+
+def nothing_starts(argument):
+    raise RuntimeError("no handler today")
+
+
+def test_workers_that_cannot_start_end_the_run_at_once():
+    with Pool(2, nothing_starts, None, Limits()) as pool, pytest.raises(UserError, match="no handler today"):
+        list(pool.run([[1, 2], [3]]))
