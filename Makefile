@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m bench
 
-.PHONY: run test lint slow clean
+.PHONY: run test lint slow gallery clean
 
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
@@ -18,6 +18,11 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# All experiments again into results/ (what is stored is not repeated), then the README's gallery from them.
+gallery: $(VENV)/.installed
+	for file in conf/experiment/*.yaml; do $(RUN) +experiment=$$(basename $$file .yaml) || exit 1; done
+	$(BIN)/python -m bench.report.gallery README.md results
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -15,7 +15,7 @@ from browser import CHROMIUM, chromium
 from test_report import experiment, row, small_rows, table
 
 from bench import cli, config, grid, studies
-from bench.report import reproduce, web
+from bench.report import gallery, reproduce, web
 from bench.report.web import document
 from bench.store import Store
 
@@ -164,6 +164,23 @@ def test_report_writes_the_page_again_with_machine_and_versions(ran):
     assert "numpy" in text.partition("Configuration")[0].partition('id="made"')[2]
 
 
+def test_gallery_has_the_finding_and_keeps_what_it_cannot_make_anew(ran, tmp_path, monkeypatch):
+    loaded = {"experiment=absent": ["name=absent"], "experiment=mine": RUN}
+    monkeypatch.setattr(config, "experiments", lambda: ["absent", "mine"])
+    monkeypatch.setattr(config, "load", lambda words, load=config.load: load([*loaded[words[0]], words[1]]))
+    readme = tmp_path / "README.md"
+    readme.write_text(f"before {gallery.MARKS[0]}\n\n### `absent`\n\nkept\n{gallery.MARKS[1]} after")
+    gallery.main(readme, ran)
+    text = readme.read_text()
+    assert text.startswith("before ")
+    assert text.endswith(" after")
+    assert "### `absent`\n\nkept\n" in text
+    assert "lowest relative RMSE in" in text
+    assert "bias_variance_stiffness.png" in text
+    gallery.main(readme, ran)
+    assert readme.read_text() == text
+
+
 # -------------------------------------------------------------------------------------------------------- browser
 
 MARKS = "document.querySelectorAll('.scatterlayer .trace .point').length"
@@ -261,6 +278,7 @@ def test_a_row_and_a_point_select_the_cell_and_show_its_command(shown):
     shown.press("Enter")
     assert shown.do("state.selected") == shown.do("Number(document.querySelectorAll('#table tbody tr')[1].dataset.row)")
     assert shown.do("document.getElementById('command').textContent") == "python -m bench name=one_cell a=1"
+    assert "null" not in shown.do("document.getElementById('cell').innerText")
     shown.do("document.querySelector('#cell button').click(); settled()")
     assert shown.do("document.getElementById('cell').hidden")
     x, y = shown.do(

@@ -6,16 +6,20 @@ import csv
 import itertools
 import math
 import re
+import shutil
+import subprocess
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 from bench.grid import Experiment
 from bench.report import charts, tables, terminal, views
-from bench.report.figures import styled
+from bench.report.figures import save, styled
+from bench.report.plotted import plotted
 from bench.store import BIAS_VARIANCE
 
 NAMES = ("alpha_order", "finite_difference", "fobg", "inverse_variance", "randomized_smoothing", "reinforce")
@@ -203,7 +207,7 @@ def test_text_is_escaped_in_every_format(tmp_path):
     assert len(body) == 5
     assert len({len(re.findall(r"(?<!\\)\|", line)) for line in body}) == 1
     latex = (tmp_path / "bias_variance.tex").read_text()
-    plain = re.sub(r"\\[a-zA-Z]+(\{\})?|\\[&%$#_{}]|\$[<>|]\$", "", "\n".join(latex.splitlines()[3:]))
+    plain = re.sub(r"\\[a-zA-Z]+(\{\})?|\\[&%$#_{}]|\$[<>|]\$", "", "\n".join(latex.splitlines()[4:]))
     plain = plain.replace(r"\\", "")
     assert not set(plain) & set("$#_%~^<>|")
     assert r"\input" not in latex
@@ -277,15 +281,18 @@ def curves(panel):
     return found
 
 
-def test_charts_are_written_as_png_and_svg(tmp_path):
+def test_charts_are_written_as_pictures_and_data(tmp_path):
     made = experiment(tmp_path)
     made.directory.mkdir()
     paths = charts.write(made, small_rows(sigmas=(0.1, 0.3)), ["sigma", "stiffness"], NAMES)
     stems = {"bias_variance_sigma", "bias_variance_stiffness", "speed_accuracy"}
-    assert {path.name for path in paths} == {f"{stem}.{suffix}" for stem in stems for suffix in ("png", "svg")}
+    assert {path.name for path in paths} == {
+        f"{stem}.{suffix}" for stem in stems for suffix in ("png", "svg", "pdf", "plotted.csv")
+    }
     for path in paths:
         content = path.read_bytes()
-        assert content.startswith(b"\x89PNG" if path.suffix == ".png" else b"<?xml")
+        starts = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF", ".csv": b"panel,"}
+        assert content.startswith(starts[path.suffix])
         assert len(content) > 10_000
 
 
@@ -398,3 +405,96 @@ def test_odd_rows_break_nothing(rows, tmp_path, capsys):
     charts.write(made, table(rows), ["sigma", "stiffness"], NAMES)
     terminal.show(made, table(rows), ["sigma", "stiffness"])
     assert capsys.readouterr().out
+
+
+# ----------------------------------------------------------------------------------------------------------- paper
+
+
+def figure_of_known_data():
+    """Two panels: a line, points with intervals, an upper limit, a cross at the panel's edge."""
+    with styled():
+        made = Figure()
+        upper, lower = made.subplots(2, 1)
+        upper.set(title="up", ylabel="error")
+        upper.plot([1, 2, 3], [10.0, 20.0, math.nan], label="a", color="#0072B2")
+        upper.errorbar([1], [10.0], yerr=[[4.0], [5.0]], color="#0072B2", marker="o", linestyle="none")
+        upper.plot([2], [20.0], marker="o", markerfacecolor="white", color="#0072B2", linestyle="none")
+        upper.plot([9], [0.5], marker="x", transform=upper.get_xaxis_transform(), color="#0072B2")
+        lower.errorbar([5.0], [6.0], xerr=[[1.0], [1.0]], label="b", color="#D55E00", marker="s")
+        return made
+
+
+def test_plotted_data_is_that_of_the_figure():
+    found = plotted(figure_of_known_data())
+    assert list(found["title"]) == ["up", "up", "up"]
+    assert list(found["series"]) == ["a", "a", "b"]
+    assert list(found["mark"]) == ["point", "limit", "point"]
+    assert found[["x", "y"]].to_numpy().tolist() == [[1, 10], [2, 20], [5, 6]]
+    assert found[["y_low", "y_high"]].iloc[0].tolist() == [6.0, 15.0]
+    assert found[["x_low", "x_high"]].iloc[2].tolist() == [4.0, 6.0]
+
+
+def test_every_bias_and_interval_of_the_rows_is_in_the_plotted_data(tmp_path):
+    rows = stiffness_rows(sigmas=(0.1,), backends=("jax",), estimators=("fobg", "reinforce"))
+    made = Experiment("made_up", {}, sweep={"stiffness": list(STIFFNESS)}, results_dir=tmp_path)
+    (tmp_path / "made_up").mkdir()
+    charts.write(made, rows, ["stiffness"], NAMES)
+    found = pd.read_csv(tmp_path / "made_up" / "bias_variance_stiffness.plotted.csv")
+    for _, cell in rows[rows["bias_low"] > 0].iterrows():
+        ends = cell[["bias", "bias_low", "bias_high"]] / cell["reference_norm"]
+        near = np.isclose(found[["y", "y_low", "y_high"]], ends.to_numpy(dtype=float), rtol=1e-6).all(axis=1)
+        assert (found["series"][near] == cell["estimator"]).any()
+
+
+def test_equal_figures_are_equal_files_with_their_fonts_inside(tmp_path):
+    for name in ("first", "second"):
+        with styled():
+            paths = save(figure_of_known_data(), tmp_path / name)
+        assert [path.name.partition(".")[2] for path in paths] == ["png", "svg", "pdf", "plotted.csv"]
+    for path in paths:
+        assert path.read_bytes() == (tmp_path / f"first.{path.name.partition('.')[2]}").read_bytes()
+    pdf = (tmp_path / "first.pdf").read_bytes()
+    assert b"/FontFile2" in pdf
+    assert b"CreationDate" not in pdf
+    assert b"<text" not in (tmp_path / "first.svg").read_bytes()
+
+
+def test_best_is_told_only_where_its_interval_is_apart_from_every_other_estimator():
+    def rows(other):
+        made = [row(estimator=name, backend=backend) for name in ("fobg", "reinforce") for backend in ("jax", "torch")]
+        known = table(made)
+        known[["bias_low", "bias_high"]] = 0.0
+        ends = {"fobg": (1.0, 2.0), "reinforce": other}
+        for end, place in (("low", 0), ("high", 1)):
+            known[f"variance_{end}"] = [ends[name][place] for name in known["estimator"]]
+        return known.assign(rmse=[1.2 if name == "fobg" else 2.0 for name in known["estimator"]])
+
+    assert tables.best(rows((2.5, 4.0))).tolist() == [True, True, False, False]
+    assert not tables.best(rows((1.9, 4.0))).any()
+    assert not tables.best(rows((2.5, 4.0)).assign(variance_low=math.nan)).any()
+    assert tables.latex(tables.readable(rows((2.5, 4.0)))).count(r"\bfseries") == 2
+    assert r"\bfseries" not in tables.latex(tables.readable(rows((1.9, 4.0))))
+
+
+@pytest.mark.parametrize(
+    ("texts", "form"),
+    [(["0.10", "12", "-"], "2.2"), (["1.2e5", "-3"], "-1.1e1"), (["2.0e-7"], "1.1e-1"), (["0 (< 0.1)", "-"], "1.0")],
+)
+def test_column_format_holds_every_number(texts, form):
+    assert tables.number_format(texts) == form
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex: apt-get install texlive-science")
+@pytest.mark.parametrize("count", [30, 60])
+def test_table_compiles_in_latex(count, tmp_path):
+    rows = table(
+        [row(scene=EVIL), failed("error", EVIL, scene="other"), *(row(stiffness=float(k + 1)) for k in range(count))]
+    )
+    rows.loc[2, ["bias", "bias_low"]] = 0.0
+    tables.write(rows, tmp_path)
+    packages = re.search(r"usepackage\{(.*)\}", (tmp_path / "bias_variance.tex").read_text())[1]
+    text = rf"\documentclass{{article}}\usepackage{{{packages}}}\begin{{document}}\input{{bias_variance.tex}}\end{{document}}"
+    (tmp_path / "paper.tex").write_text(text)
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, errors="replace", timeout=120)
+    assert done.returncode == 0, done.stdout[-2000:]

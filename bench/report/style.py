@@ -34,6 +34,7 @@ STYLE: dict[str, Any] = {
     "lines.markersize": 4.5,
     "legend.frameon": False,
     "svg.hashsalt": "bench",
+    "pdf.fonttype": 42,
 }
 SYMBOLS = {
     "horizon": "$T$",

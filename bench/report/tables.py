@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.report.views import NUMBERS, axis_value, bias_text, number, pareto
+from bench.report.views import NUMBERS, UNSTEADY, axis_value, bias_text, number, pareto, unsteady
 from bench.store import BIAS_VARIANCE, IDENTITY, write_whole
 
 WHOLE = ("horizon", "samples", "repeats", "dim", "seed")
@@ -24,7 +25,8 @@ FOOTNOTES = [
     "0 (< u): the bias is not distinguishable from 0, its 95% interval reaches up to u.",
     "relative bias and rel. RMSE: divided by the norm of the reference gradient. A relative RMSE above 1 is worse "
     "than answering zero.",
-    "variance: trace of the covariance of one estimate. time: one estimate, steady state, without compilation.",
+    "variance: trace of the covariance of one estimate. time: one estimate, steady state, without compilation. "
+    f"{UNSTEADY}: the interquartile range of its calls is over 20% of it; something else ran beside them.",
 ]
 
 
@@ -68,6 +70,8 @@ class Readable:
     """Of each column, whether it holds numbers."""
     body: list[list[str]]
     reasons: list[str]
+    best: list[bool]
+    """Of each row, whether its error is the lowest of its problem beyond the intervals."""
 
 
 def readable(rows: pd.DataFrame) -> Readable:
@@ -88,7 +92,27 @@ def readable(rows: pd.DataFrame) -> Readable:
         numeric=[*(c in (*NUMBERS, "seed") for c in varying), *(True for _ in results), *(False for _ in status)],
         body=body,
         reasons=[f"({i}) {text}" for text, i in reasons.items()],
+        best=best(rows).tolist(),
     )
+
+
+def best(rows: pd.DataFrame) -> pd.Series:
+    """Of each row, whether its RMSE is the lowest of its problem and apart from that of every other estimator.
+
+    The interval of an RMSE goes from the lower to the upper ends of bias and variance, RMSE^2 = bias^2 + variance.
+    """
+    low, high = (np.sqrt(rows[f"bias_{end}"] ** 2 + rows.get(f"variance_{end}", math.nan)) for end in ("low", "high"))
+    estimator = rows["estimator"] + "[" + rows["estimator_params"] + "]"
+    ends = pd.DataFrame({"low": low, "high": high, "estimator": estimator, "rmse": rows["rmse"]})
+    found = pd.Series(False, index=rows.index)
+    for _, part in ends[rows["status"] == "ok"].groupby([rows[name] for name in (*PROBLEM, "samples")], dropna=False):
+        first = part.loc[part["rmse"].idxmin()] if part["rmse"].notna().any() else None
+        if first is not None:
+            others = part[part["estimator"] != first["estimator"]]
+            mine = part[part["estimator"] == first["estimator"]]
+            if len(others) and mine["high"].max() < others["low"].min() and others["low"].notna().all():
+                found[mine.index] = True
+    return found
 
 
 def _varying(rows: pd.DataFrame) -> tuple[list[str], list[str]]:
@@ -119,7 +143,8 @@ def _results(row: Any) -> list[str]:
         return ["-"] * 6
     return [
         bias_text(row), bias_text(row, row["reference_norm"], interval=False),
-        number(row["variance"], 3), number(row["rmse_rel"], 3), number(row["cosine"], 3), number(row["time_s"] * 1e3, 3),
+        number(row["variance"], 3), number(row["rmse_rel"], 3), number(row["cosine"], 3),
+        number(row["time_s"] * 1e3, 3) + UNSTEADY * bool(unsteady(row)),
     ]  # fmt: skip
 
 
@@ -139,20 +164,55 @@ def markdown(table: Readable) -> str:
 
 
 def latex(table: Readable) -> str:
-    """The main table in LaTeX: a ``tabular`` of booktabs, or a ``longtable`` where it would not fit a page."""
+    """The main table in LaTeX: booktabs, numbers aligned by siunitx; a ``longtable`` where it would not fit a page.
+
+    The RMSE of a row that is best of its problem beyond the intervals is bold.
+    """
     e = escape_latex
-    spec = "".join("r" if right else "l" for right in table.numeric)
-    head = [r"\toprule", " & ".join(map(e, table.headers)) + r" \\", r"\midrule"]
-    body = [" & ".join(map(e, cells)) + r" \\" for cells in table.body]
+    texts = [[row[i] for row in table.body] for i in range(len(table.headers))]
+    formats = [number_format(column) if right else "" for column, right in zip(texts, table.numeric, strict=True)]
+    spec = "".join(f"S[table-format={form}]" if form else "l" for form in formats)
+    heads = [f"{{{e(text)}}}" if form else e(text) for text, form in zip(table.headers, formats, strict=True)]
+    error = table.headers.index("rel. RMSE")
+    body = []
+    for row, first in zip(table.body, table.best, strict=True):
+        cells = [_latex_number(text) if form else e(text) for text, form in zip(row, formats, strict=True)]
+        if first:
+            cells[error] = rf"\bfseries {cells[error]}"
+        body.append(" & ".join(cells) + r" \\")
+    head = [r"\toprule", " & ".join(heads) + r" \\", r"\midrule"]
     if len(table.body) > PAGE_ROWS:
-        kind, packages = "longtable", "booktabs,longtable"
+        kind, packages = "longtable", "booktabs,longtable,siunitx"
         body = [*head, r"\endhead", r"\bottomrule", r"\endfoot", *body, r"\end{longtable}"]
     else:
-        kind, packages = "tabular", "booktabs"
+        kind, packages = "tabular", "booktabs,siunitx"
         body = [*head, *body, r"\bottomrule", r"\end{tabular}", ""]
-    out = [rf"% needs \usepackage{{{packages}}}", r"\begingroup\footnotesize", rf"\begin{{{kind}}}{{{spec}}}", *body]
-    notes = (table.title + ".", *table.shared, *FOOTNOTES, *table.reasons)
+    setup = [r"\begingroup\footnotesize\setlength{\tabcolsep}{3pt}", r"\sisetup{detect-weight=true,mode=text}"]
+    out = [rf"% needs \usepackage{{{packages}}}", *setup, rf"\begin{{{kind}}}{{{spec}}}", *body]
+    bold = ["Bold: lowest error of its problem, its interval apart from that of every other estimator."] * any(
+        table.best
+    )
+    notes = (table.title + ".", *table.shared, *FOOTNOTES, *bold, *table.reasons)
     return "\n".join([*out, *(rf"\noindent {e(note)}\par" for note in notes), r"\endgroup"]) + "\n"
+
+
+NUMBER = re.compile(r"(-?)(\d+)(?:\.(\d+))?(?:e(-?)(\d+))?")
+"""A number as tables print it: sign, whole and decimal digits, sign and digits of its exponent."""
+
+
+def number_format(texts: Sequence[str]) -> str:
+    """The ``table-format`` that holds all numbers of a column: ``-3.2e-1``."""
+    found = [match.groups(default="") for match in map(NUMBER.fullmatch, texts) if match]
+    if not found:
+        return "1.0"
+    sign, power_sign = ("-" if any(parts[i] for parts in found) else "" for i in (0, 3))
+    whole, decimals, power = (max(len(parts[i]) for parts in found) for i in (1, 2, 4))
+    return f"{sign}{whole}" + (f".{decimals}" if decimals else "") + (f"e{power_sign}{power}" if power else "")
+
+
+def _latex_number(text: str) -> str:
+    """A number for siunitx to align; what is none in braces."""
+    return text if NUMBER.fullmatch(text) else f"{{{escape_latex(text)}}}"
 
 
 def plain_markdown(table: pd.DataFrame, heads: Mapping[str, str] = MappingProxyType({})) -> str:

@@ -20,6 +20,7 @@ from bench.report.views import (
     Family,
     Line,
     along,
+    duration,
     families,
     lines,
     number,
@@ -63,6 +64,8 @@ RESULTS = [
     Column("compile_s", "compile", "seconds"),
     Column("rollouts", "rollouts"),
 ]
+GOAL = 0.1
+"""Relative RMSE to which the fastest way is named."""
 EXCEPTIONS = 2
 """Most settings that the finding names where another estimator is to be used."""
 
@@ -105,7 +108,7 @@ def content(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]) -> 
         )
     )
     return Content(
-        finding=nothing_ran(rows) or finding(told),
+        finding=nothing_ran(rows) or "; ".join(filter(None, [finding(told), fastest(rows)])) + ".",
         rows=made,
         columns=[*identity_columns(rows), *RESULTS, *STATUS],
         charts=charts,
@@ -165,7 +168,7 @@ def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
     styles = Look(rows, sorted(registry.entries()["estimators"]))
     found = {}
     for estimator, params in dict.fromkeys(zip(rows["estimator"], rows["estimator_params"], strict=True)):
-        line = Line(estimator, params, {}, rows.iloc[:0], {}, 0)
+        line = Line(estimator, params, {}, rows.iloc[:0], {}, frozenset(), 0)
         style = styles.marked(line)
         found[line.label] = look(style["color"], SYMBOLS[style["marker"]], DASHES[str(style["linestyle"])])
     return found
@@ -222,7 +225,7 @@ def finding(told: Sequence[Told]) -> str:
     """One sentence: the estimator that has the lowest error most often, and where to use another."""
     settings = [(one, x) for one in told for x in one.lowest]
     if not settings:
-        return "No cell has an error that could be compared."
+        return "No cell has an error that could be compared"
     labels = list(dict.fromkeys(line.label for one in told for line in one.lines))
     wins = {label: [(one, x) for one, x in settings if label in one.winners[x]] for label in labels}
     main = min(labels, key=lambda label: (-len(wins[label]), labels.index(label)))
@@ -234,8 +237,24 @@ def finding(told: Sequence[Told]) -> str:
     if min(errors) >= 1:
         text = f"Nothing beats answering zero: even {main}, lowest in {share}, has a relative RMSE of {between(errors)}"
     others = elsewhere(told, main)
-    left = counted(len(others) - EXCEPTIONS, "further exception") + " below" if len(others) > EXCEPTIONS else ""
-    return "; ".join(filter(None, [text, *(other.told(main) for other in others[:EXCEPTIONS]), left])) + "."
+    left = counted(len(others) - EXCEPTIONS, "further exception") if len(others) > EXCEPTIONS else ""
+    return "; ".join(filter(None, [text, *(other.told(main) for other in others[:EXCEPTIONS]), left]))
+
+
+def fastest(rows: pd.DataFrame) -> str:
+    """Which estimator on which backend reaches GOAL first most often; nothing where there is one backend alone."""
+    good = rows[(rows["status"] == "ok") & (rows["rmse_rel"] <= GOAL) & np.isfinite(rows["time_s"])]
+    if rows["backend"].nunique() < 2 or good.empty:
+        return ""
+    settings = good["time_s"].groupby([good[name] for name in PROBLEM], dropna=False)
+    first = good.loc[settings.idxmin()]
+    ways = _label(first) + " on " + first["backend"]
+    way = ways.value_counts().index[0]
+    times = sorted(first.loc[ways == way, "time_s"])
+    if len(first) < 2:
+        return ""
+    share = f"{len(times)} of the {counted(len(first), 'setting')} where any does"
+    return f"a relative RMSE of {GOAL:g} is reached first by {way} in {share} ({duration(times[0])} to {duration(times[-1])})"
 
 
 def elsewhere(told: Sequence[Told], main: str) -> list[Elsewhere]:

@@ -150,8 +150,10 @@ def answers(rows: pd.DataFrame) -> pd.DataFrame:
     for problem, part in good.groupby(titled(good, names), sort=False):
         part = part.sort_values("horizon")
         first, last = part.iloc[0], part.iloc[-1]
-        wins = part[part["zeroth_order_variance"] < part["first_order_variance"]]
-        from_ = f"from {axis_value(wins['horizon'].iloc[0])} steps" if len(wins) else "nowhere"
+        wins = (part["zeroth_order_variance"] < part["first_order_variance"]).to_numpy()
+        losing = np.flatnonzero(~wins)
+        first_win = int(losing[-1]) + 1 if len(losing) else 0
+        from_ = f"from {axis_value(part['horizon'].iloc[first_win])} steps" if first_win < len(part) else "nowhere"
         found.append(
             {
                 "problem": str(problem),

@@ -12,6 +12,7 @@ const FIRST = 60, MORE = 240; // rows of the table at first, and with every "Sho
 const GLYPHS = {
   circle: "●", square: "■", diamond: "◆", "triangle-up": "▲", "triangle-down": "▼", cross: "✚", x: "✖", star: "★",
 };
+const GONE = "The experiment, as configured when this page was written, has no such cell any more.";
 const state = { chosen: {}, find: "", sort: null, limit: FIRST, selected: -1, theme: "auto" };
 let visible = new Uint8Array(rowCount).fill(1);
 let searchable = null;
@@ -566,14 +567,15 @@ function select(row) {
     .filter(([, value]) => value !== null && value !== "" && value !== "none");
   const results = page.columns.filter((column) => !page.identity.includes(column.name) && column.name !== "reason");
   const reason = reader("rows", "reason")(row);
+  const failed = reader("rows", "status")(row) !== "ok";
   const command = commandOf(row);
   cell.replaceChildren(
     element("div", { className: "top" }, element("h2", { textContent: "The selected cell" }), close),
+    ...(reason ? [element("p", { className: failed ? "failed" : "hint", textContent: reason })] : []),
+    ...(command ? [element("p", { textContent: "It alone is run again, to the same numbers, by" }), copyable(command)] : []),
+    ...(!command && page.command.words.length ? [element("p", { textContent: GONE })] : []),
     element("dl", {}, ...identity.map(([name, value]) => fact(name.replace(/_/g, " "), exact(value))),
       ...results.map((column) => fact(column.label, shownAs(column, row)))),
-    reason ? element("p", { className: "failed", textContent: reason }) : null,
-    ...(command ? [element("p", { textContent: "It alone is run again, to the same numbers, by" }), copyable(command)]
-      : page.command.words.length ? [element("p", { textContent: "The experiment as configured when this page was written has no such cell any more." })] : []),
   );
   cell.focus({ preventScroll: true });
 }

@@ -42,7 +42,7 @@ def content(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]) -> 
     charts = [
         Chart(
             "The errors against each other",
-            "Lower right is the trap: a gradient of the right program and the wrong physics is at the top of this chart.",
+            "High and to the left is the trap: right for the program, wrong for the physics.",
             [Axis(name, text) for name, text in ERRORS.items() if name != "model_error_rel"],
             [Axis("model_error_rel", ERRORS["model_error_rel"], above_one="larger than the gradient")],
             facet="problem",

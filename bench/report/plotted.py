@@ -1,0 +1,150 @@
+"""The data of a figure as a table, read from what is drawn: exactly the plotted values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_hex
+from matplotlib.container import ErrorbarContainer
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+COLUMNS = [
+    "panel",
+    "title",
+    "x_label",
+    "y_label",
+    "series",
+    "mark",
+    "x",
+    "y",
+    "x_low",
+    "x_high",
+    "y_low",
+    "y_high",
+    "text",
+]
+HOLLOW = "#ffffff"
+"""The face of markers at upper limits."""
+SIGNS: dict[Any, str] = {"|": "tick", "x": "cross"}
+
+
+def plotted(figure: Figure) -> pd.DataFrame:
+    """A line per point of a figure, with its interval; also bands, vertex by vertex, and texts at places of the data.
+
+    ``mark`` is ``point``, ``limit`` (an upper limit), ``tick``, ``cross``, ``line`` (a corner of a line without markers), ``band`` or ``text``.
+    """
+    rows = []
+    for number, axes in enumerate(figure.axes):
+        told = {"panel": number, "title": _title(axes), "x_label": axes.get_xlabel(), "y_label": _y_label(axes)}
+        rows += [told | row for row in (*_points(axes), *_bands(axes), *_texts(axes))]
+    return pd.DataFrame(rows, columns=COLUMNS)
+
+
+def _points(axes: Axes) -> Iterator[dict[str, Any]]:
+    """The points of all lines; one without a label belongs to the last labelled one of its colour before it, or the first."""
+    bars = _intervals(axes)
+    drawn = [line for line in axes.lines if line.get_transform() == axes.transData]
+    named = {line: label for line in drawn if (label := _label(axes, line))}
+    labels = {to_hex(line.get_color()): label for line, label in reversed(named.items())}
+    seen: dict[tuple[str, float, float], dict[str, Any]] = {}
+    for line in drawn:
+        colour = to_hex(line.get_color())
+        labels[colour] = named.get(line, labels.get(colour, ""))
+        series = labels[colour]
+        for x, y in np.asarray(line.get_xydata(), dtype=float):
+            if not np.isfinite([x, y]).all():
+                continue
+            row = {"series": series, "mark": _mark(line), "x": x, "y": y}
+            known = seen.setdefault((series, x, y), row)
+            if known["mark"] == "line":
+                known["mark"] = row["mark"]
+            known |= bars.get((colour, x, y), {})
+    yield from seen.values()
+
+
+def _label(axes: Axes, line: Line2D) -> str:
+    """The label of a line, or of the error bars that it is a part of; nothing where it has none."""
+    owners = [c for c in axes.containers if isinstance(c, ErrorbarContainer) and c.lines[0] is line]
+    texts = [str(line.get_label()), *(str(owner.get_label()) for owner in owners)]
+    return next((text for text in texts if not text.startswith("_") and text != "None"), "")
+
+
+def _mark(line: Line2D) -> str:
+    if line.get_marker() in ("", "None", None):
+        return "line"
+    if line.get_marker() in SIGNS:
+        return SIGNS[line.get_marker()]
+    face = line.get_markerfacecolor()
+    return "limit" if face not in ("none", "auto") and to_hex(face) == HOLLOW else "point"
+
+
+def _intervals(axes: Axes) -> dict[tuple[str, float, float], dict[str, float]]:
+    """The ends of error bars by the colour and place of their points."""
+    found: dict[tuple[str, float, float], dict[str, float]] = {}
+    for container in axes.containers:
+        if not isinstance(container, ErrorbarContainer) or container.lines[0] is None:
+            continue
+        line, _, bars = container.lines
+        points = np.asarray(line.get_xydata(), dtype=float)
+        kinds = [name for name, drawn in (("x", container.has_xerr), ("y", container.has_yerr)) if drawn]
+        for kind, collection in zip(kinds, bars, strict=True):
+            assert isinstance(collection, LineCollection)
+            for (x, y), segment in zip(points, collection.get_segments(), strict=False):
+                ends = np.asarray(segment)[:, 0 if kind == "x" else 1]
+                place = found.setdefault((to_hex(line.get_color()), x, y), {})
+                place |= {f"{kind}_low": float(ends.min()), f"{kind}_high": float(ends.max())}
+    return found
+
+
+def _bands(axes: Axes) -> Iterator[dict[str, Any]]:
+    """Corners of filled areas between curves."""
+    for area in axes.collections:
+        if isinstance(area, PolyCollection) and area.get_transform().contains_branch(axes.transData):
+            for path in area.get_paths():
+                for x, y in np.asarray(path.vertices):
+                    yield {"series": str(area.get_label()).removeprefix("_"), "mark": "band", "x": x, "y": y}
+
+
+def _texts(axes: Axes) -> Iterator[dict[str, Any]]:
+    """Texts that stand at a place of the data: letters of a map."""
+    for text in axes.texts:
+        if text.get_transform() == axes.transData and text.get_text():
+            x, y = text.get_position()
+            yield {"series": "", "mark": "text", "x": x, "y": y, "text": text.get_text()}
+
+
+def _title(axes: Axes) -> str:
+    """The panel's title, or that of the panel above it."""
+    return " ".join(_nearest(axes, "title").split())
+
+
+def _y_label(axes: Axes) -> str:
+    """The label of the y axis, or that of the panel to the left."""
+    return re.sub(r"\s+", " ", _nearest(axes, "label"))
+
+
+def _nearest(axes: Axes, what: str) -> str:
+    def text(one: Axes) -> str:
+        return one.get_title() if what == "title" else one.get_ylabel()
+
+    spec = axes.get_subplotspec()
+    if text(axes) or spec is None or axes.figure is None:
+        return text(axes)
+    found = []
+    for other in axes.figure.axes:
+        place = other.get_subplotspec()
+        if place is None or place.get_gridspec() is not spec.get_gridspec() or not text(other):
+            continue
+        down = spec.rowspan.start - place.rowspan.start
+        across = spec.colspan.start - place.colspan.start
+        apart, aside = (down, across) if what == "title" else (across, down)
+        if apart > 0 and aside == 0:
+            found.append((apart, text(other)))
+    return min(found)[1] if found else ""
