@@ -115,6 +115,6 @@ def _print(experiment: Experiment, rows: pd.DataFrame, table: pd.DataFrame) -> N
         grid.add_column(HEADERS.get(name, name), no_wrap=True)
     for line in table[list(PRINTED)].itertuples(index=False):
         grid.add_row(*map(str, line))
-    Console(highlight=False).print(grid)
+    Console(highlight=False, markup=False).print(grid)
     for row in rows[rows["status"] != "ok"].to_dict("records"):
         print(f"{row['scene']}, {row['backend']}: {row['status']}: {row['reason']}")

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, MechanicalScene, State, param
+from bench.contracts import Array, MechanicalScene, State, Unsupported, param
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,12 @@ class TossedBox(MechanicalScene):
         return State(xp.stack([zero, zero + self.height, zero]), theta)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """None of its own: the engine's."""
-        raise NotImplementedError
+        """The engine's: raises :class:`Unsupported`."""
+        raise Unsupported("tossed_box moves in physics engines alone")
+
+    def gap(self, xp: Any, q: Array) -> Array:
+        """The engine's: raises :class:`Unsupported`."""
+        raise Unsupported("the contacts of tossed_box are a physics engine's")
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         """Squared distance to the target."""
