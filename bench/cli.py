@@ -26,6 +26,7 @@ Compare gradient estimators through physics simulation.
   python -m bench check [NAME ...]                          the conformance kit on some plugins, or all
   python -m bench gradcheck SCENE ... [key=value ...]       gradients against differences of the cost, and what is wrong
   python -m bench trace SCENE ... [key=value ...]           one rollout: do gradient spikes line up with contact switches?
+  python -m bench bench-self [quick=true]                   the harness's own speed, beside a NumPy loop and native code
   python -m bench compare BEFORE AFTER [--timings]          two results, cell by cell: 1 when something got worse
 
 Experiments: {experiments}
@@ -70,6 +71,7 @@ def _dispatch(words: list[str]) -> int:
         "check": _check,
         "gradcheck": _gradcheck,
         "trace": _trace,
+        "bench-self": _bench_self,
         "compare": _compare,
     }
     if not words or words[0] in ("-h", "--help", "help"):
@@ -93,7 +95,11 @@ def _dispatch(words: list[str]) -> int:
 def _prepare(words: list[str]) -> tuple[Experiment, Store, list[Planned]]:
     from bench import config
 
-    return _planned(config.load([word for word in words if word != QUIET]))
+    overrides = [word for word in words if word != QUIET]
+    experiment = config.load(overrides)
+    for note in config.notes(overrides):
+        print(f"bench: {note}", file=sys.stderr)
+    return _planned(experiment)
 
 
 def _planned(experiment: Experiment) -> tuple[Experiment, Store, list[Planned]]:
@@ -111,10 +117,13 @@ def _run(words: list[str]) -> int:
 def _execute(experiment: Experiment, store: Store, planned: list[Planned], words: list[str]) -> int:
     import time
 
-    from bench import runner
+    from bench import runner, timing
     from bench.report import progress
 
     started = time.time()
+    timing.load_at_start()
+    if experiment.compile_cache:
+        os.environ["BENCH_COMPILE_CACHE"] = str(experiment.compile_cache)
     progress.print_versions(planned, experiment.execution.versions)
     store.prepare()
     with progress.of(experiment.name, planned, QUIET in words) as shown:
@@ -245,6 +254,12 @@ def _facts(entry: Any) -> str:
 
 
 # ---------------------------------------------------------------------------------------------------- check
+
+
+def _bench_self(words: list[str]) -> int:
+    from bench import benchself
+
+    return benchself.main(words)
 
 
 def _check(words: list[str]) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -51,31 +52,38 @@ def load(overrides: Sequence[str]) -> Experiment:
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
             config = compose("config", overrides=prepared)
-        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        plain = OmegaConf.to_container(config, resolve=False, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(str(error).strip().splitlines()[0]) from None
     assert isinstance(plain, dict)
     return experiment({str(k): v for k, v in plain.items()})
 
 
-def _known_keys() -> set[str]:
+@registry.remember
+def _known_keys() -> frozenset[str]:
     import yaml
 
-    return set(yaml.safe_load((config_dir() / "config.yaml").read_text())) - {"defaults"}
+    return frozenset(yaml.safe_load((config_dir() / "config.yaml").read_text())) - {"defaults"}
 
 
 def _prepared(override: str) -> str:
     """The override as Hydra wants it, with experiments and plugin parameters reachable without ``+``."""
     if "=" not in override:
         raise UserError(f"'{override}' is not an override: write key=value (commands come first: see --help)")
+    if "${" in override:
+        raise UserError(f"'{override}': interpolations are not resolved here, give the value itself")
     key, _, value = override.partition("=")
     bare = key.lstrip("+~")
     head = bare.partition(".")[0]
     if head == "experiment":
+        if "," in value:
+            raise UserError(
+                f"'{override}': one command runs one experiment, with its own sweep; give a command to each"
+            )
         if value not in experiments():
             raise unknown("experiment", value, experiments())
         return f"+experiment={value}"
-    if head == "hydra" or key.startswith("~"):
+    if head.partition("/")[0] == "hydra" or key.startswith("~"):
         raise UserError(f"'{override}': Hydra's own settings cannot be changed here")
     if head not in _known_keys():
         raise unknown("setting", bare, {*_known_keys(), "experiment"})
@@ -86,6 +94,26 @@ def _prepared(override: str) -> str:
     if bare != head and head != "reference":
         raise UserError(f"'{bare}' is not a setting: '{head}' has no parts")
     return f"{bare}={value}"
+
+
+def notes(overrides: Sequence[str]) -> list[str]:
+    """What wins where both an experiment's file and the command line give a sweep."""
+    import yaml
+
+    split = [(key.lstrip("+"), value) for key, _, value in (word.partition("=") for word in overrides)]
+    chosen = [value for key, value in split if key == "experiment"]
+    given: list[str] = []
+    for key, value in split:
+        head, _, axis = key.partition(".")
+        if head == "sweep":
+            given.extend([axis] if axis else (yaml.safe_load(value.replace(":", ": ")) or {}))
+    if not chosen or not given:
+        return []
+    own = yaml.safe_load((config_dir() / "experiment" / f"{chosen[-1]}.yaml").read_text()).get("sweep") or {}
+    wins = [f"{axis} of the command line replaces that of {chosen[-1]}" for axis in given if axis in own]
+    adds = [f"{axis} of the command line is multiplied with it" for axis in given if axis not in own]
+    kept = [f"{axis} of {chosen[-1]} stays" for axis in own if axis not in given]
+    return [f"sweep: {'; '.join(wins + kept + adds)}"] if own else []
 
 
 def _quoted(value: str) -> str:
@@ -141,10 +169,21 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         question=str(config["question"] or ""),
         study=str(config["study"]),
         marks=_table(config, "marks"),
+        compile_time=registry.coerce(bool, config["compile_time"], "compile_time"),
         reference_samples=budget,
         reference_tolerance=tolerance,
+        compile_cache=_compile_cache(config["compile_cache"]),
         **counts,
     )
+
+
+def _compile_cache(value: Any) -> Path | None:
+    if value is None:
+        return None
+    if str(value) != "default":
+        return Path(str(value)).expanduser().absolute()
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "diffsim-bench" / "jax"
 
 
 def _execution(config: Mapping[str, Any]) -> Execution:

@@ -12,13 +12,15 @@ A parameter annotated ``float`` may be a traced value, so never branch on it in 
 from __future__ import annotations
 
 import dataclasses
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
+from bench import blocks
 from bench.errors import Unsupported
 
 if TYPE_CHECKING:
@@ -30,6 +32,7 @@ Array = Any
 __all__ = [
     "Array",
     "Backend",
+    "Compilations",
     "Contact",
     "ContactLaw",
     "Dynamics",
@@ -50,6 +53,7 @@ __all__ = [
     "Trajectory",
     "Unsupported",
     "Usage",
+    "compilations",
     "param",
 ]
 
@@ -371,21 +375,53 @@ class Jacobians(NamedTuple):
 
 @dataclass
 class Usage:
-    """What a stretch of work cost: rollouts, gradients, and seconds of compilation it stood on."""
+    """What a stretch of work cost: rollouts, gradients, and seconds of compilation it stood on.
+
+    ``compile_s`` includes ``trace_s``, running the Python code once, and ``lower_s``, turning it into the compiler's input.
+    """
 
     rollouts: int = 0
     gradients: int = 0
     compile_s: float = 0.0
+    trace_s: float = 0.0
+    lower_s: float = 0.0
+
+
+@dataclass
+class Compilations:
+    """What this process has compiled since :meth:`restart`."""
+
+    made: int = 0
+    """Compilations, not counting what came from the folder."""
+    shapes: set[str] = field(default_factory=set)
+    """What programs were asked for: a hash for each program structure, function and shape."""
+
+    @property
+    def folder(self) -> str | None:
+        """Where compiled programs are kept between runs, as ``BENCH_COMPILE_CACHE`` says; None for nowhere."""
+        return os.environ.get("BENCH_COMPILE_CACHE") or None
+
+    def restart(self) -> None:
+        """Count from zero."""
+        self.made = 0
+        self.shapes.clear()
+
+
+compilations = Compilations()
+"""The count of this process, kept by backends that compile."""
 
 
 class Problem(ABC):
     """A compiled program: costs, gradients and scores of batches of rollouts, in NumPy float64 arrays.
 
     ``theta`` is ``(d,)`` for one theta shared by all samples or ``(d, B)``; ``w`` is ``(n_w, B)``.
-    Larger batches than ``block`` columns are evaluated block by block, so that memory stays flat.
+    Larger batches than ``block`` columns are evaluated block by block, so that memory stays flat; blocks are filled up to a
+    multiple of ``grain`` columns, so that few shapes occur, and ``threads`` of them run at once.
     """
 
     block: int = 1 << 16
+    grain: int = 1
+    threads: int = 1
     device: str = "cpu"
     """What the program runs on."""
 
@@ -393,11 +429,17 @@ class Problem(ABC):
         self.program = program
         self.usage = Usage()
         self._charged: set[object] = set()
+        self._measured = False
 
     def reset_usage(self) -> None:
-        """Count rollouts, gradients and compilations from zero."""
+        """Count rollouts, gradients and compilations from zero; what is compiled from now on is not taken from a folder."""
+        self._measured = True
         self.usage = Usage()
         self._charged.clear()
+
+    def fit_blocks(self, column_bytes: int) -> None:
+        """Make blocks of rollouts that keep so many bytes each fit a core's cache, one on every core at once."""
+        self.block, self.threads = blocks.fitting(column_bytes, self.grain), blocks.cores()
 
     @property
     def sigma(self) -> float:
@@ -417,18 +459,18 @@ class Problem(ABC):
     def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Costs f(theta, w), ``(B,)``."""
         self.usage.rollouts += w.shape[1]
-        return self._blocks(self._value, theta, w)
+        return self._blocks(self._value, theta, w, ())
 
     def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Per-sample gradients df/dtheta, ``(d, B)``."""
         self.usage.gradients += w.shape[1]
-        return self._blocks(self._grad, theta, w)
+        return self._blocks(self._grad, theta, w, (self.dim,))
 
     def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Per-sample scores d log p(actions | theta)/dtheta, ``(d, B)``; w / sigma where noise is on theta."""
         if self.noise_on_theta:
             return w / self.sigma
-        return self._blocks(self._score, theta, w)
+        return self._blocks(self._score, theta, w, (self.dim,))
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
         """States and controls along each rollout; raises :class:`Unsupported` where there are none."""
@@ -451,17 +493,13 @@ class Problem(ABC):
         """Costs at ``theta + shift`` with ``shift (d, B)`` and the noise ``w`` of the cost, ``(B,)``."""
         return self.value(np.asarray(theta).reshape(self.dim, -1) + shift, w)
 
-    def _blocks(self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def _blocks(
+        self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray, lead: tuple[int, ...]
+    ) -> np.ndarray:
         theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
         w = np.asarray(w, dtype=np.float64)
-        count = w.shape[1]
-        if count <= self.block:
-            return function(theta, w)
-        parts = []
-        for start in range(0, count, self.block):
-            part = slice(start, start + self.block)
-            parts.append(function(theta if theta.shape[1] == 1 else theta[:, part], w[:, part]))
-        return np.concatenate(parts, axis=-1)
+        columns = blocks.size(w.shape[1], self.block, self.grain, self.threads)
+        return blocks.evaluate(function, theta, w, columns, self.threads, lead)
 
     @abstractmethod
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...

@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -76,8 +76,12 @@ class Experiment:
     """What is measured of each cell."""
     marks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Per axis, named values to draw as lines in the charts."""
+    compile_time: bool = False
+    """Whether charts of error against time add compilation to it."""
     reference_samples: int = 1 << 18
     reference_tolerance: float = 0.005
+    compile_cache: Path | None = None
+    """Where compiled programs are kept between runs."""
     timing: bool | None = None
     """Whether cells are timed, each alone on the machine; None for what the study asks for."""
     referenced: bool = True
@@ -237,13 +241,13 @@ _ranked: dict[str, list[Backend]] = {}
 
 
 def fingerprint(plugin: Plugin | None) -> str:
-    """Kind, name, parameters and hash of the source of a plugin, as JSON: floats to their last bit, texts in quotes."""
+    """Hash of kind, name, parameters and source of a plugin, as JSON: floats to their last bit, texts in quotes."""
     if plugin is None:
         return ""
     if id(plugin) not in _fingerprints:
         values = {name: getattr(plugin, name) for name in sorted(registry.parameters(type(plugin)))}
         text = json.dumps([plugin.kind, plugin.name, values, registry.source_hash(type(plugin))], default=repr)
-        _fingerprints[id(plugin)] = (plugin, text)
+        _fingerprints[id(plugin)] = (plugin, hashlib.sha256(text.encode()).hexdigest())
     return _fingerprints[id(plugin)][1]
 
 
@@ -321,12 +325,11 @@ def cells(experiment: Experiment) -> list[Cell]:
     """The cells of an experiment, each once, in sweep order; raises :class:`UserError` for what cannot be."""
     _check_axes(experiment)
     found: dict[str, Cell] = {}
+    expansion = _Expansion(experiment)
     for point in points(experiment.sweep):
-        for scene_choice in experiment.choices["scenes"]:
-            for rest in itertools.product(*(experiment.choices[kind] for kind in list(AXES.values())[1:])):
-                cell = _cell(experiment, point, (scene_choice, *rest))
-                if cell is not None:
-                    found.setdefault(cell.key, cell)
+        for choices in itertools.product(*(experiment.choices[kind] for kind in AXES.values())):
+            cell = expansion.cell(point, choices)
+            found.setdefault(cell.key, cell)
     if not found:
         raise UserError("the experiment has no cells: choose at least one of each of scenes, backends, estimators")
     return list(found.values())
@@ -353,7 +356,15 @@ def points(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:
             factors.append([point for part in value for point in points(_mapping(part, "sweep.union"))])
         else:
             factors.extend([{name: v} for v in _values(name, vs)] for name, vs in _flat({axis: value}).items())
-    return [dict(itertools.chain(*(p.items() for p in combo))) for combo in itertools.product(*factors)]
+    return [_joined(combo) for combo in itertools.product(*factors)]
+
+
+def _joined(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    point = dict(itertools.chain(*(part.items() for part in parts)))
+    if len(point) < sum(map(len, parts)):
+        name = next(name for name in point if sum(name in part for part in parts) > 1)
+        raise UserError(f"sweep axis '{name}' is given twice: once by itself and once in a zip, union or product")
+    return point
 
 
 def swept(sweep: Mapping[str, Any]) -> list[str]:
@@ -399,50 +410,72 @@ def _check_axes(experiment: Experiment) -> None:
             raise unknown("sweep axis", axis, names)
 
 
-def _cell(experiment: Experiment, point: Mapping[str, Any], choices: Iterable[Choice]) -> Cell | None:
-    scene_choice, contact_choice, integrator_choice, backend_choice, estimator_choice = choices
-    used: dict[str, str] = {}
+class _Expansion:
+    """Makes the cells of an experiment, and their plugins once for all cells that share the values concerning them."""
 
-    def make(choice: Choice, given: Mapping[str, Any] | None = None) -> Plugin:
+    def __init__(self, experiment: Experiment) -> None:
+        self._experiment = experiment
+        self._axes: dict[tuple[type[Plugin], tuple[str, ...]], list[tuple[str, str]]] = {}
+        self._made: dict[tuple[int, str], Plugin] = {}
+
+    def cell(self, point: Mapping[str, Any], choices: Sequence[Choice]) -> Cell:
+        """The cell of these choices at a point of the sweep."""
+        used: dict[str, str] = {}
+        scene_choice, contact_choice, integrator_choice, backend_choice, estimator_choice = choices
+        scene = cast(Scene, self._plugin(scene_choice, point, used))
+        contact: ContactLaw | None = None
+        integrator: Integrator | None = None
+        if isinstance(scene, MechanicalScene):
+            integrator = cast(Integrator, self._plugin(integrator_choice, point, used))
+            if scene.n_contacts:
+                contact = cast(ContactLaw, self._plugin(contact_choice, point, used, scene.contact_values))
+        backend = cast(Backend, self._plugin(backend_choice, point, used))
+        estimator = cast(Estimator, self._plugin(estimator_choice, point, used))
+        return Cell(
+            scene, contact, integrator, backend, estimator, **self._counts(point), study=self._experiment.study,
+            timing=bool(self._experiment.timing), budget=self._experiment.budget,
+        )  # fmt: skip
+
+    def _counts(self, point: Mapping[str, Any]) -> dict[str, int]:
+        counts: dict[str, int] = {}
+        for name, low in (("samples", 1), ("repeats", 2), ("seed", 0)):
+            count = registry.coerce(int, point.get(name, getattr(self._experiment, name)), name)
+            if count < low:
+                raise UserError(f"{name}={count} must be at least {low}")
+            counts[name] = count
+        return counts
+
+    def _plugin(
+        self, choice: Choice, point: Mapping[str, Any], used: dict[str, str], given: Mapping[str, Any] | None = None
+    ) -> Plugin:
         plugin = choice.entry.plugin
         if plugin is None:
             raise UserError(
                 f"{choice.entry.kind.removesuffix('s')} '{choice.entry.name}' cannot be used: {choice.entry.reason}"
             )
-        group = next(g for g, kind in AXES.items() if kind == plugin.kind)
-        values = {k: v for k, v in (given or {}).items() if k in registry.parameters(plugin)}
-        values |= experiment.values.get(group, {}).get(plugin.name, {})
-        values |= dict(choice.values)
-        for axis, value in point.items():
-            parameter = _applies(axis, plugin)
-            if parameter is not None and axis not in COUNTS:
-                if axis in used:
-                    raise UserError(
-                        f"sweep axis '{axis}' is a parameter of both {used[axis]} and {plugin.name}: "
-                        f"write sweep.{used[axis]}.{parameter} or sweep.{plugin.name}.{parameter}"
-                    )
-                used[axis] = plugin.name
-                values[parameter] = value
-        return _build(plugin, sorted(values.items()))
+        axes = self._axes_of(plugin, tuple(point))
+        for axis, parameter in axes:
+            if axis in used:
+                raise UserError(
+                    f"sweep axis '{axis}' is a parameter of both {used[axis]} and {plugin.name}: "
+                    f"write sweep.{used[axis]}.{parameter} or sweep.{plugin.name}.{parameter}"
+                )
+            used[axis] = plugin.name
+        key = (id(choice), repr([point[axis] for axis, _ in axes] + [given]))
+        if key not in self._made:
+            group = next(g for g, kind in AXES.items() if kind == plugin.kind)
+            values = {k: v for k, v in (given or {}).items() if k in registry.parameters(plugin)}
+            values |= self._experiment.values.get(group, {}).get(plugin.name, {})
+            values |= dict(choice.values) | {parameter: point[axis] for axis, parameter in axes}
+            self._made[key] = _build(plugin, sorted(values.items()))
+        return self._made[key]
 
-    scene = cast(Scene, make(scene_choice))
-    contact: ContactLaw | None = None
-    integrator: Integrator | None = None
-    if isinstance(scene, MechanicalScene):
-        integrator = cast(Integrator, make(integrator_choice))
-        if scene.n_contacts:
-            contact = cast(ContactLaw, make(contact_choice, scene.contact_values))
-    counts: dict[str, int] = {}
-    for name, low in (("samples", 1), ("repeats", 2), ("seed", 0)):
-        count = registry.coerce(int, point.get(name, getattr(experiment, name)), name)
-        if count < low:
-            raise UserError(f"{name}={count} must be at least {low}")
-        counts[name] = count
-    backend, estimator = make(backend_choice), make(estimator_choice)
-    return Cell(
-        scene, contact, integrator, cast(Backend, backend), cast(Estimator, estimator), **counts,
-        study=experiment.study, timing=bool(experiment.timing), budget=experiment.budget,
-    )  # fmt: skip
+    def _axes_of(self, plugin: type[Plugin], names: tuple[str, ...]) -> list[tuple[str, str]]:
+        """Axes that are parameters of the plugin, and which."""
+        if (plugin, names) not in self._axes:
+            found = [(name, _applies(name, plugin)) for name in names if name not in COUNTS]
+            self._axes[plugin, names] = [(axis, parameter) for axis, parameter in found if parameter is not None]
+        return self._axes[plugin, names]
 
 
 _built: dict[tuple[type[Plugin], str], Plugin] = {}

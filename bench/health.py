@@ -96,6 +96,8 @@ def _of_cell(session: Session, cell: Cell, seeded: bool) -> Trace:
     scene, backend = cell.scene, cell.backend
     if not isinstance(scene, MechanicalScene):
         raise UserError(f"scene {scene.name} is a plain function: it has no steps to trace")
+    if scene.needs_physics:
+        raise UserError(f"scene {scene.name} runs in physics engines alone, and their contacts are not shown")
     try:
         program = cell.program()
         if program.needs_root and "root" not in backend.provides:

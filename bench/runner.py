@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import os
 import time
 from collections import defaultdict
@@ -122,7 +121,10 @@ def outcome(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
         raise
     except Exception as error:
         return dict(failure(error))
-    return result if cell.timing else result | dict.fromkeys(set(study.COLUMNS.measured) & set(result), math.nan)
+    if cell.timing:
+        return result
+    empty = study.COLUMNS.blank()
+    return result | {name: empty[name] for name in study.COLUMNS.measured}
 
 
 # ------------------------------------------------------------------------------------------------ a run
@@ -177,7 +179,8 @@ class _Run:
     def _pool(self, count: int, single: bool) -> Pool | Here:
         if not self._workers:
             return Here(Measure(self._experiment))
-        return Pool(count, Measure, self._experiment, self._limits, single)
+        lean = replace(self._experiment, choices={}, values={}, sweep={}, marks={})
+        return Pool(count, Measure, lean, self._limits, single)
 
     def _missing_references(self, waiting: list[Cell]) -> list[Cell]:
         """One cell for each reference that has to be computed; closed forms are left to the cells themselves."""

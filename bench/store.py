@@ -96,10 +96,10 @@ BIAS_VARIANCE = Columns(
         "finite_fraction", "model_error", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients",
         "peak_memory_mb", "dtype", "device", "versions", "key",
     ),
-    texts=("reference_method", "device"),
+    texts=("reference_method", "device", "shapes"),
     lists=("time_samples",),
-    extra=("variance_low", "variance_high", "time_samples"),
-    measured=("time_s", "time_iqr_s", "time_samples", "compile_s", "peak_memory_mb"),
+    extra=("variance_low", "variance_high", "time_samples", "compilations", "shapes"),
+    measured=("time_s", "time_iqr_s", "time_samples", "compile_s", "peak_memory_mb", "compilations", "shapes"),
 )  # fmt: skip
 """The columns of the main table: a contract with people's scripts."""
 
@@ -207,7 +207,7 @@ class Store:
                 os.rename(self._table, aside)
                 if _mark(aside) != known:
                     return False
-            os.link(part, self._table)  # fails where there is one, as a rename would not
+            _link(part, self._table)
             _sync(self.directory)
         except FileExistsError:
             return False
@@ -233,6 +233,16 @@ def ordered(table: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:
     place = {key: index for index, key in enumerate(keys)}
     position = table["key"].map(lambda key: place.get(key, -1))
     return table.iloc[position.argsort(kind="stable")].reset_index(drop=True)
+
+
+def _link(path: Path, name: Path) -> None:
+    """Give a file a second name; raises FileExistsError where it is taken, as a rename would not."""
+    try:
+        os.link(path, name)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links
+        os.rename(path, name)
 
 
 def _mark(path: Path) -> tuple[int, int]:

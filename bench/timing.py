@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import os
+import platform
+import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from bench import blocks
+
+LEAST_S = 0.005
+"""Seconds that the calls of one timing should fill; fast ones are repeated."""
+MOST = 20
+"""Calls made for each one asked for, at most."""
+NOISY = 0.2
+"""Interquartile range over median above which a timing is marked in tables."""
 
 
 @dataclass(frozen=True)
@@ -20,20 +34,73 @@ class Timing:
     samples_s: tuple[float, ...] = ()
     """Of each call, in order."""
 
+    @property
+    def calls(self) -> int:
+        """Calls made, the warm-up included."""
+        return len(self.samples_s) + 1
 
-def timed(call: Callable[[int], np.ndarray], count: int) -> tuple[list[np.ndarray], Timing]:
+    @property
+    def spread(self) -> float:
+        """Interquartile range over median."""
+        return self.iqr_s / self.median_s
+
+
+def timed(
+    call: Callable[[int], np.ndarray], count: int, least_s: float = LEAST_S, most: int = MOST
+) -> tuple[list[np.ndarray], Timing]:
     """Results and seconds of ``call(0) ... call(count - 1)``, after one warm-up call that is thrown away.
 
-    Calls must return finished NumPy arrays, so that no work is left on a device when the clock stops.
+    Where these take less than ``least_s`` in all, calls are repeated until they do, ``most`` times each at most. Calls must
+    return finished NumPy arrays, so that no work is left on a device when the clock stops.
     """
     call(0)
-    results, seconds = [], []
-    for index in range(count):
+    results: list[np.ndarray] = []
+    seconds: list[float] = []
+    while len(seconds) < count or (sum(seconds) < least_s and len(seconds) < most * count):
         start = time.perf_counter()
-        results.append(call(index))
+        result = call(len(seconds) % count)
         seconds.append(time.perf_counter() - start)
+        if len(results) < count:
+            results.append(result)
     low, median, high = np.percentile(seconds, [25, 50, 75])
     return results, Timing(float(median), float(high - low), tuple(seconds))
+
+
+def conditions() -> dict[str, Any]:
+    """What times of this process depend on: processor, cores and threads that it may use, other load."""
+    torch = sys.modules.get("torch")
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "affinity": sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+        "cache_bytes_per_core": blocks.cache_bytes(),
+        "threads": {
+            "blocks": blocks.cores(),
+            "xla_per_block": 1,
+            "torch": torch.get_num_threads() if torch else None,
+            "environment": {name: os.environ[name] for name in sorted(os.environ) if name.endswith("_NUM_THREADS")},
+        },
+        "load_average": load_average(),
+    }
+
+
+def load_average() -> list[float] | None:
+    """Processes that ran or waited to, over the last 1, 5 and 15 minutes; None where it is not known."""
+    return list(os.getloadavg()) if hasattr(os, "getloadavg") else None
+
+
+@cache
+def load_at_start() -> list[float] | None:
+    """The load average when this was first asked for."""
+    return load_average()
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor()
 
 
 def reset_peak_memory() -> None:

@@ -16,10 +16,12 @@ import signal
 import sys
 import threading
 import time
+import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Protocol
@@ -38,8 +40,10 @@ STEAL_S = 5.0
 """Seconds of work that must be left in a group before an idle worker takes half of it: it has to compile again."""
 START_S = 60.0
 """Seconds granted to a worker for starting, and for importing what an item needs, beyond the item's own time."""
-TAIL = 4000
+TAIL = 16000
 """Bytes of a worker's output that are kept."""
+MARK = "BENCH_WORKER"
+"""Environment variable by which what a worker has started is known, wherever it has gone."""
 SINGLE = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -89,7 +93,7 @@ def _serve(connection: Connection, output: Connection, make: Callable[[Any], Han
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.dup2(output.fileno(), 1)
     os.dup2(output.fileno(), 2)
-    faulthandler.enable()
+    faulthandler.enable(all_threads=False)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     own, handle = os.getpid(), make(argument)
     while True:
@@ -127,6 +131,7 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
+    _kill(_marked(os.environ[MARK]))
     os.killpg(0, signal.SIGKILL)
 
 
@@ -137,12 +142,26 @@ def _end_children() -> None:
     except ChildProcessError:
         return
     children = psutil.Process().children(recursive=True)
-    for child in children:
-        with suppress(psutil.Error):
-            child.kill()
+    _kill(children)
     for child in children:
         with suppress(ChildProcessError):
             os.waitpid(child.pid, 0)
+
+
+def _marked(mark: str) -> list[psutil.Process]:
+    """The other processes that have this mark in their environment."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):
+            if process.pid != os.getpid() and process.environ().get(MARK) == mark:
+                found.append(process)
+    return found
+
+
+def _kill(processes: Sequence[psutil.Process]) -> None:
+    for process in processes:
+        with suppress(psutil.Error):
+            process.kill()
 
 
 # ------------------------------------------------------------------------------------------------ the pool
@@ -154,6 +173,7 @@ class _Worker:
     connection: Connection
     output: Connection
     memory: psutil.Process
+    mark: str
     group: deque[Any] = field(default_factory=deque)
     """What it will be given next."""
     given: deque[Any] = field(default_factory=deque)
@@ -179,11 +199,12 @@ class _Worker:
                     return
 
     def take_output(self) -> str:
-        """The last lines printed since this was last asked, on one line."""
-        lines = self.tail.decode(errors="replace").split("\n")
+        """The last lines printed since this was last asked, or the first of Python's own dump of a crash, on one line."""
+        _, crash, dump = self.tail.decode(errors="replace").rpartition("(most recent call first):")
         self.tail = b""
-        printable = ("".join(letter for letter in line if letter.isprintable()).strip() for line in lines)
-        return " | ".join([line for line in printable if line][-4:])[-600:]
+        printable = ("".join(letter for letter in line if letter.isprintable()).strip() for line in dump.split("\n"))
+        lines = [line for line in printable if line]
+        return " | ".join(lines[:3] if crash else lines[-4:])[-600:]
 
 
 class Pool:
@@ -197,6 +218,7 @@ class Pool:
     ) -> None:
         self._count, self._make, self._argument, self._limits, self._single = count, make, argument, limits, single
         self._workers: list[_Worker] = []
+        self._unsent: list[Answer] = []
         self._context = multiprocessing.get_context("spawn")
 
     def __enter__(self) -> Pool:
@@ -212,10 +234,11 @@ class Pool:
         while True:
             self._share(waiting)
             busy = [worker for worker in self._workers if worker.given]
-            if not busy:
+            if not busy and not self._unsent:
                 return
-            wait([end for worker in busy for end in (worker.connection, worker.output)], TICK)
-            yield [answer for worker in busy for answer in self._look_after(worker, waiting)]
+            wait([end for worker in busy for end in (worker.connection, worker.output)], 0 if self._unsent else TICK)
+            answers, self._unsent = self._unsent, []
+            yield answers + [answer for worker in busy for answer in self._look_after(worker, waiting)]
 
     @property
     def current(self) -> list[Any]:
@@ -245,22 +268,30 @@ class Pool:
         return taken
 
     def _give(self, worker: _Worker) -> None:
+        item = worker.group.popleft()
+        try:
+            message = pickle.dumps(item)
+        except Exception as error:
+            self._unsent.append(Answer(item, dict(failure(error)), 0.0))
+            return
         if not worker.given:
             worker.since, worker.begun = time.monotonic(), False
-        worker.given.append(worker.group.popleft())
+        worker.given.append(item)
         with suppress(OSError):  # a worker that has died is found so when it is looked after
-            worker.connection.send_bytes(pickle.dumps(worker.given[-1]))
+            worker.connection.send_bytes(message)
 
     def _start(self) -> _Worker:
         connection, theirs = self._context.Pipe()
         output, printed = self._context.Pipe(duplex=False)
         os.set_blocking(output.fileno(), False)
         process = self._context.Process(target=_serve, args=(theirs, printed, self._make, self._argument))
-        with _environment(SINGLE if self._single else {}):
+        resource_tracker.ensure_running()  # else it starts with the worker's mark, and ends with it
+        mark = uuid.uuid4().hex
+        with _environment({MARK: mark} | (SINGLE if self._single else {})):
             process.start()
         theirs.close()
         printed.close()
-        return _Worker(process, connection, output, psutil.Process(process.pid))
+        return _Worker(process, connection, output, psutil.Process(process.pid), mark)
 
     def _look_after(self, worker: _Worker, waiting: deque[deque[Any]]) -> list[Answer]:
         answers = _received(worker)
@@ -325,16 +356,11 @@ def _received(worker: _Worker) -> list[Answer]:
 
 def _end(worker: _Worker) -> None:
     """Kill a worker and all that it has started."""
-    family: list[psutil.Process] = []
-    with suppress(psutil.Error):
-        family = worker.memory.children(recursive=True)
     with suppress(ProcessLookupError):
         os.killpg(worker.memory.pid, signal.SIGKILL)
-    for process in family:
-        with suppress(psutil.Error):
-            process.kill()
     worker.process.kill()
     worker.process.join()
+    _kill(_marked(worker.mark))
     worker.listen()
 
 

@@ -33,10 +33,20 @@ from plugins.scenes.heaviside import Heaviside
 from plugins.scenes.pushing import Pushing
 from plugins.scenes.quadratic import Quadratic
 
-ENTRIES = [entry for table in registry.entries().values() for entry in table.values()]
+
+def _is_engine(entry: registry.Entry) -> bool:
+    """Whether it is a physics engine, whose kit takes a minute or, where each program compiles for seconds, many."""
+    return entry.plugin is not None and "physics" in getattr(entry.plugin, "provides", ())
 
 
-@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry.kind}-{entry.name}")
+ENTRIES = [
+    pytest.param(entry, id=f"{entry.kind}-{entry.name}", marks=[pytest.mark.slow] if _is_engine(entry) else [])
+    for table in registry.entries().values()
+    for entry in table.values()
+]
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
 def test_registered_plugin_conforms(entry):
     if not entry.available:
         pytest.skip(entry.reason)

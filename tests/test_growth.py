@@ -3,11 +3,13 @@
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from bench.cli import main
 from bench.contracts import Jacobians
 from bench.program import Program
+from bench.report import growth as report
 from bench.store import Store
 from bench.studies.growth import COLUMNS, classify, products, rate
 from plugins.backends.jax import Jax
@@ -89,3 +91,27 @@ def test_from_the_command_line(tmp_path, capsys):
     assert chaotic["growth"] == "exploding"
     assert chaotic["gain_of"] == "states"
     assert len(chaotic["lags"]) == len(chaotic["gain"])
+
+
+def test_every_singular_value_and_the_gain_are_drawn():
+    """Two scenes of 2 and 3 states, four rows of panels; what is below rounding is left out and said to be."""
+    columns = {name: math.nan for name in COLUMNS.names} | dict.fromkeys(report.PROBLEM, 0.0)
+    lines = [
+        columns | {
+            "scene": scene, "contact": "none", "dt": 0.1, "time_horizon": t, "gradient_median": t, "gradient_low": t / 2,
+            "gradient_high": 2 * t, "growth": "exploding", "spectral_rate": 0.1, "lags": [1, 10], "gain": [1.0, 5.0],
+            "gain_low": [0.5, 2.0], "gain_high": [2.0, 9.0], "gain_of": "states", "singular_values": values,
+            **{f"{order}_order_variance{end}": t for order in ("first", "zeroth") for end in ("", "_low", "_high")},
+        }
+        for scene, values in (("ball", [10.0, 0.1]), ("leg", [1e3, 1.0, 1e-15]))
+        for t in (1.0, 2.0)
+    ]  # fmt: skip
+    drawn = report.figure(pd.DataFrame(lines))
+    assert drawn is not None
+    panels = np.array(drawn.axes).reshape(4, 2)
+    shown = [{float(line.get_ydata()[0]) for line in panel.lines} for panel in panels[1]]
+    assert shown[0] == {10.0, 0.1, 1.0}  # and the 1 at which nothing grows
+    assert {value for value in shown[1] if math.isfinite(value)} == {1e3, 1.0}
+    assert 5.0 in panels[2, 0].lines[0].get_ydata()
+    assert report._ends([1e3, 1.0, 1e-15]) == "1000 to < 2.2e-13"
+    assert report._ends([10.0, 0.1]) == "10 to 0.10"

@@ -229,7 +229,7 @@ def test_kit_names_the_reason_of_an_unavailable_plugin(tree):
 # ---------------------------------------------------------------------------------------------------------- imports
 
 LAYERS = [
-    ["errors"],
+    ["errors", "blocks"],
     ["contracts"],
     ["program"],
     ["registry", "noise", "statistics", "store", "timing", "gradcheck", "workers"],
@@ -239,7 +239,7 @@ LAYERS = [
     ["report"],
     ["studies"],
     ["runner"],
-    ["conformance"],
+    ["conformance", "benchself"],
     ["cli"],
     ["__main__"],
 ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bench import timing
 from bench.store import IDENTITY, write_whole
 
 if TYPE_CHECKING:
@@ -49,12 +49,8 @@ def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in LIBRARIES},
-        "machine": {
-            "system": platform.system(),
-            "processor": _processor(),
-            "cores": os.cpu_count(),
-            "load_average": list(os.getloadavg()) if hasattr(os, "getloadavg") else None,
-        },
+        **_compilations(rows),
+        "machine": {**machine(), "load_average_start": timing.load_at_start()},
         "git_commit": _commit(),
         "argv": [Path(sys.argv[0]).name, *words],
     }
@@ -75,12 +71,17 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor()
+def machine() -> dict[str, Any]:
+    """The system, and what times on it depend on."""
+    return {"system": platform.system(), **timing.conditions()}
+
+
+def _compilations(rows: pd.DataFrame) -> dict[str, int]:
+    """Compilations that the rows took, and the distinct program structures, functions and shapes among them."""
+    if "compilations" not in rows:
+        return {}
+    shapes = {shape for text in rows["shapes"] for shape in text.split()}
+    return {"compilations": int(rows["compilations"].sum()), "distinct_shapes": len(shapes)}
 
 
 def _commit() -> str | None:

@@ -10,6 +10,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.grid import Experiment
+from bench.report.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost
 from bench.report.figures import save, styled
-from bench.report.panels import bias_variance, overview, speed_accuracy, timed
+from bench.report.panels import bias_variance, overview, speed_accuracy
 from bench.report.style import SYMBOLS, Look
 from bench.report.views import CATEGORIES, Family, along, families, numeric_axes, ran, short_axis
 
@@ -72,14 +74,22 @@ def figures(
     nothing_swept = not found
     good = rows[rows["status"] == "ok"]
     if good["samples"].nunique() > 1 or good["backend"].nunique() > 1:
-        chosen, held = choose(problems("samples", lambda part: len(timed(part)) > 1))
-        if chosen:
-            found["speed_accuracy"] = speed_accuracy(chosen, held + merged, look)
+        for name, cost in (
+            ("speed_accuracy", TIME_COMPILED if experiment.compile_time else TIME),
+            ("rollouts_accuracy", ROLLOUTS),
+        ):
+            chosen, held = choose(problems("samples", partial(_costed, cost)))
+            if chosen and (cost is not ROLLOUTS or good["samples"].nunique() > 1):
+                found[name] = speed_accuracy(chosen, held + merged, look, cost)
     if nothing_swept:
         chosen = problems(None, lambda part: len(ran(part)) > 0)
         if chosen:
             found["overview"] = overview(chosen, merged, look)
     return found
+
+
+def _costed(cost: Cost, rows: pd.DataFrame) -> bool:
+    return len(cost.known(rows)) > 1
 
 
 def choose(problems: Sequence[Family], room: int = ROOM) -> tuple[list[Family], list[str]]:

@@ -1,8 +1,9 @@
-"""Growth with the horizon as a table, and as a chart: gradient norms above, variances of both orders below."""
+"""Growth with the horizon as a table, and as a chart: gradient norms, singular values and gain of the Jacobian product, variances."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +30,23 @@ VARIANCES: dict[str, tuple[str, dict[str, Any]]] = {
     "first_order": ("fobg", {"color": PALETTE[2], "marker": "D"}),
     "zeroth_order": ("zeroth order", {"color": PALETTE[5], "marker": "P", "linestyle": (0, (4, 1.5))}),
 }
-CLASSES = {"exploding": "#000000", "neutral": "#404040", "vanishing": PALETTE[0]}
+SINGULAR: tuple[dict[str, Any], ...] = (
+    {"color": PALETTE[2], "marker": "^", "markersize": 3.5},
+    {"color": PALETTE[0], "marker": "v", "markersize": 3.5},
+    {"color": "#808080", "linewidth": 0.8},
+)
+"""The looks of the largest singular value, the smallest and those between."""
+CLASSES = {"exploding": PALETTE[2], "neutral": "#404040", "vanishing": PALETTE[0]}
 """Colours of the names of growth classes."""
 PROBLEM = ["scene", "contact", "integrator", "backend", "dt", "stiffness", "sigma", "smoothing"]
+ROUNDING = float(np.finfo(np.float64).eps)
+"""Part of a matrix's largest singular value below which the others are rounding."""
 NOTES = (
     "|grad|: norm of one sample's gradient, median and 5% to 95% of the noise samples. growth: log of the largest "
     "singular value (stretch) and of the spectral radius of the Jacobian product dx_N/dx_0, per second, mean and 95% "
     "interval over noise samples. exploding: the spectral radius surely grows; vanishing: the stretch surely falls. "
-    "gain: largest singular value of dx_N/du_0 (dx_N/dx_1 without controls), median. variance: per sample, median over "
+    "singular values: largest and smallest of that product, median. gain: largest singular value of dx_N/du_0 (dx_N/dx_1 "
+    "without controls), median. variance: per sample, median over "
     "repeats.",
 )
 
@@ -74,12 +84,21 @@ def readable(rows: pd.DataFrame) -> pd.DataFrame:
         for kind in ("stretch", "spectral"):
             line[f"{kind} [1/s]"] = _interval(row, f"{kind}_rate", f"{kind}_low", f"{kind}_high", 1.0 / row["dt"])
         line["growth"] = row["growth"]
+        line["singular values"] = _ends(row["singular_values"])
         line["gain"] = number(row["gain"][-1]) if len(row["gain"]) else "-"
         line["var fobg"] = number(row["first_order_variance"])
         line["var zeroth"] = number(row["zeroth_order_variance"])
         line["status"] = row["status"]
         lines.append(line)
     return pd.DataFrame(lines)
+
+
+def _ends(values: Sequence[float]) -> str:
+    """The largest and the smallest singular value, that one at most as small as rounding lets it be seen."""
+    if not len(values):
+        return "-"
+    floor = ROUNDING * values[0]
+    return f"{number(values[0])} to " + (number(values[-1]) if values[-1] > floor else f"< {number(floor)}")
 
 
 def _interval(row: Any, middle: str, low: str, high: str, factor: float = 1.0) -> str:
@@ -113,57 +132,82 @@ def _print(experiment: Experiment, rows: pd.DataFrame, table: pd.DataFrame) -> N
 
 
 def figure(rows: pd.DataFrame) -> Figure | None:
-    """A column of panels per problem: the norm of a sample's gradient above, variances per sample below."""
+    """A column of panels per problem: norms of sampled gradients, what the Jacobian product does, variances per sample."""
     groups = [part.sort_values("time_horizon") for _, part in rows.groupby(PROBLEM, dropna=False, sort=False)]
     groups = [part for part in groups if np.isfinite(part["gradient_median"]).any()]
     if not groups:
         return None
-    found = Figure(figsize=(max(WIDTH, 1.45 * len(groups)), 4.4), layout="constrained")
+    found = Figure(figsize=(max(WIDTH, 1.45 * len(groups)), 7.6), layout="constrained")
     FigureCanvasAgg(found)
-    found.suptitle("Growth of sampled gradients with the horizon", fontsize=9, fontweight="bold")
-    grid = found.subplots(2, len(groups), squeeze=False, sharey="row")
-    for (upper, lower), part in zip(grid.T, groups, strict=True):
-        _draw_norms(upper, part)
-        _draw_variances(lower, part)
-        lower.set_xlabel("horizon [s]")
-        for panel in (upper, lower):
-            times = part["time_horizon"]
+    found.suptitle("Do gradients through time vanish or explode?", fontsize=9, fontweight="bold")
+    grid = found.subplots(len(ROWS), len(groups), squeeze=False, sharey="row")
+    for column, part in zip(grid.T, groups, strict=True):
+        times = part["time_horizon"]
+        for panel, (_, draw) in zip(column, ROWS, strict=True):
+            draw(panel, part)
             log_axis(panel, "x", times.min() / 1.25, times.max() * 1.25)
-    grid[0, 0].set_ylabel("norm of one sample's gradient")
-    grid[1, 0].set_ylabel("variance per sample")
-    for row in grid:
-        _decades(row)
-    handles: list[Any] = [Line2D([], [], label="median over noise samples", **NORM)]
-    handles.append(Patch(label="5% to 95%", color="#000000", alpha=0.2, linewidth=0))
-    handles += [Line2D([], [], label=f"variance of {name}", **style) for name, style in VARIANCES.values()]
-    found.legend(handles=handles, loc="outside lower center", ncols=4, columnspacing=1.2)
+            panel.tick_params(labelbottom=panel is column[-1])
+        _draw_title(column[0], part)
+        column[-1].set_xlabel("time [s]")
+    for line, (label, _) in zip(grid, ROWS, strict=True):
+        line[0].set_ylabel(label)
+        _decades(line)
+    found.legend(handles=_legend(), loc="outside lower center", ncols=3, columnspacing=1.2)
     return found
 
 
-def _draw_norms(panel: Axes, rows: pd.DataFrame) -> None:
-    """Median norms in their band, titled with the problem and what becomes of its Jacobian product."""
-    shown = rows[rows["gradient_median"] > 0]
-    panel.fill_between(
-        shown["time_horizon"], shown["gradient_low"], shown["gradient_high"], color="#000000", alpha=0.2, linewidth=0
-    )
-    panel.plot(shown["time_horizon"], shown["gradient_median"], **NORM)
+def _legend() -> list[Any]:
+    handles: list[Any] = [Line2D([], [], label="median over noise samples", **NORM)]
+    handles.append(Patch(label="5% to 95%", color="#000000", alpha=0.2, linewidth=0))
+    names = ("largest singular value", "smallest", "between")
+    handles += [Line2D([], [], label=name, **look) for name, look in zip(names, SINGULAR, strict=True)]
+    handles += [Line2D([], [], label=f"variance of {name}", **style) for name, style in VARIANCES.values()]
+    return handles
+
+
+def _draw_title(panel: Axes, rows: pd.DataFrame) -> None:
+    """The problem, and what becomes of its Jacobian product over the longest horizon."""
     last = rows.iloc[-1]
     panel.set_title(plain(last["scene"]), pad=15)
     text = last["growth"]
-    if text == "exploding":
-        text = f"{text}, {last['spectral_rate'] / last['dt']:.2g}/s"
-    elif text == "vanishing":
-        text = f"{text}, {last['stretch_rate'] / last['dt']:.2g}/s"
-    panel.text(
-        0.5,
-        1.02,
-        text,
-        transform=panel.transAxes,
-        ha="center",
-        va="bottom",
-        color=CLASSES.get(last["growth"], "#404040"),
-    )
-    panel.tick_params(labelbottom=False)
+    if text in ("exploding", "vanishing"):
+        rate = "spectral_rate" if text == "exploding" else "stretch_rate"
+        text = f"{text}, {last[rate] / last['dt']:.2g}/s"
+    colour = CLASSES.get(last["growth"], "#404040")
+    panel.text(0.5, 1.02, text, transform=panel.transAxes, ha="center", va="bottom", color=colour, fontweight="bold")
+
+
+def _draw_norms(panel: Axes, rows: pd.DataFrame) -> None:
+    """Median norms in their band, at each horizon."""
+    shown = rows[rows["gradient_median"] > 0]
+    low, high = shown["gradient_low"], shown["gradient_high"]
+    panel.fill_between(shown["time_horizon"], low, high, color="#000000", alpha=0.2, linewidth=0)
+    panel.plot(shown["time_horizon"], shown["gradient_median"], **NORM)
+
+
+def _draw_singular(panel: Axes, rows: pd.DataFrame) -> None:
+    """Every singular value of dx_N/dx_0, at each horizon, and the 1 at which a direction neither grows nor fades."""
+    values = np.array(rows["singular_values"].to_list(), dtype=float)
+    values = np.where(values > ROUNDING * values[:, :1], values, np.nan)
+    last = values.shape[1] - 1
+    for i in range(last, -1, -1):
+        panel.plot(rows["time_horizon"], values[:, i], **SINGULAR[0 if i == 0 else 1 if i == last else 2])
+    _unity(panel)
+
+
+def _draw_gain(panel: Axes, rows: pd.DataFrame) -> None:
+    """Gain of the longest horizon by how long before the end a control, or a state, was changed."""
+    row = rows.iloc[-1]
+    times, (gain, low, high) = np.array(row["lags"]) * row["dt"], (row[f"gain{end}"] for end in ("", "_low", "_high"))
+    panel.fill_between(times, low, high, color="#000000", alpha=0.2, linewidth=0)
+    panel.plot(times, gain, **NORM | {"marker": ""})
+    panel.text(0.04, 0.97, f"of {row['gain_of']}", transform=panel.transAxes, ha="left", va="top")
+    if row["gain_of"] == "states":
+        _unity(panel)
+
+
+def _unity(panel: Axes) -> None:
+    panel.axhline(1.0, color="#808080", linewidth=0.7, linestyle=(0, (1, 1.5)), zorder=1)
 
 
 def _draw_variances(panel: Axes, rows: pd.DataFrame) -> None:
@@ -172,6 +216,15 @@ def _draw_variances(panel: Axes, rows: pd.DataFrame) -> None:
         low, high = (shown[f"{name}_variance_{end}"] for end in ("low", "high"))
         panel.fill_between(shown["time_horizon"], low, high, color=style["color"], alpha=0.2, linewidth=0)
         panel.plot(shown["time_horizon"], shown[f"{name}_variance"], **style)
+
+
+ROWS = (
+    ("norm of one sample's\ngradient, by horizon", _draw_norms),
+    ("singular values of\n$dx_N/dx_0$, by horizon", _draw_singular),
+    ("gain to the end state,\nby time before it", _draw_gain),
+    ("variance per sample,\nby horizon", _draw_variances),
+)
+"""The rows of panels: what they show, and what draws one."""
 
 
 def _decades(panels: Any) -> None:

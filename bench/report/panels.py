@@ -13,10 +13,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.path import Path
 
+from bench.report.costs import Cost
 from bench.report.page import columns, page, shared
 from bench.report.scales import extent, log_axis, mark_values, scale_x, scale_y, shifts
 from bench.report.style import CROSS, DEVIANT, FRONT, GREY, MARKS, SHADE, TICK, Look, axis_name, plain, quantity, twin
-from bench.report.views import Family, Line, duration, lines, pareto, resolved, short_axis
+from bench.report.views import Family, Line, lines, pareto, resolved, short_axis
 
 ALIKE = 0.03
 """Backends within this relative difference are one line: less could not be seen."""
@@ -153,8 +154,8 @@ def _handle(text: str, color: str = GREY, **style: Any) -> Line2D:
     return Line2D([], [], label=plain(text), color=color, **style)
 
 
-def speed_accuracy(problems: Sequence[Family], notes: Sequence[str], look: Look) -> Figure:
-    """Relative RMSE of one estimate against its time, a panel per problem, a curve per estimator and backend."""
+def speed_accuracy(problems: Sequence[Family], notes: Sequence[str], look: Look, cost: Cost) -> Figure:
+    """Relative RMSE of one estimate against its cost, a panel per problem, a curve per estimator and backend."""
     drawn = [lines(problem.rows, close=None) for problem in problems]
     every = [line for found in drawn for line in found]
     entries = {line.label: _handle(line.label, **look.line(line)) for line in every}
@@ -165,48 +166,39 @@ def speed_accuracy(problems: Sequence[Family], notes: Sequence[str], look: Look)
     curve = [f"along a curve $N$ = {', '.join(map(str, samples))}"] if len(samples) > 1 else []
     figure, panels = page(
         problems, columns(len(problems), 3), 2.4, ("relative RMSE",),
-        "Relative RMSE of one estimate against the time it takes", [*shared(problems, "samples"), *notes, *curve],
+        f"Relative RMSE of one estimate against {cost.name}", [*shared(problems, "samples"), *notes, *curve],
         (list(entries.values()), symbols),
     )  # fmt: skip
     for (panel,), problem, found in zip(panels, problems, drawn, strict=True):
         for line in found:
-            _draw_curve(panel, line, {**look.line(line), "marker": look.backend(line.rows["backend"].iloc[0])})
-        _draw_front(panel, timed(problem.rows))
-        panel.set_xlabel("time of one estimate")
+            _draw_curve(panel, line, cost, {**look.line(line), "marker": look.backend(line.rows["backend"].iloc[0])})
+        _draw_front(panel, cost.known(problem.rows), cost)
+        panel.set_xlabel(cost.label)
     return figure
 
 
-def timed(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows that have a point in a chart of error against time."""
-    good = (rows["status"] == "ok") & np.isfinite(rows["rmse_rel"]) & np.isfinite(rows["time_s"])
-    return rows[good & (rows["rmse_rel"] > 0) & (rows["time_s"] > 0)]
+def _draw_curve(panel: Axes, line: Line, cost: Cost, style: Mapping[str, Any]) -> None:
+    rows = cost.known(line.rows)
+    spread, at = cost.spread(rows), cost.of(rows)
+    bars = [np.minimum(spread, 0.9 * at), spread]
+    panel.errorbar(at, rows["rmse_rel"], xerr=bars, elinewidth=0.7, label=line.label, **style)
 
 
-def _draw_curve(panel: Axes, line: Line, style: Mapping[str, Any]) -> None:
-    rows = timed(line.rows)
-    spread = rows["time_iqr_s"].fillna(0.0) / 2
-    bars = [np.minimum(spread, 0.9 * rows["time_s"]), spread]
-    panel.errorbar(rows["time_s"], rows["rmse_rel"], xerr=bars, elinewidth=0.7, label=line.label, **style)
-
-
-def _draw_front(panel: Axes, rows: pd.DataFrame) -> None:
-    """The Pareto front as a step line from the fastest point down to the most accurate, and the panel's scales."""
-    front = rows[pareto(rows["time_s"], rows["rmse_rel"])].sort_values(["time_s", "rmse_rel"])
+def _draw_front(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
+    """The Pareto front as a step line from the cheapest point down to the most accurate, and the panel's scales."""
+    at = cost.of(rows)
+    front = rows.assign(at=at)[pareto(at, rows["rmse_rel"])].sort_values(["at", "rmse_rel"])
     low, high = rows["rmse_rel"].min(), rows["rmse_rel"].max()
-    spread = np.minimum(rows["time_iqr_s"].fillna(0.0) / 2, rows["time_s"] / 2)
-    first, last = (rows["time_s"] - spread).min(), (rows["time_s"] + spread).max()
+    spread = np.minimum(cost.spread(rows), at / 2)
+    first, last = (at - spread).min(), (at + spread).max()
     tall, wide = max(high / low, 4.0) ** 0.08, max(last / first, 4.0) ** 0.08
-    log_axis(panel, "x", first / wide, last * wide, text=_seconds)
+    log_axis(panel, "x", first / wide, last * wide, text=cost.text)
     log_axis(panel, "y", low / tall, high * tall)
     if high * tall > 1:
         panel.axhspan(1.0, high * tall, zorder=0, **SHADE)
-    x = [front["time_s"].iloc[0], *front["time_s"], last * wide]
+    x = [front["at"].iloc[0], *front["at"], last * wide]
     y = [high * tall, *front["rmse_rel"], front["rmse_rel"].iloc[-1]]
     panel.step(x, y, where="post", zorder=0.5, solid_capstyle="butt", **FRONT)
-
-
-def _seconds(value: float) -> str:
-    return duration(value).replace("us", "µs").replace(".0 ", " ")
 
 
 def overview(problems: Sequence[Family], notes: Sequence[str], look: Look) -> Figure:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.report.views import NUMBERS, axis_value, bias_text, number, pareto
+from bench.report.views import NUMBERS, UNSTEADY, axis_value, bias_text, number, pareto, unsteady
 from bench.store import BIAS_VARIANCE, IDENTITY, write_whole
 
 WHOLE = ("horizon", "samples", "repeats", "dim", "seed")
@@ -25,7 +25,8 @@ FOOTNOTES = [
     "0 (< u): the bias is not distinguishable from 0, its 95% interval reaches up to u.",
     "relative bias and rel. RMSE: divided by the norm of the reference gradient. A relative RMSE above 1 is worse "
     "than answering zero.",
-    "variance: trace of the covariance of one estimate. time: one estimate, steady state, without compilation.",
+    "variance: trace of the covariance of one estimate. time: one estimate, steady state, without compilation. "
+    f"{UNSTEADY}: the interquartile range of its calls is over 20% of it; something else ran beside them.",
 ]
 
 
@@ -142,7 +143,8 @@ def _results(row: Any) -> list[str]:
         return ["-"] * 6
     return [
         bias_text(row), bias_text(row, row["reference_norm"], interval=False),
-        number(row["variance"], 3), number(row["rmse_rel"], 3), number(row["cosine"], 3), number(row["time_s"] * 1e3, 3),
+        number(row["variance"], 3), number(row["rmse_rel"], 3), number(row["cosine"], 3),
+        number(row["time_s"] * 1e3, 3) + UNSTEADY * bool(unsteady(row)),
     ]  # fmt: skip
 
 

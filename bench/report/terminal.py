@@ -17,6 +17,7 @@ from bench.grid import Experiment
 from bench.report.findings import TIE, lowest, problems, span, winners
 from bench.report.tables import one_line
 from bench.report.views import (
+    UNSTEADY,
     Family,
     Line,
     axis_text,
@@ -28,6 +29,7 @@ from bench.report.views import (
     relative,
     resolved,
     short_axis,
+    unsteady,
 )
 
 GOALS = (0.3, 0.1, 0.03)
@@ -85,10 +87,10 @@ def _show_rows(console: Console, group: Family, axis: str | None, merge: bool) -
             table.add_row(*cells, Text(row["status"], "red"), "-", "-", "-", "-")
             continue
         bias = bias_text(row, row["reference_norm"]) + _noted(row)
-        times = line.seconds.values() if merge else [row["time_s"]]
+        times = _times(line) if merge else [duration(row["time_s"]) + UNSTEADY * bool(unsteady(row))]
         table.add_row(
             *cells, bias, number(row["variance"]), _rmse(row, best.get(x, math.nan)), number(row["cosine"], 3),
-            "\n".join(map(duration, times)),
+            "\n".join(times),
         )  # fmt: skip
     console.print(table)
 
@@ -145,9 +147,13 @@ def _backends(line: Line) -> list[str]:
     return [("" if exact else "~") + name for name, exact in line.backends.items()]
 
 
+def _times(line: Line) -> list[str]:
+    return [duration(seconds) + UNSTEADY * (name in line.noisy) for name, seconds in line.seconds.items()]
+
+
 def _timed_backends(line: Line, width: int) -> str:
     """``jax 0.21ms, torch 12ms``, broken between backends."""
-    times = [duration(seconds).replace(" ", "") for seconds in line.seconds.values()]
+    times = [time.replace(" ", "") for time in _times(line)]
     text = ", ".join(f"{name}\0{time}" for name, time in zip(_backends(line), times, strict=True))
     return textwrap.fill(text, width, initial_indent="  ", subsequent_indent="  ").replace("\0", " ")
 
@@ -162,7 +168,8 @@ def _show_legend(console: Console, condensed: bool) -> None:
     )
     console.print(
         f"\nbias: |mean - reference| / |grad J|, {bias} (95%). rmse: error of one estimate / |grad J|, above 1 worse than "
-        "answering zero; * lowest, within 10%. A ? is explained below. Backends on one line agree to 1e-6, with ~ to 1%."
+        "answering zero; * lowest, within 10%. A ? is explained below. Backends on one line agree to 1e-6, with ~ to 1%. "
+        f"A time marked {UNSTEADY} was unsteady: the interquartile range of its calls is over 20% of it."
         + (" Under each estimator: backends and their time per estimate. fail: cells not ok." if condensed else "")
     )
 

@@ -23,6 +23,7 @@ from bench.store import write_whole
 WIDTH, PANEL = 6.6, 1.05
 """Inches: of the chart, and of one of its panels."""
 BLUE, BLACK, RED, GREEN, PINK = PALETTE[:5]
+SLIPPING: dict[str, Any] = {"color": "#a6a6a6", "alpha": 0.6, "linewidth": 0}
 SWITCH: dict[str, Any] = {"color": GREY, "linewidth": 0.5}
 SPIKED: dict[str, Any] = {"color": RED, "linewidth": 2.4, "solid_capstyle": "butt"}
 DRAWN = 1e30
@@ -76,6 +77,8 @@ def _legend(table: pd.DataFrame) -> list[Any]:
     handles: list[Any] = []
     if table["contacts"].any():
         handles.append(Patch(label="in contact", **SHADE))
+    if (table["slipping"] > 0).any():
+        handles.append(Patch(label="slipping", **SLIPPING))
     if table["switch"].any():
         handles.append(Line2D([], [], label="contact switch", **SWITCH))
     if any(spikes(table[name]).any() for name in MEASURES):
@@ -84,13 +87,13 @@ def _legend(table: pd.DataFrame) -> list[Any]:
 
 
 def _contacts(ax: Axes, table: pd.DataFrame) -> None:
-    """Shade the states in contact and mark the switches, each between the two states that differ."""
+    """Shade the states in contact, those that slip darker, and mark the switches, each between the states that differ."""
     time = table["time"].to_numpy()
     half = 0.5 * (time[1] - time[0])
-    touching = np.concatenate([[False], table["contacts"].to_numpy() > 0, [False]]).astype(int)
-    edges = np.diff(touching)
-    for start, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        ax.axvspan(time[start] - half, time[end - 1] + half, **SHADE)
+    for name, look in (("contacts", SHADE), ("slipping", SLIPPING)):
+        edges = np.diff(np.concatenate([[False], table[name].to_numpy() > 0, [False]]).astype(int))
+        for start, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+            ax.axvspan(time[start] - half, time[end - 1] + half, **look)
     for k in np.flatnonzero(table["switch"]):
         ax.axvline(time[k] - half, **SWITCH)
 

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 
 from bench.store import IDENTITY
+from bench.timing import NOISY
 
 if TYPE_CHECKING:
     from bench.grid import Experiment
@@ -27,6 +28,8 @@ CATEGORIES = ("scene", "contact", "integrator", "noise")
 NUMBERS = ("horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats")
 """Numeric identity columns; with the categories they say which problem a row is."""
 UNITS = {"horizon": "steps", "dt": "s", "stiffness": "N/m", "kappa": "N m"}
+UNSTEADY = "!"
+"""Mark of a time whose calls spread too much."""
 EXACT, CLOSE = 1e-6, 1e-2
 """Relative difference below which backends count as giving the same numbers, and nearly the same."""
 
@@ -180,6 +183,8 @@ class Line:
     """The first backend's rows, indexed by ``x`` in increasing order."""
     seconds: Mapping[str, float]
     """Median time per estimate on each backend."""
+    noisy: frozenset[str]
+    """Backends whose timings spread too much for most of the rows."""
     failed: int
 
     @cached_property
@@ -212,8 +217,9 @@ def lines(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Line]:
             exact = {name: name == first or _agree(mine, runs[name], EXACT) for name in alike}
             backends = dict(sorted(exact.items(), key=lambda item: not item[1]))
             seconds = {name: float(runs[name]["time_s"].median()) for name in backends}
+            noisy = frozenset(name for name in backends if unsteady(runs[name]).mean() > 0.5)
             failed = sum(int(runs[name]["lost"].sum()) for name in backends)
-            found.append(Line(str(estimator), str(params), backends, mine, seconds, failed))
+            found.append(Line(str(estimator), str(params), backends, mine, seconds, noisy, failed))
             runs = {name: run for name, run in runs.items() if name not in backends}
     return found
 
@@ -258,6 +264,11 @@ def axis_value(value: float) -> str:
         return f"{value:g}"
     mantissa, exponent = f"{value:e}".split("e")
     return f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}"
+
+
+def unsteady(rows: Any) -> Any:
+    """Whether the interquartile range of a timing is over 20% of its median: of one row, or of each of several."""
+    return rows["time_iqr_s"] > NOISY * rows["time_s"]
 
 
 def duration(seconds: float) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench import noise, registry, statistics, timing
+from bench.contracts import Problem, compilations
 from bench.grid import Cell, Experiment
 from bench.reference import Reference
 from bench.session import Session
@@ -26,6 +27,7 @@ TIMED_CALLS = 5
 
 def measure(cell: Cell, session: Session) -> dict[str, Any]:
     """Estimates of one cell held against the reference."""
+    compilations.restart()
     program = cell.program()
     theta = cell.scene.theta0()
     truth = session.references.of(cell)
@@ -57,10 +59,12 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
         "time_iqr_s": clock.iqr_s,
         "time_samples": list(clock.samples_s),
         "compile_s": usage.compile_s,
-        "rollouts": usage.rollouts / (calls + 1),
-        "gradients": usage.gradients / (calls + 1),
+        "rollouts": usage.rollouts / clock.calls,
+        "gradients": usage.gradients / clock.calls,
         "peak_memory_mb": timing.peak_memory_mb(),
         "device": problem.device,
+        "compilations": compilations.made,
+        "shapes": " ".join(sorted(compilations.shapes)),
     }
     if not np.isfinite(truth.batches).all():
         return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}
@@ -69,8 +73,23 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
     bad = ~np.isfinite(estimates).all(axis=1)
     if bad.any():
         result["status"] = "nonfinite"
-        result["reason"] += f", the first in repeat {int(np.argmax(bad))} of seed {cell.seed}"
+        result["reason"] += f"; {first_bad(cell, problem, w, int(np.argmax(bad)))}"
     return result
+
+
+def first_bad(cell: Cell, problem: Problem, w: np.ndarray, repeat: int) -> str:
+    """Where an estimate that is not finite comes from, so that it can be repeated: theta, seed and sample.
+
+    The sample is the first of the repeat ``w[repeat]`` whose own cost or gradient is not finite; an estimator may
+    also spoil finite ones, or displace theta.
+    """
+    theta, samples = cell.scene.theta0(), w[repeat].T
+    spoilt = ~np.isfinite(problem.value(theta, samples))
+    if "grad" in cell.backend.provides:
+        spoilt |= ~np.isfinite(problem.grad(theta, samples)).all(axis=0)
+    sample = f"sample {int(np.argmax(spoilt))}" if spoilt.any() else "no single sample, costs and gradients are finite"
+    text = np.array2string(theta, precision=17, threshold=8, separator=", ").replace("\n", "")
+    return f"the first at seed {cell.seed}, repeat {repeat}, {sample}, theta {text}"
 
 
 def truth_of(found: Reference) -> statistics.Truth:
@@ -82,10 +101,10 @@ def truth_of(found: Reference) -> statistics.Truth:
 
 def write(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]) -> list[Path]:
     """Tables, charts and the printed table."""
-    from bench.report import charts, tables, terminal, views
+    from bench.report import charts, fastest, tables, terminal, views
 
     names = sorted(registry.entries()["estimators"])
     smoothing = views.smoothing_parameters()
     paths = tables.write(rows, experiment.directory) + charts.write(experiment, rows, axes, names, smoothing)
     terminal.show(experiment, rows, axes, smoothing)
-    return paths
+    return paths + fastest.write(experiment, rows)

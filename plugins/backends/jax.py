@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -22,6 +21,8 @@ from bench.contracts import (
     Unsupported,
     param,
 )
+from plugins.backends import rows
+from plugins.backends.compiling import compiled
 
 
 @dataclass(frozen=True)
@@ -56,10 +57,28 @@ class JaxOps:
         self.xp = jax.numpy
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """lax.scan, keeping the carry."""
+        """lax.scan over rows, keeping the carry.
+
+        The backward pass keeps the carries alone and repeats each step, unless the step iterates.
+        """
         import jax
 
-        return jax.lax.scan(lambda c, x: (step(c, x), None), carry, xs, length)[0]
+        leaves, tree = jax.tree.flatten(carry)
+        slices, slice_tree = jax.tree.flatten(xs)
+
+        def flat(*arguments: Array) -> list[Array]:
+            state, x = arguments[: len(leaves)], arguments[len(leaves) :]
+            return jax.tree.leaves(step(jax.tree.unflatten(tree, state), jax.tree.unflatten(slice_tree, x)))
+
+        traced = jax.make_jaxpr(flat)(*leaves, *(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in slices))
+
+        def body(state: list[Any], x: list[Any]) -> tuple[list[Any], None]:
+            return rows.evaluate(traced.jaxpr, traced.consts, [*state, *x]), None
+
+        if not rows.iterates(traced.jaxpr):
+            body = jax.checkpoint(body, prevent_cse=False)
+        last, _ = jax.lax.scan(body, [rows.split(x) for x in leaves], [rows.split(x, axis=1) for x in slices], length)
+        return jax.tree.unflatten(tree, [rows.join(x) for x in last])
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
         """Refused: the implicit backend does this."""
@@ -72,18 +91,29 @@ def _platform() -> str:
     return str(jax.default_backend())
 
 
-_compiled: dict[tuple[Any, ...], tuple[Any, float]] = {}
-"""Compiled functions and their compile seconds, by program structure, function, mode, dtype and shapes."""
+def _numbers(program: Program) -> int:
+    """About how many numbers the gradient of one rollout keeps: a carry, a control and its gradient each step, theta, noise."""
+    scene, kept = program.scene, 2 * program.dim + program.n_noise
+    if isinstance(scene, MechanicalScene):
+        kept += scene.horizon * (2 * scene.n_q + 2 + 2 * scene.n_u)
+    return kept
 
 
 class JaxProblem(Problem):
-    """A program compiled once per batch shape; float parameters are traced, so sweeping them compiles nothing."""
+    """A program compiled once per batch shape; float parameters are traced, so sweeping them compiles nothing.
+
+    Each block runs on one thread of XLA, and blocks run beside each other, which shares the cores without a wait per step.
+    """
+
+    grain = 128
 
     def __init__(self, program: Program, ops: Ops, dtype: str, mode: str) -> None:
         super().__init__(program)
         self._ops, self._dtype, self._mode = ops, np.dtype(dtype), mode
         self._parameters = program.parameters().astype(self._dtype)
         self.device = _platform()
+        if self.device == "cpu":
+            self.fit_blocks(_numbers(program) * self._dtype.itemsize)
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._call(self._cost, theta, w)
@@ -148,20 +178,17 @@ class JaxProblem(Problem):
         return np.asarray(self._run(function, theta, w), dtype=np.float64)
 
     def _run(self, function: Callable[..., Any], theta: np.ndarray, w: np.ndarray) -> Any:
-        import jax
 
-        args = (self._parameters, theta.astype(self._dtype), w.astype(self._dtype))
+        args = (self._parameters, theta.astype(self._dtype, copy=False), w.astype(self._dtype, copy=False))
         solver = type(self._ops) if self.program.needs_root else None
         key = (solver, self.program.structure, function.__name__, self._mode, self._dtype, theta.shape, w.shape)
-        if key not in _compiled:
-            start = time.perf_counter()
-            compiled = jax.jit(function).lower(*args).compile()
-            _compiled[key] = (compiled, time.perf_counter() - start)
-        compiled, seconds = _compiled[key]
+        executable = compiled(key, function, args, self._measured)
         if key not in self._charged:
             self._charged.add(key)
-            self.usage.compile_s += seconds
-        return compiled(*args)
+            self.usage.trace_s += executable.trace_s
+            self.usage.lower_s += executable.lower_s
+            self.usage.compile_s += executable.seconds
+        return executable.call(*args)
 
     def _cost(self, parameters: Array, theta: Array, w: Array) -> Array:
         return self.program.bind(parameters).cost(self._ops, theta, w)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, Backend, Jacobians, MechanicalScene, Ops, Problem, Program, State, param
+from bench.contracts import Array, Backend, Jacobians, MechanicalScene, Ops, Problem, Program, State, Trajectory, param
 from plugins import mjcf
 from plugins.backends.numpy import NumpyOps, NumpyProblem
 from plugins.backends.torch import TorchOps
@@ -77,6 +77,10 @@ class MujocoProblem(NumpyProblem):
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return _reverse(Recorded(self.program, self._rollout(theta, w)[0]), theta, w, scored=True)
 
+    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
+        """States and controls of the engine."""
+        return Trajectory(*self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w))
+
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """States, controls and finite-difference Jacobians of the steps (``mjd_transitionFD``)."""
         theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
@@ -111,6 +115,8 @@ class Engine:
         import mujoco
         from mujoco.rollout import Rollout
 
+        # a rollout that diverges ends in NaN, which says it; by default MuJoCo writes a log file where it is run
+        mujoco.set_mju_user_warning(lambda message: None)
         self._mujoco, self._model = mujoco, model
         self._data = [mujoco.MjData(model) for _ in range(_cores())]
         self._pool = Rollout(nthread=len(self._data))

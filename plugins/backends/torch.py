@@ -47,7 +47,7 @@ class TorchOps:
 class TorchProblem(Problem):
     """A program run by torch."""
 
-    block = 1 << 12
+    block = 1 << 13
 
     def __init__(self, program: Program, dtype: str) -> None:
         import torch

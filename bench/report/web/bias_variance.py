@@ -168,7 +168,7 @@ def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
     styles = Look(rows, sorted(registry.entries()["estimators"]))
     found = {}
     for estimator, params in dict.fromkeys(zip(rows["estimator"], rows["estimator_params"], strict=True)):
-        line = Line(estimator, params, {}, rows.iloc[:0], {}, 0)
+        line = Line(estimator, params, {}, rows.iloc[:0], {}, frozenset(), 0)
         style = styles.marked(line)
         found[line.label] = look(style["color"], SYMBOLS[style["marker"]], DASHES[str(style["linestyle"])])
     return found

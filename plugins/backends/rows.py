@@ -1,0 +1,99 @@
+"""Row-wise evaluation of JAX code: a ``(n, B)`` array of few rows as a tuple of n arrays ``(B,)``.
+
+Model code stacks and slices rows, and XLA compiles a stack to a loop that asks of each element which row it is in. The
+same operations applied to each row apart are long loops without a branch, which vectorise. The numbers stay the same:
+each element is computed by the operations that the code names, in their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from bench.contracts import Array
+
+MOST_ROWS = 16
+"""Arrays with more rows are left whole."""
+ELEMENTWISE = {
+    "abs", "acos", "acosh", "add", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
+    "convert_element_type", "cos", "cosh", "div", "eq", "erf", "exp", "exp2", "expm1", "floor", "ge", "gt",
+    "integer_pow", "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not",
+    "or", "pow", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan",
+    "tanh", "xor",
+}  # fmt: skip
+"""Primitives that compute each element from the elements at its place."""
+
+
+def split(array: Array, axis: int = 0) -> Any:
+    """The rows of a ``(n, B)`` array, or of ``(T, n, B)`` with axis 1; an array of another shape as it is."""
+    if array.ndim != axis + 2 or not 0 < array.shape[axis] <= MOST_ROWS:
+        return array
+    return tuple(array[(slice(None),) * axis + (i,)] for i in range(array.shape[axis]))
+
+
+def join(value: Any) -> Array:
+    """The array of a tuple of rows."""
+    import jax.numpy as jnp
+
+    return jnp.stack(value) if isinstance(value, tuple) else value
+
+
+def evaluate(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
+    """The outputs of a jaxpr, each ``(n, B)`` array of few rows split, for arguments split likewise."""
+    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
+
+    def read(atom: Any) -> Any:
+        return atom.val if hasattr(atom, "val") else known[atom]
+
+    for equation in jaxpr.eqns:
+        values = [read(atom) for atom in equation.invars]
+        known.update(zip(equation.outvars, _apply(equation, values), strict=True))
+    return [split(value) if hasattr(value, "ndim") else value for value in map(read, jaxpr.outvars)]
+
+
+def _apply(equation: Any, values: list[Any]) -> list[Any]:
+    """The outputs of one equation."""
+    name, parameters, primitive = equation.primitive.name, equation.params, equation.primitive
+    out = equation.outvars[0].aval
+    if name in ("jit", "pjit"):
+        return evaluate(parameters["jaxpr"].jaxpr, parameters["jaxpr"].consts, values)
+    rows = None
+    if any(isinstance(value, tuple) for value in values) or name == "stack":
+        rows = _rows(name, parameters, primitive, values, out)
+    if rows is not None:
+        return [rows]
+    result = primitive.bind(*map(join, values), **primitive.get_bind_params(parameters))
+    return list(result) if primitive.multiple_results else [result]
+
+
+def _rows(name: str, parameters: Any, primitive: Any, values: list[Any], out: Any) -> Any:
+    """The output as rows, or as one row ``(B,)``; None where the operation has no row-wise form."""
+    if name == "squeeze" and parameters["dimensions"] == (0,):
+        return values[0][0]
+    if out.ndim != 2 or not 0 < out.shape[0] <= MOST_ROWS:
+        return None
+    if name in ELEMENTWISE:
+        columns = [_repeated(value, out.shape[0]) for value in values]
+        return tuple(primitive.bind(*row, **parameters) for row in zip(*columns, strict=True))
+    if name == "stack" and parameters["axis"] == 0:
+        return tuple(values)
+    if name == "concatenate" and parameters["dimension"] == 0:
+        return tuple(row for value in values for row in (value if isinstance(value, tuple) else split(value)))
+    if name == "slice" and parameters["strides"] is None and values[0][0].shape == out.shape[1:]:
+        return values[0][parameters["start_indices"][0] : parameters["limit_indices"][0]]
+    return None
+
+
+def _repeated(value: Any, count: int) -> tuple[Any, ...]:
+    """What each of ``count`` rows takes of an operand: its own row, the only row or the same number."""
+    if getattr(value, "ndim", 0) == 2:
+        value = split(value)
+    rows = value if isinstance(value, tuple) else (value,)
+    return rows if len(rows) == count else rows * count
+
+
+def iterates(jaxpr: Any) -> bool:
+    """Whether it holds a loop, at any depth."""
+    from jax.extend.core import subjaxprs
+
+    return any(e.primitive.name in ("while", "scan") for e in jaxpr.eqns) or any(map(iterates, subjaxprs(jaxpr)))
