@@ -111,7 +111,7 @@ def summary(table: pd.DataFrame) -> str:
     text = f"{', '.join(parts)}, {counts.get('same', 0)} are the same within what was measured"
     worse = table.loc[table["outcome"] == "worse", "change"]
     changes = Counter(change.partition(" ")[0] for text in worse for change in text.split("; "))
-    most = ", ".join(f"{kind} of {count}" for kind, count in changes.most_common())
+    most = ", ".join(f"{count} in {kind}" for kind, count in changes.most_common())
     return f"Of {counted(len(table), 'cell')} {text}" + (f"; of the worse, {most}." if most else ".")
 
 

@@ -612,11 +612,21 @@ function buildTheme() {
   let before = state.theme;
   addEventListener("beforeprint", () => {
     before = state.theme;
+    document.documentElement.dataset.printing = "";
     applyTheme("light");
     for (const chart of charts) if (chart.dirty) drawChart(chart);
+    fitCharts();
     document.querySelector("#made details").open = true;
   });
-  addEventListener("afterprint", () => applyTheme(before));
+  addEventListener("afterprint", () => {
+    delete document.documentElement.dataset.printing;
+    fitCharts();
+    applyTheme(before);
+  });
+}
+
+function fitCharts() {
+  for (const plot of document.querySelectorAll(".plot")) Plotly.Plots.resize(plot);
 }
 
 // --------------------------------------------------------------------------------------------------------- start
