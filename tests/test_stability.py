@@ -245,6 +245,8 @@ def test_files_and_the_printed_table(tmp_path, capsys):
     assert names == {
         "stability_map.csv", "stability_map.md", "stability_map_semi_implicit_euler.png",
         "stability_map_semi_implicit_euler.svg",
+        "stability_map_semi_implicit_euler.pdf",
+        "stability_map_semi_implicit_euler.plotted.csv",
     }  # fmt: skip
     printed = capsys.readouterr().out
     assert "semi_implicit_euler" in printed

@@ -276,7 +276,9 @@ def test_command_writes_table_and_chart(tmp_path, capsys):
     assert "no contacts in this scene" in printed
     for scene, steps in (("pushing", 60), ("double_integrator", 20)):
         directory = tmp_path / "trace" / scene
-        assert sorted(path.name for path in directory.iterdir()) == ["trace.csv", "trace.png", "trace.svg"]
+        assert sorted(path.name for path in directory.iterdir()) == [
+            "trace.csv", "trace.pdf", "trace.plotted.csv", "trace.png", "trace.svg",
+        ]  # fmt: skip
         table = pd.read_csv(directory / "trace.csv")
         assert tuple(table.columns[: len(COLUMNS)]) == COLUMNS
         assert len(table) == steps + 1
