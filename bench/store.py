@@ -98,8 +98,10 @@ BIAS_VARIANCE = Columns(
     ),
     texts=("reference_method", "device", "shapes"),
     lists=("time_samples",),
-    extra=("variance_low", "variance_high", "time_samples", "compilations", "shapes"),
-    measured=("time_s", "time_iqr_s", "time_samples", "compile_s", "peak_memory_mb", "compilations", "shapes"),
+    extra=("variance_low", "variance_high", "time_samples", "estimates_s", "compilations", "shapes"),
+    measured=(
+        "time_s", "time_iqr_s", "time_samples", "estimates_s", "compile_s", "peak_memory_mb", "compilations", "shapes",
+    ),
 )  # fmt: skip
 """The columns of the main table: a contract with people's scripts."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -45,10 +46,12 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
     timing.reset_peak_memory()
     calls = cell.repeats if cell.backend.compiles else min(TIMED_CALLS, cell.repeats)
     problem.reset_usage()
+    started = time.perf_counter()
     parts, clock = timing.timed(lambda r: estimate(w[r : r + 1]), calls)
     usage = replace(problem.usage)
     if calls < cell.repeats:
         parts.append(estimate(w[calls:]))
+    spent = time.perf_counter() - started
     estimates = np.concatenate(parts)
 
     result: dict[str, Any] = {
@@ -58,6 +61,7 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
         "time_s": clock.median_s,
         "time_iqr_s": clock.iqr_s,
         "time_samples": list(clock.samples_s),
+        "estimates_s": spent,
         "compile_s": usage.compile_s,
         "rollouts": usage.rollouts / clock.calls,
         "gradients": usage.gradients / clock.calls,
