@@ -8,6 +8,7 @@ several can write to one directory: what is stored is the union of all files, th
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -196,7 +197,6 @@ class Store:
 
         False where another run has put its own there meanwhile: its rows have to be read too.
         """
-        import io
 
         buffer = io.BytesIO()
         table.to_parquet(buffer, index=False)
@@ -259,7 +259,8 @@ def _frames(paths: Iterable[Path]) -> Iterator[pd.DataFrame]:
     for path in paths:
         try:
             if path.suffix == ".parquet":
-                yield pd.read_parquet(path)
+                # opened once: a path is opened for the schema and again for the pages, and may be replaced in between
+                yield pd.read_parquet(io.BytesIO(path.read_bytes()))
             else:
                 read = json.loads(path.read_text())
                 rows.extend(read if isinstance(read, list) else [read])

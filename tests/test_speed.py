@@ -134,8 +134,7 @@ def test_a_sweep_compiles_each_shape_once():
     assert compilations.made == len(compilations.shapes) == 2
 
 
-def test_run_counts_compilations_and_keeps_compiled_programs(tmp_path, monkeypatch):
-    monkeypatch.setenv("BENCH_COMPILE_CACHE", "")
+def test_run_counts_compilations_and_keeps_compiled_programs(tmp_path):
     words = [
         "scenes=[pushing]", "contacts=[softplus]", "estimators=[fobg]", "sweep.stiffness=[100,1000]",
         "sweep.sigma=[0.1,0.2]", "sweep.beta=[5,20]", "scene.pushing.horizon=7", "samples=8", "repeats=4",
