@@ -120,7 +120,9 @@ class MjxProgram(Program):
             after = mjx.step(self._model, data.replace(qpos=q, qvel=v, ctrl=u))
             return State(after.qpos, after.qvel)
 
-        return jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)
+        # numbers that MJX makes itself are of JAX's default precision
+        with jax.enable_x64(kind == np.float64):
+            return jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)
 
 
 def _library() -> Any:
