@@ -78,7 +78,9 @@ def figures(
             ("speed_accuracy", TIME_COMPILED if experiment.compile_time else TIME),
             ("rollouts_accuracy", ROLLOUTS),
         ):
-            chosen, held = choose(problems("samples", partial(_costed, cost)))
+            costed = problems("samples", partial(_costed, cost))
+            curves = [problem for problem in costed if ran(problem.rows)["x"].nunique() > 1]
+            chosen, held = choose(curves or costed)
             if chosen and (cost is not ROLLOUTS or good["samples"].nunique() > 1):
                 found[name] = speed_accuracy(chosen, held + merged, look, cost)
     if nothing_swept:
