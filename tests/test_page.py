@@ -69,6 +69,14 @@ def test_finding_says_when_nothing_beats_zero_and_when_nothing_ran():
     assert "No cell gave a result" in finding(page(rows))
 
 
+def test_finding_tells_of_backends_that_refused_every_cell():
+    rows = table([row(stiffness=k) for k in (10.0, 100.0)])
+    refused = rows.assign(backend="stubborn", status="unsupported", reason="cannot", key=rows["key"] + "s")
+    assert "stubborn refuses: cannot" in finding(page(pd.concat([rows, refused], ignore_index=True)))
+    refused.loc[0, "status"] = "ok"
+    assert "stubborn" not in finding(page(pd.concat([rows, refused], ignore_index=True)))
+
+
 def test_every_row_is_in_the_page_with_its_status_and_reason():
     rows = small_rows()
     found = data_of(page(rows))
@@ -216,6 +224,17 @@ def shown(opened):
     yield opened
     assert opened.said == []
     assert opened.requests == []
+
+
+def test_unsteady_times_are_marked(browser, tmp_path):
+    rows = table([row(stiffness=k, time_s=0.01, time_iqr_s=spread) for k, spread in ((1.0, 1e-4), (2.0, 5e-3))])
+    path = tmp_path / "report.html"
+    path.write_text(page(rows))
+    browser.open(path)
+    assert browser.do("[0, 1].map((i) => shownAs(page.columns.find((c) => c.name === 'time_s'), i))") == [
+        "10 ms",
+        "10 ms !",
+    ]
 
 
 def test_charts_are_drawn_and_a_filter_takes_points_away(shown):

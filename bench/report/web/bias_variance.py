@@ -25,9 +25,11 @@ from bench.report.views import (
     lines,
     number,
     numeric_axes,
+    ran,
     resolved,
     short_axis,
     smoothing_parameters,
+    unsteady,
 )
 from bench.report.web.content import (
     DASHES,
@@ -60,7 +62,7 @@ RESULTS = [
     Column("variance_rel", "rel. variance"),
     Column("rmse_rel", "rel. RMSE"),
     Column("cosine", "cosine"),
-    Column("time_s", "time", "seconds"),
+    Column("time_s", "time", "seconds", "unsteady"),
     Column("compile_s", "compile", "seconds"),
     Column("rollouts", "rollouts"),
 ]
@@ -108,7 +110,7 @@ def content(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]) -> 
         )
     )
     return Content(
-        finding=nothing_ran(rows) or "; ".join(filter(None, [finding(told), fastest(rows)])) + ".",
+        finding=nothing_ran(rows) or "; ".join(filter(None, [finding(told), fastest(rows), refused(rows)])) + ".",
         rows=made,
         columns=[*identity_columns(rows), *RESULTS, *STATUS],
         charts=charts,
@@ -134,6 +136,7 @@ def derived(rows: pd.DataFrame) -> pd.DataFrame:
     good = rows["status"] == "ok"
     texts = {
         "bias_limit": limit.astype(float),
+        "unsteady": unsteady(rows).astype(float),
         "series": _label(rows),
         "problem": titled(rows, ["scene", "contact"]),
         "line": rows["backend"] + " " + rows["dtype"] + " " + _label(rows),
@@ -255,6 +258,13 @@ def fastest(rows: pd.DataFrame) -> str:
         return ""
     share = f"{len(times)} of the {counted(len(first), 'setting')} where any does"
     return f"a relative RMSE of {GOAL:g} is reached first by {way} in {share} ({duration(times[0])} to {duration(times[-1])})"
+
+
+def refused(rows: pd.DataFrame) -> str:
+    """Which backends refused every cell, with the reason of most; nothing where none did."""
+    left = rows[(rows["status"] == "unsupported") & ~rows["backend"].isin(ran(rows)["backend"])]
+    told = left.groupby("backend", sort=False)["reason"].agg(lambda reasons: reasons.mode().iloc[0])
+    return "; ".join(f"{backend} refuses: {reason}" for backend, reason in told.items())
 
 
 def elsewhere(told: Sequence[Told], main: str) -> list[Elsewhere]:

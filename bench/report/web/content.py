@@ -69,7 +69,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the main table; ``kind`` is text, number, seconds, or limit: a number with < where ``flag`` is not 0."""
+    """A column of the main table; ``kind`` is text, number, seconds, with ``!`` where ``flag`` is not 0, or limit, with ``<`` there."""
 
     name: str
     label: str

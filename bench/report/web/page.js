@@ -76,8 +76,9 @@ function duration(seconds) {
 function shownAs(column, row) {
   const value = reader("rows", column.name)(row);
   if (column.kind === "text") return value === null ? "" : String(value);
-  if (column.kind === "seconds") return duration(value);
-  if (column.kind === "limit" && value !== null && reader("rows", column.flag)(row)) return "0 (< " + number(value) + ")";
+  const flagged = column.flag && value !== null && reader("rows", column.flag)(row);
+  if (column.kind === "seconds") return duration(value) + (flagged ? " !" : "");
+  if (column.kind === "limit" && flagged) return "0 (< " + number(value) + ")";
   return page.identity.includes(column.name) ? exact(value) : number(value);
 }
 
