@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -16,10 +17,12 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from bench.report.style import inches, plain, quantity, wrapped
 from bench.report.views import CATEGORIES, Family
 
-WIDTH, NARROW = 7.4, 4.6
-"""Inches of a page between its margins, and of a lone panel: fonts are printed at the size given."""
+WIDTH, NARROW = 7.16, 3.5
+"""Inches of two columns of a paper and of one, which holds a lone panel: fonts are printed at the size given."""
 LINE = 0.16
 """Inches of a line of text."""
+BOLD = 1.25
+"""How much wider a title is than the same text elsewhere."""
 PLACES: Any = ("upper center", "lower center")
 
 
@@ -43,16 +46,18 @@ def page(
     titles = _panel_titles(problems, 0.86 * width / across)
     blocks = math.ceil(len(problems) / across)
     head = wrapped(subtitle, 0.97 * width)
+    title = "\n".join(textwrap.wrap(title, math.floor(len(title) * 0.97 * width / (BOLD * inches(title)))))
     counts = [_legend_columns(part, width) for part in legends]
-    above = 0.25 + LINE * (head.count("\n") + 1)
+    named = 0.25 + LINE * title.count("\n")
+    above = named + LINE * (head.count("\n") + 1)
     middle = blocks * (height + LINE * max(text.count("\n") + 1 for text in titles))
-    below = 0.1 + 0.17 * sum(math.ceil(len(part) / count) for part, count in zip(legends, counts, strict=True))
+    below = 0.15 + 0.15 * sum(math.ceil(len(part) / count) for part, count in zip(legends, counts, strict=True))
     layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03, rect=(0.005, 0, 0.99, 1))
     figure = Figure(figsize=(width, above + middle + below), layout=layout)
     FigureCanvasAgg(figure)
     top, centre, bottom = figure.subfigures(3, 1, height_ratios=[above, middle, below], squeeze=False)[:, 0]
     top.text(0.5, 1 - 0.07 / above, title, ha="center", va="top", fontsize=9, fontweight="bold")
-    top.text(0.5, 1 - 0.25 / above, head, ha="center", va="top", color="#404040")
+    top.text(0.5, 1 - named / above, head, ha="center", va="top", color="#404040")
     _legends(bottom, legends, counts)
     grid = centre.subplots(blocks * len(labels), across, squeeze=False, sharey=sharey)
     return figure, _panels(grid, titles, labels)

@@ -41,7 +41,7 @@ def bias_variance(
     across = columns(len(problems), 4)
     figure, panels = page(
         problems, across, 3.3, ("|bias| / |∇J|", "variance / |∇J|²"),
-        f"Relative bias and variance along {axis_name(axis)}", [*shared(problems, short_axis(axis)), *notes],
+        f"Relative bias and variance along {axis_name(axis).split(' [')[0]}", [*shared(problems, short_axis(axis)), *notes],
         _line_legends(drawn, look, axis, marks),
     )  # fmt: skip
     for (upper, lower), found in zip(panels, drawn, strict=True):

@@ -17,11 +17,12 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from bench.errors import UserError
 from bench.health import MEASURES, Trace, align, number, spikes
 from bench.report.figures import save, styled
+from bench.report.page import WIDTH
 from bench.report.style import GREY, PALETTE, SHADE, STYLE, plain, wrapped
 from bench.store import write_whole
 
-WIDTH, PANEL = 6.6, 1.05
-"""Inches: of the chart, and of one of its panels."""
+PANEL = 1.05
+"""Inches of the height of a panel."""
 BLUE, BLACK, RED, GREEN, PINK = PALETTE[:5]
 SLIPPING: dict[str, Any] = {"color": "#a6a6a6", "alpha": 0.6, "linewidth": 0}
 SWITCH: dict[str, Any] = {"color": GREY, "linewidth": 0.5}
