@@ -129,7 +129,7 @@ Hidden = local()
 EXPECTED = {
     "bad_shape": ("error", "returned shape"),
     "bad_number": ("nonfinite", "theta"),
-    "hangs": ("timeout", "no result within 2 s"),
+    "hangs": ("timeout", "no result within 5 s"),
     "allocates": ("crashed", "GiB of memory"),
     "shouts": ("ok", ""),
     "forks": ("ok", ""),
@@ -141,7 +141,7 @@ EXPECTED = {
     "cannot_be_sent": ("error", "Can't pickle"),
     "vanishes": ("crashed", "exit status 7"),
 }
-LIMITS = ["timeout=2", "memory=600m"]
+LIMITS = ["timeout=5", "memory=600m"]
 BASE = ["scenes=[quadratic]", "backends=[numpy]", "samples=8", "repeats=4", "timing=false"]
 
 
