@@ -185,7 +185,8 @@ def _write(
     axes = grid.swept(experiment.sweep)
     paths = studies.find(experiment.study).write(experiment, rows, axes)
     if seconds:
-        paths.append(report.record(experiment, rows, words, seconds))
+        simulated = planned is None or any(item.runs for item in planned)
+        paths.append(report.record(experiment, rows, words, seconds, simulated))
     paths.append(web.write(experiment, rows, axes))
     print("\nWritten:")
     for path in paths:

@@ -53,6 +53,17 @@ def test_only_missing_cells_run_and_rows_are_kept(tmp_path, monkeypatch):
     assert len(pd.read_csv(tmp_path / "tiny" / "bias_variance.csv")) == 2
 
 
+def test_record_of_a_run_outlasts_one_that_finds_all_rows_stored(tmp_path):
+    here = [*TINY, f"results_dir={tmp_path}", "workers=0"]
+    path = tmp_path / "tiny" / "run.json"
+    assert main([*here, "sweep.sigma=[0.1,0.2]"]) == 0
+    first = path.read_text()
+    assert main([*here, "sweep.sigma=[0.1,0.2]"]) == 0
+    assert path.read_text() == first
+    assert main([*here, "sweep.sigma=[0.1]"]) == 0
+    assert json.loads(path.read_text())["counts"] == {"ok": 2}
+
+
 def test_same_seed_same_rows(tmp_path):
     overrides = [
         "scenes=[pushing,heaviside]", "contacts=[penalty]", "backends=[jax,torch,numpy]", "scene.pushing.horizon=5",

@@ -27,8 +27,11 @@ def latest(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.drop_duplicates(list(IDENTITY), keep="last").reset_index(drop=True)
 
 
-def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds: float) -> Path:
-    """Write ``run.json``: what was run, with what, on what, and how it ended."""
+def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds: float, simulated: bool) -> Path:
+    """Write ``run.json``: what was run, with what, on what, and how it ended.
+
+    A run that found all its rows stored leaves what the last one that simulated the same has written.
+    """
     content: dict[str, Any] = {
         "command": " ".join(["python -m bench", *words]),
         "experiment": experiment.name,
@@ -55,8 +58,18 @@ def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds
         "argv": [Path(sys.argv[0]).name, *words],
     }
     path = experiment.directory / "run.json"
-    write_whole(path, (json.dumps(content, indent=1, default=str) + "\n").encode())
+    text = json.dumps(content, indent=1, default=str) + "\n"
+    if simulated or _is_other(path, json.loads(text)):
+        write_whole(path, text.encode())
     return path
+
+
+def _is_other(path: Path, made: dict[str, Any]) -> bool:
+    """Whether a record is of another configuration, or is none."""
+    try:
+        return bool(json.loads(path.read_text())["config"] != made["config"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return True
 
 
 def _identity(choice: Any) -> str:

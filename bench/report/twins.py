@@ -115,6 +115,9 @@ def _print(experiment: Experiment, rows: pd.DataFrame, table: pd.DataFrame) -> N
         grid.add_column(HEADERS.get(name, name), no_wrap=True)
     for line in table[list(PRINTED)].itertuples(index=False):
         grid.add_row(*map(str, line))
-    Console(highlight=False, markup=False).print(grid)
+    console = Console(highlight=False, markup=False)
+    if not console.is_terminal:
+        console.width = max(console.width, 120)
+    console.print(grid)
     for row in rows[rows["status"] != "ok"].to_dict("records"):
         print(f"{row['scene']}, {row['backend']}: {row['status']}: {row['reason']}")
