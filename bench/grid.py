@@ -204,6 +204,8 @@ class Cell:
         except Unsupported as error:
             return "unsupported", str(error)
         backend, estimator = self.backend, self.estimator
+        if "physics" in backend.provides and (reason := backend.refuses(program)):
+            return "unsupported", reason
         if program.needs_root and "root" not in backend.provides:
             part = next(p for p in (self.contact, self.integrator) if p is not None and p.needs_root)
             return "unsupported", f"{part.name} solves an equation each step, backend {backend.name} has no root finder"

@@ -12,7 +12,9 @@ from bench import blocks, cli, registry, timing
 from bench.contracts import compilations
 from bench.program import Program
 from plugins.backends import rows
+from plugins.backends.implicit import Implicit
 from plugins.backends.jax import Jax
+from plugins.contacts.complementarity import Complementarity
 from plugins.contacts.penalty import Penalty
 from plugins.contacts.softplus import Softplus
 from plugins.integrators.semi_implicit_euler import SemiImplicitEuler
@@ -132,6 +134,26 @@ def test_a_sweep_compiles_each_shape_once():
         problem.grad(theta, w)
         problem.grad(theta, w[:, :7])
     assert compilations.made == len(compilations.shapes) == 2
+
+
+def test_what_libraries_compile_while_a_program_is_traced_is_no_program():
+    compilations.restart()
+    for stiffness in (1e2, 1e3):
+        problem = Implicit().compile(pushing(8, Complementarity(stiffness=stiffness, kappa=1e-6)))
+        problem.grad(problem.program.scene.theta0(), np.ones((8, 20)))
+    assert compilations.made == len(compilations.shapes) == 1
+
+
+@pytest.mark.slow
+def test_mjx_compiles_once_along_stiffness():
+    pytest.importorskip("mujoco.mjx")
+    from plugins.backends.mjx import Mjx
+
+    compilations.restart()
+    for stiffness in (1e2, 1e3):
+        problem = Mjx().compile(pushing(8, Penalty(stiffness=stiffness, damping=0.0)))
+        problem.grad(problem.program.scene.theta0(), np.ones((8, 20)))
+    assert compilations.made == len(compilations.shapes) == 1
 
 
 def test_run_counts_compilations_and_keeps_compiled_programs(tmp_path):

@@ -19,6 +19,7 @@ _busy = threading.Lock()
 class Compiled:
     """An executable, and the seconds of its tracing, lowering and compiling; ``loaded`` from the folder for the last."""
 
+    name: str
     call: Callable[..., Any]
     seconds: tuple[float, float, float]
     loaded: bool
@@ -30,19 +31,20 @@ def compiled(key: tuple[Any, ...], function: Callable[..., Any], arguments: tupl
     With ``fresh`` its seconds are those of a compilation: the folder is not asked, and what came from it is made again.
     """
     with _busy:
-        compilations.shapes.add(hashlib.sha256(repr(key).encode()).hexdigest()[:16])
         found = _known.get(key)
         if found is None or (fresh and found.loaded):
-            found = _known[key] = _compile(function, arguments, None if fresh else compilations.folder)
+            name = found.name if found else hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+            found = _known[key] = _compile(name, function, arguments, None if fresh else compilations.folder)
+        compilations.shapes.add(found.name)
         return found
 
 
-def _compile(function: Callable[..., Any], arguments: tuple[Any, ...], folder: str | None) -> Compiled:
+def _compile(name: str, function: Callable[..., Any], arguments: tuple[Any, ...], folder: str | None) -> Compiled:
+    """Compile, and count it. What libraries make JAX compile on the way, single operations on constants, is in the seconds alone."""
     import jax
 
     _use(folder)
     _listen()
-    before = compilations.made
     # blocks run beside each other, one thread each
     options: dict[str, str | bool] | None = None
     if jax.default_backend() == "cpu":
@@ -52,9 +54,11 @@ def _compile(function: Callable[..., Any], arguments: tuple[Any, ...], folder: s
     after_trace = time.perf_counter()
     lowered = traced.lower()
     after_lowering = time.perf_counter()
+    before = _loaded
     call = lowered.compile(options)
     seconds = (after_trace - started, after_lowering - after_trace, time.perf_counter() - after_lowering)
-    return Compiled(call, seconds, loaded=compilations.made == before)
+    compilations.made += _loaded == before
+    return Compiled(name, call, seconds, loaded=_loaded > before)
 
 
 def _use(folder: str | None) -> None:
@@ -70,21 +74,20 @@ def _use(folder: str | None) -> None:
 
 
 _listening = False
+_loaded = 0
+"""Programs that JAX took from the folder."""
 
 
 def _listen() -> None:
-    """Count what XLA compiles in this process, wherever it is asked to, less what it takes from the folder."""
+    """Have JAX say what it takes from the folder."""
     global _listening
     if _listening:
         return
     _listening = True
     from jax import monitoring
 
-    def duration(event: str, duration_secs: float, **facts: Any) -> None:
-        compilations.made += event == "/jax/core/compile/backend_compile_duration"
-
     def happened(event: str, **facts: Any) -> None:
-        compilations.made -= event == "/jax/compilation_cache/cache_hits"
+        global _loaded
+        _loaded += event == "/jax/compilation_cache/cache_hits"
 
-    monitoring.register_event_duration_secs_listener(duration)
     monitoring.register_event_listener(happened)

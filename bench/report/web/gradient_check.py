@@ -76,15 +76,22 @@ def finding(rows: pd.DataFrame) -> str:
     if found.empty:
         return "No gradient could be checked: the table has the reason of each cell."
     if faults.empty:
-        worst = found.loc[found["error"].idxmax()] if found["error"].notna().any() else None
-        told = (
-            ""
-            if worst is None
-            else f"; the largest error is {number(worst['error'])}, {worst['verdict']} on {worst['scene']}"
-        )
-        return f"None of {counted(len(found), 'checked point')} shows a wrong gradient{told}."
+        return f"None of {counted(len(found), 'checked point')} shows a wrong gradient{_told(found)}."
     named = ", ".join(dict.fromkeys(titled(faults, ["scene", "contact", "backend"])))
     return f"{len(faults)} of {counted(len(found), 'checked point')} show a fault: {', '.join(faults['verdict'].unique())}; on {named}."
+
+
+def _told(found: pd.DataFrame) -> str:
+    """The largest error where there is a derivative, and how many points have none."""
+    broken = found["verdict"].isin(("kink", "jump", "unsettled"))
+    errors = found.loc[~broken, "error"].dropna()
+    told = (
+        f"; the largest error is {number(errors.max())} ({found.loc[errors.idxmax(), 'scene']})" if len(errors) else ""
+    )
+    if broken.any():
+        scenes = ", ".join(dict.fromkeys(found.loc[broken, "scene"]))
+        told += f"; {broken.sum()} of them lie on a kink or a jump, where a gradient can be of one side only ({scenes})"
+    return told
 
 
 def answers(rows: pd.DataFrame) -> pd.DataFrame:

@@ -490,6 +490,7 @@ function buildTable() {
     button.addEventListener("click", () => sortBy(column.name));
     return element("th", { scope: "col", className: column.kind === "text" ? "" : "number" }, button);
   })));
+  document.getElementById("unsteady").hidden = !page.columns.some((column) => column.kind === "seconds" && column.flag);
   document.getElementById("more").addEventListener("click", () => { state.limit += MORE; drawTable(); });
   body.addEventListener("click", (event) => {
     const line = event.target.closest("tr");
