@@ -34,13 +34,13 @@ from plugins.scenes.pushing import Pushing
 from plugins.scenes.quadratic import Quadratic
 
 
-def _is_engine(entry: registry.Entry) -> bool:
-    """Whether it is a physics engine, whose kit takes a minute or, where each program compiles for seconds, many."""
-    return entry.plugin is not None and "physics" in getattr(entry.plugin, "provides", ())
+def _is_long(entry: registry.Entry) -> bool:
+    """Whether its kit takes a minute, or many: engines and solvers, each of whose programs compiles for seconds."""
+    return entry.plugin is not None and bool({"physics", "root"} & set(getattr(entry.plugin, "provides", ())))
 
 
 ENTRIES = [
-    pytest.param(entry, id=f"{entry.kind}-{entry.name}", marks=[pytest.mark.slow] if _is_engine(entry) else [])
+    pytest.param(entry, id=f"{entry.kind}-{entry.name}", marks=[pytest.mark.slow] if _is_long(entry) else [])
     for table in registry.entries().values()
     for entry in table.values()
 ]
