@@ -53,6 +53,28 @@ def good(rows):
     return rows.index[rows["status"] == "ok"][0]
 
 
+def test_errors_without_noise_are_judged_beyond_rounding():
+    before = given().assign(model_error_rel=1e-13, program_error_rel=0.1)
+    place = good(before)
+    for name, value, expected in (
+        ("model_error_rel", 5e-13, None),
+        ("model_error_rel", 0.2, "worse"),
+        ("program_error_rel", 0.11, None),
+        ("program_error_rel", 0.01, "better"),
+    ):
+        after = before.copy()
+        after.loc[place, name] = value
+        found = changes.compared(before, after, timings=False)
+        assert set(found["outcome"]) - {"same"} == ({expected} if expected else set())
+
+
+def test_growth_rates_that_are_apart_are_changed():
+    before = given().assign(stretch_rate=1.0, stretch_low=0.9, stretch_high=1.1)
+    after = before.copy()
+    after.loc[good(before), ["stretch_rate", "stretch_low", "stretch_high"]] = [2.0, 1.8, 2.2]
+    assert "growth rate" in only(changes.compared(before, after, timings=False), "changed")
+
+
 def test_equal_results_are_the_same_whatever_the_noise_of_their_times():
     found = changes.compared(given(seed=1), given(seed=2), timings=True)
     assert set(found["outcome"]) == {"same"}

@@ -4,6 +4,8 @@
 - Variance: the two 95% intervals are apart where both are stored, else the ratio leaves the central 99% of an F
   distribution with R - 1 degrees of freedom on both sides (normal estimates of one dominant component: the fewest there can
   be). Only where it is by EFFECT at least.
+- Errors that are computed and not estimated (EXACT): by EFFECT at least, and by more than ROUNDING of what they are of.
+- Growth rate: the two 95% intervals are apart; faster is neither better nor worse.
 - Time: the medians differ by EFFECT at least and, of the stored times of single calls, a two-sided Mann-Whitney test
   (Mann and Whitney 1947) has p < ALPHA; without those, the middle halves of the calls (median and half its
   interquartile range on each side) are apart.
@@ -12,7 +14,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,14 @@ from bench.store import IDENTITY
 EFFECT = 1.25
 """Ratio below which neither a variance nor a time counts as changed."""
 ALPHA = 0.01
+EXACT = {
+    "forward_error_rel": "forward error", "program_error_rel": "program error", "model_error_rel": "model error",
+    "relative_error": "error", "state_difference_rel": "difference of states",
+    "gradient_difference_rel": "difference of gradients",
+}  # fmt: skip
+"""Relative errors without noise, of the studies that have them."""
+ROUNDING = 1e-6
+"""Change of such an error that another machine's rounding may make through a long rollout."""
 MEASURED = ("bias_rel", "rmse_rel", "time_s")
 """Columns told of both sides."""
 COLUMNS = [
@@ -34,6 +44,8 @@ NOTES = (
     "worse, better: a bias whose 95% interval is apart from the one before; a variance that is too (or, without its "
     f"interval, outside 99% of an F test) and differs by {EFFECT:g} times or more; a time that differs by {EFFECT:g} times or "
     f"more with p < {ALPHA:g} in a Mann-Whitney test of the single calls (or, without them, with interquartile ranges apart).",
+    f"Errors computed without noise (of cost, program, model, twin) count by {EFFECT:g} times and more than {ROUNDING:g}; a growth "
+    "rate with its interval apart is changed, neither worse nor better.",
     "A cell that was ok and is not, or is gone, is worse. A cell that is new is neither, nor is one whose intervals were "
     "remarked to be doubtful.",
     f"Each cell is judged by itself: of cells that did not change up to {ALPHA:.0%} may be told as changed by chance.",
@@ -72,7 +84,7 @@ def _line(old: dict[str, Any] | None, new: dict[str, Any] | None, timings: bool)
         changes += _status(old, new)
     else:
         accuracy = [_sure(found, old, new) for found in (_bias(old, new), _variance(old, new))]
-        changes += filter(None, [_verdict(old, new), *accuracy])
+        changes += filter(None, [_verdict(old, new), *accuracy, *_exact(old, new), _growth(old, new)])
         if timings:
             found, judged_by = _time(old, new)
             changes += [found] if found else []
@@ -132,6 +144,20 @@ def _outside_f(ratio: float, before: float, after: float) -> bool:
 
     low, high = (float(fdtri(after - 1, before - 1, p)) for p in (ALPHA / 2, 1 - ALPHA / 2))
     return not low <= ratio <= high
+
+
+def _exact(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    for name, called in EXACT.items():
+        was, now = _value(old, name), _value(new, name)
+        if abs(now - was) > ROUNDING and max(was, now) >= EFFECT * min(was, now):
+            yield ("worse" if now > was else "better"), f"{called} {number(was, 3)} to {number(now, 3)}"
+
+
+def _growth(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str] | None:
+    if _apart(old, new, "stretch") == 0:
+        return None
+    rates = (number(_value(row, "stretch_rate"), 3) for row in (old, new))
+    return "changed", f"growth rate {' to '.join(rates)}"
 
 
 def _time(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[tuple[str, str] | None, str]:
