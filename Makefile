@@ -19,15 +19,15 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# All experiments again into results/ (what is stored is not repeated), then the README's gallery from them.
+# All experiments again into results/standard (what is stored is not repeated), then the gallery from them.
 gallery: $(VENV)/.installed
-	for file in conf/experiment/*.yaml; do $(RUN) +experiment=$$(basename $$file .yaml) || exit 1; done
-	$(BIN)/python -m bench.report.gallery README.md results
+	for file in conf/experiment/*.yaml; do $(RUN) +experiment=$$(basename $$file .yaml) results_dir=results/standard || exit 1; done
+	$(BIN)/python -m bench.gallery docs/gallery.md results/standard
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt torch==2.13.0
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,engines]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,dev]'
 	touch $@
 
 clean:

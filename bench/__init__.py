@@ -1,1 +1,33 @@
-"""Compare gradient estimators through physics simulation against a certified gradient."""
+"""Compare gradient estimators through physics simulation: bias, variance and cost against a certified gradient.
+
+The Python face (:func:`run`, :func:`load`, :func:`problem`, :func:`estimate`) and the contracts that plugin authors import.
+"""
+
+from bench.errors import StorageError, UserError
+from bench.face import Estimates, estimate, load, problem, run
+from bench.model import *  # noqa: F403
+from bench.model import __all__ as _contracts
+from bench.sweep.cell import Cell
+from bench.sweep.columns import Column, Columns, Judged
+from bench.sweep.experiment import Experiment
+from bench.sweep.session import Session
+from bench.sweep.study import Study
+
+__version__ = "0.2.0"
+__all__ = [
+    *_contracts,
+    "Cell",
+    "Column",
+    "Columns",
+    "Estimates",
+    "Experiment",
+    "Judged",
+    "Session",
+    "StorageError",
+    "Study",
+    "UserError",
+    "estimate",
+    "load",
+    "problem",
+    "run",
+]

@@ -1,4 +1,4 @@
-"""The verbs: run (the default), report, plan, list, check, gradcheck, trace."""
+"""The verbs of the command line: a thin layer over the Python face and the modules below it."""
 
 from __future__ import annotations
 
@@ -7,39 +7,41 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.errors import StorageError, UserError, unknown
+from bench.errors import UserError, printable, unknown
 
 if TYPE_CHECKING:
-    from bench.grid import Experiment
-    from bench.runner import Planned
-    from bench.store import Store
+    import pandas as pd
 
-HELP = """\
-Compare gradient estimators through physics simulation.
+    from bench.sweep.execute import Finished
+    from bench.sweep.experiment import Experiment
 
-  python -m bench +experiment=NAME [key=value ...]          run what is missing, then write tables and charts
-  python -m bench report +experiment=NAME [key=value ...]   tables and charts again from stored rows
-  python -m bench plan +experiment=NAME [key=value ...]     cells, how many are stored, expected time
-  python -m bench list [NAME ...]                           plugins: parameters, capabilities, availability
-  python -m bench check [NAME ...]                          the conformance kit on some plugins, or all
-  python -m bench gradcheck SCENE ... [key=value ...]       gradients against differences of the cost, and what is wrong
-  python -m bench trace SCENE ... [key=value ...]           one rollout: do gradient spikes line up with contact switches?
-  python -m bench bench-self [quick=true]                   the harness's own speed, beside a NumPy loop and native code
-  python -m bench compare BEFORE AFTER [--timings]          two results, cell by cell: 1 when something got worse
-
-Experiments: {experiments}
-Settings: scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..]
+SETTINGS = """\
+Settings: scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..] study=NAME
   sweep.AXIS=[..]  scene.NAME.PARAMETER=..  (also contact. integrator. backend. estimator.)
-  samples=N repeats=R seed=S results_dir=DIR name=FOLDER
-
-  workers=N timeout=10m memory=4g on_error=stop timing=false retry=[timeout]    --quiet: no progress
-
+  samples=N repeats=R seed=S theta=[mass,..] theta0=[..] results_dir=DIR name=FOLDER formats=[png,svg,pdf]
+  workers=N timeout=10m memory=4g on_error=stop timing=false retry=[timeout]
+  plugins=DIR: plugins of your own.  --config-dir DIR: experiments of your own, as DIR/experiment/NAME.yaml
+  --quiet: no progress
+"""
+STATUS = """\
 Exit status: 0 every cell has a row that is not 'error'; 1 some cell failed unexpectedly; 2 bad input.
 """
+QUIET, CONFIG_DIR = "--quiet", "--config-dir"
 
-QUIET = "--quiet"
+
+@dataclass(frozen=True)
+class Verb:
+    """One command."""
+
+    call: Callable[[list[str]], int]
+    usage: str
+    does: str
+    more: str = ""
+    """Text that ``--help`` adds."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -48,14 +50,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return _dispatch(words)
     except UserError as error:
-        print("bench:", " ".join(str(error).split()), file=sys.stderr)
+        print("bench:", printable(error), file=sys.stderr)
         return 2
     except BrokenPipeError:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, the reader has gone; nothing may be written at exit
         return 0
     except OSError as error:
-        where = f"'{error.filename}': " if error.filename else ""
-        print(f"bench: {where}{error.strerror or error}", file=sys.stderr)
+        where = f"'{printable(error.filename)}': " if error.filename else ""
+        print(f"bench: {where}{error.strerror or printable(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("\nbench: stopped", file=sys.stderr)
@@ -63,145 +65,129 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(words: list[str]) -> int:
-    verbs: dict[str, Callable[[list[str]], int]] = {
-        "run": _run,
-        "report": _report,
-        "plan": _plan,
-        "list": _list,
-        "check": _check,
-        "gradcheck": _gradcheck,
-        "trace": _trace,
-        "bench-self": _bench_self,
-        "compare": _compare,
-    }
     if not words or words[0] in ("-h", "--help", "help"):
-        from bench import config
-
-        print(HELP.format(experiments=", ".join(config.experiments())), end="")
+        print(_overview(), end="")
         return 0 if words else 2
+    if words[0] in ("--version", "-V"):
+        from bench import __version__
+
+        print(f"bench {__version__}")
+        return 0
     verb = "run"
-    if "=" not in words[0]:
+    if "=" not in words[0] and not words[0].startswith("-"):
         verb = words.pop(0)
-    if verb in ("-m", "--multirun"):
+    if words[:1] in (["-m"], ["--multirun"]):
         raise UserError("one run is one experiment, and its grid is expanded by bench itself: leave out --multirun")
-    if verb not in verbs:
-        raise unknown("command", verb, verbs)
-    return verbs[verb](words)
+    if verb not in VERBS:
+        raise unknown("command", verb, VERBS)
+    if any(word in ("-h", "--help") for word in words):
+        command = VERBS[verb]
+        print(f"python -m bench {command.usage}\n\n{command.does}\n{command.more and chr(10) + command.more}", end="")
+        return 0
+    return VERBS[verb].call(words)
+
+
+def _overview() -> str:
+    from bench.sweep import config
+
+    lines = [f"  python -m bench {verb.usage:<45} {verb.does}" for verb in VERBS.values()]
+    parts = [
+        "Compare gradient estimators through physics simulation.",
+        "\n".join(lines),
+        f"Each takes --help.  Experiments: {', '.join(config.experiments())}\n{SETTINGS}",
+        STATUS,
+    ]
+    return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
 # ------------------------------------------------------------------------------------------------------ run
 
 
-def _prepare(words: list[str]) -> tuple[Experiment, Store, list[Planned]]:
-    from bench import config
+def _loaded(words: Sequence[str], notes: bool = True) -> Experiment:
+    """Load the experiment that the words describe."""
+    from bench.sweep import config
 
-    overrides = [word for word in words if word != QUIET]
-    experiment = config.load(overrides)
-    for note in config.notes(overrides):
-        print(f"bench: {note}", file=sys.stderr)
-    return _planned(experiment)
-
-
-def _planned(experiment: Experiment) -> tuple[Experiment, Store, list[Planned]]:
-    from bench import runner, studies
-    from bench.store import Store
-
-    store = Store(experiment.directory, studies.find(experiment.study).COLUMNS)
-    return experiment, store, runner.plan(experiment, store)
+    overrides, folders = [], []
+    rest = iter(word for word in words if word != QUIET)
+    for word in rest:
+        name, equals, value = word.partition("=")
+        if name == CONFIG_DIR:
+            folder = value if equals else next(rest, None)
+            if not folder:
+                raise UserError(f"{CONFIG_DIR} takes a folder: {CONFIG_DIR} DIR")
+            folders.append(Path(folder).expanduser())
+        else:
+            overrides.append(word)
+    experiment = config.load(overrides, folders)
+    for note in config.notes(overrides, folders) if notes else ():
+        print(f"bench: {printable(note)}", file=sys.stderr)
+    return experiment
 
 
 def _run(words: list[str]) -> int:
-    return _execute(*_prepare(words), words)
+    finished = _executed(_loaded(words), words)
+    return finished if isinstance(finished, int) else _finished(finished, words)[0]
 
 
-def _execute(experiment: Experiment, store: Store, planned: list[Planned], words: list[str]) -> int:
-    import time
+def _executed(experiment: Experiment, words: Sequence[str]) -> Finished | int:
+    """Return the finished run, or the exit status of one that ended early."""
+    from bench.sweep import runner
+    from bench.sweep.execute import execute, store_of
+    from bench.sweep.grid import cells
 
-    from bench import runner, timing
-    from bench.report import progress
-
-    started = time.time()
-    timing.load_at_start()
-    if experiment.compile_cache:
-        os.environ["BENCH_COMPILE_CACHE"] = str(experiment.compile_cache)
-    progress.print_versions(planned, experiment.execution.versions)
-    store.prepare()
-    with progress.of(experiment.name, planned, QUIET in words) as shown:
-        try:
-            runner.run(experiment, planned, store, shown.finished, shown.working)
-        except (KeyboardInterrupt, runner.Stopped) as end:
-            return _ended(end, store, planned, words)
-        finally:
-            _compact(store, planned)
-    return _write(experiment, store, words, time.time() - started, planned)
-
-
-def _ended(end: BaseException, store: Store, planned: list[Planned], words: list[str]) -> int:
-    """Say why a run has ended early, what is stored and how to go on."""
-    keys = {item.cell.key for item in planned}
-    stored = int(store.load()["key"].isin(keys).sum())
-    why = "stopped" if isinstance(end, KeyboardInterrupt) else f"stopped after a failed cell ({end})"
-    again = shlex.join(["python", "-m", "bench", *words])
-    print(
-        f"\nbench: {why}; {stored} of {len(keys)} cells are stored in '{store.directory}', go on with: {again}",
-        file=sys.stderr,
-    )
-    return 130 if isinstance(end, KeyboardInterrupt) else 1
-
-
-def _compact(store: Store, planned: list[Planned]) -> None:
-    """Fold small files; a full disk is no reason to hide why a run has ended, and the rows are read from them as well."""
     try:
-        store.compact([item.cell.key for item in planned])
-    except StorageError as error:
-        print(f"bench: {error}; every finished cell is stored all the same", file=sys.stderr)
+        return execute(experiment, QUIET in words)
+    except (KeyboardInterrupt, runner.Stopped) as end:
+        store = store_of(experiment)
+        keys = {cell.key for cell in cells(experiment)}
+        stored = int(store.load()["key"].isin(keys).sum())
+        interrupted = isinstance(end, KeyboardInterrupt)
+        why = "stopped" if interrupted else f"stopped after a failed cell ({printable(end)})"
+        again = shlex.join(["python", "-m", "bench", *words])
+        print(
+            f"\nbench: {why}; {stored} of {len(keys)} cells are stored in '{store.directory}', go on with: {again}",
+            file=sys.stderr,
+        )
+        return 130 if interrupted else 1
 
 
-def _report(words: list[str]) -> int:
-    from bench import config, studies
-    from bench.store import Store
+def _finished(finished: Finished, words: Sequence[str]) -> tuple[int, pd.DataFrame]:
+    """Return exit status and rows, after all files are written and then shown."""
+    from bench.report.finish import finish
 
-    experiment = config.load(words)
-    store = Store(experiment.directory, studies.find(experiment.study).COLUMNS)
-    return _write(experiment, store, words, 0.0, None)
+    rows, paths = finish(finished, words)
+    return _show(finished.experiment, rows, paths), rows
 
 
-def _write(
-    experiment: Experiment, store: Store, words: list[str], seconds: float, planned: list[Planned] | None
-) -> int:
-    """Tables and charts, of the planned cells in their order or of all that is stored."""
-    from bench import grid, report, studies
-    from bench.report import web
-    from bench.store import ordered
+def _show(experiment: Experiment, rows: pd.DataFrame, paths: Sequence[Path]) -> int:
+    from bench.report.finish import shown
+    from bench.sweep.study import study_of
 
-    rows = store.load()
-    if planned is None:
-        rows = report.latest(rows)
-    else:
-        keys = [item.cell.key for item in planned]
-        rows = ordered(rows[rows["key"].isin(keys)], keys)
-    if rows.empty:
-        raise UserError(f"no rows are stored in '{store.directory}': run the experiment first")
-    axes = grid.swept(experiment.sweep)
-    paths = studies.find(experiment.study).write(experiment, rows, axes)
-    if seconds:
-        simulated = planned is None or any(item.runs for item in planned)
-        paths.append(report.record(experiment, rows, words, seconds, simulated))
-    paths.append(web.write(experiment, rows, axes))
-    print("\nWritten:")
-    for path in paths:
-        print(f"  {path}")
+    study_of(experiment).show(experiment, shown(rows))
+    _print_written(paths)
     return 1 if (rows["status"] == "error").any() else 0
 
 
-# ----------------------------------------------------------------------------------------------------- plan
+def _print_written(paths: Sequence[Path]) -> None:
+    print("\nWritten:")
+    for path in paths:
+        print(f"  {printable(path)}")
+
+
+def _report(words: list[str]) -> int:
+    from bench.report.finish import report
+
+    experiment = _loaded(words, notes=False)
+    return _show(experiment, *report(experiment))
 
 
 def _plan(words: list[str]) -> int:
-    from bench.report import progress
+    from bench.sweep import plan, progress
+    from bench.sweep.execute import store_of
 
-    experiment, store, planned = _prepare(words)
-    progress.print_plan(experiment, planned, store.load())
+    experiment = _loaded(words)
+    store = store_of(experiment)
+    progress.print_plan(experiment, plan.plan(experiment, store), store.load())
     return 0
 
 
@@ -209,30 +195,41 @@ def _plan(words: list[str]) -> int:
 
 
 def _list(words: list[str]) -> int:
-    from bench import registry
+    """List plugins of the given kinds or names."""
+    from bench.model import registry
+    from bench.model.identity import text_of
+    from bench.model.parameters import parameters, singular
 
-    known = {name for table in registry.entries().values() for name in table}
+    folders = [word.partition("=")[2] for word in words if word.startswith("plugins=")]
+    words = [word for word in words if not word.startswith("plugins=")]
+    for folder in folders:
+        registry.add_folder(Path(folder))
+    table = registry.entries()
+    kinds = {name: kind for kind in table for name in (kind, singular(kind))}
+    names = {name for entries in table.values() for name in entries}
     for word in words:
-        if word not in known:
-            raise unknown("plugin", word, known)
-    for kind, table in registry.entries().items():
-        chosen = {name: entry for name, entry in table.items() if not words or name in words}
-        if chosen:
-            print(f"\n{kind}")
-        for name, entry in sorted(chosen.items()):
-            print(f"  {name:<22}{_facts(entry)}")
+        if word not in names and word not in kinds:
+            raise unknown("plugin or kind", word, {*names, *table})
+    wanted = {kinds[word] for word in words if word in kinds}
+    for kind, entries in table.items():
+        listed = {name: e for name, e in entries.items() if not words or kind in wanted or name in words}
+        if listed:
+            print(f"\n{printable(kind)}")
+        for name, entry in sorted(listed.items()):
+            print(f"  {printable(name):<22}{printable(_facts(entry))}")
             if entry.plugin is None:
                 continue
-            for parameter in registry.parameters(entry.plugin).values():
+            for parameter in parameters(entry.plugin).values():
                 unit = f" [{parameter.unit}]" if parameter.unit else ""
                 choices = f" ({' | '.join(parameter.choices)})" if parameter.choices else ""
-                value = registry.identity("", {"": parameter.default})[2:-1]
-                print(f"      {parameter.name}={value}{unit}  {parameter.doc}{choices}")
+                print(
+                    f"      {printable(f'{parameter.name}={text_of(parameter.default)}{unit}  {parameter.doc}{choices}')}"
+                )
     return 0
 
 
 def _facts(entry: Any) -> str:
-    from bench.contracts import Backend, Estimator, Integrator, Scene
+    from bench.model import Backend, Estimator, Integrator, Scene
 
     plugin = entry.plugin
     if plugin is None:
@@ -254,7 +251,7 @@ def _facts(entry: Any) -> str:
     return "; ".join(facts)
 
 
-# ---------------------------------------------------------------------------------------------------- check
+# ---------------------------------------------------------------------------------------- checks and traces
 
 
 def _bench_self(words: list[str]) -> int:
@@ -264,65 +261,108 @@ def _bench_self(words: list[str]) -> int:
 
 
 def _check(words: list[str]) -> int:
-    from bench import conformance, registry
+    from bench import conformance
+    from bench.model import registry
 
-    known = {name for table in registry.entries().values() for name in table}
+    for folder in [word.partition("=")[2] for word in words if word.startswith("plugins=")]:
+        registry.add_folder(Path(folder))
+    words = [word for word in words if not word.startswith("plugins=")]
+    names = {name for table in registry.entries().values() for name in table}
     for word in words:
-        if word not in known:
-            raise unknown("plugin", word, known)
+        if word not in names:
+            raise unknown("plugin", word, names)
     return conformance.main(words)
 
 
-# ------------------------------------------------------------------------------------------------ gradcheck
+def _scenes_first(words: Sequence[str], verb: str) -> tuple[list[str], list[str]]:
+    """Return the scenes that a command names first, and its settings; raises :class:`UserError` if it names none."""
+    scenes = list(itertools.takewhile(lambda word: "=" not in word.partition("[")[0] and word[0] != "-", words))
+    rest = list(words[len(scenes) :])
+    if not scenes and not any(word.lstrip("+").startswith("scenes=") for word in rest):
+        from bench.model import registry
+
+        names = ", ".join(registry.entries()["scenes"])
+        raise UserError(f"name a scene: python -m bench {verb} SCENE ... [key=value ...]; scenes are {names}")
+    return scenes, rest
 
 
 def _gradcheck(words: list[str]) -> int:
-    """The experiment ``gradient_check`` on the scenes named first, under the overrides that follow; 1 for a fault too."""
+    """Run ``gradient_check`` on the scenes named first, with the overrides that follow; a fault too gives status 1."""
     from dataclasses import replace
 
-    from bench import config, registry
-    from bench.report import gradient_check
+    from bench.model.parameters import parameters
+    from bench.sweep.study import study_of
 
-    scenes = list(itertools.takewhile(lambda word: "=" not in word.partition("[")[0], words))
-    chosen = [f"scenes=[{','.join(scenes)}]", "name=gradcheck"] if scenes else []
-    experiment = config.load(["experiment=gradient_check", *chosen, *words[len(scenes) :]])
-    plugins = [choice.entry.plugin for choice in experiment.choices["scenes"]]
-    if not any(plugin and "horizon" in registry.parameters(plugin) for plugin in plugins):
+    scenes, rest = _scenes_first(words, "gradcheck")
+    settings_ = [f"scenes=[{','.join(scenes)}]", "name=gradcheck"] if scenes else ["name=gradcheck"]
+    experiment = _loaded(["experiment=gradient_check", *settings_, *rest])
+    plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
+    if not any(plugin and "horizon" in parameters(plugin) for plugin in plugins):
         experiment = replace(experiment, sweep={k: v for k, v in experiment.sweep.items() if k != "horizon"})
-    experiment, store, planned = _planned(experiment)
-    status = _execute(experiment, store, planned, ["gradcheck", *words])
-    rows = store.load()
-    return 1 if status or gradient_check.failed(rows[rows["key"].isin([p.cell.key for p in planned])]) else 0
-
-
-# ---------------------------------------------------------------------------------------------------- trace
+    finished = _executed(experiment, words)
+    if isinstance(finished, int):
+        return finished
+    status, rows = _finished(finished, ["gradcheck", *words])
+    return 1 if status or study_of(experiment).faults(rows) else 0
 
 
 def _trace(words: list[str]) -> int:
-    """One rollout of each scene named first: w = 0, or a sample of the noise where ``seed=`` is among the overrides."""
-    from bench import config, health
-    from bench.report import trace
+    """Trace one rollout of each scene named first: at w = 0, or for a noise sample if ``seed=`` is given."""
+    from bench import trace
 
-    scenes = list(itertools.takewhile(lambda word: "=" not in word.partition("[")[0], words))
-    if not scenes:
-        raise UserError("name a scene to trace: python -m bench trace SCENE ... [key=value ...]")
-    overrides = words[len(scenes) :]
-    experiment = config.load([f"scenes=[{','.join(scenes)}]", *overrides])
-    for found in health.run(experiment, any(word.startswith("seed=") for word in overrides)):
-        print(f"\n{found.title}")
-        for sentence in found.report():
-            print(f"  {sentence}")
-        print("Written:")
-        for path in trace.write(found, experiment.results_dir):
-            print(f"  {path}")
+    scenes, rest = _scenes_first(words, "trace")
+    settings_ = [f"scenes=[{','.join(scenes)}]"] if scenes else []
+    experiment = _loaded([*settings_, *rest], notes=False)
+    for one in trace.run(experiment, any(word.startswith("seed=") for word in rest)):
+        paths = trace.write(one, experiment.results_dir, experiment.formats)
+        print(f"\n{printable(one.title)}")
+        for sentence in one.report():
+            print(f"  {printable(sentence)}")
+        _print_written(paths)
     return 0
 
 
-# ------------------------------------------------------------------------------------------------------ compare
-
-
 def _compare(words: list[str]) -> int:
-    """Two directories of results, or two revisions of them in git, cell by cell."""
-    from bench.report import compare
+    """Compare two directories of results, or two git revisions of them, cell by cell."""
+    from bench import compare
 
     return compare.main(words)
+
+
+VERBS = {
+    "run": Verb(
+        _run, "+experiment=NAME [key=value ...]", "run what is missing, then write tables and charts",
+        f"Without an experiment, name=FOLDER and the settings say what is run.\n{SETTINGS}{STATUS}",
+    ),
+    "report": Verb(
+        _report, "report +experiment=NAME [key=value ...]", "tables and charts again from stored rows",
+        "Nothing is simulated.\n" + SETTINGS,
+    ),
+    "plan": Verb(
+        _plan, "plan +experiment=NAME [key=value ...]", "cells, how many are stored, expected time",
+        "Refused cells are listed with their reason.\n" + SETTINGS,
+    ),
+    "list": Verb(
+        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
+        "KIND is scenes, contacts, integrators, backends, estimators or studies.\n",
+    ),
+    "check": Verb(
+        _check, "check [NAME ...] [plugins=DIR]", "the conformance kit on some plugins, or all",
+        "Every fact that a plugin declares is verified by running it. Exit status 1 when a check fails.\n",
+    ),
+    "gradcheck": Verb(
+        _gradcheck, "gradcheck SCENE ... [key=value ...]", "gradients against differences of the cost, and what is wrong",
+        f"Exit status 1 when a gradient must not be used.\n{SETTINGS}",
+    ),
+    "trace": Verb(
+        _trace, "trace SCENE ... [key=value ...]", "one rollout: do gradient spikes line up with contact switches?",
+        f"Without noise, or with seed=S the first sample of that seed.\n{SETTINGS}",
+    ),
+    "bench-self": Verb(
+        _bench_self, "bench-self [quick=true] [results_dir=DIR]", "the harness's own speed, beside a NumPy loop and native code",
+    ),
+    "compare": Verb(
+        _compare, "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
+        "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH.\n",
+    ),
+}  # fmt: skip

@@ -1,4 +1,4 @@
-"""What a user can get wrong, and the statuses a cell can end in."""
+"""Errors that a user can cause, and the statuses in which a cell can end."""
 
 from __future__ import annotations
 
@@ -12,19 +12,28 @@ STATUSES: tuple[str, ...] = get_args(Status)
 
 
 class UserError(Exception):
-    """Bad input. Its message says what was given, what is allowed and the nearest valid name."""
+    """Bad input. The message says what was given, what is allowed and the nearest valid name."""
 
 
 class StorageError(UserError):
-    """Results that cannot be written or read; what was stored before stays."""
+    """Raised when results cannot be written or read; what was stored before stays."""
 
 
 class Unsupported(Exception):
-    """A combination of plugins that cannot work, with the reason; becomes a row of that status."""
+    """Raised for a combination of plugins that cannot work, with the reason; becomes a row of that status."""
+
+
+def printable(text: object) -> str:
+    """Return text on one line without control characters, fit for a terminal or a message.
+
+    >>> printable("a\\nb\\x1b[31m")
+    'a b [31m'
+    """
+    return " ".join("".join(c if c.isprintable() else " " for c in str(text)).split())
 
 
 def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:
-    """The error for a name that does not exist, with the nearest one that does."""
+    """Make the error for a name that does not exist, with the nearest one that does."""
     names = sorted(allowed)
     text = str(given)
     near = get_close_matches(text.lower(), [n.lower() for n in names], n=1, cutoff=0.4)
@@ -33,7 +42,7 @@ def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:
 
 
 def failure(error: BaseException) -> dict[str, str]:
-    """Status and reason of an exception that a plugin raised: its message and the last lines of its traceback."""
+    """Return status and reason of a plugin's exception: its message and the last lines of its traceback."""
     if isinstance(error, Unsupported):
         return {"status": "unsupported", "reason": str(error)}
     lines, step = [], error.__traceback__
@@ -42,7 +51,7 @@ def failure(error: BaseException) -> dict[str, str]:
         lines.append(f"{os.path.basename(code.co_filename)}:{step.tb_lineno} in {code.co_name}")
         step = step.tb_next
     try:
-        said = " ".join(str(error).split())[:1000]
+        said = printable(error)[:1000]
     except Exception:
         said = "(a message that cannot be printed)"
     return {"status": "error", "reason": f"{type(error).__name__}: {said} ({' < '.join(reversed(lines[-3:]))})"}

@@ -1,4 +1,4 @@
-"""From a scene's MJCF twin to a MuJoCo model: what the engine backends share."""
+"""Builds MuJoCo models from scenes' MJCF twins, for both engine backends."""
 
 from __future__ import annotations
 
@@ -6,21 +6,25 @@ from typing import Any
 
 import numpy as np
 
-from bench.contracts import MechanicalScene, Program, Unsupported
-from plugins.contacts.penalty import Penalty
+from bench.model import EngineTwin, MechanicalScene, Program, Unsupported
+
+from .contacts.penalty import Penalty
 
 MATCH = {"euler": "semi_implicit_euler", "implicitfast": "semi_implicit_euler", "rk4": "rk4"}
-"""The engine's integrators, and those of the scene's program whose place they take.
+"""The engine's integrators, and the integrators of the scene's program that each replaces.
 
-``euler`` is the same map. ``implicitfast`` takes joint and tendon damping at the end of the step, else it is the same.
+``euler`` is the same map. ``implicitfast`` takes joint and tendon damping at the end of the step and is otherwise the
+same.
 """
 
 
 def refusal(backend: Any, program: Program) -> str | None:
-    """Why an engine cannot run the program, or None."""
+    """Return why an engine cannot run the program, or None."""
     scene, law = program.scene, program.contact
-    if not isinstance(scene, MechanicalScene) or scene.mjcf() is None:
+    if not isinstance(scene, EngineTwin):
         return f"scene {scene.name} has no MJCF twin"
+    if program.decision.names:
+        return f"{backend.name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
     if program.integrator is None or program.integrator.name != MATCH[backend.integrator]:
         name = program.integrator.name if program.integrator else "none"
         return f"{backend.name} steps by its own {backend.integrator}, which stands for {MATCH[backend.integrator]}, not {name}"
@@ -34,9 +38,9 @@ def refusal(backend: Any, program: Program) -> str | None:
 
 
 def build(backend: Any, program: Program) -> Any:
-    """The twin as an ``mujoco.MjModel`` with the scene's time step, the law's springs and the backend's solver.
+    """Build the twin as an ``mujoco.MjModel`` with the scene's time step, the law's springs and the backend's solver.
 
-    Raises :class:`Unsupported` for what the backend refuses.
+    Raises :class:`Unsupported` for programs that the backend refuses.
     """
     import mujoco
 
@@ -45,6 +49,7 @@ def build(backend: Any, program: Program) -> Any:
         raise Unsupported(reason)
     scene, law = program.scene, program.contact
     assert isinstance(scene, MechanicalScene)
+    assert isinstance(scene, EngineTwin)
     model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/>{scene.mjcf()}</mujoco>')
     if (model.nq, model.nv, model.nu) != (scene.n_q, scene.n_q, scene.n_u):
         raise ValueError(f"the twin of {scene.name} has {model.nq} coordinates and {model.nu} motors")
@@ -61,10 +66,10 @@ def build(backend: Any, program: Program) -> Any:
 
 
 def _set_springs(model: Any, law: Penalty, impedance: float) -> None:
-    """Each contact pair's solref and solimp such that its force is that of ``law``, for an impedance near 0.
+    """Set each contact pair's solref and solimp so that its force is that of ``law``, for an impedance near 0.
 
-    The engine gives a contact the acceleration a = (1 - d) a_free - (k r + c r') A, with the impedance d and the inverse
-    mass A that it takes for the pair: a spring of k [N/m] that hides the share d of all other forces.
+    The engine gives a contact the acceleration a = (1 - d) a_free - (k r + c r') A, with the impedance d and the
+    inverse mass A that it takes for the pair: a spring of k [N/m] that hides the share d of all other forces.
     """
     bodies = model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2])]
     inverse_mass = model.body_invweight0[bodies, 0].sum(axis=0)
@@ -73,9 +78,9 @@ def _set_springs(model: Any, law: Penalty, impedance: float) -> None:
 
 
 def _disabled(bit: Any, model: Any, lean: bool) -> int:
-    """Flags of what no twin may do, and with ``lean`` of what this one has no use for.
+    """Return flags for features that no twin may use and, with ``lean``, for those that this one does not use.
 
-    Steps must depend on the state alone (no warm start), damp as the scene does (not implicitly), diverge where they
+    Steps must depend only on the state (no warm start), damp as the scene does (not implicitly), diverge where they
     diverge (no reset) and take any spring (no refsafe).
     """
     off = bit.mjDSBL_WARMSTART | bit.mjDSBL_EULERDAMP | bit.mjDSBL_AUTORESET | bit.mjDSBL_REFSAFE | bit.mjDSBL_CLAMPCTRL
@@ -87,7 +92,7 @@ def _disabled(bit: Any, model: Any, lean: bool) -> int:
         bit.mjDSBL_CONSTRAINT: model.npair,
         bit.mjDSBL_CONTACT: model.npair,
         bit.mjDSBL_GRAVITY: model.opt.gravity.any(),
-        # together, for MJX takes either flag to switch off both
+        # one entry, because MJX switches off both for either flag
         bit.mjDSBL_SPRING | bit.mjDSBL_DAMPER: springs or dampers,
         bit.mjDSBL_ACTUATION: model.nu,
         bit.mjDSBL_EQUALITY: model.neq,
@@ -104,9 +109,9 @@ def _disabled(bit: Any, model: Any, lean: bool) -> int:
 
 
 def has_friction(program: Program) -> bool:
-    """Whether a contact of the scene's twin has more than its normal direction."""
+    """Return whether a contact of the scene's twin has more than its normal direction."""
     import mujoco
 
-    assert isinstance(program.scene, MechanicalScene)
+    assert isinstance(program.scene, EngineTwin)
     model = mujoco.MjModel.from_xml_string(f"<mujoco>{program.scene.mjcf()}</mujoco>")
     return bool((model.pair_dim > 1).any())

@@ -1,9 +1,42 @@
-"""What every test stands on."""
+"""What every test stands on: the registered backends as a fixture."""
 
 import pytest
 
+from bench.model import registry
+
+
+def pytest_configure(config):
+    config.addinivalue_line(
+        "markers",
+        "needs(*capabilities): what the backend fixture must provide; physics asks for engines, which else are left out",
+    )
+
+
+@pytest.fixture(params=list(registry.entries()["backends"]))
+def backend(request):
+    """Each registered backend that can run a scene's own program, with its default parameters.
+
+    A test marked ``needs("root")`` is skipped on backends that provide no root finder; one marked ``needs("physics")`` runs
+    on physics engines, which step a model of their own.
+    """
+    entry = registry.find("backends", request.param)
+    if not entry.available:
+        pytest.skip(entry.reason)
+    marker = request.node.get_closest_marker("needs")
+    needs = set(marker.args) if marker else set()
+    chosen = entry.plugin()
+    if "physics" in chosen.provides and "physics" not in needs:
+        pytest.skip(f"{chosen.name} steps a model of its own")
+    if needs - chosen.provides:
+        pytest.skip(f"{chosen.name} does not provide {', '.join(sorted(needs - chosen.provides))}")
+    return chosen
+
 
 @pytest.fixture(autouse=True)
-def compile_cache(monkeypatch):
-    """A command run in this process names a folder of compiled programs; the next test does not see it."""
-    monkeypatch.setenv("BENCH_COMPILE_CACHE", "")
+def forgotten_folders():
+    """Plugin folders that a test has added are gone after it, and with them their plugins."""
+    before = registry.folders()
+    yield
+    if registry.folders() != before:
+        registry._folders[:] = before
+        registry.entries.cache_clear()

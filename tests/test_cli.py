@@ -1,12 +1,16 @@
 """The commands as a user types them: what runs, what is cached, and what bad input answers."""
 
+import importlib
 import json
+import subprocess
+import sys
 
 import pandas as pd
 import pytest
 
-from bench.cli import main
-from bench.store import BIAS_VARIANCE, IDENTITY
+from bench.cli import VERBS, main
+from bench.studies.bias_variance.columns import COLUMNS
+from bench.sweep.columns import IDENTITY
 
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny"]
 TIMES = ["time_s", "time_iqr_s", "compile_s", "peak_memory_mb"]
@@ -19,7 +23,7 @@ def test_run_then_report_then_plan(tmp_path, capsys):
     for name in ("rows.parquet", "bias_variance.csv", "bias_variance.md", "bias_variance.tex", "run.json"):
         assert (directory / name).stat().st_size > 0
     table = pd.read_csv(directory / "bias_variance.csv")
-    assert list(table.columns) == list(BIAS_VARIANCE.names)
+    assert list(table.columns) == [*COLUMNS.table, "study", "parameters"]
     assert len(table) == 4
     assert (table["status"] == "ok").all()
     assert json.loads((directory / "run.json").read_text())["counts"] == {"ok": 4}
@@ -38,11 +42,11 @@ def test_run_then_report_then_plan(tmp_path, capsys):
 
 
 def test_only_missing_cells_run_and_rows_are_kept(tmp_path, monkeypatch):
-    from bench.studies import bias_variance
+    module = importlib.import_module("bench.studies.bias_variance.measure")
 
     measured = []
-    real = bias_variance.measure
-    monkeypatch.setattr(bias_variance, "measure", lambda cell, *rest: (measured.append(cell.key), real(cell, *rest))[1])
+    real = module.measure
+    monkeypatch.setattr(module, "measure", lambda cell, *rest: (measured.append(cell.key), real(cell, *rest))[1])
     where = f"results_dir={tmp_path}"
     here = [*TINY, where, "workers=0"]
     assert main([*here, "sweep.sigma=[0.1]"]) == 0
@@ -64,6 +68,7 @@ def test_record_of_a_run_outlasts_one_that_finds_all_rows_stored(tmp_path):
     assert json.loads(path.read_text())["counts"] == {"ok": 2}
 
 
+@pytest.mark.slow
 def test_same_seed_same_rows(tmp_path):
     overrides = [
         "scenes=[pushing,heaviside]", "contacts=[penalty]", "backends=[jax,torch,numpy]", "scene.pushing.horizon=5",
@@ -199,3 +204,103 @@ def test_unreadable_rows_are_not_written_over(tmp_path, capsys):
 def test_help_names_the_experiments(capsys):
     assert main(["--help"]) == 0
     assert "stiffness_sweep" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help(verb, capsys):
+    assert main([verb, "--help"]) == 0
+    answer = capsys.readouterr()
+    assert VERBS[verb].does in answer.out
+    assert "python -m bench" in answer.out
+    assert answer.err == ""
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("bench 0.")
+
+
+def test_list_takes_a_kind(capsys):
+    assert main(["list", "scenes"]) == 0
+    kinds = [line for line in capsys.readouterr().out.splitlines() if line and not line.startswith(" ")]
+    assert kinds == ["scenes"]
+
+
+@pytest.mark.parametrize("verb", ["gradcheck", "trace"])
+def test_a_scene_has_to_be_named(verb, capsys):
+    assert main([verb]) == 2
+    message = capsys.readouterr().err
+    assert "name a scene" in message
+    assert "pushing" in message
+
+
+def test_files_are_written_before_anything_is_printed(tmp_path):
+    """A reader that goes away at once, as ``head`` does, costs no file."""
+    words = [sys.executable, "-m", "bench", *TINY, f"results_dir={tmp_path}", "--quiet"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        run.stdout.close()
+        run.wait(timeout=120)
+    names = {path.name for path in (tmp_path / "tiny").iterdir()}
+    assert {"rows.parquet", "run.json", "bias_variance.csv", "report.html"} <= names
+
+
+ESCAPING = '''
+from dataclasses import dataclass
+from bench import SampleMean
+
+@dataclass(frozen=True)
+class Escaping(SampleMean):
+    """Colours \\x1b[31m and \\x07 bells in its docstring."""
+    name = "escaping"
+    needs = frozenset({"grad"})
+    def terms(self, problem, theta, w):
+        raise ValueError("red \\x1b[31m alert")
+'''
+
+
+def test_nothing_raw_reaches_the_terminal(tmp_path, capsys):
+    folder = tmp_path / "own"
+    folder.mkdir()
+    (folder / "escaping.py").write_text(ESCAPING)
+    assert main(["list", "escaping", f"plugins={folder}"]) == 0
+    words = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[escaping]", "samples=8", "repeats=4", "name=raw"]
+    assert main([*words, f"plugins={folder}", f"results_dir={tmp_path}"]) == 1
+    answer = capsys.readouterr()
+    assert "alert" in answer.out
+    for letter in ("\x1b", "\x07"):
+        assert letter not in answer.out
+        assert letter not in answer.err
+
+
+def test_theta_from_the_command_line(tmp_path):
+    words = [
+        "scenes=[pushing]", "backends=[numpy]", "estimators=[fobg,reinforce]", "scene.pushing.horizon=5", "samples=8",
+        "repeats=4", "reference.samples=4096", "sweep.sigma=[0.001]", "theta=[mass,stiffness]", "theta0=[0.12,900]",
+        "name=theta", f"results_dir={tmp_path}",
+    ]  # fmt: skip
+    assert main(words) == 0
+    table = pd.read_csv(tmp_path / "theta" / "bias_variance.csv")
+    assert (table["dim"] == 2).all()
+    assert (table["noise"] == "parameter").all()
+    assert all(
+        json.loads(text)["theta"] == {"names": ["mass", "stiffness"], "at": [0.12, 900]} for text in table["parameters"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["theta=[mas]"], ["'mas'", "'mass'"]),
+        (["theta=[mass]", "theta0=[1,2]"], ["theta0 has 2 values", "has 1"]),
+        (["theta0=[nan]"], ["theta0"]),
+        (["plugins=nowhere_at_all"], ["nowhere_at_all", "not a folder"]),
+        (["formats=[gif]"], ["gif", "png"]),
+        (["study='stability[diverge=3]'"], ["diverge", "'diverged'"]),
+        (["--config-dir", "nowhere_at_all", "+experiment=quick"], ["nowhere_at_all", "experiment"]),
+    ],
+)
+def test_bad_new_settings(words, said, tmp_path, capsys):
+    assert main([*words, f"results_dir={tmp_path / 'out'}"]) == 2
+    message = capsys.readouterr().err
+    for part in said:
+        assert part in message

@@ -1,74 +1,209 @@
-"""The README's own text, run."""
+"""The text of README and docs, checked and run: links, commands, examples, and lists of what there is."""
 
+import json
 import os
 import re
-import shutil
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
-from bench import config, registry
+import bench
+from bench import cli
+from bench.model import registry
+from bench.sweep import config
+from bench.sweep.columns import COMMON
 
 ROOT = Path(__file__).resolve().parent.parent
+DOCS = {path.name: path.read_text() for path in sorted((ROOT / "docs").glob("*.md"))}
 README = (ROOT / "README.md").read_text()
-EXAMPLES = dict(re.findall(r"```python\n# (plugins/\S+)\n(.*?)```", README, re.DOTALL))
+PAGES = [
+    ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md",
+    *(ROOT / folder / "README.md" for folder in ("plugins", "conf", "results")), *(ROOT / "docs" / name for name in DOCS),
+]  # fmt: skip
+EXAMPLES = dict(re.findall(r"```python\n# (\S+\.py)\n(.*?)```", DOCS["extending.md"], re.DOTALL))
+SOFT = "# @package _global_\nscenes: [heaviside]\nbackends: [numpy]\n"
+"""The experiment that docs/experiments.md has the reader write."""
+
+
+def python_blocks(text):
+    return [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if not block.startswith("# ")]
+
+
+def commands(text):
+    """The words of every ``python -m bench`` command of a page, without those that have placeholders in capitals."""
+    text = re.sub(r"```.*?```", "", text.replace("\\\n", " "), flags=re.DOTALL)
+    lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
+    lines += re.findall(r"`(python -m bench [^`]+)`", re.sub(r"\s+", " ", text))
+    words = [shlex.split(line, comments=True)[3:] for line in lines if line.startswith("python -m bench ")]
+    return [
+        found for found in words if not any(re.search(r"\b[A-Z]{3,}\b", w) for w in found if not w.startswith("HEAD"))
+    ]
+
+
+COMMANDS = [(path.name, words) for path in PAGES for words in commands(path.read_text())]
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory):
-    """A copy of the project with the README's plugins dropped in."""
-    root = tmp_path_factory.mktemp("tree")
-    for name in ("bench", "plugins", "conf"):
-        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+def folder(tmp_path_factory):
+    """A directory with nothing in it except the plugins of docs/extending.md and one experiment."""
+    root = tmp_path_factory.mktemp("empty")
+    (root / "my_experiments" / "experiment").mkdir(parents=True)
+    (root / "my_experiments" / "experiment" / "soft.yaml").write_text(SOFT)
     for path, text in EXAMPLES.items():
+        (root / path).parent.mkdir(exist_ok=True)
         (root / path).write_text(text)
     return root
 
 
-def bench(tree, *words):
-    environment = {**os.environ, "PYTHONPATH": str(tree)}
-    command = [sys.executable, "-P", "-m", "bench", *words]
-    return subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=300)
-
-
-def test_an_estimator_takes_at_most_25_lines():
-    assert len(EXAMPLES["plugins/estimators/clipped_fobg.py"].strip().splitlines()) <= 25
-
-
-@pytest.mark.parametrize("path", EXAMPLES)
-def test_example_is_listed_and_passes_the_kit(tree, path):
-    name = Path(path).stem
-    listed = bench(tree, "list", name)
-    assert name in listed.stdout
-    checked = bench(tree, "check", name)
-    assert checked.returncode == 0, checked.stdout + checked.stderr
-
-
-def test_examples_run_together(tree, tmp_path):
-    done = bench(
-        tree, "scenes=[sliding_mass]", "backends=[numpy,jax]", "estimators=[fobg,clipped_fobg]",
-        "estimator.clipped_fobg.limit=0.5", "scene.sliding_mass.mass=2", "samples=16", "repeats=8", "name=mine",
-        f"results_dir={tmp_path}",
-    )  # fmt: skip
+def python(folder, *words, text=None):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, *words]
+    done = subprocess.run(command, cwd=folder, env=environment, input=text, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "clipped_fobg[limit=0.5]" in done.stdout
+    return done.stdout
+
+
+# ----------------------------------------------------------------------------------------------- links and lists
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_relative_links_lead_somewhere(path):
+    for target in re.findall(r"\]\((?!https?:)([^)\s]+)\)", path.read_text()):
+        name, _, anchor = target.partition("#")
+        there = (path.parent / name).resolve() if name else path
+        assert there.exists(), target
+        assert not anchor or anchor in anchors(there.read_text()), target
+
+
+def anchors(text):
+    """The anchors that a page's headings get."""
+    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+def test_readme_is_short():
+    assert len(README.splitlines()) <= 150
+
+
+def test_every_page_is_linked_from_the_readme():
+    for name in DOCS:
+        assert f"(docs/{name}" in README, name
 
 
 def test_every_scene_and_experiment_is_described():
     for name in registry.entries()["scenes"]:
-        assert f"| `{name}` |" in README
+        assert f"| `{name}` |" in DOCS["experiments.md"]
     for name in config.experiments():
         assert f"| `{name}` |" in README
+        assert f"| `{name}` |" in DOCS["experiments.md"]
 
 
-def test_module_map_is_complete():
-    for path in (ROOT / "bench").glob("*.py"):
-        if not path.name.startswith("__"):
-            assert f"bench/{path.name}" in README
+def test_every_command_and_setting_is_described():
+    for verb in cli.VERBS:
+        assert f"\n## {verb}\n" in DOCS["commands.md"], verb
+    for key in set(yaml.safe_load((config.config_dir() / "config.yaml").read_text())) - {"defaults"}:
+        assert re.search(rf"^\|.*`{key}`.*\|", DOCS["commands.md"], re.MULTILINE), key
 
 
-def test_readme_and_repository_have_the_files_they_name():
-    for target in re.findall(r"\]\((?!http)([^)#]+)\)", README):
-        assert (ROOT / target).exists(), target
+def test_architecture_names_every_room():
+    for path in (ROOT / "bench").iterdir():
+        if path.is_dir() and (path / "__init__.py").exists():
+            assert f"`bench/{path.name}/`" in DOCS["architecture.md"], path
+        elif path.suffix == ".py":
+            assert f"`bench/{path.name}`" in DOCS["architecture.md"], path
+
+
+def test_columns_are_those_of_all_studies():
+    listed = {
+        title.strip("`"): re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)
+        for title, section in re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", DOCS["columns.md"], re.MULTILINE | re.DOTALL)
+    }
+    assert listed.pop("Common columns") == list(COMMON)
+    studies = {name: entry.plugin for name, entry in registry.entries()["studies"].items()}
+    assert listed == {name: [c for c in study.columns.stored if c not in COMMON] for name, study in studies.items()}
+
+
+def test_versions_agree():
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == bench.__version__
+    assert f"\n## {bench.__version__} (" in (ROOT / "CHANGELOG.md").read_text()
+
+
+# ------------------------------------------------------------------------------------------------------ commands
+
+PLANNED = """
+import json, sys
+from bench.cli import main
+
+for page, words in json.load(sys.stdin):
+    verb = "run" if "=" in words[0] or words[0].startswith("-") else words.pop(0)
+    if verb in ("gradcheck", "trace"):
+        scenes = [w for w in words if "=" not in w.partition("[")[0]]
+        chosen = ["experiment=gradient_check"] * (verb == "gradcheck")
+        words = [*chosen, f"scenes=[{','.join(scenes)}]", *words[len(scenes):]]
+    if verb in ("run", "report", "plan", "gradcheck", "trace"):
+        asked = ["plan", *words]
+    elif verb in ("list", "check"):
+        asked = ["list", *words]
+    else:
+        asked = [verb, "--help"]
+    assert main(asked) == 0, (page, words)
+"""
+
+
+def test_commands_can_be_planned(folder):
+    assert len(COMMANDS) > 20
+    python(folder, "-c", PLANNED, text=json.dumps(COMMANDS))
+
+
+def test_readme_example_runs(folder):
+    (example,) = python_blocks(README)
+    assert len(example.strip().splitlines()) <= 8
+    printed = python(folder, "-c", example)
+    assert printed.startswith("fobg 16 estimates: bias")
+    assert "\nrandomized_smoothing 16 estimates: bias" in printed
+
+
+def test_examples_of_the_python_page_run(folder):
+    printed = python(folder, "-c", "\n".join(python_blocks(DOCS["python.md"])))
+    assert "randomized_smoothing" in printed
+
+
+# ------------------------------------------------------------------------------------------------------- plugins
+
+
+def test_an_estimator_takes_at_most_25_lines():
+    assert len(EXAMPLES["my_plugins/clipped_fobg.py"].strip().splitlines()) <= 25
+
+
+@pytest.mark.slow
+def test_examples_are_listed_and_pass_the_kit(folder):
+    names = [Path(path).stem for path in EXAMPLES if path.startswith("my_plugins/")]
+    listed = python(folder, "-m", "bench", "list", "plugins=my_plugins", *names)
+    assert all(f"\n  {name} " in listed for name in names)
+    python(folder, "-m", "bench", "check", "plugins=my_plugins", *(set(names) - {"clipped_fobg"}))
+
+
+@pytest.mark.slow
+def test_the_kit_runs_in_pytest(folder):
+    done = python(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_my_plugins.py")
+    assert " passed" in done
+
+
+def test_examples_run_together(folder, tmp_path):
+    printed = python(
+        folder, "-m", "bench", "name=mine", "plugins=my_plugins", "scenes=[sliding_mass]", "backends=[numpy,jax]",
+        "estimators=[fobg,clipped_fobg]", "estimator.clipped_fobg.limit=0.5", "scene.sliding_mass.mass=2", "samples=16",
+        "repeats=8", f"results_dir={tmp_path}",
+    )  # fmt: skip
+    assert "clipped_fobg[limit=0.5]" in printed
+
+
+def test_the_study_of_the_example_writes_its_table(folder, tmp_path):
+    (words,) = (words for page, words in COMMANDS if page == "extending.md" and "study=gradient_norm" in words)
+    python(folder, "-m", "bench", *words, f"results_dir={tmp_path}")
+    header = (tmp_path / "norms" / "gradient_norm.csv").read_text().partition("\n")[0]
+    assert "gradient_norm" in header.split(",")

@@ -8,12 +8,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from bench.benchself import harness, lines, rollouts, sweep
-from bench.config import config_dir
 from bench.errors import UserError
+from bench.sweep.config import config_dir
 
 
 def main(words: Sequence[str]) -> int:
-    """Measure, print and write; ``quick=true`` makes it small, ``results_dir=`` says where it writes."""
+    """Measure, write and print; ``quick=true`` makes the run small, ``results_dir=`` chooses the output folder."""
     given = dict(word.partition("=")[::2] for word in words)
     for name in given:
         if name not in ("quick", "results_dir"):
@@ -26,14 +26,15 @@ def main(words: Sequence[str]) -> int:
     for line in measure(quick):
         print(f"{line.what}: {line.value:.3g} {line.unit}", file=sys.stderr, flush=True)
         found.append(line)
+    paths = lines.write(found, Path(given.get("results_dir", "results")).expanduser() / "bench_self", before)
     lines.show(found)
-    for path in lines.write(found, Path(given.get("results_dir", "results")).expanduser() / "bench_self", before):
+    for path in paths:
         print(f"  {path}")
     return 0
 
 
 def measure(quick: bool) -> Iterator[lines.Line]:
-    """All lines, one after the other."""
+    """Return all lines, one after the other."""
     import yaml
 
     settings = yaml.safe_load((config_dir() / "bench_self.yaml").read_text())

@@ -1,4 +1,4 @@
-"""Time of the harness's own work: planning, resuming, listing, and what a cell costs beside its estimates."""
+"""Times the harness's own work: planning, resuming, listing, and the cost of a cell besides its estimates."""
 
 from __future__ import annotations
 
@@ -9,20 +9,23 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from bench import config, runner, studies
 from bench.benchself.lines import Line
-from bench.grid import cells
-from bench.store import Store
+from bench.sweep import config
+from bench.sweep.execute import store_of
+from bench.sweep.experiment import Experiment
+from bench.sweep.grid import cells
+from bench.sweep.plan import plan
+from bench.sweep.runner import blank
 
 SIDE, QUICK_SIDE = 100, 5
 """Values on each of the two axes of the planned sweep."""
 CELLS, QUICK_CELLS = 500, 40
-"""Cells of the run that the overhead of a cell is taken from."""
+"""Number of cells in the run that measures the overhead per cell."""
 SMALL = ("scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "samples=16", "repeats=4")
 
 
 def lines(quick: bool) -> Iterator[Line]:
-    """Every figure of the harness, each command in a process of its own as a user starts it."""
+    """Measure every figure of the harness, each command in a process of its own, as a user starts it."""
     with tempfile.TemporaryDirectory() as folder:
         side = QUICK_SIDE if quick else SIDE
         sweep = [
@@ -34,15 +37,19 @@ def lines(quick: bool) -> Iterator[Line]:
         ]
         yield Line(f"planning {side**2} cells", _fastest("plan", *sweep), "s", 2.0)
         experiment = config.load(sweep)
-        study = studies.find(experiment.study)
-        store = Store(experiment.directory, study.COLUMNS)
-        store.prepare()
-        for cell in cells(experiment):
-            store.append(runner.blank(experiment, cell, study) | {"status": "ok"})
-        store.compact()
+        store_all(experiment)
         yield Line(f"resuming {side**2} stored cells", _fastest("plan", *sweep), "s", 3.0, note="until none is missing")
         yield Line("python -m bench list", _fastest("list"), "s", 1.0)
         yield _overhead(Path(folder), QUICK_CELLS if quick else CELLS)
+
+
+def store_all(experiment: Experiment) -> None:
+    """Store a row for every cell of an experiment, so that a plan of it resumes all of them and runs none."""
+    store = store_of(experiment)
+    store.prepare()
+    store.append(*(blank(experiment, cell) | {"status": "ok"} for cell in cells(experiment)))
+    store.compact()
+    assert all(item.stored for item in plan(experiment, store)), "cells that are stored are planned again"
 
 
 def _range(count: int, start: int = 0) -> str:
@@ -55,15 +62,16 @@ def _fastest(*words: str, calls: int = 3) -> float:
         started = time.perf_counter()
         subprocess.run([sys.executable, "-m", "bench", *words], check=True, capture_output=True)
         seconds.append(time.perf_counter() - started)
+    # other load can only add time, so the fastest call is nearest to the command's own cost
     return min(seconds)
 
 
 def _overhead(folder: Path, count: int) -> Line:
-    """Seconds between the first cell stored and the last, less those spent in estimates, per cell."""
+    """Return the seconds per cell between the first cell stored and the last, less those spent in estimates."""
     words = [*SMALL, f"sweep.seed=[{_range(count)}]", "name=overhead", f"results_dir={folder}"]
     subprocess.run([sys.executable, "-m", "bench", *words], check=True, capture_output=True)
     experiment = config.load(words)
-    rows = Store(experiment.directory, studies.find(experiment.study).COLUMNS).load().sort_values("stored_at")
+    rows = store_of(experiment).load().sort_values("stored_at")
     later = rows[rows["stored_at"] > rows["stored_at"].iloc[0]]
     spent = rows["stored_at"].iloc[-1] - rows["stored_at"].iloc[0] - later["estimates_s"].sum()
     return Line(

@@ -1,4 +1,4 @@
-"""Lines of the table: what was measured, its target, and the files they are written to."""
+"""Lines of the table: measured number, target, and the files they are written to."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.report import machine
 from bench.report.tables import plain_markdown
-from bench.store import write_whole
+from bench.sweep.files import make_directory, write_all
+from bench.sweep.record import machine
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Line:
 
 
 def texts(lines: Sequence[Line]) -> list[dict[str, str]]:
-    """The lines as they are printed."""
+    """Return the lines as they are printed."""
     return [
         {
             "what": line.what,
@@ -65,10 +65,10 @@ def show(lines: Sequence[Line]) -> None:
 
 
 def write(lines: Sequence[Line], directory: Path, load_before: list[float] | None) -> list[Path]:
-    """``bench_self`` as .csv, .md and .json; returns their paths."""
+    """Write ``bench_self`` as .csv, .md and .json; returns their paths."""
     import pandas as pd
 
-    directory.mkdir(parents=True, exist_ok=True)
+    make_directory(directory)
     table = pd.DataFrame([{**asdict(line), "ratio": line.ratio} for line in lines])
     record: dict[str, Any] = {
         "machine": machine(), "load_average_before": load_before, "lines": json.loads(table.to_json(orient="records")),
@@ -78,6 +78,4 @@ def write(lines: Sequence[Line], directory: Path, load_before: list[float] | Non
         "bench_self.md": "# bench-self\n\n" + plain_markdown(pd.DataFrame(texts(lines))) + "\n",
         "bench_self.json": json.dumps(record, indent=1) + "\n",
     }
-    for name, text in contents.items():
-        write_whole(directory / name, text.encode())
-    return [directory / name for name in contents]
+    return write_all(directory, contents)

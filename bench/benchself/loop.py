@@ -8,7 +8,7 @@ import numpy as np
 
 
 def gradient(scene: Any, stiffness: float, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """df/dtheta ``(T, B)`` under the penalty spring with semi-implicit Euler steps, for ``theta (T,)``, ``w (T, B)``."""
+    """Return df/dtheta ``(T, B)`` with the penalty spring and semi-implicit Euler, for ``theta (T,)``, ``w (T, B)``."""
     h, h_over_m, c, s = scene.dt, scene.dt / scene.mass, scene.velocity_factor, scene.speed
     goal, weight = np.array([[1.0], [2.0]]), np.array([[0.1], [10.0]])
     u = theta[:, None] + scene.sigma * w

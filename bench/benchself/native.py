@@ -18,17 +18,17 @@ LANES = 32
 
 
 class Unavailable(Exception):
-    """There is no compiler here, or it failed."""
+    """Raised when there is no compiler here, or it failed."""
 
 
 class Parameters(ctypes.Structure):
-    """Of the scene and its contact law."""
+    """Parameters of the scene and its contact law."""
 
     _fields_ = [(name, ctypes.c_double) for name in ("dt", "mass", "factor", "speed", "sigma", "stiffness")]
 
 
 def gradient(scene: Any, stiffness: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """The function from ``theta (T,)`` and ``w (T, B)`` to df/dtheta ``(T, B)``; raises :class:`Unavailable`."""
+    """Return the function from ``theta (T,)``, ``w (T, B)`` to df/dtheta ``(T, B)``; raises :class:`Unavailable`."""
     library = _library()
     values = Parameters(scene.dt, scene.mass, scene.velocity_factor, scene.speed, scene.sigma, stiffness)
     pointer = np.ctypeslib.ndpointer(np.float64, flags="C_CONTIGUOUS")

@@ -11,8 +11,8 @@ import numpy as np
 
 from bench.conformance.kit import Skipped, require, verifies
 from bench.conformance.subjects import (
-    Ops,
-    contact_of,
+    ROUNDED,
+    NewtonOps,
     distance,
     largest_jump,
     law_for,
@@ -20,20 +20,12 @@ from bench.conformance.subjects import (
     sound_scenes,
     stepping,
 )
-from bench.contracts import (
-    Array,
-    ContactLaw,
-    ForceLaw,
-    ImpulseLaw,
-    MechanicalScene,
-    State,
-)
-from bench.program import Program
+from bench.model import Array, ContactLaw, ContactScene, ForceLaw, ImpulseLaw, Ops, State, compose
 
 
 @dataclass(frozen=True)
-class _Tower(MechanicalScene):
-    """Two masses above each other over a floor: two contacts, which share a body."""
+class _Tower(ContactScene):
+    """Two masses, one above the other, over a floor: two contacts that share a body."""
 
     name = "conformance_tower"
     n_q: ClassVar[int] = 2
@@ -66,7 +58,7 @@ PUSH_DT = 0.01
 
 
 def _push(law: ContactLaw, gap: Any, rate: Any, ops: Ops | None = None) -> np.ndarray:
-    """Normal impulse over 0.01 s on both contacts of a tower, ``(2, B)``, for gaps and rates of each."""
+    """Return the normal impulse over 0.01 s on both contacts of a tower, ``(2, B)``, for the gaps and rates of each."""
     gaps, rates = (np.asarray(part, dtype=float).reshape(2, -1) for part in (gap, rate))
     if isinstance(law, ForceLaw):
         return PUSH_DT * law.force(np, gaps, rates)
@@ -74,7 +66,7 @@ def _push(law: ContactLaw, gap: Any, rate: Any, ops: Ops | None = None) -> np.nd
     scene = _Tower()
     before = State(np.stack([gaps[0], gaps[0] + gaps[1] + 1.0]), np.stack([rates[0], rates[0] + rates[1]]))
     free = State(before.q + PUSH_DT * before.v, before.v)
-    change = law.impulse(ops or Ops(), contact_of(scene), before, free, PUSH_DT).v
+    change = law.impulse(ops or NewtonOps(), scene.contact(np), before, free, PUSH_DT).v
     upper = scene.masses[1] * change[1]
     return np.stack([scene.masses[0] * change[0] + upper, upper])
 
@@ -84,7 +76,7 @@ FAR = ([[0.05, 0.2, 1.0], [0.05, 0.2, 1.0]], [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
 
 
 def _sharpened(law: ContactLaw, factor: float) -> ContactLaw:
-    """The law with its smoothing changed by a factor, up or down, whichever pushes less from afar."""
+    """Return the law with its smoothing changed by a factor, up or down, whichever pushes less from afar."""
     value = getattr(law, law.smoothing)
     changed = [dataclasses.replace(law, **{law.smoothing: value * f}) for f in (factor, 1 / factor)]
     return min(changed, key=lambda one: np.abs(_push(one, *FAR)).max())
@@ -92,7 +84,7 @@ def _sharpened(law: ContactLaw, factor: float) -> ContactLaw:
 
 @verifies(ContactLaw)
 def does_not_push_from_afar(law: ContactLaw) -> str:
-    """No force between bodies apart; with smoothing, one that vanishes as it sharpens."""
+    """Verify that separated bodies feel no force; with smoothing, one that vanishes as it sharpens."""
     push = np.abs(_push(law, *FAR)).max() / PUSH_DT
     if not law.smoothing:
         require(push == 0, f"a force of {push:.3g} N on bodies apart")
@@ -105,7 +97,7 @@ def does_not_push_from_afar(law: ContactLaw) -> str:
 
 @verifies(ContactLaw)
 def pushes_in_contact(law: ContactLaw) -> str:
-    """Bodies that overlap and approach are pushed apart, and those that approach faster no less."""
+    """Verify that bodies that overlap and approach are pushed apart, and faster ones no less."""
     push = _push(law, [[-0.01] * 3, [1.0] * 3], [[-1.0, -2.0, -4.0], [0.0] * 3])[0] / PUSH_DT
     require((push > 0).all(), f"forces of {push.round(3).tolist()} N on bodies that overlap and approach: it pulls")
     require((np.diff(push) >= -1e-9 * push.max()).all(), f"a faster approach lowers the force: {push.tolist()} N")
@@ -114,7 +106,7 @@ def pushes_in_contact(law: ContactLaw) -> str:
 
 @verifies(ForceLaw)
 def force_grows_with_penetration(law: ForceLaw) -> str:
-    """At rest: repulsive, and the deeper the stronger."""
+    """Verify that at rest the force is repulsive and grows with penetration."""
     depth = np.linspace(0.001, 0.1, 40)
     force = law.force(np, np.stack([-depth, -depth]), np.zeros((2, depth.size)))
     require(force.shape == (2, depth.size), f"shape {force.shape}, not {(2, depth.size)}")
@@ -125,18 +117,18 @@ def force_grows_with_penetration(law: ForceLaw) -> str:
 
 @verifies(ForceLaw)
 def contacts_are_separate(law: ForceLaw) -> str:
-    """The force of one contact does not depend on another's gap."""
+    """Verify that the force of one contact does not depend on another's gap."""
     draw = rng("separate")
     gap, rate = 0.02 * draw.standard_normal((2, 50)), draw.standard_normal((2, 50))
     together = law.force(np, gap, rate)
     alone = np.concatenate([law.force(np, gap[i : i + 1], rate[i : i + 1]) for i in range(2)])
-    require(distance(together, alone) < 1e-12, "two contacts together differ from each alone")
-    return "2 contacts as each alone"
+    require(distance(together, alone) < ROUNDED, "two contacts together differ from each by itself")
+    return "2 contacts as each by itself"
 
 
 @verifies(ContactLaw)
 def smoothing_converges(law: ContactLaw) -> str:
-    """As the smoothing sharpens by factors of 10, forces settle on those of an unsmoothed law."""
+    """Verify that forces settle on those of an unsmoothed law as the smoothing sharpens by factors of 10."""
     if not law.smoothing:
         raise Skipped("has no smoothing")
     gaps = np.array([[-0.05, -0.01, -0.001, 0.0, 0.001, 0.01, 0.05], [1.0] * 7])
@@ -149,7 +141,7 @@ def smoothing_converges(law: ContactLaw) -> str:
 
 @verifies(ImpulseLaw)
 def impulse_keeps_momentum(law: ImpulseLaw) -> str:
-    """Bodies that meet in the air push each other equally, and apart; afterwards they no longer approach."""
+    """Verify that bodies meeting in the air push each other equally, and apart; afterwards they do not approach."""
     sharp = _sharpened(law, 1e4) if law.smoothing else law
     rate = np.array([[0.0, 0.3, -0.2], [-1.0, -3.0, -0.5]])
     push = _push(sharp, [[1.0] * 3, [0.0] * 3], rate)
@@ -163,8 +155,8 @@ def impulse_keeps_momentum(law: ImpulseLaw) -> str:
 
 @verifies(ContactLaw)
 def needs_root_of_law_is_truthful(law: ContactLaw) -> str:
-    """Solves an equation if and only if it declares to."""
-    ops = Ops()
+    """Verify that the law solves an equation if and only if it declares so."""
+    ops = NewtonOps()
     _push(law, [[-0.01], [1.0]], [[-1.0], [0.0]], ops)
     require(
         bool(ops.solved) == law.needs_root, f"needs_root is {law.needs_root}, but {ops.solved} equations were solved"
@@ -174,23 +166,23 @@ def needs_root_of_law_is_truthful(law: ContactLaw) -> str:
 
 @verifies(ContactLaw)
 def continuity_in_rollouts_is_as_declared(law: ContactLaw) -> str:
-    """Costs of continuous scenes do not jump along theta if ``continuous``, and do in some scene if not."""
+    """Verify that costs of continuous scenes do not jump along theta if ``continuous``, and do in some scene if not."""
     values = {f.name: getattr(law, f.name) for f in dataclasses.fields(law) if getattr(law, f.name) != f.default}
-    scenes = [s for s in sound_scenes() if isinstance(s, MechanicalScene) and s.n_contacts and s.continuous]
+    scenes = [s for s in sound_scenes() if isinstance(s, ContactScene) and s.continuous]
     jumps: dict[bool, dict[str, float]] = {True: {}, False: {}}
     for scene in scenes:
-        program = Program(scene, law_for(scene, type(law), values), stepping())
+        program = compose(scene, law_for(scene, type(law), values), stepping())
         jumps[program.continuous][scene.name] = largest_jump(program)
     details = []
-    for continuous, found in jumps.items():
-        if not found:
+    for continuous, sizes in jumps.items():
+        if not sizes:
             continue
-        name, jump = max(found.items(), key=lambda item: item[1])
+        name, jump = max(sizes.items(), key=lambda item: item[1])
         if continuous:
             require(not jump, f"declares to be continuous, but {name} jumps by {jump:.1e} of its range")
-            details.append(f"no jump in {', '.join(found)}")
+            details.append(f"no jump in {', '.join(sizes)}")
         else:
-            require(jump, f"declares to jump, but no jump was found in {', '.join(found)}")
+            require(jump, f"declares to jump, but no jump was found in {', '.join(sizes)}")
             details.append(f"a jump of {jump:.2g} of the range in {name}")
     if not details:
         raise Skipped("no continuous scene with contacts is registered")

@@ -22,17 +22,10 @@ from bench.conformance.subjects import (
     sound_scenes,
     stepping,
 )
-from bench.contracts import (
-    Estimator,
-    FunctionScene,
-    MechanicalScene,
-    Problem,
-    SampleMean,
-)
-from bench.program import Program
+from bench.model import Estimator, FunctionScene, MechanicalScene, Problem, SampleMean, compose
 
 SIGMAS = (0.1, 0.5)
-"""Noise levels of the oracles: not 1, where sigma and its square are the same."""
+"""Noise levels of the oracles: never 1, where sigma and its square are the same."""
 
 
 class Watched(Problem):
@@ -44,15 +37,15 @@ class Watched(Problem):
         self.used: set[str] = set()
 
     def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Costs, if allowed."""
+        """Return costs, if allowed."""
         return self._use("value", theta, w)
 
     def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Gradients, if allowed."""
+        """Return gradients, if allowed."""
         return self._use("grad", theta, w)
 
     def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Scores, if allowed."""
+        """Return scores, if allowed."""
         return self._use("score", theta, w)
 
     def _use(self, capability: str, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -79,8 +72,8 @@ class Oracle(NamedTuple):
 
 @cache
 def oracles() -> tuple[Oracle, ...]:
-    """Every sound function with a closed-form gradient that holds, at each of :data:`SIGMAS`."""
-    found = []
+    """Return every sound function with a valid closed-form gradient, at each of :data:`SIGMAS`."""
+    result = []
     for default, sigma in itertools.product(sound_scenes(), SIGMAS):
         if isinstance(default, FunctionScene):
             scene = dataclasses.replace(default, sigma=sigma)
@@ -88,71 +81,72 @@ def oracles() -> tuple[Oracle, ...]:
                 closed_form_is_right(scene)
             except Exception:
                 continue
-            truth = np.asarray(scene.closed_form_gradient(None, None))
-            problem = plain_backend().compile(Program(scene, None, None))
-            found.append(Oracle(problem, truth, np.zeros_like(truth), f"{scene.name}[sigma={sigma}]"))
-    return tuple(found)
+            program = compose(scene)
+            truth = np.asarray(program.closed_form_gradient())
+            problem = plain_backend().compile(program)
+            result.append(Oracle(problem, truth, np.zeros_like(truth), f"{scene.name}[sigma={sigma}]"))
+    return tuple(result)
 
 
 @cache
 def feedback_oracle() -> Oracle:
-    """A smooth scene with noise on the actions of a policy, five steps long, by long first-order sampling."""
+    """Return a smooth five-step scene with noise on a policy's actions, its gradient from long first-order sampling."""
     for default in sound_scenes():
         if not isinstance(default, MechanicalScene) or default.n_contacts or not default.continuous:
             continue
-        program = Program(dataclasses.replace(default, horizon=5, sigma=2.0), None, stepping())
+        program = compose(dataclasses.replace(default, horizon=5, sigma=2.0), None, stepping())
         if not program.noise_on_theta:
             problem = plain_backend().compile(program)
             w = rng("feedback").standard_normal((program.n_noise, 1 << 15))
-            terms = problem.grad(program.scene.theta0(), w)
+            terms = problem.grad(program.theta0, w)
             error = terms.std(axis=1) / math.sqrt(w.shape[1])
             return Oracle(problem, terms.mean(axis=1), error, f"{program.scene.name}[horizon=5,sigma=2]")
     raise Skipped("no scene with a policy under action noise is registered")
 
 
 def lively_oracle(estimator: Estimator) -> Oracle:
-    """The first oracle on which no two samples have the same gradient, and sigma matters."""
+    """Return the first oracle on which no two samples have the same gradient, and sigma matters."""
     for oracle in usable(estimator, [o for o in oracles() if o.continuous]):
         w = rng("lively").standard_normal((oracle.problem.program.n_noise, 64))
-        gradients = oracle.problem.grad(oracle.problem.program.scene.theta0(), w)
-        plain = oracle.problem.grad(oracle.problem.program.scene.theta0(), 0.0 * w[:, :1])
+        gradients = oracle.problem.grad(oracle.problem.program.theta0, w)
+        plain = oracle.problem.grad(oracle.problem.program.theta0, 0.0 * w[:, :1])
         if len(np.unique(gradients[0])) == 64 and distance(oracle.truth, plain[:, 0]) > 1e-3:
             return oracle
     raise Skipped("refuses every oracle whose samples all differ")
 
 
-def usable(estimator: Estimator, found: Iterable[Oracle]) -> Iterator[Oracle]:
-    """The oracles that the estimator does not refuse."""
-    return (oracle for oracle in found if estimator.refuses(oracle.problem.program) is None)
+def usable(estimator: Estimator, candidates: Iterable[Oracle]) -> Iterator[Oracle]:
+    """Yield the oracles that the estimator does not refuse."""
+    return (oracle for oracle in candidates if estimator.refuses(oracle.problem.program) is None)
 
 
 def draw_noise(oracle: Oracle, repeats: int, count: int, *key: str | int) -> np.ndarray:
-    """Read-only noise ``(R, N, n_w)``, as estimators get it."""
+    """Draw read-only noise ``(R, N, n_w)``, as estimators get it."""
     noise = rng("noise", *key).standard_normal((repeats, count, oracle.problem.program.n_noise))
     noise.setflags(write=False)
     return noise
 
 
 def estimates(estimator: Estimator, oracle: Oracle, noise: np.ndarray, problem: Problem | None = None) -> np.ndarray:
-    """Estimates of the right shape and finite; :class:`Failed` otherwise."""
+    """Return estimates of the right shape, all finite; raises :class:`Failed` otherwise."""
     problem = problem or oracle.problem
-    found = np.asarray(estimator.estimate(problem, problem.program.scene.theta0(), noise))
-    require(found.shape == (noise.shape[0], problem.dim), f"shape {found.shape}, not {(noise.shape[0], problem.dim)}")
-    require(np.isfinite(found).all(), f"{(~np.isfinite(found)).sum()} numbers are not finite on {oracle.label}")
-    return found
+    result = np.asarray(estimator.estimate(problem, problem.program.theta0, noise))
+    require(result.shape == (noise.shape[0], problem.dim), f"shape {result.shape}, not {(noise.shape[0], problem.dim)}")
+    require(np.isfinite(result).all(), f"{(~np.isfinite(result)).sum()} numbers are not finite on {oracle.label}")
+    return result
 
 
 def target(estimator: Estimator, oracle: Oracle) -> np.ndarray:
-    """What the estimator declares to estimate, ``(d,)``."""
+    """Return the quantity that the estimator declares to estimate, ``(d,)``."""
     if estimator.target == "smoothed":
         return oracle.truth
     program = oracle.problem.program
-    return oracle.problem.grad(program.scene.theta0(), np.zeros((program.n_noise, 1)))[:, 0]
+    return oracle.problem.grad(program.theta0, np.zeros((program.n_noise, 1)))[:, 0]
 
 
 @verifies(Estimator)
 def shape_and_repeatability(estimator: Estimator) -> str:
-    """Estimates are ``(R, d)``, finite, and the same when asked for again."""
+    """Verify that estimates are ``(R, d)``, finite, and the same in a second call."""
     labels = []
     for oracle in usable(estimator, oracles()):
         noise = draw_noise(oracle, 7, 8)
@@ -166,7 +160,7 @@ def shape_and_repeatability(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def repeats_are_independent(estimator: Estimator) -> str:
-    """Estimate r depends on ``noise[r]`` and on no other."""
+    """Verify that estimate r depends on ``noise[r]`` and on no other."""
     oracle = lively_oracle(estimator)
     noise = np.array(draw_noise(oracle, 6, 8))
     whole = estimates(estimator, oracle, noise)
@@ -175,7 +169,7 @@ def repeats_are_independent(estimator: Estimator) -> str:
     require(worst < DIFFERENCED, f"permuting the repeats changes the estimates by {worst:.1e}")
     for r in range(len(noise)):
         alone = distance(estimates(estimator, oracle, noise[r : r + 1]), whole[r : r + 1])
-        require(alone < DIFFERENCED, f"estimate {r} alone differs from the one in the batch by {alone:.1e}")
+        require(alone < DIFFERENCED, f"estimate {r} by itself differs from the one in the batch by {alone:.1e}")
         changed = noise.copy()
         changed[r] = draw_noise(oracle, 1, 8, "other")[0]
         moved = np.abs(estimates(estimator, oracle, changed) - whole).max(axis=1) > DIFFERENCED * np.abs(whole).max()
@@ -187,7 +181,7 @@ def repeats_are_independent(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def uses_every_sample(estimator: Estimator) -> str:
-    """Other noise in any one sample of 8 gives another estimate, or in any eighth of 4096 for those that need as many."""
+    """Verify that other noise in any one of 8 samples (or any eighth of 4096, if needed) changes the estimate."""
     oracle = lively_oracle(estimator)
     unused = set(range(8))
     for size in (1, 512):
@@ -205,13 +199,13 @@ def uses_every_sample(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def variance_falls_as_one_over_n(estimator: Estimator) -> str:
-    """Slope of log variance against log N: -1 for sample means and unbiased estimators, -1 or steeper for others."""
+    """Verify the slope of log variance against log N: -1 for sample means and unbiased ones, else at most -1."""
     oracle = lively_oracle(estimator)
     counts, groups = np.array([32, 128, 512]), 16
     logs = np.empty((len(counts), groups))
     for i, n in enumerate(counts):
-        found = estimates(estimator, oracle, draw_noise(oracle, 32 * groups, n, "slope", i))
-        variance = found.reshape(groups, 32, -1).var(axis=1, ddof=1).sum(axis=1)
+        values = estimates(estimator, oracle, draw_noise(oracle, 32 * groups, n, "slope", i))
+        variance = values.reshape(groups, 32, -1).var(axis=1, ddof=1).sum(axis=1)
         require((variance > 0).all(), f"estimates of {n} samples have no variance, where the samples differ")
         logs[i] = np.log(variance)
     slopes = np.polyfit(np.log(counts), logs, 1)[0]
@@ -226,25 +220,25 @@ def variance_falls_as_one_over_n(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def bias_is_as_declared(estimator: Estimator) -> str:
-    """On continuous costs: none if ``unbiased``; else less than answering zero would have."""
-    found = list(usable(estimator, [o for o in oracles() if o.continuous]))
-    if not found:
+    """Verify the bias on continuous costs: none if ``unbiased``, else less than that of answering zero."""
+    candidates = list(usable(estimator, [o for o in oracles() if o.continuous]))
+    if not candidates:
         raise Skipped("refuses every continuous oracle")
-    return _bias_held(estimator, found)
+    return _bias_held(estimator, candidates)
 
 
 @verifies(Estimator)
 def bias_across_jumps_is_as_declared(estimator: Estimator) -> str:
-    """On costs that jump: none if ``across_jumps``, one that shows if not."""
-    found = list(usable(estimator, [o for o in oracles() if not o.continuous]))
+    """Verify the bias on costs that jump: none if ``across_jumps``, a visible one if not."""
+    candidates = list(usable(estimator, [o for o in oracles() if not o.continuous]))
     if not estimator.unbiased:
         raise Skipped("declares a bias anyway")
-    if not found or estimator.target != "smoothed":
+    if not candidates or estimator.target != "smoothed":
         raise Skipped("no oracle with a jump applies")
     if estimator.across_jumps:
-        return _bias_held(estimator, found)
+        return _bias_held(estimator, candidates)
     details = []
-    for oracle in found:
+    for oracle in candidates:
         z, bias = _standard_errors(estimator, oracle, 4, 4096)
         detail = f"bias {np.linalg.norm(bias):.3g} on {oracle.label}"
         require(z.max() > LIMIT, f"declares to be biased across jumps, but {detail} is {z.max():.1f} standard errors")
@@ -254,53 +248,53 @@ def bias_across_jumps_is_as_declared(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def bias_under_action_feedback(estimator: Estimator) -> str:
-    """As ``bias_is_as_declared``, with noise on the actions of a feedback policy, for estimators that use its score."""
+    """Verify the bias with noise on the actions of a feedback policy, for estimators that use the policy's score."""
     if "score" not in estimator.needs or estimator.target != "smoothed":
         raise Skipped("uses no score")
-    found = list(usable(estimator, [feedback_oracle()]))
-    if not found:
+    candidates = list(usable(estimator, [feedback_oracle()]))
+    if not candidates:
         raise Skipped("refuses feedback policies")
-    return _bias_held(estimator, found)
+    return _bias_held(estimator, candidates)
 
 
-def _bias_held(estimator: Estimator, found: list[Oracle]) -> str:
-    return (_is_unbiased if estimator.unbiased else _beats_zero)(estimator, found)
+def _bias_held(estimator: Estimator, candidates: list[Oracle]) -> str:
+    return (_is_unbiased if estimator.unbiased else _beats_zero)(estimator, candidates)
 
 
-def _is_unbiased(estimator: Estimator, found: list[Oracle]) -> str:
+def _is_unbiased(estimator: Estimator, candidates: list[Oracle]) -> str:
     worst = 0.0
-    for oracle in found:
+    for oracle in candidates:
         z, bias = _standard_errors(estimator, oracle, 4, 8192)
         detail = f"bias {np.linalg.norm(bias):.3g} on {oracle.label} is {z.max():.1f} standard errors"
         require(z.max() <= LIMIT, f"declares to be unbiased, but {detail}")
         worst = max(worst, float(z.max()))
-    return f"at most {worst:.1f} standard errors on {len(found)} oracles"
+    return f"at most {worst:.1f} standard errors on {len(candidates)} oracles"
 
 
-def _beats_zero(estimator: Estimator, found: list[Oracle]) -> str:
+def _beats_zero(estimator: Estimator, candidates: list[Oracle]) -> str:
     worst = 0.0
-    for oracle in found:
+    for oracle in candidates:
         z, bias = _standard_errors(estimator, oracle, 256, 512)
         size, norm = float(np.linalg.norm(bias)), float(np.linalg.norm(target(estimator, oracle)))
         detail = f"bias {size:.3g} at 256 samples on {oracle.label} is not below the gradient's norm, {norm:.3g}"
         require(size < norm or z.max() <= LIMIT, detail)
         worst = max(worst, size / norm if norm else 0.0)
-    return f"declared; at 256 samples up to {worst:.2g} of the gradient on {len(found)} oracles"
+    return f"declared; at 256 samples up to {worst:.2g} of the gradient on {len(candidates)} oracles"
 
 
 def _standard_errors(estimator: Estimator, oracle: Oracle, count: int, repeats: int) -> tuple[np.ndarray, np.ndarray]:
-    """Bias of each coordinate in its standard errors, beyond rounding, and the bias itself."""
-    found = estimates(estimator, oracle, draw_noise(oracle, repeats, count, oracle.label, count))
+    """Return the bias of each coordinate in its standard errors, beyond rounding, and the bias itself."""
+    values = estimates(estimator, oracle, draw_noise(oracle, repeats, count, oracle.label, count))
     truth = target(estimator, oracle)
-    bias = found.mean(axis=0) - truth
-    error = np.sqrt(found.var(axis=0, ddof=1) / repeats + oracle.error**2)
+    bias = values.mean(axis=0) - truth
+    error = np.sqrt(values.var(axis=0, ddof=1) / repeats + oracle.error**2)
     beyond = np.maximum(np.abs(bias) - DIFFERENCED * (1 + np.abs(truth)), 0.0)
     return np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0), bias
 
 
 @verifies(Estimator)
 def needs_are_truthful(estimator: Estimator) -> str:
-    """Runs on a problem that has only what it needs, and uses all of that."""
+    """Verify that the estimator runs with only what it needs, and uses all of that."""
     oracle = lively_oracle(estimator)
     watched = Watched(oracle.problem, estimator.needs)
     estimates(estimator, oracle, draw_noise(oracle, 4, 8), watched)

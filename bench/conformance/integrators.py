@@ -10,25 +10,24 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bench.conformance.kit import require, verifies
-from bench.conformance.subjects import (
-    Ops,
-    distance,
-)
-from bench.contracts import (
+from bench.conformance.subjects import NewtonOps, distance
+from bench.model import (
     Array,
     Contact,
+    ContactScene,
+    DampedScene,
+    Dynamics,
     ImpulseLaw,
     Integrator,
     MechanicalScene,
     State,
     param,
 )
-from bench.program import Dynamics
 
 
 @dataclass(frozen=True)
-class _Swing(MechanicalScene):
-    """q'' = -4 sin q - 0.2 v + u from (1, 0.5): a smooth motion without closed form."""
+class _Swing(DampedScene):
+    """The motion q'' = -4 sin q - 0.2 v + u from (1, 0.5), smooth and without closed form."""
 
     name = "conformance_swing"
     n_q: ClassVar[int] = 1
@@ -36,7 +35,6 @@ class _Swing(MechanicalScene):
 
     stiffness: float = param(4.0, "restoring acceleration at a right angle", "rad/s^2")
     friction: float = param(0.2, "deceleration per velocity", "1/s")
-    velocity_factor: float = param(1.0, "factor on the velocity each step")
 
     def theta0(self) -> np.ndarray:
         return np.array([1.0])
@@ -62,7 +60,7 @@ class _Kick(ImpulseLaw):
 
 
 @dataclass(frozen=True)
-class _Kicked(_Swing):
+class _Kicked(_Swing, ContactScene):
     """The same motion, with a contact."""
 
     n_contacts: ClassVar[int] = 1
@@ -109,7 +107,7 @@ class _Oscillator(_Swing):
 
 
 EXACT = 1e-9
-"""Relative difference allowed between numbers that are equal but for rounding, and for where a Newton iteration stops."""
+"""Relative difference allowed between numbers equal up to rounding and to the end of a Newton iteration (1e-13)."""
 
 
 def _advance(integrator: Integrator, dynamics: Dynamics, steps: int, dt: float) -> State:
@@ -121,7 +119,7 @@ def _advance(integrator: Integrator, dynamics: Dynamics, steps: int, dt: float) 
 
 @verifies(Integrator)
 def error_falls_with_declared_order(integrator: Integrator) -> str:
-    """Slope of log error against log dt over 1 s of a smooth motion, within 0.2 of ``order``."""
+    """Verify the slope of log error against log dt over 1 s of a smooth motion, within 0.2 of ``order``."""
     from scipy.integrate import solve_ivp
 
     scene = _Swing()
@@ -134,7 +132,7 @@ def error_falls_with_declared_order(integrator: Integrator) -> str:
     steps = np.array([32, 64, 128])
     errors = []
     for n in steps:
-        state = _advance(integrator, Dynamics(Ops(), scene, None), n, 1.0 / n)
+        state = _advance(integrator, Dynamics(NewtonOps(), scene, None), n, 1.0 / n)
         errors.append(np.abs(np.concatenate(state).ravel() - exact).max())
     require(np.isfinite(errors).all() and min(errors) > 0, f"errors {errors}")
     slope = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
@@ -145,27 +143,27 @@ def error_falls_with_declared_order(integrator: Integrator) -> str:
 
 @verifies(Integrator)
 def free_motion_is_exact(integrator: Integrator) -> str:
-    """Without forces: q grows by dt v, v is multiplied by the scene's velocity factor, and columns are their own."""
+    """Verify that without forces q grows by dt v, v takes the scene's velocity factor, and columns stay separate."""
     scene = _Swing(stiffness=0.0, friction=0.0, velocity_factor=0.5)
     state = State(np.array([[1.0, 0.3]]), np.array([[0.5, -1.0]]))
-    end = integrator.step(Dynamics(Ops(), scene, None), state, np.zeros((1, 2)), 0.01)
+    end = integrator.step(Dynamics(NewtonOps(), scene, None), state, np.zeros((1, 2)), 0.01)
     off = distance(end.v, 0.5 * state.v)
-    require(off < 1e-9, f"the velocity factor is missed by {off:.1e}")
+    require(off < EXACT, f"the velocity factor is missed by {off:.1e}")
     whole = integrator.step(
-        Dynamics(Ops(), dataclasses.replace(scene, velocity_factor=1.0), None), state, np.zeros((1, 2)), 0.01
+        Dynamics(NewtonOps(), dataclasses.replace(scene, velocity_factor=1.0), None), state, np.zeros((1, 2)), 0.01
     )
     off = distance(whole.q, state.q + 0.01 * state.v)
-    require(off < 1e-9, f"the position is off by {off:.1e}")
+    require(off < EXACT, f"the position is off by {off:.1e}")
     return f"to {off:.0e}"
 
 
 @verifies(Integrator)
 def amplification_is_that_of_the_step(integrator: Integrator) -> str:
-    """The factor of one step on v' = a v is ``amplification(a dt)``, for decay and growth, slow and stiff."""
+    """Verify that the factor of one step on v' = a v is ``amplification(a dt)``: decay and growth, slow and stiff."""
     worst = 0.0
     for dt, rate in itertools.product((0.01, 0.5), (-50.0, -3.0, 0.0, 0.7)):
         state = State(np.zeros((0, 1)), np.ones((1, 1)))
-        end = integrator.step(Dynamics(Ops(), _Decay(rate=rate), None), state, np.zeros((0, 1)), dt)
+        end = integrator.step(Dynamics(NewtonOps(), _Decay(rate=rate), None), state, np.zeros((0, 1)), dt)
         require(end.q.shape == (0, 1), f"without positions, q becomes {end.q.shape}")
         stated = integrator.amplification(rate * dt)
         off = abs(end.v[0, 0] - stated) / max(1.0, abs(stated))
@@ -178,41 +176,41 @@ def amplification_is_that_of_the_step(integrator: Integrator) -> str:
 
 @verifies(Integrator)
 def transition_is_that_of_the_step(integrator: Integrator) -> str:
-    """One step on q' = v, v' = -stiffness q - damping v is ``transition``, with and without a velocity factor."""
+    """Verify ``transition`` against a step on q' = v, v' = -stiffness q - damping v, for two velocity factors."""
     worst = 0.0
     for dt, stiffness, damping, factor in itertools.product((0.01, 0.3), (0.0, 4.0, 1e4), (0.0, 0.5, 20.0), (1.0, 0.6)):
         scene = _Oscillator(stiffness=stiffness, friction=damping, velocity_factor=factor)
         unit = State(np.array([[1.0, 0.0]]), np.array([[0.0, 1.0]]))
-        found = np.concatenate(integrator.step(Dynamics(Ops(), scene, None), unit, np.zeros((1, 2)), dt))
+        stepped = np.concatenate(integrator.step(Dynamics(NewtonOps(), scene, None), unit, np.zeros((1, 2)), dt))
         stated = integrator.transition(dt, stiffness, damping, factor)
-        off = distance(found, stated)
+        off = distance(stepped, stated)
         at = f"dt = {dt:g}, stiffness {stiffness:g}, damping {damping:g}, velocity factor {factor:g}"
-        require(off < EXACT, f"at {at} the step is {found.tolist()}, the stated matrix {stated.tolist()}")
+        require(off < EXACT, f"at {at} the step is {stepped.tolist()}, the stated matrix {stated.tolist()}")
         worst = max(worst, off)
     return f"to {worst:.0e} in 36 settings"
 
 
 @verifies(Integrator)
 def takes_impulses_is_truthful(integrator: Integrator) -> str:
-    """An impulse law changes the step if and only if it is declared to."""
-    plain, kicked = (_advance(integrator, Dynamics(Ops(), _Kicked(), law), 1, 0.01) for law in (None, _Kick()))
+    """Verify that an impulse law changes the step if and only if the integrator declares it."""
+    plain, kicked = (_advance(integrator, Dynamics(NewtonOps(), _Kicked(), law), 1, 0.01) for law in (None, _Kick()))
     change = np.array([np.abs(kicked.q - plain.q).max(), np.abs(kicked.v - plain.v).max()])
     if not integrator.takes_impulses:
         require(not change.any(), "takes impulses, but does not declare it")
         return "takes none"
     require(
-        distance(change, np.array([0.11, 1.0])) < 1e-9, f"an impulse of (0.1, 1) changes (q, v) by {change.tolist()}"
+        distance(change, np.array([0.11, 1.0])) < EXACT, f"an impulse of (0.1, 1) changes (q, v) by {change.tolist()}"
     )
     return "an impulse changes velocity, and position by dt times that and its own"
 
 
 @verifies(Integrator)
 def needs_root_of_integrator_is_truthful(integrator: Integrator) -> str:
-    """Solves an equation if and only if it declares to."""
-    ops = Ops()
+    """Verify that the integrator solves an equation if and only if it declares so."""
+    ops = NewtonOps()
     _advance(integrator, Dynamics(ops, _Swing(), None), 1, 0.01)
     require(
         bool(ops.solved) == integrator.needs_root,
         f"needs_root is {integrator.needs_root}, {ops.solved} equations solved",
     )
-    return f"{ops.solved} equations a step"
+    return f"{ops.solved} equations per step"

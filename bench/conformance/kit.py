@@ -1,14 +1,17 @@
-"""Registers checks, and runs them on plugins."""
+"""Registers checks, and runs them on plugins: as printed lines, as a list of results, or as pytest items."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from bench import registry
-from bench.contracts import Plugin
+from bench.errors import unknown
+from bench.model import Plugin, registry
+from bench.model.identity import identity
+from bench.model.parameters import build, parameters
 
 
 @dataclass(frozen=True)
@@ -22,11 +25,11 @@ class Result:
 
 
 class Failed(Exception):
-    """What a plugin declares and what it does differ."""
+    """Raised when a plugin's behaviour differs from its declaration."""
 
 
 class Skipped(Exception):
-    """The check does not apply to the plugin."""
+    """Raised when the check does not apply to the plugin."""
 
 
 Check = Callable[[Any], str]
@@ -34,7 +37,7 @@ _CHECKS: dict[type[Plugin], list[Check]] = {}
 
 
 def verifies(kind: type[Plugin]) -> Callable[[Check], Check]:
-    """Register a check for the plugins of a kind."""
+    """Register a check for plugins of one kind."""
 
     def register(function: Check) -> Check:
         _CHECKS.setdefault(kind, []).append(function)
@@ -50,7 +53,7 @@ def require(condition: Any, message: str) -> None:
 
 
 def main(names: Sequence[str]) -> int:
-    """Check the plugins of those names, or all, and print a line for each check; the exit status."""
+    """Check the plugins of those names, or all, and print a line per check; returns the exit status."""
     started = time.perf_counter()
     tally = dict.fromkeys(("pass", "fail", "skip"), 0)
     plugins = 0
@@ -71,42 +74,135 @@ def main(names: Sequence[str]) -> int:
     return 1 if tally["fail"] else 0
 
 
-def check(plugin_class: type[Plugin]) -> list[Result]:
-    """Every check that applies to a plugin class, with its default parameters and with each other choice it offers."""
-    results = [_outcome(function, plugin_class, plugin_class.name) for function in _CHECKS[Plugin]]
-    own: list[Result] = []
-    try:
-        instances = variants(plugin_class)
-    except Exception as error:
-        return [*results, Result(plugin_class.name, "builds", "fail", f"{type(error).__name__}: {error}")]
-    for identity, plugin in instances.items():
-        for kind, functions in _CHECKS.items():
-            if kind is not Plugin and isinstance(plugin, kind):
-                own.extend(_outcome(function, plugin, identity) for function in functions)
-    if all(result.outcome == "skip" for result in own):
-        own.append(Result(plugin_class.name, "something_was_checked", "fail", "every check of its kind was skipped"))
-    return results + own
+def check(plugin_class: type[Plugin], only: Collection[str] = ()) -> list[Result]:
+    """Run every check that applies to a plugin class, with default parameters and with each other choice it offers. Names in ``only`` leave out the other checks."""
+    results = [
+        _outcome(function, subject, name)
+        for name, subject, function in _items(plugin_class)
+        if not only or function.__name__ in only
+    ]
+    asked = something_was_checked.__name__
+    return [result for result in results if result.check != asked or result.outcome == "fail"]
+
+
+def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str, str] | None = None) -> Any:
+    """Make a ``pytest.mark.parametrize`` over (plugin, check) pairs, one per check of each variant of the classes.
+
+    ``expected_failures`` gives reasons by name of a check, or by id of one item (``variant-check``); if such a check
+    passes, the test fails. Plugins that lack a module they require are skipped::
+
+        @bench.conformance.parametrize([MyEstimator], expected_failures={
+            "bias_is_as_declared": "biased below 4 samples, see #12"})
+        def test_conforms(plugin, check):
+            check(plugin)
+    """
+    import pytest
+
+    reasons = dict(expected_failures or {})
+    items, names = [], set()
+    for plugin_class in plugins:
+        modules = (requirement.partition("=")[0] for requirement in plugin_class.requires)
+        missing = [module for module in modules if not registry.installed(module)]
+        for name, subject, function in _items(plugin_class):
+            title = f"{name}-{function.__name__}"
+            names |= {title, function.__name__}
+            marks: list[Any] = [pytest.mark.skip(reason=f"not installed: {', '.join(missing)}")] if missing else []
+            reason = reasons.get(title, reasons.get(function.__name__))
+            if reason is not None:
+                marks.append(pytest.mark.xfail(reason=reason, strict=True))
+            items.append(pytest.param(subject, partial(_run, function, name), id=title, marks=marks))
+    for name in reasons:
+        if name not in names:
+            raise unknown("check in expected_failures:", name, names)
+    return pytest.mark.parametrize(("plugin", "check"), items)
 
 
 def variants(plugin_class: type[Plugin]) -> dict[str, Plugin]:
-    """By identity: the default instance, and one for every other choice of a text or switch parameter but ``dtype``."""
-    found = {plugin_class.name: registry.build(plugin_class, {})}
-    for name, parameter in registry.parameters(plugin_class).items():
+    """Return instances by identity: the default one, and one per other choice of a text or switch except ``dtype``."""
+    instances = {plugin_class.name: build(plugin_class, {})}
+    for name, parameter in parameters(plugin_class).items():
         choices = (True, False) if parameter.type is bool else parameter.choices or ()
         for choice in choices:
             if choice != parameter.default and name != "dtype":
                 values = {name: choice}
-                found[registry.identity(plugin_class.name, values)] = registry.build(plugin_class, values)
-    return found
+                instances[identity(plugin_class.name, values)] = build(plugin_class, values)
+    return instances
 
 
-def _outcome(function: Check, subject: Any, identity: str) -> Result:
+def _items(plugin_class: type[Plugin]) -> Iterator[tuple[str, Any, Check]]:
+    """Yield identity, subject and check for everything that is verified of a plugin class.
+
+    The class's own checks come first, since the last check asks whether any of them applied.
+    """
+    for function in _CHECKS[Plugin]:
+        yield plugin_class.name, plugin_class, function
     try:
-        outcome, detail = "pass", function(subject)
+        instances = variants(plugin_class)
+    except Exception:
+        yield plugin_class.name, plugin_class, builds
+        return
+    for name, plugin in instances.items():
+        for function in _own_checks(plugin):
+            yield name, plugin, function
+    if plugin_class.kind in {kind.kind for kind in _CHECKS}:
+        yield plugin_class.name, plugin_class, something_was_checked
+
+
+def _own_checks(plugin: Plugin) -> list[Check]:
+    """Return the checks of a plugin's kind and roles."""
+    kinds = [kind for kind in _CHECKS if kind is not Plugin and isinstance(plugin, kind)]
+    return [function for kind in kinds for function in _CHECKS[kind]]
+
+
+def builds(plugin_class: type[Plugin]) -> str:
+    """Verify that an instance can be made with default parameters, and with each other choice."""
+    return f"{len(variants(plugin_class))} variants"
+
+
+def something_was_checked(plugin_class: type[Plugin]) -> str:
+    """Verify that at least one check of its kind applies to the plugin."""
+    for name, plugin in variants(plugin_class).items():
+        for function in _own_checks(plugin):
+            if (function, plugin_class, name) not in _skipped:
+                _outcome(function, plugin, name)
+            if not _skipped[function, plugin_class, name]:
+                return f"{function.__name__} among others"
+    raise Failed("every check of its kind was skipped")
+
+
+_skipped: dict[tuple[Check, type, str], bool] = {}
+"""Whether a check did not apply to a variant, for the checks that ran in this process."""
+
+
+def _outcome(function: Check, subject: Any, name: str) -> Result:
+    try:
+        outcome, detail = "pass", _remembered(function, subject, name)
     except Skipped as reason:
         outcome, detail = "skip", str(reason)
     except Failed as reason:
         outcome, detail = "fail", str(reason)
     except Exception as error:
         outcome, detail = "fail", f"{type(error).__name__}: {error}"
-    return Result(identity, function.__name__, outcome, " ".join(detail.split()))
+    return Result(name, function.__name__, outcome, " ".join(detail.split()))
+
+
+def _remembered(function: Check, subject: Any, name: str) -> str:
+    """Run the check, note whether it applied, and return its details."""
+    skipped = False
+    try:
+        return function(subject)
+    except Skipped:
+        skipped = True
+        raise
+    finally:
+        _skipped[function, type(subject), name] = skipped
+
+
+def _run(function: Check, name: str, subject: Any) -> None:
+    """Run the check as a test: a reason to skip the check skips the test."""
+    import pytest
+
+    try:
+        _remembered(function, subject, name)
+    except Skipped as reason:
+        pytest.skip(str(reason))

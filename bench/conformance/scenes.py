@@ -14,10 +14,10 @@ from bench.conformance.subjects import (
     COLUMNS,
     DIFFERENCED,
     LIMIT,
+    ROUNDED,
+    SAME,
     able_backend,
     available,
-    can_run,
-    contact_of,
     distance,
     disturbed,
     largest_jump,
@@ -29,17 +29,12 @@ from bench.conformance.subjects import (
     sound_laws,
     title,
 )
-from bench.contracts import (
-    ImpulseLaw,
-    MechanicalScene,
-    Scene,
-)
-from bench.program import Program
+from bench.model import ContactScene, EngineScene, ImpulseLaw, MechanicalScene, Program, Scene, compose
 
 
 @verifies(Scene)
 def theta_and_noise_are_declared(scene: Scene) -> str:
-    """theta0 is a finite vector, sigma positive, noise one of the two models, breakpoints in order."""
+    """Verify that theta0 is a finite vector, noise is one of the two models, breakpoints are in order."""
     theta = scene.theta0()
     require(isinstance(theta, np.ndarray) and theta.ndim == 1 and theta.size, "theta0 must be a vector (d,)")
     require(theta.dtype == np.float64 and np.isfinite(theta).all(), "theta0 must be finite and of type float64")
@@ -55,49 +50,49 @@ def theta_and_noise_are_declared(scene: Scene) -> str:
 
 @verifies(Scene)
 def costs_are_finite(scene: Scene) -> str:
-    """Costs are ``(B,)`` and finite, and each depends on its own column, under every contact law."""
-    found = programs(scene)
-    for program in found:
+    """Verify that costs are ``(B,)`` and finite, and depend only on their own column, under every contact law."""
+    subjects = programs(scene)
+    for program in subjects:
         (theta, w), problem = samples(program), able_backend(program).compile(program)
         cost = problem.value(theta, w)
         require(cost.shape == (COLUMNS,), f"{title(program)}: shape {cost.shape}, not {(COLUMNS,)}")
         require(np.isfinite(cost).all(), f"{title(program)}: {(~np.isfinite(cost)).sum()} costs are not finite")
         other = problem.value(*disturbed(theta, w))
         kept = np.arange(COLUMNS) != 2
-        # 1e-12: vectorised functions may round differently from one batch to the next
-        require(distance(other[kept], cost[kept]) < 1e-12, f"{title(program)}: a column changes the cost of others")
-    return f"{cost.mean():.4g} on average, {len(found)} programs"
+        off = distance(other[kept], cost[kept])
+        require(off < ROUNDED, f"{title(program)}: a column changes the cost of others")
+    return f"{cost.mean():.4g} on average, {len(subjects)} programs"
 
 
 @verifies(Scene)
 def noise_is_where_declared(scene: Scene) -> str:
-    """Costs at (theta, w) are those at (theta + sigma w, 0), but for action noise under a policy."""
+    """Verify that costs at (theta, w) are those at (theta + sigma w, 0), except for action noise under a policy."""
     program = programs(scene)[0]
     if not program.noise_on_theta:
         raise Skipped("its noise is on the actions of a policy")
     require(program.n_noise == program.dim, f"{program.n_noise} normal numbers for {program.dim} components of theta")
     (theta, w), problem = samples(program), able_backend(program).compile(program)
     off = distance(problem.value(theta + scene.sigma * w, 0 * w), problem.value(theta, w))
-    require(off < 1e-9, f"noise w and a step of sigma w in theta differ by {off:.1e}: theta is not the controls")
+    require(off < SAME, f"noise w and a step of sigma w in theta differ by {off:.1e}: theta is not the controls")
     return f"on theta, to {off:.0e}"
 
 
 @verifies(Scene)
 def backends_agree(scene: Scene) -> str:
-    """Every available backend gives the same cost, to 1e-9, under every contact law it can run.
+    """Verify that every available backend gives the same cost under every contact law it can run.
 
-    Backends with physics of their own are held to what the scene says of its twin, in their own checks.
+    Backends with physics of their own have their own checks, with the tolerance that the scene declares for its twin.
     """
-    if isinstance(scene, MechanicalScene) and scene.needs_physics:
-        raise Skipped("runs in physics engines alone")
+    if isinstance(scene, EngineScene):
+        raise Skipped("runs in physics engines only")
     worst, names = 0.0, set()
     for program in programs(scene):
         theta, w = samples(program)
         expected = able_backend(program).compile(program).value(theta, w)
         for backend in (plugin() for plugin in available("backends")):
-            if can_run(backend, program) and "physics" not in backend.provides:
+            if "physics" not in backend.provides and backend.lacks(program) is None:
                 off = distance(backend.compile(program).value(theta, w), expected)
-                require(off < 1e-9, f"{title(program)}: {backend.name} differs by {off:.1e}")
+                require(off < SAME, f"{title(program)}: {backend.name} differs by {off:.1e}")
                 worst = max(worst, off)
                 names.add(backend.name)
     return f"{', '.join(sorted(names))} to {worst:.0e}"
@@ -105,9 +100,9 @@ def backends_agree(scene: Scene) -> str:
 
 @verifies(Scene)
 def continuity_is_as_declared(scene: Scene) -> str:
-    """Along lines through theta0: no jump if ``continuous`` (under a continuous law), one if not."""
-    found = [p for p in programs(scene) if p.contact is None or p.contact.continuous]
-    runs = [p for p in found if can_run(plain_backend(), p)] or found
+    """Verify jumps along lines through theta0: none if ``continuous`` (under a continuous law), one if not."""
+    subjects = [p for p in programs(scene) if p.contact is None or p.contact.continuous]
+    runs = [p for p in subjects if plain_backend().lacks(p) is None] or subjects
     if not runs:
         raise Skipped("no continuous contact law is available")
     jump = largest_jump(runs[0], lines=2)
@@ -120,11 +115,11 @@ def continuity_is_as_declared(scene: Scene) -> str:
 
 @verifies(Scene)
 def closed_form_is_right(scene: Scene) -> str:
-    """Against long sampling, for every law and integrator it is given for, at the default sigma and twice that."""
+    """Verify the closed form against long sampling, for every law and integrator, at the default sigma and twice it."""
     worst, count = 0.0, 0
     for sigma in (scene.sigma, 2 * scene.sigma):
         for program in _all_combinations(dataclasses.replace(scene, sigma=sigma)):
-            closed = program.scene.closed_form_gradient(program.contact, program.integrator)
+            closed = program.closed_form_gradient()
             if closed is None:
                 continue
             shape = np.shape(closed)
@@ -142,17 +137,17 @@ def closed_form_is_right(scene: Scene) -> str:
 
 def _all_combinations(scene: Scene) -> Iterator[Program]:
     if not isinstance(scene, MechanicalScene):
-        yield Program(scene, None, None)
+        yield compose(scene)
         return
     laws = [law_for(scene, law) for law in sound_laws()] if scene.n_contacts else [None]
     for law, integrator in itertools.product(laws, available("integrators")):
         if not isinstance(law, ImpulseLaw) or integrator.takes_impulses:
-            yield Program(scene, law, integrator())
+            yield compose(scene, law, integrator())
 
 
 def _sampled_gradient(program: Program) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard error of first-order terms where the program is continuous, of antithetic zeroth-order ones if not."""
-    problem, theta = able_backend(program).compile(program), program.scene.theta0()
+    """Return mean and standard error of first-order terms if the program is continuous, else of zeroth-order ones."""
+    problem, theta = able_backend(program).compile(program), program.theta0
     w = rng("closed form").standard_normal((program.n_noise, 1 << 14))
     if program.continuous:
         terms = problem.grad(theta, w)
@@ -163,7 +158,7 @@ def _sampled_gradient(program: Program) -> tuple[np.ndarray, np.ndarray]:
 
 @verifies(Scene)
 def physical_gradient_is_finite(scene: Scene) -> str:
-    """Shape ``(d,)`` and finite, where there is one."""
+    """Verify that the physical gradient has shape ``(d,)`` and is finite, where there is one."""
     gradient = scene.physical_gradient()
     if gradient is None:
         raise Skipped("has none")
@@ -173,12 +168,20 @@ def physical_gradient_is_finite(scene: Scene) -> str:
 
 
 @verifies(MechanicalScene)
-def contact_geometry_is_consistent(scene: MechanicalScene) -> str:
-    """gap_rate is the derivative of gap along the motion; forces act linearly and push bodies apart."""
-    if not scene.n_contacts:
-        raise Skipped("has no contacts")
-    if scene.needs_physics:
-        raise Skipped("its geometry is a physics engine's")
+def state_has_declared_size(scene: MechanicalScene) -> str:
+    """Verify that the initial state is ``q (n_q, B)`` and ``v (n_v, B)``."""
+    require(hasattr(scene, "n_q"), "does not say the length of q: set the class variable n_q")
+    state = scene.initial_state(np, scene.theta0()[:, None])
+    n_v = scene.n_q if scene.n_v is None else scene.n_v
+    require(state.q.shape == (scene.n_q, 1), f"n_q = {scene.n_q}, but q has shape {state.q.shape} for one column")
+    require(state.v.shape == (n_v, 1), f"v should have length {n_v}, but has shape {state.v.shape} for one column")
+    return f"n_q = {scene.n_q}, n_v = {n_v}"
+
+
+@verifies(ContactScene)
+def contact_geometry_is_consistent(scene: ContactScene) -> str:
+    """Verify that gap_rate is the derivative of gap along the motion, and forces act linearly and push bodies apart."""
+    require(scene.n_contacts > 0, "n_contacts is 0: a ContactScene sets it to the number of its gaps")
     draw = rng("geometry")
     start = scene.initial_state(np, scene.theta0()[:, None])
     q = start.q + 0.1 * draw.standard_normal((scene.n_q, COLUMNS))
@@ -186,11 +189,12 @@ def contact_geometry_is_consistent(scene: MechanicalScene) -> str:
     shape = (scene.n_contacts, COLUMNS)
     require(scene.gap(np, q).shape == shape, f"gap has shape {scene.gap(np, q).shape}, not {shape}")
     off = distance(scene.gap_rate(np, q, v), (scene.gap(np, q + 1e-6 * v) - scene.gap(np, q - 1e-6 * v)) / 2e-6)
+    # 1e-6: central differences of step 1e-6 of a smooth gap leave 1e-10 by rounding, 1e-12 by truncation
     require(off < 1e-6, f"gap_rate differs from the derivative of gap by {off:.1e}")
     a, b = draw.uniform(0.0, 1.0, (2, *shape))
     pushed, parts = scene.contact_acceleration(np, q, a + 2 * b), [scene.contact_acceleration(np, q, f) for f in (a, b)]
     require(pushed.shape == v.shape, f"contact_acceleration has shape {pushed.shape}, not {v.shape}")
-    require(distance(pushed, parts[0] + 2 * parts[1]) < 1e-12, "contact_acceleration is not linear in the force")
-    response = contact_of(scene).response(np, q)
+    require(distance(pushed, parts[0] + 2 * parts[1]) < ROUNDED, "contact_acceleration is not linear in the force")
+    response = scene.contact(np).response(np, q)
     require((response > 0).all(), f"a force of 1 N changes its own gap by {response.min():.3g} m/s^2: it pulls")
     return f"response {response.min():.3g} to {response.max():.3g} per kg"

@@ -18,7 +18,7 @@ from bench.report.style import inches, plain, quantity, wrapped
 from bench.report.views import CATEGORIES, Family
 
 WIDTH, NARROW = 7.16, 3.5
-"""Inches of two columns of a paper and of one, which holds a lone panel: fonts are printed at the size given."""
+"""Inches of two columns of a paper and of one (for a single panel): fonts are printed at the size given."""
 LINE = 0.16
 """Inches of a line of text."""
 BOLD = 1.25
@@ -27,7 +27,7 @@ PLACES: Any = ("upper center", "lower center")
 
 
 def columns(count: int, most: int) -> int:
-    """How many panels to put beside each other, at most ``most``, for rows that are filled evenly."""
+    """Return how many panels to put side by side, at most ``most``, so that rows are filled evenly."""
     return math.ceil(count / math.ceil(count / most))
 
 
@@ -41,7 +41,7 @@ def page(
     legends: Sequence[Sequence[Any]],
     sharey: bool = False,
 ) -> tuple[Figure, list[list[Axes]]]:
-    """A figure and the panels of each problem: one for each of ``labels``, below each other, ``height`` inches in all."""
+    """Make a figure and the panels of each problem, one per label below each other, ``height`` inches in all."""
     width = WIDTH if across > 1 else NARROW
     titles = _panel_titles(problems, 0.86 * width / across)
     blocks = math.ceil(len(problems) / across)
@@ -64,7 +64,7 @@ def page(
 
 
 def _panels(grid: np.ndarray, titles: Sequence[str], labels: Sequence[str]) -> list[list[Axes]]:
-    """The panels of each problem, titled; the others are removed."""
+    """Return the panels of each problem, titled; remove the others."""
     blocks = grid.reshape(-1, len(labels), grid.shape[1]).swapaxes(1, 2)
     panels = blocks.reshape(-1, len(labels)).tolist()
     for spare in panels[len(titles) :]:
@@ -79,7 +79,7 @@ def _panels(grid: np.ndarray, titles: Sequence[str], labels: Sequence[str]) -> l
 
 
 def _legend_columns(entries: Sequence[Any], width: float) -> int:
-    """The most columns in which legend entries fit ``width`` inches; they fill column after column."""
+    """Return the most columns in which legend entries fit ``width`` inches; entries fill column after column."""
     lengths = np.array([0.6 + inches(entry.get_label()) for entry in entries])
     for count in range(len(lengths), 1, -1):
         if sum(column.max() for column in np.array_split(lengths, count)) <= width:
@@ -88,7 +88,7 @@ def _legend_columns(entries: Sequence[Any], width: float) -> int:
 
 
 def _legends(figure: SubFigure, legends: Iterable[Sequence[Any]], counts: Iterable[int]) -> None:
-    """Legends at the upper and the lower edge of a figure."""
+    """Draw legends at the upper and the lower edge of a figure."""
     for entries, count, place, anchor in zip(legends, counts, PLACES, (1, 0), strict=True):
         if entries:
             figure.legend(
@@ -98,7 +98,7 @@ def _legends(figure: SubFigure, legends: Iterable[Sequence[Any]], counts: Iterab
 
 
 def _panel_titles(problems: Sequence[Family], width: float) -> list[str]:
-    """What tells problems apart, all broken before their numbers where one of them is too long for a line."""
+    """Return titles that distinguish problems, all broken before their numbers if one is too long for a line."""
     parts = [_title(problem) for problem in problems]
     if all(inches(", ".join(kinds + numbers)) <= width for kinds, numbers in parts):
         return [", ".join(kinds + numbers) for kinds, numbers in parts]
@@ -106,7 +106,7 @@ def _panel_titles(problems: Sequence[Family], width: float) -> list[str]:
 
 
 def _title(problem: Family) -> tuple[list[str], list[str]]:
-    """The scene, contact law and the like of a problem, and its numbers."""
+    """Return a problem's scene, contact law and the like, and its numbers."""
     kinds = [plain(str(value)) for name, value in problem.identity.items() if name in CATEGORIES]
     numbers = [quantity(name, value) for name, value in problem.identity.items() if name not in CATEGORIES]
     if not (problem.rows["reference_norm"] > 0).any():
@@ -115,13 +115,13 @@ def _title(problem: Family) -> tuple[list[str], list[str]]:
 
 
 def shared(problems: Sequence[Family], axis: str) -> list[str]:
-    """What panels have in common and their titles leave out."""
+    """Return what panels have in common and therefore leave out of their titles."""
     rows = pd.concat([problem.rows for problem in problems])
-    told = {axis, *(name for problem in problems for name in problem.identity)}
+    named = {axis, *(name for problem in problems for name in problem.identity)}
     parts = []
     for name in ("scene", "contact", "stiffness", "sigma", "horizon", "samples", "repeats"):
         values = rows[name].unique()
-        if name in told or len(values) > 1 or values[0] in ("none", 0.0) or pd.isna(values[0]):
+        if name in named or len(values) > 1 or values[0] in ("none", 0.0) or pd.isna(values[0]):
             continue
         parts.append(plain(values[0]) if name in CATEGORIES else quantity(name, values[0]))
     return parts

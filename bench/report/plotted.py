@@ -1,4 +1,4 @@
-"""The data of a figure as a table, read from what is drawn: exactly the plotted values."""
+"""Reads the data of a figure back as a table: exactly the plotted values, wherever they are drawn on paper."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from matplotlib.colors import to_hex
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+
+from bench.report.scales import in_data
 
 COLUMNS = [
     "panel",
@@ -31,29 +33,30 @@ COLUMNS = [
     "text",
 ]
 HOLLOW = "#ffffff"
-"""The face of markers at upper limits."""
+"""The face colour of markers at upper limits."""
 SIGNS: dict[Any, str] = {"|": "tick", "x": "cross"}
 
 
 def plotted(figure: Figure) -> pd.DataFrame:
-    """A line per point of a figure, with its interval; also bands, vertex by vertex, and texts at places of the data.
+    """Return a line per point of a figure, with its interval; also bands, vertex by vertex, and texts in the data.
 
-    ``mark`` is ``point``, ``limit`` (an upper limit), ``tick``, ``cross``, ``line`` (a corner of a line without markers), ``band`` or ``text``.
+    ``mark`` is ``point``, ``limit`` (an upper limit), ``tick``, ``cross``, ``line`` (a corner of a line without
+    markers), ``band`` or ``text``.
     """
     rows = []
     for number, axes in enumerate(figure.axes):
-        told = {"panel": number, "title": _title(axes), "x_label": axes.get_xlabel(), "y_label": _y_label(axes)}
-        rows += [told | row for row in (*_points(axes), *_bands(axes), *_texts(axes))]
+        common = {"panel": number, "title": _title(axes), "x_label": axes.get_xlabel(), "y_label": _y_label(axes)}
+        rows += [common | row for row in (*_points(axes), *_bands(axes), *_texts(axes))]
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def _points(axes: Axes) -> Iterator[dict[str, Any]]:
-    """The points of all lines; one without a label belongs to the last labelled one of its colour before it, or the first."""
+    """Yield the points of all lines; an unlabelled line belongs to the last labelled one of its colour or the first."""
     bars = _intervals(axes)
-    drawn = [line for line in axes.lines if line.get_transform() == axes.transData]
+    drawn = [line for line in axes.lines if in_data(axes, line)]
     named = {line: label for line in drawn if (label := _label(axes, line))}
     labels = {to_hex(line.get_color()): label for line, label in reversed(named.items())}
-    seen: dict[tuple[str, float, float], dict[str, Any]] = {}
+    seen: dict[tuple[str, int, float, float], dict[str, Any]] = {}
     for line in drawn:
         colour = to_hex(line.get_color())
         labels[colour] = named.get(line, labels.get(colour, ""))
@@ -62,15 +65,20 @@ def _points(axes: Axes) -> Iterator[dict[str, Any]]:
             if not np.isfinite([x, y]).all():
                 continue
             row = {"series": series, "mark": _mark(line), "x": x, "y": y}
-            known = seen.setdefault((series, x, y), row)
-            if known["mark"] == "line":
-                known["mark"] = row["mark"]
-            known |= bars.get((colour, x, y), {})
+            point = seen.setdefault((series, _place(line), x, y), row)
+            if point["mark"] == "line":
+                point["mark"] = row["mark"]
+            point |= bars.get((colour, _place(line), x, y), {})
     yield from seen.values()
 
 
+def _place(line: Line2D) -> int:
+    """Return what distinguishes lines drawn beside each other, each with a transform of its own."""
+    return id(line.get_transform())
+
+
 def _label(axes: Axes, line: Line2D) -> str:
-    """The label of a line, or of the error bars that it is a part of; nothing where it has none."""
+    """Return the label of a line, or of the error bars it belongs to; nothing where it has none."""
     owners = [c for c in axes.containers if isinstance(c, ErrorbarContainer) and c.lines[0] is line]
     texts = [str(line.get_label()), *(str(owner.get_label()) for owner in owners)]
     return next((text for text in texts if not text.startswith("_") and text != "None"), "")
@@ -85,9 +93,9 @@ def _mark(line: Line2D) -> str:
     return "limit" if face not in ("none", "auto") and to_hex(face) == HOLLOW else "point"
 
 
-def _intervals(axes: Axes) -> dict[tuple[str, float, float], dict[str, float]]:
-    """The ends of error bars by the colour and place of their points."""
-    found: dict[tuple[str, float, float], dict[str, float]] = {}
+def _intervals(axes: Axes) -> dict[tuple[str, int, float, float], dict[str, float]]:
+    """Return the ends of error bars by the colour and place of their points."""
+    intervals: dict[tuple[str, int, float, float], dict[str, float]] = {}
     for container in axes.containers:
         if not isinstance(container, ErrorbarContainer) or container.lines[0] is None:
             continue
@@ -98,13 +106,13 @@ def _intervals(axes: Axes) -> dict[tuple[str, float, float], dict[str, float]]:
             assert isinstance(collection, LineCollection)
             for (x, y), segment in zip(points, collection.get_segments(), strict=False):
                 ends = np.asarray(segment)[:, 0 if kind == "x" else 1]
-                place = found.setdefault((to_hex(line.get_color()), x, y), {})
+                place = intervals.setdefault((to_hex(line.get_color()), _place(line), x, y), {})
                 place |= {f"{kind}_low": float(ends.min()), f"{kind}_high": float(ends.max())}
-    return found
+    return intervals
 
 
 def _bands(axes: Axes) -> Iterator[dict[str, Any]]:
-    """Corners of filled areas between curves."""
+    """Yield the corners of filled areas between curves."""
     for area in axes.collections:
         if isinstance(area, PolyCollection) and area.get_transform().contains_branch(axes.transData):
             for path in area.get_paths():
@@ -113,7 +121,7 @@ def _bands(axes: Axes) -> Iterator[dict[str, Any]]:
 
 
 def _texts(axes: Axes) -> Iterator[dict[str, Any]]:
-    """Texts that stand at a place of the data: letters of a map."""
+    """Yield texts at a place of the data: the letters of a map."""
     for text in axes.texts:
         if text.get_transform() == axes.transData and text.get_text():
             x, y = text.get_position()
@@ -121,12 +129,12 @@ def _texts(axes: Axes) -> Iterator[dict[str, Any]]:
 
 
 def _title(axes: Axes) -> str:
-    """The panel's title, or that of the panel above it."""
+    """Return the panel's title, or that of the panel above it."""
     return " ".join(_nearest(axes, "title").split())
 
 
 def _y_label(axes: Axes) -> str:
-    """The label of the y axis, or that of the panel to the left."""
+    """Return the label of the y axis, or that of the panel to the left."""
     return re.sub(r"\s+", " ", _nearest(axes, "label"))
 
 
@@ -137,7 +145,7 @@ def _nearest(axes: Axes, what: str) -> str:
     spec = axes.get_subplotspec()
     if text(axes) or spec is None or axes.figure is None:
         return text(axes)
-    found = []
+    candidates = []
     for other in axes.figure.axes:
         place = other.get_subplotspec()
         if place is None or place.get_gridspec() is not spec.get_gridspec() or not text(other):
@@ -146,5 +154,5 @@ def _nearest(axes: Axes, what: str) -> str:
         across = spec.colspan.start - place.colspan.start
         apart, aside = (down, across) if what == "title" else (across, down)
         if apart > 0 and aside == 0:
-            found.append((apart, text(other)))
-    return min(found)[1] if found else ""
+            candidates.append((apart, text(other)))
+    return min(candidates)[1] if candidates else ""

@@ -1,57 +1,136 @@
-"""The command that runs one cell again, by itself."""
+"""Gives the command that runs one cell again by itself, from its row."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from bench.contracts import MechanicalScene, Plugin
 from bench.errors import UserError
-from bench.grid import Cell, Experiment, cells, changed
-from bench.registry import identity
-from bench.store import IDENTITY
+from bench.model import Decision, MechanicalScene, Plugin, registry
+from bench.model.identity import changed, identity
+from bench.model.parameters import build
+from bench.sweep.axes import NOT_PARTS, parsed
+from bench.sweep.cell import Cell
+from bench.sweep.experiment import Budget, Experiment
+from bench.sweep.grid import COUNTS
+from bench.sweep.study import Study
 
 HEAD = "python -m bench name=one_cell"
 
 
-def words(cell: Cell, experiment: Experiment) -> list[str]:
-    """What follows :data:`HEAD`, quoted for a shell; the cell has the same key under it and so the same numbers."""
-    given = dict(cell.scene.contact_values) if isinstance(cell.scene, MechanicalScene) else {}
-    parts = [f"study={cell.study}"]
-    for part in cell.parts:
-        if part is not None:
-            parts.append(f"{part.kind}=[{_identity(part, given if part is cell.contact else {})}]")
-    parts += [f"{name}={getattr(cell, name)}" for name in ("samples", "repeats", "seed")]
-    for name in ("samples", "tolerance"):
-        value = getattr(experiment, f"reference_{name}")
-        if value != getattr(Experiment, f"reference_{name}"):
-            parts.append(f"reference.{name}={value}")
-    return [shlex.quote(part) for part in parts]
-
-
-def _identity(plugin: Plugin, given: Mapping[str, Any]) -> str:
-    return identity(plugin.name, changed(plugin, given))
-
-
 def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
-    """Of each row the words that run its cell; none where the experiment, as it is configured now, has no such cell."""
-    try:
-        known = cells(experiment)
-    except UserError:
-        return [[] for _ in range(len(rows))]
-    by_key = {cell.key: cell for cell in known}
-    by_identity: dict[tuple[str, ...], Cell] = {}
-    if not set(rows["key"]) <= set(by_key):
-        by_identity = {_named(cell.columns()): cell for cell in known}
-    found = []
-    for row in rows[["key", *IDENTITY]].to_dict("records"):
-        cell = by_key.get(row["key"]) or by_identity.get(_named(row))
-        found.append([] if cell is None else words(cell, experiment))
-    return found
+    """Return each row's words after :data:`HEAD`, quoted for a shell; none if one of its plugins is not installed."""
+    folders = plugin_folders(experiment.plugins)
+    revive = Reviver()
+    lines: list[list[str]] = []
+    for given, row in zip(parsed(rows), rows[["key", *COUNTS]].to_dict("records"), strict=True):
+        try:
+            cell = revive.cell(given, row, experiment.timing)
+        except (UserError, KeyError):
+            lines.append([])
+        else:
+            lines.append([shlex.quote(word) for word in [*folders, *words(cell)]])
+    return lines
 
 
-def _named(columns: Mapping[Any, Any]) -> tuple[str, ...]:
-    return tuple(value if isinstance(value, str) else f"{value:g}" for value in (columns[name] for name in IDENTITY))
+class Reviver:
+    """Makes cells from rows, building each plugin once."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, Plugin] = {}
+
+    def cell(self, given: Mapping[str, Any], row: Mapping[Any, Any], timing: bool) -> Cell:
+        """Make the cell of a row's parameters and counts; raises :class:`UserError` if a plugin is not installed.
+
+        The parameters do not say whether the cell was timed, but its key does; ``timing`` is used if no key matches
+        today's.
+        """
+        study = self._plugin("study", given["study"])
+        assert study is not None
+        theta, budget = given["theta"], given["reference"]
+        cell = Cell(
+            {axis: self._plugin(axis, part) for axis, part in given.items() if axis not in NOT_PARTS},
+            **{name: int(row[name]) for name in COUNTS},
+            study=study,
+            decision=Decision()
+            if theta is None
+            else Decision(tuple(theta["names"]), theta["at"] and tuple(theta["at"])),
+            timing=timing,
+            budget=None if budget is None else Budget(**budget),
+        )
+        other = dataclasses.replace(cell, timing=not timing)
+        return other if other.key == row["key"] else cell
+
+    def _plugin(self, axis: str, part: Mapping[str, Any] | None) -> Plugin | None:
+        if part is None:
+            return None
+        text = json.dumps([axis, part])
+        if text not in self._known:
+            values = {name: value for name, value in part.items() if name != "name"}
+            self._known[text] = build(registry.usable(registry.kind_of(axis), part["name"]), values)
+        return self._known[text]
+
+
+def words(cell: Cell) -> list[str]:
+    """Return the settings under which one cell, with the same key, is a whole experiment."""
+    parts = [f"study={_identity(cell.study)}", *plugins(cell)]
+    parts += [f"{name}={getattr(cell, name)}" for name in ("samples", "repeats", "seed")]
+    parts += decided(cell)
+    if cell.budget is not None:
+        default = Budget()
+        for name in ("samples", "tolerance"):
+            if getattr(cell.budget, name) != getattr(default, name):
+                parts.append(f"reference.{name}={getattr(cell.budget, name)!r}")
+    if isinstance(cell.study, Study) and cell.timing != cell.study.timed:
+        parts.append(f"timing={str(cell.timing).lower()}")
+    return parts
+
+
+def plugins(cell: Cell, without: Collection[str] = ()) -> list[str]:
+    """Return a setting for the plugin on each axis, ``contacts=[penalty[stiffness=100]]``, except axes ``without``.
+
+    Parameters at their defaults are left out; the scene's contact values count as the defaults of its contact law.
+    """
+    given = dict(cell.scene.contact_values) if isinstance(cell.scene, MechanicalScene) else {}
+    return [
+        f"{part.kind}=[{_identity(part, given if axis == 'contact' else {})}]"
+        for axis, part in cell.parts.items()
+        if part is not None and axis not in without
+    ]
+
+
+def decided(cell: Cell) -> list[str]:
+    """Return the settings for theta and the point of the gradients, if they are not the scene's own."""
+    names, at = cell.decision.names, cell.decision.at
+    return [f"theta=[{','.join(names)}]"] * bool(names) + (
+        [] if at is None else [f"theta0=[{','.join(map(repr, at))}]"]
+    )
+
+
+def plugin_folders(folders: Sequence[Path]) -> list[str]:
+    """Return the setting that names folders of plugins, if there are any."""
+    return [f"plugins=[{','.join(repr(str(folder)) for folder in folders)}]"] if folders else []
+
+
+def check_of(cell: Cell) -> str:
+    """Return a shell command that repeats a cell's gradient checks: ``gradcheck SCENE``, and non-default settings.
+
+    The cell's horizon replaces the sweep that ``gradcheck`` makes. Counts and estimator are left out: no check depends
+    on them.
+    """
+    scene, line = _identity(cell.scene), []
+    if isinstance(cell.scene, MechanicalScene):
+        scene, line = _identity(cell.scene, {"horizon": cell.scene.horizon}), [f"sweep.horizon=[{cell.scene.horizon}]"]
+    study = [f"study={_identity(cell.study)}"] * bool(changed(cell.study))
+    line += [*plugins(cell, without=("scene", "estimator")), f"seed={cell.seed}", *decided(cell), *study]
+    return shlex.join(["python", "-m", "bench", "gradcheck", scene, *line])
+
+
+def _identity(plugin: Plugin, given: Mapping[str, Any] | None = None) -> str:
+    return identity(plugin.name, changed(plugin, given))

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from matplotlib.transforms import Affine2D, Transform, blended_transform_factory
 
 from bench.report.style import MARKS, SHADE
-from bench.report.views import axis_value
+from bench.report.text import axis_value
 
 TICKS = (
     (1, (1, 1.5, 2, 3, 5, 7)), (1, (1, 2, 5)), (1, (1, 3)), (1, (1,)), (2, (1,)), (3, (1,)), (4, (1,)), (6, (1,)), (10, (1,))
@@ -20,20 +21,33 @@ TICKS = (
 
 
 def logarithmic(values: np.ndarray) -> bool:
-    """Whether the values of a swept axis ask for a logarithmic scale."""
+    """Return whether the values of a swept axis ask for a logarithmic scale."""
     return bool(values.min() > 0 and values.max() >= 8 * values.min())
 
 
-def shifts(values: np.ndarray, count: int, columns: int) -> list[Callable[[np.ndarray], np.ndarray]]:
-    """Moves the points of each of ``count`` lines sideways by a part of the smallest step, so that none hide others."""
+def shifts(values: np.ndarray, count: int, columns: int) -> list[Affine2D]:
+    """Return sideways shifts for ``count`` lines by a part of the smallest step, so that no points hide others.
+
+    They go before a panel's own transform, so that points move on paper while their data stay the same.
+    """
     positions = np.log10(values) if logarithmic(values) else values
     step = min(0.4 * np.diff(positions).min(), 0.003 * columns * count * np.ptp(positions)) / max(count, 2)
     offsets = step * (np.arange(count) - (count - 1) / 2)
-    return [partial(np.multiply, 10**o) if logarithmic(values) else partial(np.add, o) for o in offsets]
+    return [Affine2D().scale(10**o, 1) if logarithmic(values) else Affine2D().translate(o, 0) for o in offsets]
+
+
+def in_data(panel: Axes, artist: Line2D) -> bool:
+    """Return whether both coordinates of an artist are data, drawn at their place or moved from it."""
+    return bool(artist.get_transform().contains_branch(panel.transData))
+
+
+def above(panel: Axes, place: Transform) -> Transform:
+    """Return a transform: across, data as ``place`` puts them; upwards, 0 to 1 from the panel's lower to upper edge."""
+    return blended_transform_factory(place, panel.transAxes)
 
 
 def scale_x(panel: Axes, values: np.ndarray) -> None:
-    """The scale of a swept axis, labelled at its values where they are few."""
+    """Set the scale of a swept axis, labelled at its values if they are few."""
     if logarithmic(values):
         margin = (values.max() / values.min()) ** 0.07
         log_axis(panel, "x", values.min() / margin, values.max() * margin, values if len(values) <= 6 else ())
@@ -44,7 +58,7 @@ def scale_x(panel: Axes, values: np.ndarray) -> None:
 
 
 def scale_y(panels: Sequence[Axes]) -> None:
-    """One logarithmic scale for panels, with room for crosses, and shade where the error exceeds the gradient."""
+    """Set one logarithmic scale for panels, with room for crosses, and shade where the error exceeds the gradient."""
     low, high = extent(panels, "y", 0.3, 3.0)
     margin = (high / low) ** 0.12
     for panel in panels:
@@ -62,7 +76,7 @@ def log_axis(
     wanted: Sequence[float] | np.ndarray = (),
     text: Callable[[float], str] | None = None,
 ) -> None:
-    """A logarithmic axis from ``low`` to ``high`` with few labels: ``wanted`` ones if near each other, or round ones."""
+    """Set a logarithmic axis from ``low`` to ``high`` with few labels: ``wanted`` ones if close, or round ones."""
     axis = panel.xaxis if which == "x" else panel.yaxis
     getattr(panel, f"set_{which}scale")("log")
     getattr(panel, f"set_{which}lim")(low, high)
@@ -93,10 +107,10 @@ def _power(value: float) -> str:
 
 
 def extent(panels: Iterable[Axes], which: str, low: float, high: float) -> tuple[float, float]:
-    """The range of the points drawn in panels, widened to contain ``low`` to ``high``."""
+    """Return the range of the points drawn in panels, widened to contain ``low`` to ``high``."""
     for panel in panels:
         for line in panel.lines:
-            if line.get_transform() == panel.transData:
+            if in_data(panel, line):
                 data = np.asarray(line.get_xdata() if which == "x" else line.get_ydata(), dtype=float)
                 data = data[np.isfinite(data) & (data > 0)]
                 low, high = min([low, *data]), max([high, *data])
@@ -104,7 +118,7 @@ def extent(panels: Iterable[Axes], which: str, low: float, high: float) -> tuple
 
 
 def mark_values(panel: Axes, marks: Mapping[str, float]) -> None:
-    """Lines at named values of the horizontal axis that are in sight."""
+    """Draw lines at those named values of the horizontal axis that are in sight."""
     low, high = panel.get_xlim()
     for value, dashes in zip(marks.values(), MARKS * len(marks), strict=False):
         if low < value < high:

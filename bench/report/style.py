@@ -1,4 +1,4 @@
-"""What things look like in every chart: colours, markers, line styles, and names and numbers as printed."""
+"""The look of every chart: colours, markers, line styles, and names and numbers as printed."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from typing import Any
 
 import pandas as pd
 
-from bench.report.views import UNITS, Line, axis_value, short_axis
+from bench.report.text import axis_value
+from bench.report.views import Line
+from bench.sweep.axes import Axis
+from bench.sweep.columns import COMMON
 
 PALETTE = ("#0072B2", "#000000", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000")
-"""Colours told apart by colour-blind readers (Okabe and Ito, yellow replaced by brown for white paper)."""
+"""Colours that colour-blind readers can distinguish (Okabe and Ito, yellow replaced by brown for white paper)."""
 MARKERS = "osD^vPX*"
 VARIANTS = ("-", (0, (4, 1.5)), (0, (1, 1.2)))
 """Line styles of one estimator's parameter variants."""
@@ -43,15 +46,20 @@ SYMBOLS = {
     "sigma": r"$\sigma$",
     "samples": "$N$",
     "repeats": "$R$",
-    "beta": r"$\beta$",
-    "kappa": r"$\kappa$",
 }
-WORDS = {"dt": "time step", "sigma": "noise", "beta": "sharpness", "kappa": "central-path"}
-"""What an axis is called before its symbol, where not by its parameter's name."""
+GREEK = ("alpha", "beta", "gamma", "delta", "kappa", "lambda", "mu", "nu", "rho", "tau")
+"""Parameters whose names are letters, printed as such."""
+
+WORDS = {"dt": "time step", "sigma": "noise"}
+"""Words for an axis before its symbol, where they differ from its parameter's name."""
 
 
 class Look:
-    """The colour, marker and line style of every estimator and backend, the same in all charts."""
+    """The colour, marker and line style of every estimator and backend, the same in all charts.
+
+    ``names`` are all registered estimators, so that an estimator looks the same whatever else is drawn. Beyond the
+    palette's length, colours repeat with another marker, and darker.
+    """
 
     def __init__(self, rows: pd.DataFrame, names: Sequence[str]) -> None:
         self._names = [*names, *sorted(set(rows["estimator"]) - set(names))]
@@ -59,61 +67,84 @@ class Look:
         self._backends = list(dict.fromkeys(rows["backend"]))
 
     def line(self, line: Line) -> dict[str, Any]:
-        """The colour and line style of an estimator and its parameters."""
-        colour = PALETTE[self._names.index(line.estimator) % len(PALETTE)]
-        return {"color": colour, "linestyle": VARIANTS[self._variant(line) % len(VARIANTS)]}
+        """Return the colour and line style of an estimator and its parameters."""
+        return {
+            "color": colour(self._names.index(line.estimator)),
+            "linestyle": VARIANTS[self._variant(line) % len(VARIANTS)],
+        }
 
     def marked(self, line: Line) -> dict[str, Any]:
-        """The line with the marker of an estimator and its parameters."""
+        """Return the line and the marker of an estimator and its parameters."""
         place = self._names.index(line.estimator)
         marker = MARKERS[(place + place // len(PALETTE) + 3 * self._variant(line)) % len(MARKERS)]
         return {**self.line(line), "marker": marker}
 
     def backend(self, name: str) -> str:
-        """The marker of a backend, in charts that tell backends apart."""
+        """Return the marker of a backend, in charts that distinguish backends."""
         return MARKERS[self._backends.index(name) % len(MARKERS)]
 
     def _variant(self, line: Line) -> int:
-        known = [params for estimator, params in self._variants if estimator == line.estimator]
-        return known.index(line.params) if line.params in known else 0
+        variants = [params for estimator, params in self._variants if estimator == line.estimator]
+        return variants.index(line.params) if line.params in variants else 0
 
 
-def twin(line: Line, found: Sequence[Line]) -> int:
-    """How many lines of the same estimator come before this one, of other backends."""
-    return [other for other in found if other.label == line.label].index(line)
+def colour(place: int) -> str:
+    """Return the colour of a place in a list: the palette, then its hues mixed with black or white, never repeated."""
+    from matplotlib.colors import to_hex, to_rgb
+
+    turn, index = divmod(place, len(PALETTE))
+    if turn == 0:
+        return PALETTE[index]
+    # odd turns darken and even ones lighten, by less and less of the remaining range; black can only lighten
+    share = 0.45 * 0.7 ** ((turn - 1) // 2)
+    end = 1.0 if turn % 2 == 0 or PALETTE[index] == "#000000" else 0.0
+    share = share / 2 if turn % 2 == 0 and PALETTE[index] == "#000000" else share
+    red, green, blue = ((1 - share) * part + share * end for part in to_rgb(PALETTE[index]))
+    return to_hex((red, green, blue))
 
 
-def axis_name(axis: str) -> str:
-    """An axis in words, with its symbol and unit: ``stiffness $k$ [N/m]``."""
-    name = short_axis(axis)
-    unit = f"[{UNITS[name]}]" if name in UNITS else ""
-    return " ".join(filter(None, [WORDS.get(name, plain(name)), SYMBOLS.get(name, ""), unit]))
+def twin(line: Line, lines: Sequence[Line]) -> int:
+    """Return how many lines of the same estimator on other backends come before this one."""
+    return [other for other in lines if other.label == line.label].index(line)
+
+
+def axis_name(axis: Axis) -> str:
+    """Return an axis in words, with its symbol, its unit and what moves with it: ``stiffness $k$ [N/m]``."""
+    unit = f"[{axis.unit}]" if axis.unit else ""
+    name = " ".join(filter(None, [WORDS.get(axis.column, plain(axis.column)), symbol(axis.column), unit]))
+    return name + (f", {' and '.join(map(plain, axis.moves))} with it" if axis.moves else "")
+
+
+def symbol(name: str) -> str:
+    """Return the letter that stands for a quantity in formulas; nothing where there is none."""
+    return SYMBOLS.get(name, rf"$\{name}$" if name in GREEK else "")
 
 
 def quantity(name: str, value: float) -> str:
-    """``$k$ = 1000 N/m``."""
+    """Write a quantity with its value: ``$k$ = 1000 N/m``."""
     text = axis_value(value)
     mantissa, _, power = text.partition("e")
     if power:
         text = f"$10^{{{power}}}$" if mantissa == "1" else rf"${mantissa}\times 10^{{{power}}}$"
-    return f"{SYMBOLS.get(name, plain(name))} = {text}" + (f" {UNITS[name]}" if name in UNITS else "")
+    unit = COMMON[name].unit if name in COMMON else ""
+    return f"{symbol(name) or plain(name)} = {text}" + (f" {unit}" if unit else "")
 
 
 def plain(text: str) -> str:
-    """Text that is not taken for a formula, nor left out of a legend for its underscore."""
+    """Escape text so that it is not taken for a formula, nor left out of a legend for its underscore."""
     text = " ".join(text.split()).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
 
 def inches(text: str) -> float:
-    """The width of a text as printed."""
+    """Return the width of a text as printed."""
     from matplotlib.textpath import TextPath
 
     return float(TextPath((0, 0), text, size=SIZE).get_extents().width / 72) if text.strip() else 0.0
 
 
 def wrapped(parts: Sequence[str], width: float) -> str:
-    """Parts joined by commas, in lines of at most ``width`` inches where a part is not longer."""
+    """Join parts by commas, in lines of at most ``width`` inches unless one part is longer."""
     out = ""
     for part in filter(None, parts):
         last = out.rpartition("\n")[2]

@@ -1,1 +1,1 @@
-"""What executes a program and how it differentiates it."""
+"""Backends: they execute a program and differentiate it."""

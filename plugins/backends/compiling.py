@@ -1,4 +1,4 @@
-"""Compiled JAX functions: each made once in a process, counted, and kept between runs in a folder."""
+"""Compiled JAX functions: each is compiled once per process, counted, and kept between runs in a folder."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from bench.contracts import compilations
+from bench.model import Compilations
 
 _known: dict[tuple[Any, ...], Compiled] = {}
 _busy = threading.Lock()
@@ -17,7 +17,7 @@ _busy = threading.Lock()
 
 @dataclass(frozen=True)
 class Compiled:
-    """An executable, and the seconds of its tracing, lowering and compiling; ``loaded`` from the folder for the last."""
+    """An executable, and the seconds of tracing, lowering and compiling it; ``loaded`` if it came from the folder."""
 
     name: str
     call: Callable[..., Any]
@@ -25,22 +25,35 @@ class Compiled:
     loaded: bool
 
 
-def compiled(key: tuple[Any, ...], function: Callable[..., Any], arguments: tuple[Any, ...], fresh: bool) -> Compiled:
-    """The executable of ``function`` for arguments of such shapes, under a key that tells programs and shapes apart.
+def compiled(
+    key: tuple[Any, ...],
+    function: Callable[..., Any],
+    arguments: tuple[Any, ...],
+    fresh: bool,
+    count: Compilations,
+) -> Compiled:
+    """Return the executable of ``function`` for arguments of these shapes; ``key`` identifies program and shapes.
 
-    With ``fresh`` its seconds are those of a compilation: the folder is not asked, and what came from it is made again.
+    With ``fresh`` its seconds are those of a compilation: the folder of ``count`` is bypassed, and an executable that
+    was loaded from it is compiled again. Compilations and requests are added to ``count``.
     """
+    # one at a time: JAX's cache folder is a setting of the whole process
     with _busy:
         found = _known.get(key)
         if found is None or (fresh and found.loaded):
             name = found.name if found else hashlib.sha256(repr(key).encode()).hexdigest()[:16]
-            found = _known[key] = _compile(name, function, arguments, None if fresh else compilations.folder)
-        compilations.shapes.add(found.name)
+            folder = None if fresh or count.folder is None else str(count.folder)
+            found = _known[key] = _compile(name, function, arguments, folder)
+            count.made += not found.loaded
+        count.shapes.add(found.name)
         return found
 
 
 def _compile(name: str, function: Callable[..., Any], arguments: tuple[Any, ...], folder: str | None) -> Compiled:
-    """Compile, and count it. What libraries make JAX compile on the way, single operations on constants, is in the seconds alone."""
+    """Compile a function and take the time.
+
+    Single operations on constants, which libraries make JAX compile on the way, add to the seconds but are not counted.
+    """
     import jax
 
     _use(folder)
@@ -57,12 +70,11 @@ def _compile(name: str, function: Callable[..., Any], arguments: tuple[Any, ...]
     before = _loaded
     call = lowered.compile(options)
     seconds = (after_trace - started, after_lowering - after_trace, time.perf_counter() - after_lowering)
-    compilations.made += _loaded == before
     return Compiled(name, call, seconds, loaded=_loaded > before)
 
 
 def _use(folder: str | None) -> None:
-    """Keep what is compiled in a folder and take it from there, or neither."""
+    """Keep compiled programs in a folder and load them from there; with None, do neither."""
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
@@ -75,11 +87,11 @@ def _use(folder: str | None) -> None:
 
 _listening = False
 _loaded = 0
-"""Programs that JAX took from the folder."""
+"""Number of programs that JAX loaded from the folder."""
 
 
 def _listen() -> None:
-    """Have JAX say what it takes from the folder."""
+    """Have JAX report each program that it loads from the folder."""
     global _listening
     if _listening:
         return

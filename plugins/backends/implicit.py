@@ -7,13 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bench.contracts import Array, Backend, Ops
-from plugins.backends.jax import Jax, JaxOps
+from bench.model import Array, Backend, Ops
+
+from .jax import Jax, JaxOps
 
 
 @dataclass(frozen=True)
 class Implicit(Jax):
-    """Gradients: reverse mode through the rollout, the implicit-function theorem at each solve; never through the solver.
+    """Gradients: reverse mode through the rollout, implicit-function theorem at each solve, never through the solver.
 
     optimistix finds the root (Newton), lineax solves the linear systems. Programs without an equation to solve run
     as on ``jax``. Float64 or float32; forward mode is not the solver's adjoint and is available all the same.
@@ -25,10 +26,10 @@ class Implicit(Jax):
     reference_rank: ClassVar[int | None] = 1
 
     def ops(self) -> Ops:
-        """JAX operations with a root finder.
+        """Return JAX operations with a root finder.
 
-        Equinox, under optimistix and lineax, is asked to leave a failed solve in the adjoint as it is, not finite in its
-        own column: its other answers, an exception or NaN, would end the whole batch.
+        Equinox, on which optimistix and lineax are built, is set to leave a failed solve in the adjoint as it is, not
+        finite in its own column: its other choices, an exception or NaN, would spoil the whole batch.
         """
         os.environ.setdefault("EQX_ON_ERROR", "off")
         import jax
@@ -41,7 +42,7 @@ class ImplicitOps(JaxOps):
     """JAX operations, and ``root`` through optimistix."""
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Newton's method, each column on its own: one that fails spoils neither values nor gradients of the others.
+        """Solve by Newton's method, each column on its own: a failed one spoils no values or gradients of the others.
 
         Residuals are met to a relative and absolute 1e-12 in the unknown (1e-6 in float32). Columns that do not
         converge in 64 iterations come back as NaN, which makes their rollouts ``nonfinite`` instead of wrong.
@@ -53,6 +54,7 @@ class ImplicitOps(JaxOps):
 
         tolerance = 1e-12 if guess.dtype == jnp.float64 else 1e-6
         scalar = guess.shape[0] == 1
+        # one unknown per column: a division instead of a factorisation
         linear: Any = lineax.Diagonal(well_posed=True) if scalar else lineax.LU()
         newton: Any = optimistix.Newton(rtol=tolerance, atol=tolerance, linear_solver=linear)
 
@@ -69,4 +71,5 @@ class ImplicitOps(JaxOps):
             return jnp.where(solution.result == optimistix.RESULTS.successful, solution.value, jnp.nan)
 
         axes = jax.tree.map(lambda a: -1 if jnp.ndim(a) else None, args)
+        # the root does not depend on where the search for it starts
         return jax.vmap(column, in_axes=(-1, axes), out_axes=-1)(jax.lax.stop_gradient(guess), args)

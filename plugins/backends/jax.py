@@ -8,26 +8,28 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import (
+from bench.model import (
     Array,
     Backend,
     Jacobians,
-    MechanicalScene,
+    LoopOps,
     Ops,
     Problem,
     Program,
+    Rollout,
     State,
     Trajectory,
-    Unsupported,
     param,
+    rollout,
 )
-from plugins.backends import rows
-from plugins.backends.compiling import compiled
+
+from . import rows
+from .compiling import compiled
 
 
 @dataclass(frozen=True)
 class Jax(Backend):
-    """Gradients: exact derivative of the program, reverse mode by default; float64 or float32; no implicit equations."""
+    """Gradients: exact derivative of the program, reverse mode by default; float64 or float32; no root finder."""
 
     name = "jax"
     requires: ClassVar[tuple[str, ...]] = ("jax",)
@@ -37,27 +39,27 @@ class Jax(Backend):
     mode: str = param("reverse", "direction of differentiation", choices=("reverse", "forward"))
 
     def compile(self, program: Program) -> Problem:
-        """The program as jitted functions; compilation happens at the first call with each batch shape."""
+        """Return the program as jitted functions; each batch shape is compiled at its first call."""
         return JaxProblem(program, self.ops(), self.dtype, self.mode)
 
     def ops(self) -> Ops:
-        """Array operations lent to the model code."""
+        """Return the array operations lent to the model code."""
         import jax
 
         jax.config.update("jax_enable_x64", True)
         return JaxOps()
 
 
-class JaxOps:
+class JaxOps(LoopOps):
     """jax.numpy, lax.scan, and no root."""
 
     def __init__(self) -> None:
         import jax.numpy
 
-        self.xp = jax.numpy
+        super().__init__(jax.numpy)
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """lax.scan over rows, keeping the carry; the backward pass stores the carries alone and repeats each step."""
+        """Run lax.scan over rows; the backward pass stores only the carries and computes each step again."""
         import jax
 
         leaves, tree = jax.tree.flatten(carry)
@@ -72,13 +74,10 @@ class JaxOps:
         def body(state: list[Any], x: list[Any]) -> tuple[list[Any], None]:
             return rows.evaluate(traced.jaxpr, traced.consts, [*state, *x]), None
 
+        # inside a scan XLA cannot merge the two evaluations, so CSE need not be prevented
         kept = jax.checkpoint(body, prevent_cse=False)
         last, _ = jax.lax.scan(kept, [rows.split(x) for x in leaves], [rows.split(x, axis=1) for x in slices], length)
         return jax.tree.unflatten(tree, [rows.join(x) for x in last])
-
-    def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Refused: the implicit backend does this."""
-        raise Unsupported("no implicit solve on this backend; use backend implicit")
 
 
 def _platform() -> str:
@@ -88,9 +87,10 @@ def _platform() -> str:
 
 
 def _numbers(program: Program) -> int:
-    """About how many numbers the gradient of one rollout keeps: a carry, a control and its gradient each step, theta, noise."""
-    scene, kept = program.scene, 2 * program.dim + program.n_noise
-    if isinstance(scene, MechanicalScene):
+    """Estimate how many numbers one rollout's gradient keeps: carries, controls, their gradients, theta, noise."""
+    kept = 2 * program.dim + program.n_noise
+    if isinstance(program, Rollout):
+        scene = program.scene
         kept += scene.horizon * (2 * scene.n_q + 2 + 2 * scene.n_u)
     return kept
 
@@ -98,7 +98,8 @@ def _numbers(program: Program) -> int:
 class JaxProblem(Problem):
     """A program compiled once per batch shape; float parameters are traced, so sweeping them compiles nothing.
 
-    Each block runs on one thread of XLA, and blocks run beside each other, which shares the cores without a wait per step.
+    Each block runs on one thread of XLA, and blocks run side by side, which shares the cores without a wait at every
+    step.
     """
 
     grain = 128
@@ -121,20 +122,18 @@ class JaxProblem(Problem):
         return self._call(self._score_function, theta, w)
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """States and controls, from a scan that keeps them."""
+        """Return states and controls, from a scan that keeps them."""
         return Trajectory(*self._parts(self._followed, theta, w))
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
-        """States, controls and step Jacobians, by forward mode through each step."""
+        """Return states, controls and step Jacobians, by forward mode through each step."""
         return Jacobians(*self._parts(self._linearised, theta, w))
 
     def _followed(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array]:
         import jax
         import jax.numpy as jnp
 
-        program = self.program.bind(parameters)
-        if not isinstance(program.scene, MechanicalScene):
-            raise Unsupported(f"scene {program.scene.name} has no steps")
+        program, theta, w = rollout(self.program.bind(parameters)).resolved(self._ops, theta, w)
 
         def advance(state: State, slices: Any) -> tuple[State, tuple[Array, Array]]:
             u = program.control(self._ops, theta, state, slices)
@@ -149,8 +148,7 @@ class JaxProblem(Problem):
         import jax.numpy as jnp
 
         states, controls = self._followed(parameters, theta, w)
-        program = self.program.bind(parameters)
-        assert isinstance(program.scene, MechanicalScene)
+        program, *_ = rollout(self.program.bind(parameters)).resolved(self._ops, theta, w)
         n_q = program.scene.n_q
 
         def step(x: Array, u: Array) -> Array:
@@ -178,7 +176,7 @@ class JaxProblem(Problem):
         args = (self._parameters, theta.astype(self._dtype, copy=False), w.astype(self._dtype, copy=False))
         solver = type(self._ops) if self.program.needs_root else None
         key = (solver, self.program.structure, function.__name__, self._mode, self._dtype, theta.shape, w.shape)
-        executable = compiled(key, function, args, self._measured)
+        executable = compiled(key, function, args, self._measured, self.compilations)
         if key not in self._charged:
             self._charged.add(key)
             self.usage.compile_s += sum(executable.seconds)
@@ -202,7 +200,7 @@ class JaxProblem(Problem):
         return self._derivative(log_probability, theta, w.shape[1])
 
     def _derivative(self, function: Callable[[Array], Array], theta: Array, batch: int) -> Array:
-        """Derivative of column b of ``function`` by column b of theta, ``(d, B)``."""
+        """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``."""
         import jax
         import jax.numpy as jnp
 

@@ -9,20 +9,22 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, Backend, Ops, Problem, Program, State, param
-from plugins import mjcf
-from plugins.backends.jax import Jax, JaxProblem
+from bench.model import Array, Backend, Ops, Problem, Program, Rollout, State, param, rollout
+
+from .. import mjcf
+from .jax import Jax, JaxProblem
 
 FORWARD_UP_TO = 8
-"""Length of theta up to which forward mode is the cheaper one: reverse costs as much as that many directions."""
+"""Length of theta up to which forward mode is cheaper: reverse mode costs as much as that many directions."""
 
 
 @dataclass(frozen=True)
 class Mjx(Jax):
     """Gradients: exact derivative of MJX's steps, forward or reverse mode; float64 or float32.
 
-    Steps the scene's MJCF twin with MJX's own integrator and contact solver, compiled by XLA. The whole model is traced:
-    stiffness, damping, masses, sizes and time step change without compiling anew. Costs, policy and noise are the scene's.
+    Steps the scene's MJCF twin with MJX's own integrator and contact solver, compiled by XLA. The whole model is
+    traced: stiffness, damping, masses, sizes and time step change without compiling anew. Costs, policy and noise are
+    the scene's.
     """
 
     name = "mjx"
@@ -42,12 +44,12 @@ class Mjx(Jax):
     lean: bool = param(True, "switch off every feature of the engine that the scene does not use")
 
     def compile(self, program: Program) -> Problem:
-        """The twin's steps as jitted functions, compiled at the first call with each batch shape."""
+        """Return the twin's steps as jitted functions, compiled at the first call with each batch shape."""
         ops = self.ops()
-        return JaxProblem(MjxProgram(program, self), ops, self.dtype, self._direction(program))
+        return JaxProblem(MjxProgram(rollout(program), self), ops, self.dtype, self._direction(program))
 
     def refuses(self, program: Program) -> str | None:
-        """What has no twin, and what MJX cannot differentiate."""
+        """Return why the program cannot run: it has no twin, or MJX cannot differentiate it; or None."""
         reason = mjcf.refusal(self, program)
         if reason is None and self.mode == "reverse" and self.iterations > 1:
             return (
@@ -63,14 +65,14 @@ class Mjx(Jax):
         return "reverse" if self.iterations == 1 and program.dim > FORWARD_UP_TO else "forward"
 
 
-class MjxProgram(Program):
-    """A program whose steps MJX takes: its parameters are the scene's and, after them, all numbers of the MJX model."""
+class MjxProgram(Rollout):
+    """A program stepped by MJX: its parameters are the scene's, followed by all numbers of the MJX model."""
 
-    def __init__(self, program: Program, backend: Mjx) -> None:
+    def __init__(self, program: Rollout, backend: Mjx) -> None:
         import jax
 
         mjx = _library()
-        super().__init__(program.scene, program.contact, program.integrator)
+        super().__init__(program.scene, program.contact, program.integrator, program.decision)
         model = mjcf.build(backend, program)
         leaves, self._tree = jax.tree.flatten(mjx.put_model(model))
         self._leaves = [np.asarray(leaf) for leaf in leaves]
@@ -81,18 +83,19 @@ class MjxProgram(Program):
 
     @property
     def structure(self) -> tuple[Any, ...]:  # type: ignore[override]
-        """The program's, the engine's settings, and what of the model is no number to trace."""
+        """The program's structure, the engine's settings, and the parts of the model that are not traceable numbers."""
+        # only floats are traced: any other leaf is compiled in and must be part of the key
         fixed = tuple(leaf.tobytes() for leaf in self._leaves if leaf.dtype.kind != "f")
         return (*super().structure, self._settings, self._tree, fixed)
 
     def parameters(self) -> np.ndarray:
-        """The float parameters of the parts, then those of the model, ``(p,)``."""
+        """Return the float parameters of the parts, then those of the model, ``(p,)``."""
         return np.concatenate(
             [super().parameters(), *(leaf.ravel() for leaf in self._leaves if leaf.dtype.kind == "f")]
         )
 
     def bind(self, parameters: Any) -> Program:
-        """This program, model included, with other values."""
+        """Return this program, model included, with other values."""
         import jax
         import jax.numpy as jnp
 
@@ -110,7 +113,7 @@ class MjxProgram(Program):
         return bound
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
-        """MJX's step of each column."""
+        """Take one step of MJX in each column."""
         import jax
 
         mjx, kind = _library(), state.q.dtype
@@ -126,7 +129,7 @@ class MjxProgram(Program):
 
 
 def _library() -> Any:
-    """``mujoco.mjx``, without what it prints when optional parts of it are missing."""
+    """Return ``mujoco.mjx``, without the messages it prints when optional parts of it are missing."""
     with contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
     return mjx

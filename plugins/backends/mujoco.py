@@ -10,10 +10,24 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, Backend, Jacobians, MechanicalScene, Ops, Problem, Program, State, Trajectory, param
-from plugins import mjcf
-from plugins.backends.numpy import NumpyOps, NumpyProblem
-from plugins.backends.torch import TorchOps
+from bench.model import (
+    Array,
+    Backend,
+    Jacobians,
+    MechanicalScene,
+    Ops,
+    Problem,
+    Program,
+    Rollout,
+    State,
+    Trajectory,
+    param,
+    rollout,
+)
+
+from .. import mjcf
+from .numpy import NumpyOps, NumpyProblem
+from .torch import TorchOps
 
 
 @dataclass(frozen=True)
@@ -42,60 +56,60 @@ class Mujoco(Backend):
     lean: bool = param(True, "switch off every feature of the engine that the scene does not use")
 
     def compile(self, program: Program) -> Problem:
-        """The twin's model; nothing is compiled."""
+        """Build the twin's model; nothing is compiled."""
         return MujocoProblem(program, self)
 
     def refuses(self, program: Program) -> str | None:
-        """Single precision, and what has no twin."""
+        """Return why the program cannot run: single precision, or a program without a twin; or None."""
         if self.dtype != "float64":
             return "MuJoCo computes in double precision"
         return mjcf.refusal(self, program)
 
 
 class MujocoProblem(NumpyProblem):
-    """A program whose steps MuJoCo takes."""
+    """A program stepped by MuJoCo."""
 
     block = 1 << 10
 
     def __init__(self, program: Program, backend: Mujoco) -> None:
         super().__init__(program, backend.dtype, backend.step)
-        assert isinstance(program.scene, MechanicalScene)
+        self._rolled = rollout(program)
         self._backend = backend
         self._engine = Engine(mjcf.build(backend, program))
-        self._open_loop = _is_open_loop(program.scene, self.dim)
+        self._open_loop = _is_open_loop(self._rolled.scene, self.dim)
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         states, _ = self._rollout(theta, w)
-        return np.asarray(Recorded(self.program, states).cost(NumpyOps(), theta, w))
+        return np.asarray(Recorded(self._rolled, states).cost(NumpyOps(), theta, w))
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         if self._backend.gradient == "rollouts":
             return super()._grad(theta, w)
         path = self.jacobians(theta, w)
-        return _reverse(Recorded(self.program, *path), theta, w, scored=False)
+        return _reverse(Recorded(self._rolled, *path), theta, w, scored=False)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return _reverse(Recorded(self.program, self._rollout(theta, w)[0]), theta, w, scored=True)
+        return _reverse(Recorded(self._rolled, self._rollout(theta, w)[0]), theta, w, scored=True)
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """States and controls of the engine."""
+        """Return the engine's states and controls."""
         return Trajectory(*self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w))
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
-        """States, controls and finite-difference Jacobians of the steps (``mjd_transitionFD``)."""
+        """Return states, controls and finite-difference Jacobians of the steps (``mjd_transitionFD``)."""
         theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
         states, controls = self._rollout(theta, w)
         central = self._backend.differences == "central"
         return Jacobians(states, controls, *self._engine.jacobians(states, controls, self._backend.step, central))
 
     def _rollout(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """States ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)``; NaN from where the engine gives up."""
+        """Return states ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)``; NaN once the engine gives up."""
         ops = NumpyOps()
-        moved, state, scanned = self.program.start(ops, theta, w)
-        horizon = self.program.scene.horizon  # type: ignore[attr-defined]
+        moved, state, scanned = self._rolled.start(ops, theta, w)
+        horizon = self._rolled.scene.horizon
 
         def control(t: int) -> np.ndarray:
-            return self.program.control(ops, moved, state, tuple(x[t] for x in scanned))
+            return self._rolled.control(ops, moved, state, tuple(x[t] for x in scanned))
 
         if self._open_loop:
             controls = np.stack([control(t) for t in range(horizon)])
@@ -109,22 +123,22 @@ class MujocoProblem(NumpyProblem):
 
 
 class Engine:
-    """A MuJoCo model, and a thread with data of its own for each core."""
+    """A MuJoCo model, with a thread and simulation data for each core."""
 
     def __init__(self, model: Any) -> None:
         import mujoco
         from mujoco.rollout import Rollout
 
-        # a rollout that diverges ends in NaN, which says it; by default MuJoCo writes a log file where it is run
+        # a diverging rollout ends in NaN, which is report enough; by default MuJoCo also writes a log file
         mujoco.set_mju_user_warning(lambda message: None)
         self._mujoco, self._model = mujoco, model
         self._data = [mujoco.MjData(model) for _ in range(_cores())]
         self._pool = Rollout(nthread=len(self._data))
 
     def rollout(self, first: np.ndarray, controls: np.ndarray) -> np.ndarray:
-        """States ``(T + 1, n, B)`` from ``first (n, B)`` under controls ``(T, n_u, B)``.
+        """Return states ``(T + 1, n, B)`` from ``first (n, B)`` under controls ``(T, n_u, B)``.
 
-        MuJoCo stops a rollout at the first bad number (beyond 1e10), where its clock stops too; those states are NaN.
+        MuJoCo stops a rollout, and its clock, at the first bad number (beyond 1e10); the states after it are NaN.
         """
         start = np.concatenate([np.zeros((1, first.shape[1])), first]).T
         controls = np.ascontiguousarray(np.moveaxis(controls, -1, 0))
@@ -139,7 +153,7 @@ class Engine:
     def jacobians(
         self, states: np.ndarray, controls: np.ndarray, eps: float, central: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of each step by the state ``(T, n, n, B)`` and by the control ``(T, n_u, n, B)``, columns on threads."""
+        """Return each step's derivatives by state ``(T, n, n, B)`` and by control ``(T, n_u, n, B)``, on threads."""
         horizon, n_u, batch = controls.shape
         n = states.shape[1]
         a, b = np.full((batch, horizon, n, n), np.nan), np.full((batch, horizon, n, n_u), np.nan)
@@ -150,6 +164,7 @@ class Engine:
             nq = self._model.nq
             for c in columns:
                 for t in range(horizon):
+                    # all later states are bad too, and their Jacobians stay NaN
                     if not np.isfinite(points[c, t]).all():
                         break
                     data.qpos, data.qvel, data.ctrl = points[c, t, :nq], points[c, t, nq:], inputs[c, t]
@@ -161,27 +176,27 @@ class Engine:
         return np.moveaxis(a, 0, -1), np.moveaxis(b, 0, -1)
 
 
-class Recorded(Program):
-    """A program along states that an engine went through; with Jacobians, its linearisation about them.
+class Recorded(Rollout):
+    """A program along recorded states of an engine; with Jacobians, its linearisation about them.
 
-    Its cost has the value and, by any differentiation of the rest, the gradient of the engine's rollouts: reverse mode
-    through it is the adjoint pass lambda_t = A_t^T lambda_{t+1} + ..., feedback and stage costs included.
+    Its cost has the value of the engine's rollouts and, however the rest is differentiated, their gradient: reverse
+    mode through it is the adjoint pass lambda_t = A_t^T lambda_{t+1} + ..., feedback and stage costs included.
     """
 
     def __init__(
         self,
-        program: Program,
+        program: Rollout,
         states: np.ndarray,
         controls: np.ndarray | None = None,
         a: np.ndarray | None = None,
         b: np.ndarray | None = None,
     ) -> None:
-        super().__init__(program.scene, program.contact, program.integrator)
+        super().__init__(program.scene, program.contact, program.integrator, program.decision)
         self._states, self._controls, self._a, self._b = states, controls, a, b
         self._times: Iterator[int] = iter(range(len(states) - 1))
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
-        """From each recorded state to the next; a rollout can be taken once."""
+        """Step from each recorded state to the next; the rollout can be taken only once."""
         t, xp = next(self._times), ops.xp
         after = xp.asarray(self._states[t + 1])
         if self._a is not None and self._b is not None and self._controls is not None:
@@ -194,7 +209,7 @@ class Recorded(Program):
 
 
 def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -> np.ndarray:
-    """Derivative of column b of the cost, or of the log-probability, by column b of theta, ``(d, B)``."""
+    """Return the derivative of column b of the cost, or of the log-probability, by column b of theta, ``(d, B)``."""
     import torch
 
     fixed, noise = torch.tensor(theta.copy()), torch.tensor(w.copy())
@@ -206,7 +221,7 @@ def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -
 
 
 def _is_open_loop(scene: MechanicalScene, dim: int) -> bool:
-    """Whether the control law looks at no state."""
+    """Return whether the control law ignores the state."""
     zero = np.zeros((scene.n_q, 1))
     return scene.feedback(np, np.zeros((dim, 1)), zero, zero) is None
 

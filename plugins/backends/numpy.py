@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, Backend, Problem, Program, Trajectory, Unsupported, param
+from bench.model import Backend, LoopOps, Problem, Program, Trajectory, param, rollout
 
 
 @dataclass(frozen=True)
 class Numpy(Backend):
-    """Gradients: central differences, 2 d rollouts each, error of order step^2; float64 or float32; no implicit equations."""
+    """Gradients: central differences, 2 d rollouts each, error O(step^2); float64 or float32; no implicit equations."""
 
     name = "numpy"
     reference_rank: ClassVar[int | None] = 3
@@ -23,29 +23,19 @@ class Numpy(Backend):
     )
 
     def compile(self, program: Program) -> Problem:
-        """Nothing to compile."""
+        """Return the program ready to run; there is nothing to compile."""
         # about the cube root of the rounding error, which balances rounding and truncation
         step = self.step or {"float64": 1e-6, "float32": 5e-3}[self.dtype]
         return NumpyProblem(program, self.dtype, step)
 
 
-class NumpyOps:
+class NumpyOps(LoopOps):
     """NumPy, a Python loop, and no root."""
 
     def __init__(self) -> None:
         import array_api_compat.numpy
 
-        self.xp = array_api_compat.numpy
-
-    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """A loop over the leading axis."""
-        for t in range(length):
-            carry = step(carry, tuple(x[t] for x in xs))
-        return carry
-
-    def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Refused: the implicit backend does this."""
-        raise Unsupported("no implicit solve on this backend; use backend implicit")
+        super().__init__(array_api_compat.numpy)
 
 
 class NumpyProblem(Problem):
@@ -64,10 +54,11 @@ class NumpyProblem(Problem):
         return np.asarray(cost, dtype=np.float64)
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """States and controls, step by step."""
+        """Return states and controls, step by step."""
+        bound = rollout(self._bound)
         theta = np.reshape(theta, (self.dim, -1)).astype(self._dtype)
         with np.errstate(all="ignore"):
-            steps = list(self._bound.steps(self._ops, theta, w.astype(self._dtype)))
+            steps = list(bound.steps(self._ops, theta, w.astype(self._dtype)))
         states, controls = [np.concatenate(x) for x, _ in steps], [u for _, u in steps[:-1]]
         return Trajectory(np.stack(states).astype(np.float64), np.stack(controls).astype(np.float64))
 
@@ -89,7 +80,7 @@ class NumpyProblem(Problem):
     def _differences(
         self, function: Callable[[np.ndarray, np.ndarray], np.ndarray], theta: np.ndarray, w: np.ndarray
     ) -> np.ndarray:
-        """(function(theta + h e_i) - function(theta - h e_i)) / 2h for all i, several i to a batch."""
+        """Return (function(theta + h e_i) - function(theta - h e_i)) / 2h for all i, several i per batch."""
         dim, batch = self.dim, w.shape[1]
         theta = np.broadcast_to(theta, (dim, batch))
         rows = np.empty((dim, batch))

@@ -1,7 +1,7 @@
 """Row-wise evaluation of JAX code: a ``(n, B)`` array of few rows as a tuple of n arrays ``(B,)``.
 
-Model code stacks and slices rows, and XLA compiles a stack to a loop that asks of each element which row it is in. The
-same operations applied to each row apart are long loops without a branch, which vectorise. The numbers stay the same:
+Model code stacks and slices rows, and XLA compiles a stack to a loop that checks for each element which row it is in.
+The same operations applied row by row are long loops without a branch, which vectorise. The numbers stay the same:
 each element is computed by the operations that the code names, in their order.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from bench.contracts import Array
+from bench.model import Array
 
 MOST_ROWS = 16
 """Arrays with more rows are left whole."""
@@ -21,25 +21,25 @@ ELEMENTWISE = {
     "or", "pow", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan",
     "tanh", "xor",
 }  # fmt: skip
-"""Primitives that compute each element from the elements at its place."""
+"""Primitives that compute each element only from the elements at the same place."""
 
 
 def split(array: Array, axis: int = 0) -> Any:
-    """The rows of a ``(n, B)`` array, or of ``(T, n, B)`` with axis 1; an array of another shape as it is."""
+    """Return the rows of a ``(n, B)`` array, or of ``(T, n, B)`` with axis 1; return any other array unchanged."""
     if array.ndim != axis + 2 or not 0 < array.shape[axis] <= MOST_ROWS:
         return array
     return tuple(array[(slice(None),) * axis + (i,)] for i in range(array.shape[axis]))
 
 
 def join(value: Any) -> Array:
-    """The array of a tuple of rows."""
+    """Return the array that a tuple of rows stands for; return an array unchanged."""
     import jax.numpy as jnp
 
     return jnp.stack(value) if isinstance(value, tuple) else value
 
 
 def evaluate(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
-    """The outputs of a jaxpr, each ``(n, B)`` array of few rows split, for arguments split likewise."""
+    """Return the outputs of a jaxpr for arguments split into rows, splitting each ``(n, B)`` output of few rows."""
     known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
 
     def read(atom: Any) -> Any:
@@ -52,7 +52,7 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> lis
 
 
 def _apply(equation: Any, values: list[Any]) -> list[Any]:
-    """The outputs of one equation."""
+    """Return the outputs of one equation."""
     name, parameters, primitive = equation.primitive.name, equation.params, equation.primitive
     out = equation.outvars[0].aval
     if name in ("jit", "pjit"):
@@ -67,7 +67,7 @@ def _apply(equation: Any, values: list[Any]) -> list[Any]:
 
 
 def _rows(name: str, parameters: Any, primitive: Any, values: list[Any], out: Any) -> Any:
-    """The output as rows, or as one row ``(B,)``; None where the operation has no row-wise form."""
+    """Return the output as rows, or as one row ``(B,)``; None where the operation has no row-wise form."""
     if name == "squeeze" and parameters["dimensions"] == (0,):
         return values[0][0]
     if out.ndim != 2 or not 0 < out.shape[0] <= MOST_ROWS:
@@ -85,7 +85,7 @@ def _rows(name: str, parameters: Any, primitive: Any, values: list[Any], out: An
 
 
 def _repeated(value: Any, count: int) -> tuple[Any, ...]:
-    """What each of ``count`` rows takes of an operand: its own row, the only row or the same number."""
+    """Return the part of an operand that each of ``count`` rows uses: its own row, the only row, or the same number."""
     if getattr(value, "ndim", 0) == 2:
         value = split(value)
     rows = value if isinstance(value, tuple) else (value,)

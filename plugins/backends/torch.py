@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, Backend, Problem, Program, Trajectory, Unsupported
+from bench.model import Array, Backend, LoopOps, Problem, Program, Trajectory, rollout
 
 
 @dataclass(frozen=True)
@@ -16,32 +16,29 @@ class Torch(Backend):
     """Gradients: reverse-mode autograd of the program on the CPU; float64 or float32; no implicit equations."""
 
     name = "torch"
-    requires = ("torch",)
+    requires: ClassVar[tuple[str, ...]] = ("torch",)
     reference_rank: ClassVar[int | None] = 2
 
     def compile(self, program: Program) -> Problem:
-        """The program run eagerly; nothing is compiled."""
+        """Return the program ready to run eagerly; nothing is compiled."""
         return TorchProblem(program, self.dtype)
 
 
-class TorchOps:
+class TorchOps(LoopOps):
     """torch through array-api-compat, a Python loop, and no root."""
 
     def __init__(self) -> None:
         import array_api_compat.torch
 
-        self.xp = array_api_compat.torch
+        super().__init__(array_api_compat.torch)
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """A loop over the leading axis."""
+        """Loop over the leading axis."""
+        # one node of the graph for all steps, where indexing would make one per step
         slices = [x.unbind(0) for x in xs]
         for t in range(length):
             carry = step(carry, tuple(x[t] for x in slices))
         return carry
-
-    def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Refused: the implicit backend does this."""
-        raise Unsupported("no implicit solve on this backend; use backend implicit")
 
 
 class TorchProblem(Problem):
@@ -65,10 +62,10 @@ class TorchProblem(Problem):
         return cost.to(self._torch.float64).numpy()
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """States and controls, step by step."""
+        """Return states and controls, step by step."""
         theta = np.reshape(theta, (self.dim, -1))
         with self._torch.no_grad():
-            steps = list(self.program.steps(self._ops, self._tensor(theta), self._tensor(w)))
+            steps = list(rollout(self.program).steps(self._ops, self._tensor(theta), self._tensor(w)))
             states = self._torch.stack([self._torch.cat(list(x)) for x, _ in steps])
             controls = self._torch.stack([u for _, u in steps[:-1]])
         return Trajectory(*(part.to(self._torch.float64).numpy() for part in (states, controls)))
@@ -81,7 +78,7 @@ class TorchProblem(Problem):
         return self._derivative(lambda full, w: self.program.log_probability(self._ops, fixed, full, w), theta, w)
 
     def _derivative(self, function: Callable[[Array, Array], Array], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Derivative of column b of ``function`` by column b of theta, ``(d, B)``; zero where they are not connected."""
+        """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; zero if disconnected."""
         full = self._tensor(np.broadcast_to(theta, (self.dim, w.shape[1]))).requires_grad_()
         result = function(full, self._tensor(w))
         if not result.requires_grad:

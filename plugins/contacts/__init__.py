@@ -1,1 +1,1 @@
-"""How touching bodies push on each other."""
+"""Contact laws: how touching bodies push on each other."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bench.contracts import Array, Contact, ImpulseLaw, Ops, State, param
+from bench.model import Array, Contact, ImpulseLaw, Ops, State, param
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Complementarity(ImpulseLaw):
     stiffness: float = param(float("inf"), "force per remaining penetration; inf: rigid", "N/m", positive=True)
 
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: float) -> State:
-        """Velocity change over the step; positions follow from it."""
+        """Return the velocity change over the step, from which the positions follow."""
         xp = ops.xp
         opened = dt * dt * contact.response(xp, before.q)
 
@@ -40,6 +40,7 @@ class Complementarity(ImpulseLaw):
 
         system = (before.q, dt, opened)
         compliance = 1.0 / self.stiffness
+        # exact for one contact with a linear gap, so that Newton starts close to the root
         guess = opened * _central_path_force(xp, contact.gap(free.q), opened + compliance, self.kappa)
         p = ops.root(residual, guess, (system, free.q, self.kappa, compliance))
         dv = effect(p, system)
@@ -47,8 +48,9 @@ class Complementarity(ImpulseLaw):
 
 
 def _central_path_force(xp: Any, a: Array, c: Array, kappa: Any) -> Array:
-    """lambda >= 0 with (a + c lambda) lambda = kappa: exact for one contact whose gap is linear in position."""
+    """Return lambda >= 0 with (a + c lambda) lambda = kappa: exact for one contact whose gap is linear in position."""
     root = xp.sqrt(a * a + 4.0 * c * kappa)
+    # two forms of the same root, each without a difference of nearly equal numbers on its side
     apart = 2.0 * kappa / (xp.abs(a) + root)
     pressed = (xp.abs(a) + root) / (2.0 * c)
     return xp.where(a > 0, apart, pressed)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from bench.contracts import Contact, ImpulseLaw, Ops, State, param
+from bench.model import Contact, ImpulseLaw, Ops, State, param
 
 
 @dataclass(frozen=True)
@@ -16,16 +16,25 @@ class Impulse(ImpulseLaw):
     """
 
     name = "impulse"
-    continuous = False
 
     time_of_impact: bool = param(True, "correct the position for the time of impact within the step")
 
+    @property
+    def continuous(self) -> bool:
+        """False: the step at which an impact falls switches with theta."""
+        return False
+
+    def finds_time_of_impact(self) -> bool:
+        """Return whether ``time_of_impact`` is set."""
+        return self.time_of_impact
+
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: float) -> State:
-        """Velocity change, and position change beyond dt times it."""
+        """Return the velocity change, and the position change beyond dt times the velocity change."""
         xp = ops.xp
         rate = contact.gap_rate(before.q, before.v)
         overlap = -contact.gap(before.q + dt * before.v)
         hit = (overlap > 0) & (rate < 0)
+        # where there is no hit the division by approach must stay finite, in value and derivative
         approach = xp.where(hit, -rate, 0.0 * rate + 1.0)
         strength = (1.0 + contact.restitution) * approach / contact.response(xp, before.q)
         strength = xp.where(hit, strength, 0.0 * strength)

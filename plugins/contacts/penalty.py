@@ -3,14 +3,14 @@
 from dataclasses import dataclass
 from typing import Any
 
-from bench.contracts import Array, ForceLaw, param
+from bench.model import Array, ForceLaw, param
 
 
 @dataclass(frozen=True)
 class Penalty(ForceLaw):
     """lambda = k d + c d' while the penetration d = max(0, -gap) is positive.
 
-    ``damping_mode`` says where the damper acts, since sources differ and gradients with them:
+    ``damping_mode`` says where the damper acts, since sources differ and so do their gradients:
     ``clipped`` max(0, k d + c d'), never adhesive; ``approach`` k d + c max(0, d'); ``linear`` k d + c d', which
     pulls at the end of a separation.
     """
@@ -22,12 +22,16 @@ class Penalty(ForceLaw):
     damping_mode: str = param("clipped", "where the damper acts", choices=("clipped", "approach", "linear"))
 
     @property
-    def continuous(self) -> bool:  # type: ignore[override]
-        """Only without damping: at touch a damper sets in at once."""
+    def continuous(self) -> bool:
+        """True only without damping: at touch a damper sets in at once."""
         return self.damping == 0.0
 
+    def spring(self) -> tuple[float, float]:
+        """Return (k, c)."""
+        return self.stiffness, self.damping
+
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
-        """Normal force, zero without penetration."""
+        """Return the normal force, zero without penetration."""
         damper = -self.damping * gap_rate
         if self.damping_mode == "approach":
             damper = xp.where(damper > 0, damper, 0.0 * damper)

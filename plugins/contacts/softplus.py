@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bench.contracts import Array, ForceLaw, param
+from bench.model import Array, ForceLaw, param
 
 
 @dataclass(frozen=True)
@@ -22,26 +22,31 @@ class Softplus(ForceLaw):
 
     stiffness: float = param(1e3, "k, force per penetration", "N/m", positive=True)
     damping: float = param(0.0, "c, force per penetration rate", "N s/m", low=0.0)
-    beta: float = param(1e2, "sharpness of the softplus", "1/m for smooths=gap, 1/N for smooths=clip", positive=True)
+    beta: float = param(1e2, "sharpness of the softplus, per newton with smooths=clip", "1/m", positive=True)
     smooths: str = param("gap", "what is smoothed", choices=("gap", "clip"))
 
     @property
-    def continuous(self) -> bool:  # type: ignore[override]
-        """With the gap smoothed, or without damping: at touch an unsmoothed damper sets in at once."""
+    def continuous(self) -> bool:
+        """True with the gap smoothed, or without damping: at touch an unsmoothed damper sets in at once."""
         return self.smooths == "gap" or self.damping == 0.0
 
+    def spring(self) -> tuple[float, float]:
+        """Return (k, c)."""
+        return self.stiffness, self.damping
+
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
-        """Normal force, positive everywhere."""
+        """Return the normal force, positive everywhere."""
         if self.smooths == "clip":
             penetration = xp.where(gap < 0, -gap, 0.0 * gap)
             damper = xp.where(gap < 0, -self.damping * gap_rate, 0.0 * gap)
             return _softplus(xp, self.stiffness * penetration + damper, self.beta)
         penetration = _softplus(xp, -gap, self.beta)
+        # exp overflows beyond 709, and the derivative inf / inf would be NaN
         touching = 1.0 / (1.0 + xp.exp(xp.clip(self.beta * gap, -700.0, 700.0)))
         force = self.stiffness * penetration - self.damping * touching * gap_rate
         return xp.where(force > 0, force, 0.0 * force)
 
 
 def _softplus(xp: Any, z: Array, beta: Any) -> Array:
-    # (z + |z|) / 2 and not a where: both terms then have their right share of the derivative at z = 0, 1/2 in all
+    # (z + |z|) / 2 instead of a where: at z = 0 the derivatives of both terms then add up to the right value, 1/2
     return 0.5 * (z + xp.abs(z)) + xp.log1p(xp.exp(-beta * xp.abs(z))) / beta

@@ -1,1 +1,1 @@
-"""How sampled costs, gradients and scores become an estimate of grad J."""
+"""Estimators: how sampled costs, gradients and scores become an estimate of grad J."""

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.contracts import Estimator, Problem, param
-from plugins.estimators.inverse_variance import halves
+from bench.model import Estimator, Problem, halves, param
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,7 @@ class AlphaOrder(Estimator):
     bound: float | None = param(None, "L, bound on |zeroth-order term|; null: the largest seen", positive=True)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """One interpolation weight for each repeat."""
+        """Return estimates with one interpolation weight per repeat."""
         first, zeroth = halves(problem, theta, noise)
         n = zeroth.shape[1]
         fobg, zobg = first.mean(axis=1), zeroth.mean(axis=1)
@@ -38,6 +37,7 @@ class AlphaOrder(Estimator):
         log_term = np.log((zeroth.shape[2] + 1) / self.delta)
         eps = np.sqrt(2 * per_sample * log_term / n) + 2 * largest / (3 * n) * log_term
         total = v0 + v1
+        # with both variances 0 any weight is right
         alpha = np.divide(v0, total, out=np.ones_like(total), where=total > 0)
         distance = np.linalg.norm(fobg - zobg, axis=-1)
         room = np.maximum(self.gamma - eps, 0.0)

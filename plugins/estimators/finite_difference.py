@@ -4,15 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.contracts import Problem, SampleMean, param
+from bench.model import Problem, SampleMean, param
 
 
 @dataclass(frozen=True)
 class FiniteDifference(SampleMean):
     """Approximates grad J_sigma by central differences of the mean cost under common random numbers.
 
-    2 d rollouts a sample, bias of order step^2; across a jump of the cost unbiased for J_sigma smoothed over one
-    step, with a variance that grows as 1/step (Glasserman 2003, ch. 7). Requires costs alone.
+    It takes 2 d rollouts per sample and has a bias of order step^2. Across a jump of the cost it is unbiased for
+    J_sigma smoothed over one step, with a variance that grows as 1/step (Glasserman 2003, ch. 7). Requires only costs.
     """
 
     name = "finite_difference"
@@ -22,7 +22,7 @@ class FiniteDifference(SampleMean):
     step: float = param(1e-3, "half the distance of the two points, in units of theta", positive=True)
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """(f(theta + h e_i, w) - f(theta - h e_i, w)) / 2h for every coordinate i."""
+        """Return (f(theta + h e_i, w) - f(theta - h e_i, w)) / 2h for every coordinate i."""
         rows = []
         for i in range(problem.dim):
             shift = np.zeros((problem.dim, 1))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.contracts import Problem, SampleMean
+from bench.model import Problem, SampleMean
 
 
 @dataclass(frozen=True)
@@ -18,5 +18,5 @@ class Fobg(SampleMean):
     needs = frozenset({"grad"})
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """df/dtheta of each sample."""
+        """Return df/dtheta of each sample."""
         return problem.grad(theta, w)

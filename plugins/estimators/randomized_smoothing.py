@@ -4,16 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.contracts import Problem, Program, SampleMean, param
+from bench.model import Problem, Program, SampleMean, param
 
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(SampleMean):
     """Approximates grad J_s with (f(theta + s w) - f(theta - s w)) w / 2s, or (f(theta + s w) - f(theta)) w / s.
 
-    ``variant``: ``antithetic`` (2 rollouts a sample) or ``forward`` (1, and one for the centre). The radius s is its
-    own, sigma by default; noise is on theta, without action noise: under a feedback policy with action noise, or with
-    another radius, its target is not J_sigma. Requires costs alone (Nesterov, Spokoiny 2017).
+    ``variant``: ``antithetic`` (2 rollouts per sample) or ``forward`` (1 per sample, and one for the centre). The
+    radius s is sigma by default; noise is on theta, never on actions: under a feedback policy with action noise, or
+    with another radius, the target is not J_sigma. Requires only costs (Nesterov, Spokoiny 2017).
     """
 
     name = "randomized_smoothing"
@@ -25,7 +25,7 @@ class RandomizedSmoothing(SampleMean):
     )
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """One directional difference a sample, along its own direction."""
+        """Return one directional difference per sample, along its own direction."""
         s = problem.sigma if self.radius is None else self.radius
         direction = problem.directions(w)
         still = np.zeros_like(w)
@@ -35,7 +35,7 @@ class RandomizedSmoothing(SampleMean):
         return (ahead - problem.value(theta, still[:, :1])) * direction / s
 
     def refuses(self, program: Program) -> str | None:
-        """A direction is made of a sample's normal numbers, so there must be d of them."""
+        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
         if program.n_noise >= program.dim:
             return None
         return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.contracts import Estimator, Problem, columns, param, per_repeat
+from bench.model import Estimator, Problem, columns, param, per_repeat
 
 
 @dataclass(frozen=True)
@@ -12,7 +12,7 @@ class Reinforce(Estimator):
     """Approximates grad J_sigma with the mean of (f - b) d log p(actions)/dtheta (Williams 1992).
 
     Baseline b: ``none``; ``center``, f at w = 0; ``leave_one_out``, the mean cost of the other samples of the batch.
-    Requires costs and scores. Unbiased for any cost, with jumps too.
+    Requires costs and scores. Unbiased for any cost, even one with jumps.
     """
 
     name = "reinforce"
@@ -22,7 +22,7 @@ class Reinforce(Estimator):
     baseline: str = param("center", "what is subtracted from f", choices=("none", "center", "leave_one_out"))
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Mean over samples of (f - b) * score."""
+        """Return the mean over samples of (f - b) * score."""
         w = columns(noise)
         f = per_repeat(problem.value(theta, w), noise)
         score = per_repeat(problem.score(theta, w), noise)

@@ -1,1 +1,1 @@
-"""Time-stepping maps."""
+"""Integrators: time-stepping maps."""

@@ -3,32 +3,33 @@
 from dataclasses import dataclass
 from typing import Any
 
-from bench.contracts import Array, Contact, Dynamics, State
-from plugins.integrators.stormer_verlet import StormerVerlet, flight
+from bench.model import Array, Contact, Dynamics, State
+
+from .stormer_verlet import StormerVerlet, flight
 
 LATE = 1e-3
-"""Part of a step by which an impact may lie back and still be located: what rounding lost at the end of the last step."""
+"""Fraction of a step by which an impact may lie in the past and still be located, in case rounding delayed it."""
 
 
 @dataclass(frozen=True)
 class EventDriven(StormerVerlet):
-    """Stormer-Verlet; under an impulse law it flies to the first impact of the step, and starts the law from there.
+    """Stormer-Verlet; under an impulse law it flies to the first impact of the step and applies the law from there.
 
     The time of impact is a root of gap + rate t + acceleration t^2 / 2, differentiated in closed form, so that speed
     and time of the impact depend on theta as in the physics: gradients of rigid bounces are right to discretisation
     error, and exact under constant acceleration, which no correction within a step from boundary to boundary achieves.
     The law turns the velocity at the impact and the rest of the step follows from it.
 
-    One impact a contact and step: a body that returns sooner than that (coming to rest) sinks slowly, by less than
-    dt^2 g / 2 a step. The gap's acceleration leaves out its curvature in q. Further contacts in the rest of a step,
-    and steps without an impact, are the law's alone. Made for rigid laws; without one it is Stormer-Verlet.
+    Each contact has at most one impact per step: a body that returns sooner (coming to rest) sinks slowly, by less than
+    dt^2 g / 2 per step. The gap's acceleration leaves out the gap's curvature in q. Further contacts in the rest of a
+    step, and steps without an impact, are left to the law. Made for rigid laws; without one it is Stormer-Verlet.
     """
 
     name = "event_driven"
     takes_impulses = True
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """To the impact if there is one, then to the end of the step."""
+        """Step to the impact if there is one, then to the end of the step."""
         q, v = state.q, dynamics.carried(state.v)
         contact = dynamics.contact
         if contact is None:
@@ -40,9 +41,11 @@ class EventDriven(StormerVerlet):
 
 
 def _first_impact(xp: Any, contact: Contact, state: State, a: Array, dt: Any) -> Array:
-    """Time from the start of the step to its first impact, 0 without one, ``(1, B)`` [s]."""
+    """Return the time from the start of the step to its first impact, ``(1, B)`` [s]; 0 without one."""
     gap, rate, bend = contact.gap(state.q), contact.gap_rate(*state), contact.gap_rate(state.q, a)
     square = rate * rate - 2.0 * bend * gap
+    # the untaken branch of a where is differentiated too: sqrt(<= 0) or a division by 0 would put NaN into that
+    # column's gradient, so the root's argument and both divisors are 1 where they are not used
     crossing = square > 0
     speed = xp.sqrt(xp.where(crossing, square, 0.0 * square + 1.0))
     approaching, pulled = rate < 0, bend < 0

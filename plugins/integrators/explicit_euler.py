@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.contracts import Array, Dynamics, Integrator, State
+from bench.model import Array, Dynamics, Integrator, State
 
 
 @dataclass(frozen=True)
@@ -18,14 +18,14 @@ class ExplicitEuler(Integrator):
     order = 1
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """One step, everything taken at its start."""
+        """Take one step, evaluating everything at its start."""
         v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)
         return State(state.q + dt * state.v, v)
 
     def amplification(self, z: complex) -> complex:
-        """1 + z."""
+        """Return 1 + z."""
         return 1 + z
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """Both from the old state."""
+        """Return the matrix whose rows are both taken at the old state."""
         return np.array([[1.0, dt], [-dt * stiffness, factor - dt * damping]])

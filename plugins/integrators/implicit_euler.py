@@ -5,18 +5,18 @@ from typing import Any
 
 import numpy as np
 
-from bench.contracts import Array, Dynamics, Integrator, State
+from bench.model import Array, Dynamics, Integrator, State
 
 
 @dataclass(frozen=True)
 class ImplicitEuler(Integrator):
     """v+ = d v + dt a(q + dt v+, v+, u) with velocity factor d; then q+ = q + dt v+.
 
-    Stable at every dt where the motion is, contact springs of a force law included, and loses energy for it.
-    Differentiated through the implicit-function theorem; the unknown is the displacement dt v+, in which rounding in
-    a stiff force stays below the solver's tolerance. Impulses of an impulse law act on the solved step and move the position
-    along, as in semi-implicit Euler; they are not part of the equation. A force that jumps, such as a damper that sets
-    in at touch, can leave the equation without a root: such a rollout is not finite.
+    Stable at every dt where the motion is, contact springs of a force law included, at the price of losing energy.
+    Differentiated through the implicit-function theorem; the unknown is the displacement dt v+, in which rounding in a
+    stiff force stays below the solver's tolerance. Impulses of an impulse law act on the solved step and move the
+    position along, as in semi-implicit Euler; they are not part of the equation. A force that jumps, such as a damper
+    that sets in at touch, can leave the equation without a root: such a rollout is not finite.
     """
 
     name = "implicit_euler"
@@ -25,7 +25,7 @@ class ImplicitEuler(Integrator):
     needs_root = True
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """One step, one equation, for the displacement dt v+."""
+        """Take one step by solving one equation for the displacement dt v+."""
 
         def residual(moved: Array, args: Any) -> Array:
             q, carried, u, dt = args
@@ -38,10 +38,10 @@ class ImplicitEuler(Integrator):
         return dynamics.with_impulse(state, State(state.q + dt * v, v), dt)
 
     def amplification(self, z: complex) -> complex:
-        """1 / (1 - z)."""
+        """Return 1 / (1 - z)."""
         return 1 / (1 - z)
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """v+ = (d v - dt stiffness q) / (1 + dt damping + dt^2 stiffness), then the position with it."""
+        """Return the matrix of v+ = (d v - dt stiffness q) / (1 + dt damping + dt^2 stiffness) and q+ = q + dt v+."""
         row = np.array([-dt * stiffness, factor]) / (1.0 + dt * damping + dt**2 * stiffness)
         return np.array([[1.0, 0.0] + dt * row, row])

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.contracts import Array, Dynamics, Integrator, State
+from bench.model import Array, Dynamics, Integrator, State
 
 
 @dataclass(frozen=True)
@@ -13,9 +13,9 @@ class ImplicitMidpoint(Integrator):
     """v+ = v + dt a(q + dt m / 2, m, u) with m = (v + v+) / 2; then q+ = q + dt m.
 
     Symplectic, and stable at every dt where the motion is; it keeps the energy of linear oscillators exactly, so that
-    stiff modes ring on where implicit Euler damps them. Differentiated through the implicit-function theorem;
-    the unknown is the displacement dt m, in which rounding in a stiff force stays below the solver's tolerance. The velocity
-    factor multiplies the velocity at the start of the step.
+    stiff modes ring on where implicit Euler damps them. Differentiated through the implicit-function theorem; the
+    unknown is the displacement dt m, in which rounding in a stiff force stays below the solver's tolerance. The
+    velocity factor multiplies the velocity at the start of the step.
     Source: Hairer, Lubich, Wanner 2006.
     """
 
@@ -24,7 +24,7 @@ class ImplicitMidpoint(Integrator):
     needs_root = True
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """One step, one equation, for the displacement dt m."""
+        """Take one step by solving one equation for the displacement dt m."""
 
         def residual(moved: Array, args: Any) -> Array:
             q, v, u, dt = args
@@ -35,10 +35,10 @@ class ImplicitMidpoint(Integrator):
         return State(state.q + moved, 2.0 * moved / dt - v)
 
     def amplification(self, z: complex) -> complex:
-        """(1 + z / 2) / (1 - z / 2)."""
+        """Return (1 + z / 2) / (1 - z / 2)."""
         return (1 + z / 2) / (1 - z / 2)
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """(I - Z / 2)^-1 (I + Z / 2) with Z = dt times the system matrix, after the velocity factor."""
+        """Return (I - Z / 2)^-1 (I + Z / 2) with Z = dt times the system matrix, after the velocity factor."""
         half, one = 0.5 * dt * np.array([[0.0, 1.0], [-stiffness, -damping]]), np.eye(2)
         return np.linalg.solve(one - half, one + half) @ np.diag([1.0, factor])

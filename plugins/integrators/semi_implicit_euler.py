@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.contracts import Array, Dynamics, Integrator, State
+from bench.model import Array, Dynamics, Integrator, State
 
 
 @dataclass(frozen=True)
@@ -19,15 +19,15 @@ class SemiImplicitEuler(Integrator):
     takes_impulses = True
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """One step; impulses act on the new velocity."""
+        """Take one step; impulses act on the new velocity."""
         v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)
         return dynamics.with_impulse(state, State(state.q + dt * v, v), dt)
 
     def amplification(self, z: complex) -> complex:
-        """1 + z: without positions it is explicit Euler."""
+        """Return 1 + z: without positions this is explicit Euler."""
         return 1 + z
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """Velocity first, then position with the new velocity."""
+        """Return the matrix that updates the velocity first, then the position with the new velocity."""
         row = np.array([-dt * stiffness, factor - dt * damping])
         return np.array([[1.0, 0.0] + dt * row, row])

@@ -1,1 +1,1 @@
-"""Minimal physical problems and plain functions: what is differentiated."""
+"""Scenes: minimal physical problems and plain functions to differentiate."""

@@ -7,14 +7,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, ContactLaw, Integrator, MechanicalScene, State, param
+from bench.model import Array, ContactLaw, ContactScene, EngineTwin, ImpulseLaw, Plugin, State, param
 
 
 @dataclass(frozen=True)
-class BounceOnce(MechanicalScene):
+class BounceOnce(EngineTwin, ContactScene):
     """A ball flies at constant speed to the ground and back; q is the height of its centre.
 
-    State (q, v); theta = (y0, vy0, u0), initial height and velocity and a vertical force during the first step alone,
+    State (q, v); theta = (y0, vy0, u0), initial height and velocity and a vertical force during the first step only,
     with parameter noise; f = q_T. A rigid bounce ends at radius + restitution |z| with
     z = y0 - radius + T (vy0 + dt u0 / mass). The default height starts the contact in the middle of a step. Height 1,
     the source's, starts it on the boundary between two steps, a kink of the penalty program.
@@ -29,51 +29,50 @@ class BounceOnce(MechanicalScene):
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 0.0}
 
     sigma: float = param(0.1, "standard deviation of the noise on theta", "m, m/s and N", positive=True)
-    horizon: int = param(480, "number of time steps", positive=True)
+    horizon: int = param(480, "number of time steps", "steps", positive=True)
     dt: float = param(1.0 / 480.0, "length of a time step", "s", positive=True)
     mass: float = param(1.0, "mass of the ball", "kg", positive=True)
     radius: float = param(0.1, "radius of the ball", "m", positive=True)
     height: float = param(1.0 + 1.0 / 480.0, "initial height of the centre at theta", "m", positive=True)
     velocity: float = param(-2.0, "initial velocity at theta, upwards", "m/s")
     force: float = param(0.0, "force during the first step at theta, upwards", "N")
-    restitution: float = param(1.0, "restitution of impulse laws", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
-        """(height, velocity, force)."""
+        """Return (height, velocity, force)."""
         return np.array([self.height, self.velocity, self.force])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Height and velocity."""
+        """Start at that height and velocity."""
         return State(theta[0:1], theta[1:2])
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """The force in the first step, none after it."""
+        """Return the force in the first step, none after it."""
         first = theta[None, 2:3, :]
         later = xp.zeros((self.horizon - 1, 1, theta.shape[1]), dtype=theta.dtype)
         return xp.concat([first, later], axis=0)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """The force."""
+        """Return the force per mass."""
         return u / self.mass
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Height of the lowest point."""
+        """Return the height of the ball's lowest point."""
         return q - self.radius
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """v."""
+        """Return v."""
         return v
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Upwards."""
+        """Push upwards."""
         return force / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """The final height."""
+        """Return the final height."""
         return q[0]
 
     def mjcf(self) -> str:
-        """A sphere on a vertical slide, over a plane."""
+        """Return a sphere on a vertical slide, over a plane."""
         return f"""
             <worldbody>
               <geom name="ground" type="plane" size="1 1 1"/>
@@ -85,13 +84,14 @@ class BounceOnce(MechanicalScene):
             <contact><pair geom1="ground" geom2="ball" condim="1"/></contact>
             <actuator><motor joint="height"/></actuator>"""
 
-    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray | None:
-        """With impulses corrected for the time of impact: (P(z > 0) - restitution P(z < 0)) dz/dtheta, z being normal.
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray | None:
+        """With impulses at the time of impact, return (P(z > 0) - restitution P(z < 0)) dz/dtheta, z being normal.
 
-        It takes that no sample starts inside the ground; with the default theta that is 9 standard deviations away.
+        This assumes that no sample starts inside the ground, which is 9 standard deviations away with the default
+        theta.
         """
         semi_implicit = integrator is not None and integrator.name == "semi_implicit_euler"
-        if not (semi_implicit and contact is not None and getattr(contact, "time_of_impact", False)):
+        if not (semi_implicit and isinstance(contact, ImpulseLaw) and contact.finds_time_of_impact()):
             return None
         slope = self._free_slope()
         spread = self.sigma * float(np.linalg.norm(slope))
@@ -99,19 +99,19 @@ class BounceOnce(MechanicalScene):
         return np.asarray((above - self.restitution * (1.0 - above)) * slope)
 
     def physical_gradient(self) -> np.ndarray:
-        """-restitution (1, T, T dt / mass) after a rigid bounce, (1, T, T dt / mass) without."""
+        """Return -restitution (1, T, T dt / mass) after a rigid bounce, (1, T, T dt / mass) without."""
         return np.asarray(self._free_slope() * (1.0 if self._free_end() > 0 else -self.restitution))
 
     def physical_cost(self) -> float:
-        """radius + z, or radius - restitution z after a rigid bounce."""
+        """Return radius + z, or radius - restitution z after a rigid bounce."""
         end = self._free_end()
         return self.radius + (end if end > 0 else -self.restitution * end)
 
     def _free_end(self) -> float:
-        """z, the final gap if there were no ground."""
+        """Return z, the final gap if there were no ground."""
         return self.height - self.radius + self.horizon * self.dt * (self.velocity + self.dt * self.force / self.mass)
 
     def _free_slope(self) -> np.ndarray:
-        """dz / dtheta."""
+        """Return dz / dtheta."""
         end = self.horizon * self.dt
         return np.array([1.0, end, end * self.dt / self.mass])

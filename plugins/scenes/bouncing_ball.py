@@ -7,19 +7,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, MechanicalScene, State, param
+from bench.model import Array, ContactScene, EngineTwin, State, param
 
 
 @dataclass(frozen=True)
-class BouncingBall(MechanicalScene):
+class BouncingBall(EngineTwin, ContactScene):
     """A ball on a vertical line under gravity; q is the height of its lowest point.
 
     State (q, v); theta = (initial height, initial velocity), with parameter noise; f = (q_T - target)^2.
     The default lands at 0.45 s and is on its way down again at T = 1 s.
 
-    Under gravity an impulse that takes the velocity of a step boundary has a wrong derivative at every dt, time of
-    impact or not: the speed of impact then depends on theta only through the step the impact falls in, in jumps.
-    Differences over a span of theta that moves the impact by many steps are right.
+    Under gravity an impulse that takes the velocity of a step boundary has a wrong derivative at every dt, with or
+    without time of impact: the speed of impact then depends on theta only through the step the impact falls in, in
+    jumps. Differences over a span of theta that moves the impact by many steps are right.
     """
 
     name = "bouncing_ball"
@@ -30,7 +30,7 @@ class BouncingBall(MechanicalScene):
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
 
     sigma: float = param(0.05, "standard deviation of the noise on height and velocity", "m and m/s", positive=True)
-    horizon: int = param(400, "number of time steps", positive=True)
+    horizon: int = param(400, "number of time steps", "steps", positive=True)
     dt: float = param(0.0025, "length of a time step", "s", positive=True)
     mass: float = param(1.0, "mass of the ball", "kg", positive=True)
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2", positive=True)
@@ -40,35 +40,35 @@ class BouncingBall(MechanicalScene):
     restitution: float = param(1.0, "restitution of impulse laws and of the physical gradient", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
-        """(height, velocity)."""
+        """Return (height, velocity)."""
         return np.array([self.height, self.velocity])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """theta itself."""
+        """Start at theta itself."""
         return State(theta[0:1], theta[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Gravity."""
+        """Return gravity."""
         return 0.0 * q - self.gravity
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """q."""
+        """Return q."""
         return q
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """v."""
+        """Return v."""
         return v
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Upwards."""
+        """Push upwards."""
         return force / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Squared distance to the target."""
+        """Return the squared distance to the target."""
         return (q[0] - self.target) ** 2
 
     def mjcf(self) -> str:
-        """A sphere on a vertical slide, over a plane; its own position is that of its lowest point."""
+        """Return a sphere on a vertical slide, over a plane; its own position is that of its lowest point."""
         return f"""
             <option gravity="0 0 {-self.gravity}"/>
             <worldbody>
@@ -81,20 +81,21 @@ class BouncingBall(MechanicalScene):
             <contact><pair geom1="ground" geom2="ball" condim="1"/></contact>"""
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Grad f of rigid bounces with the scene's restitution, from event to event; None if the ball comes to rest."""
+        """Return grad f of rigid bounces with the scene's restitution, event by event; None if the ball stops."""
         final = self._rigid_end()
         return None if final is None else np.asarray(2 * (final[0] - self.target) * final[1])
 
     def physical_cost(self) -> float | None:
-        """f of the same bounces."""
+        """Return f of the same bounces."""
         final = self._rigid_end()
         return None if final is None else (final[0] - self.target) ** 2
 
     def _rigid_end(self) -> tuple[float, np.ndarray] | None:
-        """Height at T and its slope by theta, ``(2,)``."""
+        """Return the height at T and its slope by theta, ``(2,)``."""
         g, end, e = self.gravity, self.horizon * self.dt, self.restitution
         start = np.array([0.0, self.velocity, self.height])  # time, velocity and height at the last take-off
         slopes = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])  # by theta
+        # a ball with more bounces than this counts as come to rest
         for _ in range(1000):
             time, v, q = start
             impact = math.sqrt(v * v + 2 * g * q)

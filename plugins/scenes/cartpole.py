@@ -5,11 +5,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, MechanicalScene, State, param
+from bench.model import Array, EngineTwin, MechanicalScene, State, param
 
 
 @dataclass(frozen=True)
-class Cartpole(MechanicalScene):
+class Cartpole(EngineTwin, MechanicalScene):
     """A point mass m on a massless pole of length l on a cart M, under the linear policy u = -K (x, a, x', a').
 
     State (x, a, x', a') with the angle a from upright, starting at rest at ``angle``; theta = K (d = 4).
@@ -25,7 +25,7 @@ class Cartpole(MechanicalScene):
     n_u: ClassVar[int] = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each force, or on each gain", "N", positive=True)
-    horizon: int = param(50, "number of time steps", positive=True)
+    horizon: int = param(50, "number of time steps", "steps", positive=True)
     dt: float = param(0.02, "length of a time step", "s", positive=True)
     noise: str = param("action", "what the noise perturbs", choices=("action", "parameter"))
     cart_mass: float = param(1.0, "M", "kg", positive=True)
@@ -35,27 +35,27 @@ class Cartpole(MechanicalScene):
     angle: float = param(0.2, "initial angle of the pole from upright", "rad")
 
     def theta0(self) -> np.ndarray:
-        """Gains (-3, -40, -4, -8): near the optimum of the quadratic cost, stable with the default masses."""
+        """Return gains (-3, -40, -4, -8): near the optimum of the quadratic cost, stable with the default masses."""
         return np.array([-3.0, -40.0, -4.0, -8.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """At rest, the pole leaning by ``angle``."""
+        """Start at rest, the pole leaning by ``angle``."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero + self.angle]), xp.stack([zero, zero]))
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
-        """-K (x, a, x', a')."""
+        """Return -K (x, a, x', a')."""
         return -(theta[0:1] * q[0:1] + theta[1:2] * q[1:2] + theta[2:3] * v[0:1] + theta[3:4] * v[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Of cart and pole under the force u on the cart."""
+        """Return the accelerations of cart and pole under the force u on the cart."""
         sine, cosine = xp.sin(q[1]), xp.cos(q[1])
         swing = self.length * v[1] * v[1] - self.gravity * cosine
         cart = (u[0] + self.pole_mass * sine * swing) / (self.cart_mass + self.pole_mass * sine * sine)
         return xp.stack([cart, (self.gravity * sine - cart * cosine) / self.length])
 
     def mjcf(self) -> str:
-        """A point mass above a hinge on a cart."""
+        """Return a point mass above a hinge on a cart."""
         return f"""
             <option gravity="0 0 {-self.gravity}"/>
             <worldbody>
@@ -71,9 +71,9 @@ class Cartpole(MechanicalScene):
             <actuator><motor joint="track"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Distance from the origin and effort of one step."""
+        """Return the squared distance from the origin and the effort of one step."""
         return self.dt * (q[0] ** 2 + 10.0 * q[1] ** 2 + 0.01 * u[0] ** 2)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Distance of the last state from rest at the origin."""
+        """Return the squared distance of the last state from rest at the origin."""
         return q[0] ** 2 + 10.0 * q[1] ** 2 + 0.1 * v[0] ** 2 + 0.1 * v[1] ** 2

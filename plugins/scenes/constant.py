@@ -1,16 +1,16 @@
-"""A flat cost: whatever an estimator reports beyond zero is its own noise."""
+"""A flat cost: anything that an estimator reports beyond zero is its own noise."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bench.contracts import Array, ContactLaw, FunctionScene, Integrator, param
+from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
 
 
 @dataclass(frozen=True)
 class Constant(FunctionScene):
-    """f = value, grad J = 0. Score-function terms without a baseline still have variance (value / sigma)^2 a coordinate."""
+    """f = value, grad J = 0. Without a baseline, score-function terms still have variance (value / sigma)^2 each."""
 
     name = "constant"
     leaves_out = "dynamics"
@@ -19,13 +19,13 @@ class Constant(FunctionScene):
     value: float = param(3.0, "the cost")
 
     def theta0(self) -> np.ndarray:
-        """Evenly from 0.5 to 1.5."""
+        """Space theta evenly from 0.5 to 1.5."""
         return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """The value, with derivative 0."""
+        """Return the value, with derivative 0."""
         return 0.0 * xp.sum(x, axis=0) + self.value
 
-    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray:
-        """Zero."""
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
+        """Return zero."""
         return np.zeros(self.dimension)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.contracts import Array, ContactLaw, FunctionScene, Integrator, param
+from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
 
 
 @dataclass(frozen=True)
@@ -21,17 +21,17 @@ class Cubic(FunctionScene):
     dimension: int = param(5, "d, length of theta", positive=True)
 
     def theta0(self) -> np.ndarray:
-        """Evenly from 0.5 to 1.5."""
+        """Space theta evenly from 0.5 to 1.5."""
         return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """The cubes."""
+        """Return the sum of the cubes over 3."""
         return xp.sum(x * x * x, axis=0) / 3.0
 
-    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray:
-        """theta^2 + sigma^2."""
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
+        """Return theta^2 + sigma^2."""
         return np.asarray(self.theta0() ** 2 + self.sigma**2)
 
     def physical_gradient(self) -> np.ndarray:
-        """theta^2."""
+        """Return theta^2."""
         return np.asarray(self.theta0() ** 2)

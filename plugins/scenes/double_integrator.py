@@ -5,11 +5,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, ContactLaw, Integrator, MechanicalScene, State, param
+from bench.model import Array, ContactLaw, EngineTwin, MechanicalScene, Plugin, State, param
 
 
 @dataclass(frozen=True)
-class DoubleIntegrator(MechanicalScene):
+class DoubleIntegrator(EngineTwin, MechanicalScene):
     """q'' = u from rest at q = 0; state (q, v), theta the controls u_0 .. u_{N-1}; f = (q_N - 1)^2 / 2.
 
     q_N = c . u with c_i = dt^2 (N - i) for semi-implicit and dt^2 (N - i - 1) for explicit Euler. Hence grad J =
@@ -18,35 +18,35 @@ class DoubleIntegrator(MechanicalScene):
 
     name = "double_integrator"
     leaves_out = "contact, friction, effort in the cost"
-    noise = "action"
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each control", "m/s^2", positive=True)
-    horizon: int = param(20, "number of time steps", positive=True)
+    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    horizon: int = param(20, "number of time steps", "steps", positive=True)
     dt: float = param(0.05, "length of a time step", "s", positive=True)
     control: float = param(1.0, "control of every step at theta", "m/s^2")
 
     def theta0(self) -> np.ndarray:
-        """The same control at every step."""
+        """Return the same control for every step."""
         return np.full(self.horizon, self.control)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """At rest at 0."""
+        """Start at rest at 0."""
         zero = 0.0 * theta[:1]
         return State(zero, zero)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """The control."""
+        """Return the control."""
         return u
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Half the squared distance to q = 1."""
+        """Return half the squared distance to q = 1."""
         return 0.5 * (q[0] - 1.0) ** 2
 
     def mjcf(self) -> str:
-        """A mass of 1 kg on a slide."""
+        """Return a mass of 1 kg on a slide."""
         return """
             <worldbody>
               <body>
@@ -56,19 +56,19 @@ class DoubleIntegrator(MechanicalScene):
             </worldbody>
             <actuator><motor joint="track"/></actuator>"""
 
-    def sensitivity(self, integrator: Integrator | None) -> np.ndarray | None:
-        """c = d q_N / d u, ``(horizon,)``, or None for an integrator it is not written down for."""
+    def sensitivity(self, integrator: Plugin | None) -> np.ndarray | None:
+        """Return c = d q_N / d u, ``(horizon,)``, or None for an integrator without a formula here."""
         steps = {"semi_implicit_euler": 0, "explicit_euler": 1}
         if integrator is None or integrator.name not in steps:
             return None
         return np.asarray(self.dt**2 * (self.horizon - steps[integrator.name] - np.arange(self.horizon)))
 
-    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray | None:
-        """(c . theta - 1) c."""
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray | None:
+        """Return (c . theta - 1) c."""
         c = self.sensitivity(integrator)
         return None if c is None else (c @ self.theta0() - 1.0) * c
 
-    def first_order_variance(self, integrator: Integrator | None) -> float | None:
-        """Trace of the covariance of a sample's gradient, sigma^2 |c|^4."""
+    def first_order_variance(self, integrator: Plugin | None) -> float | None:
+        """Return the trace of the covariance of a sample's gradient, sigma^2 |c|^4."""
         c = self.sensitivity(integrator)
         return None if c is None else float(self.sigma**2 * (c @ c) ** 2)

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, MechanicalScene, State, param
+from bench.model import Array, MechanicalScene, State, param
 
 
 @dataclass(frozen=True)
@@ -13,8 +13,8 @@ class DoublePendulum(MechanicalScene):
     """Two equal point masses on two equal rods; q are the absolute angles from hanging down.
 
     State (q1, q2, v1, v2); theta = its initial value, with parameter noise; f = 1 - cos q1 at the end. Equal masses
-    drop out of the motion, 0.1 kg each only scale its :meth:`energy`. Sample gradients grow exponentially with the
-    horizon, while costs, and with them the zeroth-order variance, stay bounded.
+    drop out of the motion; their 0.1 kg each only scale the :meth:`energy`. Sample gradients grow exponentially with
+    the horizon, while costs, and with them the zeroth-order variance, stay bounded.
     """
 
     name = "double_pendulum"
@@ -22,33 +22,33 @@ class DoublePendulum(MechanicalScene):
     n_q: ClassVar[int] = 2
 
     sigma: float = param(0.1, "standard deviation of the noise on the initial state", "rad and rad/s", positive=True)
-    horizon: int = param(100, "number of time steps", positive=True)
+    horizon: int = param(100, "number of time steps", "steps", positive=True)
     dt: float = param(0.01, "length of a time step", "s", positive=True)
     mass: float = param(0.1, "each point mass", "kg", positive=True)
     length: float = param(1.0, "length of each rod", "m", positive=True)
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2")
 
     def theta0(self) -> np.ndarray:
-        """First rod level and swinging up at 5 rad/s, second hanging and swinging the other way."""
+        """Start with the first rod level, swinging up at 5 rad/s, and the second hanging, swinging the other way."""
         return np.array([0.5 * np.pi, 0.0, 5.0, -5.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """theta itself."""
+        """Start at theta itself."""
         return State(theta[:2], theta[2:])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Lagrange's equations of 2 q1'' + c q2'' = f1 and c q1'' + q2'' = f2, c = cos(q1 - q2), solved by Cramer's rule."""
+        """Solve Lagrange's equations 2 q1'' + c q2'' = f1, c q1'' + q2'' = f2, c = cos(q1 - q2), by Cramer's rule."""
         c, s, pull = xp.cos(q[0] - q[1]), xp.sin(q[0] - q[1]), self.gravity / self.length
         f1 = -s * v[1] * v[1] - 2.0 * pull * xp.sin(q[0])
         f2 = s * v[0] * v[0] - pull * xp.sin(q[1])
         return xp.stack([f1 - c * f2, 2.0 * f2 - c * f1]) / (2.0 - c * c)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Height of the first mass over its lowest point, in rod lengths."""
+        """Return the height of the first mass over its lowest point, in rod lengths."""
         return 1.0 - xp.cos(q[0])
 
     def energy(self, xp: Any, q: Array, v: Array) -> Array:
-        """Kinetic and potential energy, ``(B,)`` [J]."""
+        """Return kinetic plus potential energy, ``(B,)`` [J]."""
         kinetic = v[0] * v[0] + 0.5 * v[1] * v[1] + v[0] * v[1] * xp.cos(q[0] - q[1])
         potential = -self.gravity / self.length * (2.0 * xp.cos(q[0]) + xp.cos(q[1]))
         return self.mass * self.length**2 * (kinetic + potential)

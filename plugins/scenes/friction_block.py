@@ -6,21 +6,21 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, MechanicalScene, State, param
+from bench.model import Array, FrictionScene, State, param
 
 
 @dataclass(frozen=True)
-class FrictionBlock(MechanicalScene):
+class FrictionBlock(FrictionScene):
     """A block lies on the ground by gravity and is dragged by a spring whose other end is pulled in jerks; q = (x, z).
 
     The end is at p(t) = V (t - a sin(w t) / w): pulled at speed V on average, and for a = 1 standing still once a
-    period 2 pi / w. theta = (V, a), with parameter noise; f = half the squared distance of the end position from (goal, 0).
-    The normal force comes from the contact law, the block starting at the depth that balances its weight under the
-    scene's stiffness; friction is regularised Coulomb, mu lambda tanh(slip / slip_speed), so that a sticking block creeps.
-    At a = 0 the end moves evenly. With one coefficient for stick and slip, the block then holds until the spring pulls
-    with mu m g and moves at V (1 - cos(sqrt(k/m) t)) after it, at rest for moments only: lasting sticks would take a
-    coefficient that falls with speed. Explicit steps are stable up to dt mu g < 2 slip_speed. Laws that work by
-    impulses have no friction: the block glides.
+    period 2 pi / w. theta = (V, a), with parameter noise; f = half the squared distance of the end position from (goal,
+    0). The normal force comes from the contact law, the block starting at the depth that balances its weight under the
+    scene's stiffness; friction is regularised Coulomb, mu lambda tanh(slip / slip_speed), so that a sticking block
+    creeps. At a = 0 the end moves evenly. With one coefficient for stick and slip, the block then holds until the
+    spring pulls with mu m g and moves at V (1 - cos(sqrt(k/m) t)) after that, at rest only for moments: lasting sticks
+    would need a coefficient that falls with speed. Explicit steps are stable up to dt mu g < 2 slip_speed. Impulse laws
+    have no friction: the block glides.
     """
 
     name = "friction_block"
@@ -31,7 +31,7 @@ class FrictionBlock(MechanicalScene):
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e5, "beta": 1e5}
 
     sigma: float = param(0.02, "standard deviation of the noise on V and a", "m/s and 1", positive=True)
-    horizon: int = param(1500, "number of time steps", positive=True)
+    horizon: int = param(1500, "number of time steps", "steps", positive=True)
     dt: float = param(0.001, "length of a time step", "s", positive=True)
     mass: float = param(1.0, "m", "kg", positive=True)
     gravity: float = param(9.81, "g", "m/s^2", positive=True)
@@ -46,43 +46,43 @@ class FrictionBlock(MechanicalScene):
     restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
-        """(V, a)."""
+        """Return (V, a)."""
         return np.array([self.pull, self.jerk])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """At rest, the spring without force."""
+        """Start at rest, the spring without force."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero - self.depth]), xp.stack([zero, zero]))
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """p, the position of the spring's end."""
+        """Return p, the position of the spring's end."""
         time = self.dt * xp.astype(xp.arange(self.horizon), theta.dtype)[:, None]
         return (theta[0] * (time - theta[1] * xp.sin(self.frequency * time) / self.frequency))[:, None, :]
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """The spring, and gravity."""
+        """Return the accelerations by the spring and by gravity."""
         return xp.stack([self.spring * (u[0] - q[0]) / self.mass, 0.0 * v[1] - self.gravity])
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """z."""
+        """Return z."""
         return q[1:2]
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """z'."""
+        """Return z'."""
         return v[1:2]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Upwards."""
+        """Push upwards."""
         return xp.stack([0.0 * force[0], force[0] / self.mass])
 
     def slip(self, xp: Any, q: Array, v: Array) -> Array:
-        """x'."""
+        """Return x'."""
         return v[0:1]
 
     def friction_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Along x."""
+        """Push along x."""
         return xp.stack([force[0] / self.mass, 0.0 * force[0]])
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Half the squared distance of the block from the goal on the ground."""
+        """Return half the squared distance of the block from the goal on the ground."""
         return 0.5 * ((q[0] - self.goal) ** 2 + q[1] ** 2)

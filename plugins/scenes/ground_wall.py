@@ -7,17 +7,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, MechanicalScene, State, param
+from bench.model import Array, ContactScene, State, param
 
 
 @dataclass(frozen=True)
-class GroundWall(MechanicalScene):
+class GroundWall(ContactScene):
     """A ball of mass 1 bounces off the ground, y = 0, and off a wall to its right; q = (x, y) is its centre.
 
     State (q, v); theta = initial velocity (d = 2), with parameter noise; f = squared distance to the target at T.
     Contacts are (ground, wall), both frictionless, so that x and y do not interact. Under gravity the impulse law has a
     wrong derivative by vy at every dt (see ``bouncing_ball``), while its derivative by vx is right with the time of
-    impact and of the wrong sign without. The penalty's damper sets in at once at touch, so that the program jumps
+    impact and has the wrong sign without it. The penalty's damper sets in at once at touch, so that the program jumps
     by O(dt) wherever contact begins on a step boundary, and the mean of its gradients is not the gradient of its mean.
     Source: Zhong, Han, Brikis 2022, task 2.
     """
@@ -29,7 +29,7 @@ class GroundWall(MechanicalScene):
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 10.0, "damping_mode": "approach"}
 
     sigma: float = param(0.1, "standard deviation of the noise on the velocity", "m/s", positive=True)
-    horizon: int = param(288, "number of time steps", positive=True)
+    horizon: int = param(288, "number of time steps", "steps", positive=True)
     dt: float = param(0.6 / 288.0, "length of a time step", "s", positive=True)
     mass: float = param(1.0, "mass of the ball", "kg", positive=True)
     radius: float = param(0.1, "radius of the ball", "m", positive=True)
@@ -44,36 +44,36 @@ class GroundWall(MechanicalScene):
     target_y: float = param(1.5, "y of the target", "m")
 
     def theta0(self) -> np.ndarray:
-        """(vx, vy)."""
+        """Return (vx, vy)."""
         return np.array([self.velocity_x, self.velocity_y])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """At the start, moving with theta."""
+        """Start at the fixed position, moving with theta."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero + self.start_x, zero + self.start_y]), theta)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Gravity."""
+        """Return gravity."""
         return xp.stack([0.0 * v[0], 0.0 * v[1] - self.gravity])
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """From the ball's surface to the ground and to the wall."""
+        """Return the distances of the ball's surface from the ground and the wall."""
         return xp.stack([q[1] - self.radius, self.wall - self.radius - q[0]])
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """(vy, -vx)."""
+        """Return (vy, -vx)."""
         return xp.stack([v[1], -v[0]])
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Up from the ground, left from the wall."""
+        """Push up from the ground and left from the wall."""
         return xp.stack([-force[1], force[0]]) / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Squared distance to the target."""
+        """Return the squared distance to the target."""
         return (q[0] - self.target_x) ** 2 + (q[1] - self.target_y) ** 2
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Grad f of rigid impacts with the scene's restitution, from event to event; None if the ball comes to rest."""
+        """Return grad f of rigid impacts with the scene's restitution, event by event; None if the ball stops."""
         final = self._rigid_end()
         if final is None:
             return None
@@ -81,12 +81,12 @@ class GroundWall(MechanicalScene):
         return np.array([2 * (x - self.target_x) * x_slope, 2 * (y - self.target_y) * y_slope])
 
     def physical_cost(self) -> float | None:
-        """f of the same impacts."""
+        """Return f of the same impacts."""
         final = self._rigid_end()
         return None if final is None else (final[0][0] - self.target_x) ** 2 + (final[1][0] - self.target_y) ** 2
 
     def _rigid_end(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
-        """x at T and its slope by vx, y at T and its slope by vy."""
+        """Return x at T and its slope by vx, y at T and its slope by vy."""
         end, e = self.horizon * self.dt, self.restitution
         from_wall = _bounced(self.wall - self.radius - self.start_x, -self.velocity_x, 0.0, e, end)
         from_ground = _bounced(self.start_y - self.radius, self.velocity_y, self.gravity, e, end)
@@ -96,7 +96,7 @@ class GroundWall(MechanicalScene):
 
 
 def _bounced(gap: float, velocity: float, gravity: float, e: float, end: float) -> tuple[float, float] | None:
-    """Gap at time ``end`` and its derivative by the initial velocity; None if motion ends in infinitely many impacts.
+    """Return the gap at ``end`` and its derivative by the initial velocity; None after infinitely many impacts.
 
     A fall from gap s at velocity v lasts t with s + v t = g t^2 / 2 and ends at speed w = sqrt(v^2 + 2 g s), with
     dt = t dv / w and dw = v dv / w.

@@ -2,11 +2,11 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, ContactLaw, FunctionScene, Integrator, param
+from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
 
 
 @dataclass(frozen=True)
@@ -18,24 +18,24 @@ class Heaviside(FunctionScene):
 
     name = "heaviside"
     leaves_out = "dynamics; stands for a contact that is made or missed"
-    continuous = False
+    continuous: ClassVar[bool] = False
 
     theta: float = param(0.0, "where the gradient is estimated; the jump is at 0")
 
     def theta0(self) -> np.ndarray:
-        """``(1,)``."""
+        """Return theta, ``(1,)``."""
         return np.array([self.theta])
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """The step, with derivative 0."""
+        """Return the step, with derivative 0."""
         zero = 0.0 * x[0]
         return xp.where(x[0] >= 0, zero + 1.0, zero)
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """The jump."""
+        """Return the place of the jump."""
         return ((0.0,),)
 
-    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray:
-        """phi(theta / sigma) / sigma."""
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
+        """Return phi(theta / sigma) / sigma."""
         z = self.theta / self.sigma
         return np.array([math.exp(-0.5 * z * z) / (math.sqrt(2 * math.pi) * self.sigma)])

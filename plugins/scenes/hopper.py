@@ -6,26 +6,26 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, MechanicalScene, State, param
+from bench.model import Array, ContactScene, EngineTwin, State, param
 
 
 @dataclass(frozen=True)
-class Hopper(MechanicalScene):
+class Hopper(EngineTwin, ContactScene):
     """A body on a spring-damper leg with a point foot hops on the spot; q = (body height z, foot height y).
 
     With the compression c = rest length - (z - y) the leg pushes body and foot apart with k c + b c' + u. The policy
     u = c z' (theta_0 + theta_1 (target - h)) makes the leg stiffer while the body rises than while it falls, more so
-    where the energy height h = z + z'^2 / 2g + k c^2 / (2 M g), the apex to come, is below target. theta are the two
-    gains; f = mean of (h - target)^2 over the steps, plus ``effort`` times the mean of u^2, plus (h - target)^2 at the end.
+    where the energy height h = z + z'^2 / 2g + k c^2 / (2 M g), the apex to come, is below target. theta holds the two
+    gains; f = mean of (h - target)^2 over the steps, plus ``effort`` times the mean of u^2, plus (h - target)^2 at
+    the end.
 
     The default lands and lifts off four times. Under a penalty the light foot rebounds within a stance, under
-    ``complementarity`` it stays down; the hops are the same. The ``impulse`` law is no ground to hop on: it follows the
-    velocity before the step, so that a pressed foot sinks at dt times the acceleration that presses it.
+    ``complementarity`` it stays down; the hops are the same. The ``impulse`` law is not a ground to hop on: it uses
+    the velocity before the step, so that a pressed foot sinks at dt times the acceleration that presses it.
     """
 
     name = "hopper"
     leaves_out: ClassVar[str] = "forward motion and pitch, the leg's angle and end stops, limits of the actuator"
-    noise = "action"
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1
@@ -33,7 +33,8 @@ class Hopper(MechanicalScene):
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
 
     sigma: float = param(1.0, "standard deviation of the noise on the force of each step", "N", positive=True)
-    horizon: int = param(1000, "number of time steps", positive=True)
+    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    horizon: int = param(1000, "number of time steps", "steps", positive=True)
     dt: float = param(0.002, "length of a time step", "s", positive=True)
     body_mass: float = param(1.0, "M, mass of the body", "kg", positive=True)
     foot_mass: float = param(0.1, "mass of the foot", "kg", positive=True)
@@ -47,38 +48,38 @@ class Hopper(MechanicalScene):
     restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
-        """100 N s/m^2 and 400 N s/m^3: they keep the default body hopping, a little below target."""
+        """Return 100 N s/m^2 and 400 N s/m^3, which keep the default body hopping, a little below target."""
         return np.array([100.0, 400.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """At rest in the air, the leg at its rest length."""
+        """Start at rest in the air, the leg at its rest length."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero + self.drop + self.leg, zero + self.drop]), xp.stack([zero, zero]))
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
-        """c z' (theta_0 + theta_1 (target - h))."""
+        """Return c z' (theta_0 + theta_1 (target - h))."""
         gain = theta[0] + theta[1] * (self.target - self._energy_height(q, v))
         return xp.stack([self._compression(q) * v[0] * gain])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Gravity and the leg."""
+        """Return the accelerations by gravity and the leg."""
         push = self.leg_stiffness * self._compression(q) + self.leg_damping * (v[1] - v[0]) + u[0]
         return xp.stack([push / self.body_mass - self.gravity, -push / self.foot_mass - self.gravity])
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Height of the foot."""
+        """Return the height of the foot."""
         return q[1:2]
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Velocity of the foot."""
+        """Return the velocity of the foot."""
         return v[1:2]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Upwards on the foot."""
+        """Push the foot upwards."""
         return xp.stack([0.0 * force[0], force[0] / self.foot_mass])
 
     def mjcf(self) -> str:
-        """Body and foot on vertical slides, a tendon between them for the leg; the foot a sphere over a plane."""
+        """Return body and foot on vertical slides, a tendon as the leg between them, the foot a sphere over a plane."""
         return f"""
             <option gravity="0 0 {-self.gravity}"/>
             <worldbody>
@@ -102,11 +103,11 @@ class Hopper(MechanicalScene):
             <actuator><motor tendon="leg"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """The step's share of error and effort."""
+        """Return the step's share of error and effort."""
         return (self.terminal_cost(xp, q, v) + self.effort * u[0] ** 2) / self.horizon
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Squared error of the energy height."""
+        """Return the squared error of the energy height."""
         return (self._energy_height(q, v) - self.target) ** 2
 
     def _compression(self, q: Array) -> Array:

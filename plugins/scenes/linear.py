@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.contracts import Array, ContactLaw, FunctionScene, Integrator, param
+from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
 
 
 @dataclass(frozen=True)
@@ -22,15 +22,15 @@ class Linear(FunctionScene):
     slope: float = param(2.0, "the largest of the slopes a_i")
 
     def theta0(self) -> np.ndarray:
-        """Evenly from 0.5 to 1.5."""
+        """Space theta evenly from 0.5 to 1.5."""
         return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """a . x."""
+        """Return a . x."""
         return self.slope * xp.sum(xp.asarray(_ramp(self.dimension)[:, None], dtype=x.dtype) * x, axis=0)
 
-    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray:
-        """The slopes a."""
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
+        """Return the slopes a."""
         return np.asarray(self.slope * _ramp(self.dimension))
 
 

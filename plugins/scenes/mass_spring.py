@@ -7,17 +7,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, ContactLaw, Integrator, MechanicalScene, State, param
+from bench.model import Array, ContactLaw, DampedScene, Integrator, Oscillator, Plugin, State, param
 
 
 @dataclass(frozen=True)
-class MassSpring(MechanicalScene):
+class MassSpring(Oscillator, DampedScene):
     """Two equal masses joined by a spring and damper, reduced to the spring's stretch: m q'' = -2 k q - 2 c q'.
 
     State (q, v), stretch and its rate; theta = their initial values, with parameter noise; f = q_N^2. With r the first
     row of the N-th power of the integrator's transition matrix, q_N = r . theta and grad J = 2 (r . theta) r whatever
     sigma. Semi-implicit Euler with velocity factor d is unstable when dt^2 2 k / m > 2 (1 + d), explicit Euler
-    without damping always; the gradient then grows with the horizon as the trajectory does.
+    without damping always is; the gradient then grows with the horizon as the trajectory does.
     """
 
     name = "mass_spring"
@@ -25,48 +25,47 @@ class MassSpring(MechanicalScene):
     n_q: ClassVar[int] = 1
 
     sigma: float = param(0.01, "standard deviation of the noise on stretch and rate", "m and m/s", positive=True)
-    horizon: int = param(100, "number of time steps", positive=True)
+    horizon: int = param(100, "number of time steps", "steps", positive=True)
     dt: float = param(0.01, "length of a time step", "s", positive=True)
     stiffness: float = param(50.0, "k of the spring", "N/m", low=0.0)
     damping: float = param(0.0, "c of the damper beside the spring", "N s/m", low=0.0)
     mass: float = param(1.0, "m, mass of each body", "kg", positive=True)
-    velocity_factor: float = param(1.0, "factor on the velocity each step", low=0.0)
     stretch: float = param(0.1, "initial stretch at theta", "m")
     rate: float = param(0.0, "initial rate of the stretch at theta", "m/s")
 
     def theta0(self) -> np.ndarray:
-        """(stretch, rate)."""
+        """Return (stretch, rate)."""
         return np.array([self.stretch, self.rate])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """theta itself."""
+        """Start at theta itself."""
         return State(theta[0:1], theta[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """The spring's and the damper's, on both masses."""
+        """Return the acceleration by spring and damper on both masses."""
         return -2.0 / self.mass * (self.stiffness * q + self.damping * v)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Squared stretch."""
+        """Return the squared stretch."""
         return q[0] * q[0]
 
     def energy(self, q: Array, v: Array) -> Array:
-        """k q^2 / 2 + (m / 2) v^2 / 2 with the reduced mass, ``(B,)`` [J]."""
+        """Return k q^2 / 2 + (m / 2) v^2 / 2 with the reduced mass, ``(B,)`` [J]."""
         return 0.5 * self.stiffness * q[0] * q[0] + 0.25 * self.mass * v[0] * v[0]
 
     def oscillator(self) -> tuple[float, float, float]:
-        """Stiffness 2 k / m [1/s^2], damping 2 c / m [1/s] and velocity factor, as transition matrices take them."""
+        """Return stiffness 2 k / m [1/s^2], damping 2 c / m [1/s] and velocity factor, for transition matrices."""
         return 2.0 * self.stiffness / self.mass, 2.0 * self.damping / self.mass, self.velocity_factor
 
-    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray | None:
-        """2 (r . theta) r."""
-        if integrator is None:
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray | None:
+        """Return 2 (r . theta) r."""
+        if not isinstance(integrator, Integrator):
             return None
         step = integrator.transition(self.dt, *self.oscillator())
         return self._gradient(np.linalg.matrix_power(step, self.horizon)[0])
 
     def physical_gradient(self) -> np.ndarray | None:
-        """r = the first row of exp(T A), A the oscillator's matrix; None with a velocity factor, no physics of its own."""
+        """Use r = first row of exp(T A), A the oscillator's matrix; None with a velocity factor (not physical)."""
         if self.velocity_factor != 1.0:
             return None
         stiffness, damping, _ = self.oscillator()

@@ -5,11 +5,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, MechanicalScene, State, param
+from bench.model import Array, EngineTwin, MechanicalScene, State, param
 
 
 @dataclass(frozen=True)
-class Pendulum(MechanicalScene):
+class Pendulum(EngineTwin, MechanicalScene):
     """A point mass on a rod, hanging at rest: m l^2 q'' = u - m g l sin q - b q'; q from the lowest point.
 
     State (q, q'); theta is the torque of each step (d = horizon). f = 1 + cos q_T + 0.1 q'_T^2 (0 at rest upright)
@@ -18,13 +18,13 @@ class Pendulum(MechanicalScene):
 
     name = "pendulum"
     leaves_out = "the rod's mass, torque limits, contact"
-    noise = "action"
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1
 
     sigma: float = param(0.3, "standard deviation of the noise on each torque", "N m", positive=True)
-    horizon: int = param(50, "number of time steps", positive=True)
+    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    horizon: int = param(50, "number of time steps", "steps", positive=True)
     dt: float = param(0.02, "length of a time step", "s", positive=True)
     mass: float = param(1.0, "mass at the tip", "kg", positive=True)
     length: float = param(0.5, "length of the rod", "m", positive=True)
@@ -34,21 +34,21 @@ class Pendulum(MechanicalScene):
     effort: float = param(1e-3, "cost per squared torque and second", "1/(N^2 m^2 s)", low=0.0)
 
     def theta0(self) -> np.ndarray:
-        """The same torque at every step."""
+        """Return the same torque for every step."""
         return np.full(self.horizon, self.torque)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Hanging at rest."""
+        """Start hanging at rest."""
         zero = 0.0 * theta[:1]
         return State(zero, zero)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Torque, damping and gravity over the moment of inertia."""
+        """Return torque, damping and gravity over the moment of inertia."""
         inertia = self.mass * self.length * self.length
         return (u - self.damping * v) / inertia - self.gravity / self.length * xp.sin(q)
 
     def mjcf(self) -> str:
-        """A point mass below a hinge; q is the angle from the lowest point."""
+        """Return a point mass below a hinge; q is the angle from the lowest point."""
         return f"""
             <option gravity="0 0 {-self.gravity}"/>
             <worldbody>
@@ -60,9 +60,9 @@ class Pendulum(MechanicalScene):
             <actuator><motor joint="pivot"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Effort of one step."""
+        """Return the effort of one step."""
         return self.effort * self.dt * u[0] * u[0]
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Height missing to the top, in rod lengths, and what is left of the velocity."""
+        """Return the height missing to the top, in rod lengths, plus a tenth of the squared velocity."""
         return 1.0 + xp.cos(q[0]) + 0.1 * v[0] * v[0]

@@ -6,11 +6,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, MechanicalScene, State, param
+from bench.model import Array, ContactScene, DampedScene, EngineTwin, State, param
 
 
 @dataclass(frozen=True)
-class Pushing(MechanicalScene):
+class Pushing(EngineTwin, DampedScene, ContactScene):
     """Two bodies on a line, the first pushed by an open-loop force; they touch when closer than 1 m.
 
     State (x1, x2, v1, v2); theta is the force sequence (d = horizon). f = sum over steps of the Q-weighted squared
@@ -21,7 +21,6 @@ class Pushing(MechanicalScene):
     leaves_out: ClassVar[str] = (
         "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
     )
-    noise = "action"
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 1
@@ -30,7 +29,8 @@ class Pushing(MechanicalScene):
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e3}
 
     sigma: float = param(0.3, "standard deviation of the noise on each force", "N", positive=True)
-    horizon: int = param(30, "number of time steps", positive=True)
+    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    horizon: int = param(30, "number of time steps", "steps", positive=True)
     dt: float = param(0.005, "length of a time step", "s", positive=True)
     mass: float = param(0.1, "mass of each body", "kg", positive=True)
     velocity_factor: float = param(0.6, "factor on the velocities each step", low=0.0)
@@ -39,32 +39,32 @@ class Pushing(MechanicalScene):
     restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
-        """The same push at every step."""
+        """Return the same push for every step."""
         return np.full(self.horizon, self.push)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Bodies just touching, the first moving at ``speed``."""
+        """Start with the bodies just touching, the first moving at ``speed``."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero + 1.0]), xp.stack([zero + self.speed, zero]))
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """The push on the first body."""
+        """Return the push on the first body as accelerations."""
         return xp.stack([u[0] / self.mass, 0.0 * u[0]])
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """x2 - x1 - 1."""
+        """Return x2 - x1 - 1."""
         return q[1:2] - q[0:1] - 1.0
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """v2 - v1."""
+        """Return v2 - v1."""
         return v[1:2] - v[0:1]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Equal and opposite."""
+        """Push both bodies with equal and opposite force."""
         return xp.stack([-force[0] / self.mass, force[0] / self.mass])
 
     def mjcf(self) -> str:
-        """Two spheres of radius 0.5 m on one line; joint damping of (1 - velocity_factor) m / dt is the numerical damping."""
+        """Return two spheres of radius 0.5 m on a line; joint damping (1 - velocity_factor) m / dt is numerical."""
         damping = (1.0 - self.velocity_factor) * self.mass / self.dt
         bodies = "".join(
             f"""
@@ -81,9 +81,9 @@ class Pushing(MechanicalScene):
             <actuator><motor joint="first"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Distance to the goal before the step, and effort."""
+        """Return the distance to the goal before the step, plus effort."""
         return self.terminal_cost(xp, q, v) + u[0] * u[0]
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Weights (0.1, 10, 0.1, 0.1) on the squared distance to x = (1, 2), v = (speed, 0)."""
+        """Weight the squared distance to x = (1, 2), v = (speed, 0) by (0.1, 10, 0.1, 0.1)."""
         return 0.1 * (q[0] - 1.0) ** 2 + 10.0 * (q[1] - 2.0) ** 2 + 0.1 * (v[0] - self.speed) ** 2 + 0.1 * v[1] ** 2

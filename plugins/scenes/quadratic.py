@@ -5,14 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from bench.contracts import Array, ContactLaw, FunctionScene, Integrator, param
+from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
 
 
 @dataclass(frozen=True)
 class Quadratic(FunctionScene):
     """f = sum_i c_i x_i^2 / 2, with x = theta + sigma w.
 
-    The curvatures c_i are spaced geometrically from 1 to ``condition``; theta runs evenly from 0.5 to 1.5. grad J = c theta, whatever sigma.
+    The curvatures c_i are spaced geometrically from 1 to ``condition``; theta runs evenly from 0.5 to 1.5.
+    grad J = c theta, whatever sigma.
     """
 
     name = "quadratic"
@@ -22,16 +23,16 @@ class Quadratic(FunctionScene):
     condition: float = param(10.0, "largest curvature over the smallest", positive=True)
 
     def theta0(self) -> np.ndarray:
-        """Evenly from 0.5 to 1.5."""
+        """Space theta evenly from 0.5 to 1.5."""
         return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """The weighted squares."""
+        """Return the weighted squares."""
         exponents = xp.asarray(_exponents(self.dimension)[:, None], dtype=x.dtype)
         return 0.5 * xp.sum(self.condition**exponents * x * x, axis=0)
 
-    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray:
-        """c theta."""
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
+        """Return c theta."""
         return np.asarray(self.condition ** _exponents(self.dimension) * self.theta0())
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.contracts import Array, ContactLaw, FunctionScene, Integrator, param
+from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
 
 
 @dataclass(frozen=True)
@@ -24,25 +24,25 @@ class SoftHeaviside(FunctionScene):
     nu: float = param(0.1, "width of the ramp", positive=True)
 
     def theta0(self) -> np.ndarray:
-        """``(1,)``."""
+        """Return theta, ``(1,)``."""
         return np.array([self.theta])
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """The ramp from -1 to 1."""
+        """Return the ramp from -1 to 1."""
         z = 2.0 * x[0] / self.nu
         flat = 0.0 * z
         return xp.where(z > 1, flat + 1.0, xp.where(z < -1, flat - 1.0, z))
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """Both ends of the ramp."""
+        """Return both ends of the ramp."""
         return ((-self.nu / 2, self.nu / 2),)
 
     def probability(self) -> float:
-        """p, the chance that a sample falls on the ramp."""
+        """Return p, the chance that a sample falls on the ramp."""
         scale = math.sqrt(2) * self.sigma
         upper, lower = (self.nu / 2 - self.theta) / scale, (-self.nu / 2 - self.theta) / scale
         return 0.5 * (math.erf(upper) - math.erf(lower))
 
-    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray:
-        """2 p / nu."""
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
+        """Return 2 p / nu."""
         return np.array([2 * self.probability() / self.nu])

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, ContactLaw, Integrator, MechanicalScene, State, param
+from bench.model import Array, ContactLaw, Integrator, MechanicalScene, Plugin, State, param
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class StiffDecay(MechanicalScene):
 
     One step multiplies x by the integrator's stability function R(rate dt), so that grad J = R^N whatever sigma. At
     the default, rate dt = -2.5, it is -1.5 for explicit Euler and 1 / 3.5 for implicit Euler; the physics has
-    e^-2.5 a step. Outside the stability region the derivative is exact for its program and useless.
+    e^-2.5 per step. Outside the stability region the derivative is exact for its program and useless.
     """
 
     name = "stiff_decay"
@@ -24,33 +24,33 @@ class StiffDecay(MechanicalScene):
     n_v: ClassVar[int | None] = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on x_0", positive=True)
-    horizon: int = param(20, "number of time steps", positive=True)
+    horizon: int = param(20, "number of time steps", "steps", positive=True)
     dt: float = param(0.05, "length of a time step", "s", positive=True)
     rate: float = param(-50.0, "growth rate, negative for decay", "1/s")
     start: float = param(1.0, "x_0 at theta")
 
     def theta0(self) -> np.ndarray:
-        """(x_0,)."""
+        """Return (x_0,)."""
         return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """No position, x_0 as velocity."""
+        """Start without a position, with x_0 as velocity."""
         return State(theta[:0], theta)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """rate x."""
+        """Return rate x."""
         return self.rate * v
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """x_N."""
+        """Return x_N."""
         return v[0]
 
-    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Integrator | None) -> np.ndarray | None:
-        """R(rate dt)^N."""
-        if integrator is None:
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray | None:
+        """Return R(rate dt)^N."""
+        if not isinstance(integrator, Integrator):
             return None
         return np.array([float(np.real(integrator.amplification(self.rate * self.dt) ** self.horizon))])
 
     def physical_gradient(self) -> np.ndarray:
-        """e^(rate T)."""
+        """Return e^(rate T)."""
         return np.array([math.exp(self.rate * self.horizon * self.dt)])

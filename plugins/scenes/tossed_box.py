@@ -1,4 +1,4 @@
-"""A box tossed on the ground: four corners that slide, stick and bounce, for physics engines alone."""
+"""A box tossed on the ground, only for physics engines: four corners that slide, stick and bounce."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,26 +6,25 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, MechanicalScene, State, Unsupported, param
+from bench.model import Array, EngineScene, State, param
 
 
 @dataclass(frozen=True)
-class TossedBox(MechanicalScene):
+class TossedBox(EngineScene):
     """A square box in a vertical plane lands on its corners, tumbles and slides; q = (x, height, pitch) of its centre.
 
-    State (q, v); theta is the first velocity (m/s, m/s, rad/s), with parameter noise; f = (x_T - target)^2. Four contacts
-    with friction are coupled through one body: only a physics engine runs it, from the MJCF twin.
+    State (q, v); theta is the first velocity (m/s, m/s, rad/s), with parameter noise; f = (x_T - target)^2. Four
+    contacts with friction are coupled through one body: only a physics engine runs it, from the MJCF twin.
     """
 
     name = "tossed_box"
     leaves_out: ClassVar[str] = "the third dimension, edges and faces (corners are small spheres)"
-    needs_physics: ClassVar[bool] = True
     n_q: ClassVar[int] = 3
     n_contacts: ClassVar[int] = 4
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 50.0, "damping_mode": "clipped"}
 
     sigma: float = param(0.1, "standard deviation of the noise on the first velocity", "m/s and rad/s", positive=True)
-    horizon: int = param(250, "number of time steps", positive=True)
+    horizon: int = param(250, "number of time steps", "steps", positive=True)
     dt: float = param(0.002, "length of a time step", "s", positive=True)
     mass: float = param(1.0, "mass of the box", "kg", positive=True)
     side: float = param(0.2, "length of a side", "m", positive=True)
@@ -37,28 +36,20 @@ class TossedBox(MechanicalScene):
     target: float = param(0.5, "horizontal position wanted at the end", "m")
 
     def theta0(self) -> np.ndarray:
-        """Thrown forwards, spinning."""
+        """Throw forwards, spinning."""
         return np.array([self.speed, 0.0, self.spin])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Level, at ``height``, with velocity theta."""
+        """Start level, at ``height``, with velocity theta."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero + self.height, zero]), theta)
 
-    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """The engine's: raises :class:`Unsupported`."""
-        raise Unsupported("tossed_box moves in physics engines alone")
-
-    def gap(self, xp: Any, q: Array) -> Array:
-        """The engine's: raises :class:`Unsupported`."""
-        raise Unsupported("the contacts of tossed_box are a physics engine's")
-
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Squared distance to the target."""
+        """Return the squared distance to the target."""
         return (q[0] - self.target) ** 2
 
     def mjcf(self) -> str:
-        """A box's mass with a small sphere in each corner, over a plane."""
+        """Return a box's mass with a small sphere in each corner, over a plane."""
         inertia = self.mass * self.side**2 / 6
         radius, half = 0.05 * self.side, 0.45 * self.side
         corners = {f"corner{i}{j}": (i * half, j * half) for i in (-1, 1) for j in (-1, 1)}

@@ -1,4 +1,4 @@
-"""A point running into a soft wall: how the step size alone ruins a penalty gradient."""
+"""A point running into a soft wall: how the step size by itself ruins a penalty gradient."""
 
 import math
 from collections.abc import Mapping
@@ -7,18 +7,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.contracts import Array, MechanicalScene, State, param
+from bench.model import Array, ContactScene, EngineTwin, State, param
 
 
 @dataclass(frozen=True)
-class WallPenalty1d(MechanicalScene):
+class WallPenalty1d(EngineTwin, ContactScene):
     """A point of mass 1 at q0 > 0 moves at velocity -1 into a wall at q = 0, which pushes with -v - 50 q, unclipped.
 
     State (q, v); theta = q0 (d = 1), with parameter noise; f = |q_T - 1| with T = horizon dt = 2 s. The wall is a
     penalty law with the values of ``contact_values``; unlike elsewhere the softness is part of the physics, which the
-    physical gradient takes at dt -> 0. Its damper acts from first touch, so that the program jumps by O(dt) once a
-    step's worth of q0: its derivative tends to the physical one where the wall is left again, not for rollouts that
-    end in it. Source: Paulus et al. 2025, toy example.
+    physical gradient takes at dt -> 0. Its damper acts from first touch, so that the program jumps by O(dt) each time
+    q0 grows by one step's travel: its derivative tends to the physical one where the wall is left again, not for
+    rollouts that end in it. Source: Paulus et al. 2025, toy example.
     """
 
     name = "wall_penalty_1d"
@@ -29,43 +29,43 @@ class WallPenalty1d(MechanicalScene):
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 50.0, "damping": 1.0, "damping_mode": "linear"}
 
     sigma: float = param(0.1, "standard deviation of the noise on q0", "m", positive=True)
-    horizon: int = param(200, "number of time steps", positive=True)
+    horizon: int = param(200, "number of time steps", "steps", positive=True)
     dt: float = param(0.01, "length of a time step", "s", positive=True)
     start: float = param(0.6, "q0 at theta", "m")
-    restitution: float = param(1.0, "restitution of impulse laws", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
-        """(q0,)."""
+        """Return (q0,)."""
         return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """At q0, moving towards the wall at 1 m/s."""
+        """Start at q0, moving towards the wall at 1 m/s."""
         return State(theta[0:1], 0.0 * theta[0:1] - 1.0)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """None but the wall's."""
+        """Return zero: only the wall pushes."""
         return 0.0 * v
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """q."""
+        """Return q."""
         return q
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """v."""
+        """Return v."""
         return v
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Away from the wall, mass 1."""
+        """Push away from the wall, with mass 1."""
         return force
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Distance to q = 1."""
+        """Return the distance to q = 1."""
         return xp.abs(q[0] - 1.0)
 
     def mjcf(self) -> str:
-        """A sphere on a slide, in front of a plane; its own position is that of the point that touches.
+        """Return a sphere on a slide, in front of a plane; its own position is that of the point that touches.
 
-        An engine's contact never pulls, so that this is the twin with ``damping_mode=clipped`` and not of the default wall.
+        An engine's contact never pulls, so this is the twin of the wall with ``damping_mode=clipped``, not of the
+        default wall.
         """
         return """
             <worldbody>
@@ -78,27 +78,27 @@ class WallPenalty1d(MechanicalScene):
             <contact><pair geom1="wall" geom2="point" condim="1"/></contact>"""
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """Of the physics: start in touch; end at q = 1 after a bounce, when leaving, when touching, at q = 1 untouched.
+        """Return the physics' kinks: start in touch; end at q = 1 bounced, leaving, touching, at q = 1 untouched.
 
-        A program jumps besides, by O(dt), wherever contact begins or ends on the boundary between two steps.
+        A program also jumps, by O(dt), wherever contact begins or ends on the boundary between two steps.
         """
         end = self.horizon * self.dt
         _, duration, speed = self._wall()
         return ((0.0, end - duration - 1.0 / speed, end - duration, end, end + 1.0),)
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Exact for dt -> 0 under the penalty wall; None for a start inside the wall."""
+        """Return the exact gradient for dt -> 0 under the penalty wall; None for a start inside the wall."""
         if self.start < 0.0:
             return None
         reached, slope = self._soft_end()
         return np.array([slope if reached > 1.0 else -slope])
 
     def physical_cost(self) -> float | None:
-        """The same of f."""
+        """Return f under the same conditions."""
         return None if self.start < 0.0 else abs(self._soft_end()[0] - 1.0)
 
     def _soft_end(self) -> tuple[float, float]:
-        """q_T and its slope by q0, for a start outside the wall."""
+        """Return q_T and its slope by q0, for a start outside the wall."""
         rate, duration, speed = self._wall()
         inside = self.horizon * self.dt - self.start  # time since first touch
         if inside <= 0.0:
@@ -110,7 +110,7 @@ class WallPenalty1d(MechanicalScene):
         return speed * (inside - duration), -speed
 
     def _wall(self) -> tuple[float, float, float]:
-        """Angular frequency of a contact, its duration, and the speed after it."""
+        """Return the angular frequency of a contact, its duration, and the speed after it."""
         half = 0.5 * self.contact_values["damping"]
         rate = math.sqrt(self.contact_values["stiffness"] - half * half)
         duration = math.pi / rate

@@ -1,44 +1,60 @@
-"""The page of a study that has none of its own: one chart of whichever two of its numbers the reader picks."""
+"""The page of a study without a page of its own: one chart of any two of its numbers, as the reader chooses."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
 import pandas as pd
 
-from bench.grid import Experiment
-from bench.report.web.content import STATUS, Axis, Chart, Column, Content, counted, identity_columns, looks, titled
-from bench.store import IDENTITY, TEXT
+from bench.report.text import counted
+from bench.report.views import arranged
+from bench.report.web.content import (
+    STATUS,
+    Axis,
+    Chart,
+    Column,
+    Content,
+    identity_columns,
+    logarithmic,
+    looks,
+    numeric_axis,
+    titled,
+)
+from bench.sweep import columns
+from bench.sweep.columns import COMMON, IDENTITY
+from bench.sweep.experiment import Experiment
 
 
-def content(experiment: Experiment, rows: pd.DataFrame, axes: Sequence[str]) -> Content:
-    """Counts, a chart of the study's own numbers against the swept ones, and the table."""
-    own = [name for name in rows if name not in (*IDENTITY, *TEXT, "dim")]
-    numbers = [str(name) for name in own if pd.api.types.is_numeric_dtype(rows[name]) and rows[name].notna().any()]
-    texts = [str(name) for name in own if name not in numbers and rows[name].map(type).eq(str).all()]
-    made = rows.assign(series=titled(rows, ["scene", "estimator", "estimator_params"]))
-    swept = [name for name in IDENTITY if name in rows.select_dtypes("number") and rows[name].nunique() > 1]
-    x = [_axis(rows, name) for name in (*swept, *numbers)]
-    y = [_axis(rows, name) for name in numbers]
+def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
+    """Return counts, a chart of the study's own numbers against the swept ones, and the table."""
+    shown = arranged(experiment, rows)
+    table = shown.rows
+    own = [
+        column
+        for column in experiment.columns.all
+        if column.table and column.name not in COMMON and column.name in rows
+    ]
+    numbers = [column for column in own if column.kind == "number" and table[column.name].notna().any()]
+    texts = [column.name for column in own if column.kind == "text" and table[column.name].nunique() > 1]
+    named = [name for name in ("scene", "contact", "estimator", "estimator_params") if table[name].nunique() > 1]
+    named_rows = table.assign(series=titled(table, named or ["scene"]))
+    swept = {axis.column: numeric_axis(axis, axis.column, logarithmic(table[axis.column])) for axis in shown.swept()}
+    moving = [name for name in IDENTITY if name in table.select_dtypes("number") and table[name].nunique() > 1]
+    x = [*swept.values(), *(_axis(table, COMMON[name]) for name in moving if name not in swept)]
+    y = [_axis(table, column) for column in numbers]
     good = int((rows["status"] == "ok").sum())
     return Content(
         finding=f"{good} of {counted(len(rows), 'cell')} gave a result.",
-        rows=made,
+        rows=named_rows,
         columns=[
-            *identity_columns(rows),
-            *(Column(name, name.replace("_", " "), "text") for name in texts if rows[name].nunique() > 1),
-            *(Column(name, name.replace("_", " ")) for name in numbers),
+            *identity_columns(table, [axis.column for axis in shown.axes]),
+            *(Column(name, name.replace("_", " "), "text") for name in texts),
+            *(Column(column.name, column.name.replace("_", " ")) for column in numbers),
             *STATUS,
         ],
-        charts=[Chart("Results", "Choose what to see against what.", x, y)] if x and y else [],
-        looks=looks(list(made["series"])),
+        charts=[Chart("Results", "Choose what to see against what.", [*x, *y], y)] if y else [],
+        looks=looks(list(named_rows["series"])),
     )
 
 
-def _axis(rows: pd.DataFrame, name: str) -> Axis:
-    """Logarithmic where all values are positive and some are apart."""
-    values = rows[name][np.isfinite(rows[name])]
-    return Axis(
-        name, name.replace("_", " "), log=bool(len(values) and values.min() > 0 and values.max() > 10 * values.min())
-    )
+def _axis(rows: pd.DataFrame, column: columns.Column) -> Axis:
+    unit = f" [{column.unit}]" if column.unit else ""
+    return Axis(column.name, column.name.replace("_", " ") + unit, logarithmic(rows[column.name]))

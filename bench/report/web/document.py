@@ -1,4 +1,4 @@
-"""The file itself: texts escaped, numbers as columns, and script, style and Plotly inside."""
+"""Writes the file itself: texts escaped, numbers as columns, and script, style and Plotly inside."""
 
 from __future__ import annotations
 
@@ -17,24 +17,22 @@ from typing import Any
 
 import pandas as pd
 
-from bench.grid import Experiment
 from bench.report import reproduce
 from bench.report.web.content import Axis, Chart, Content
-from bench.store import IDENTITY
+from bench.sweep.columns import IDENTITY
+from bench.sweep.experiment import Experiment
 
 HERE = Path(__file__).parent
 DIGITS = 6
 """Significant digits of the numbers in a page."""
-FILTERED = ("scene", "contact", "integrator", "backend", "estimator", "estimator_params", "stiffness", "sigma", "smoothing",
-            "horizon", "dt", "samples", "noise", "dtype", "seed", "verdict", "outcome", "experiment", "status")  # fmt: skip
-"""Columns to filter by, where they vary and have at most MOST values."""
 MOST = 24
+"""Largest number of values of a column to filter by."""
 
 
 def assemble(
     experiment: Experiment, content: Content, commands: Sequence[Sequence[str]], record: Mapping[str, Any]
 ) -> str:
-    """The page; ``commands`` are the words that run each row's cell, ``record`` what ``run.json`` says."""
+    """Assemble the page; ``commands`` are the words to run each row's cell, ``record`` the content of ``run.json``."""
     counts = content.rows["status"].value_counts()
     statuses = "".join(f'<li class="{escape(str(s))}"><b>{n}</b> {escape(str(s))}</li>' for s, n in counts.items())
     parts = {
@@ -50,21 +48,22 @@ def assemble(
         "plotly": plotly(),
     }
     template = (HERE / "page.html").read_text()
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template)
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
 
 
 def in_script(text: str) -> str:
-    """JSON that no browser takes for the end of the script it stands in."""
+    """Write JSON so that no browser takes it for the end of its script."""
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
 @cache
 def plotly() -> str:
-    """Plotly's script, compressed: base64 of gzip, a third of its size."""
-    found = find_spec("plotly")
-    assert found is not None
-    assert found.origin is not None
-    script = (Path(found.origin).parent / "package_data" / "plotly.min.js").read_bytes()
+    """Return Plotly's script, compressed: base64 of gzip, a third of its size."""
+    spec = find_spec("plotly")
+    assert spec is not None
+    assert spec.origin is not None
+    script = (Path(spec.origin).parent / "package_data" / "plotly.min.js").read_bytes()
+    # without a time stamp, so that equal pages are equal files
     return base64.b64encode(gzip.compress(script, mtime=0)).decode()
 
 
@@ -72,10 +71,10 @@ def plotly() -> str:
 
 
 def data(content: Content, commands: Sequence[Sequence[str]]) -> dict[str, Any]:
-    """What the script draws: tables as columns, and how to draw them."""
+    """Return the data that the script draws: tables as columns, and how to draw them."""
     rows = content.rows
-    filters = [c for c in FILTERED if c in rows and 1 < rows[c].nunique(dropna=False) <= MOST]
-    wanted = {"rows": {*IDENTITY, "reason", "status", *filters, *(c.name for c in content.columns)}}
+    filters = filtered(content)
+    wanted = {"rows": {*IDENTITY, *content.swept, "reason", "status", *filters, *(c.name for c in content.columns)}}
     wanted["rows"] |= {c.flag for c in content.columns}
     for chart in content.charts:
         wanted.setdefault(chart.table, {"row"}).update(_columns_of(chart))
@@ -90,9 +89,20 @@ def data(content: Content, commands: Sequence[Sequence[str]]) -> dict[str, Any]:
         "charts": [asdict(chart) for chart in content.charts],
         "looks": content.looks,
         "filters": filters,
-        "identity": [c for c in IDENTITY if c in rows],
+        "identity": [c for c in dict.fromkeys((*IDENTITY, *content.swept)) if c in rows],
         "command": {"head": reproduce.HEAD, "words": [column(pd.Series(part, dtype=object)) for part in words]},
     }
+
+
+def filtered(content: Content) -> list[str]:
+    """Return the columns to filter by: cell identity, swept parameters and verdicts of the table, where they vary.
+
+    Columns with more than :data:`MOST` values are left out, and so are the reasons, which are for reading.
+    """
+    rows = content.rows
+    texts = [column.name for column in content.columns if column.kind == "text" and column.name != "reason"]
+    names = dict.fromkeys((*IDENTITY, *content.swept, *texts, "experiment", "status"))
+    return [name for name in names if name in rows and 1 < rows[name].nunique(dropna=False) <= MOST]
 
 
 def _columns_of(chart: Chart) -> set[str]:
@@ -102,7 +112,7 @@ def _columns_of(chart: Chart) -> set[str]:
 
 
 def column(values: pd.Series) -> Any:
-    """Numbers as they are, None where there is none; texts as a list of the different ones and the place in it of each."""
+    """Write numbers as they are, None where missing; write texts as a list of distinct ones and an index into it."""
     if pd.api.types.is_bool_dtype(values) or not pd.api.types.is_numeric_dtype(values):
         codes, unique = pd.factorize(values.astype(str))
         return {"values": list(unique), "index": codes.tolist()}
@@ -120,13 +130,13 @@ def _short(value: float) -> float | int | None:
 
 
 def _finding(text: str) -> str:
-    """The finding, each further part of it on a line of its own, in smaller letters."""
+    """Write the finding, each further part of it on a line of its own, in smaller letters."""
     first, *rest = text.split("; ")
     return escape(first) + "".join(f"<span>{escape(part)}</span>" for part in rest)
 
 
 def _answers(content: Content) -> str:
-    """What to use where, as a table."""
+    """Write the answers on what to use where, as a table."""
     table = content.answers
     if table.empty:
         return ""
@@ -139,7 +149,7 @@ def _answers(content: Content) -> str:
 
 
 def _made(record: Mapping[str, Any]) -> str:
-    """Machine, versions and configuration, as far as they are recorded."""
+    """Write machine, versions and configuration, as far as they are recorded."""
     if not record:
         return "<p>There is no run.json beside this page, so machine and versions are not known.</p>"
     machine = record.get("machine") or {}

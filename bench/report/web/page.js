@@ -1,8 +1,8 @@
 /* Filters, charts, the table and the selected cell of a page, drawn from the columns in #data.
 
    A table is columns by name: a list of numbers (null where there is none), or texts as {values, index}. The table
-   "rows" has a line per cell; the others have a column "row" with the place there that each of their lines is from.
-   Texts reach the page through textContent or plotted() alone, so that none is taken for HTML. */
+   "rows" has a line per cell; in the others the column "row" has the index in "rows" that a line comes from.
+   Texts reach the page only through textContent or plotted(), so that none is taken for HTML. */
 "use strict";
 
 const page = JSON.parse(document.getElementById("data").textContent);
@@ -207,7 +207,7 @@ function choice(chart, label, property, axes) {
   return element("label", {}, label + " ", select);
 }
 
-/* Charts in sight are drawn one a frame, so that the page answers meanwhile; the others when they come into it. */
+/* Charts in sight are drawn one per frame, so that the page stays responsive; the others when they come into sight. */
 function markDirty() {
   for (const chart of charts) chart.dirty = true;
   requestAnimationFrame(drawNext);
@@ -286,7 +286,7 @@ const inkOn = (ground) => {
   return 0.3 * r + 0.59 * g + 0.11 * b > 130 ? "#000000" : "#ffffff";
 };
 
-/* The points to draw: panels by name, in each the points of a line or series, and all its points by what they compete in. */
+/* The points to draw: panels by name, each with the points of a line or series, and all its points by front. */
 function pointPanels(chart) {
   const [x, y] = [chart.xAxis, chart.yAxis];
   const read = (name) => (name ? reader(chart.table, name) : () => null);
@@ -370,14 +370,14 @@ function trace(chart, points, joined) {
 }
 
 const tellingColumns = page.columns.filter((column) => page.identity.includes(column.name) && !column.name.startsWith("estimator"));
-const told = []; // of each row, once it was drawn, which cell it is
+const cellTexts = []; // per row that was drawn, a text that identifies its cell
 
 function hover(chart, point) {
   const { xAxis, yAxis } = chart;
   const interval = point.low !== null && point.high !== null && !point.limit
     ? ` [${number(point.low)}, ${number(point.high)}]` : "";
-  if (!told[point.row]) told[point.row] = tellingColumns.map((c) => plotted(`${c.label} ${shownAs(c, point.row)}`)).join("<br>");
-  return [`<b>${plotted(point.series)}</b>`, told[point.row],
+  if (!cellTexts[point.row]) cellTexts[point.row] = tellingColumns.map((c) => plotted(`${c.label} ${shownAs(c, point.row)}`)).join("<br>");
+  return [`<b>${plotted(point.series)}</b>`, cellTexts[point.row],
     `${plotted(xAxis.label)}: ${number(point.x)}`,
     `${plotted(yAxis.label)}: ${point.limit ? "&lt; " : ""}${number(point.y)}${interval}`].join("<br>");
 }
@@ -387,7 +387,7 @@ function rings(points, size, width, ink) {
     marker: { symbol: "circle-open", size, color: ink, line: { width } } };
 }
 
-/* Of each problem the points that no other beats in both; joined where there are few problems. */
+/* Per problem, the points that no other beats in both coordinates; joined where there are few problems. */
 function frontTraces(panel) {
   const grey = dark() ? "#9aa3ab" : "#8a8a8a";
   const found = [];
@@ -411,7 +411,7 @@ function frame(x, y, range) {
   return { ...ground(), xaxis: style(x, range.x), yaxis: style(y, range.y) };
 }
 
-/* Of a log axis: whole decades, or 1, 2 and 5 of each where there are few. */
+/* Ticks of a log axis: whole decades, or 1, 2 and 5 of each if there are few. */
 function ticks(axis, limits) {
   if (!axis.log || !limits) return {};
   const [first, last] = limits;
@@ -467,13 +467,13 @@ function mapFigure(chart, panel) {
   const scale = chart.share ? [[0, dark() ? "#14171a" : "#ffffff"], [1, "#0072B2"]]
     : names.flatMap((name, n) => [[n / k, colour(name)], [(n + 1) / k, colour(name)]]);
   const text = (found) => (chart.share ? Math.round(100 * share(found)) + "%" : looks(worst(found).level).letter || "");
-  const told = (found, x, y) => [`<b>${plotted(chart.share ? text(found) : worst(found).level)}</b>`,
+  const label = (found, x, y) => [`<b>${plotted(chart.share ? text(found) : worst(found).level)}</b>`,
     `${plotted(chart.xAxis.label)} ${plotted(x)}`, `${plotted(chart.yAxis.label)} ${plotted(y)}`,
     chart.share ? `${found.length} cells` : plotted(reader("rows", "reason")(worst(found).row) || "")].join("<br>");
   const made = {
     type: "heatmap", x: xs.map(plotted), y: ys.map(plotted), z: grid((found) => (chart.share ? share(found) : names.indexOf(worst(found).level))),
     text: grid(text), texttemplate: "%{text}", customdata: grid((found) => (chart.share ? null : worst(found).row)),
-    hovertext: grid(told), hovertemplate: "%{hovertext}<extra></extra>", colorscale: scale, showscale: false, xgap: 1, ygap: 1,
+    hovertext: grid(label), hovertemplate: "%{hovertext}<extra></extra>", colorscale: scale, showscale: false, xgap: 1, ygap: 1,
     zmin: chart.share ? 0 : -0.5, zmax: chart.share ? 1 : k - 0.5,
   };
   const axis = (from) => ({ title: { text: plotted(from.label), standoff: 6 }, type: "category", automargin: true, showgrid: false });
@@ -525,7 +525,7 @@ function order() {
   const values = found.map((i) => [read(i), i]);
   values.sort(([a, i], [b, j]) => {
     if (a === b) return i - j;
-    if (a === null || b === null) return a === null ? 1 : -1; // what has no value comes last either way
+    if (a === null || b === null) return a === null ? 1 : -1; // missing values come last in both orders
     return sign * (a < b ? -1 : 1);
   });
   return values.map(([, i]) => i);
@@ -574,7 +574,7 @@ function select(row) {
   cell.replaceChildren(
     element("div", { className: "top" }, element("h2", { textContent: "The selected cell" }), close),
     ...(reason ? [element("p", { className: failed ? "failed" : "hint", textContent: reason })] : []),
-    ...(command ? [element("p", { textContent: "It alone is run again, to the same numbers, by" }), copyable(command)] : []),
+    ...(command ? [element("p", { textContent: "To run only this cell again, with the same numbers:" }), copyable(command)] : []),
     ...(!command && page.command.words.length ? [element("p", { textContent: GONE })] : []),
     element("dl", {}, ...identity.map(([name, value]) => fact(name.replace(/_/g, " "), exact(value))),
       ...results.map((column) => fact(column.label, shownAs(column, row)))),

@@ -1,0 +1,1 @@
+"""Numbers from problems: references, statistics, noise, timing and gradient checks, pure where they can be."""

@@ -1,0 +1,118 @@
+"""The measuring protocol: warm up, time whole estimates, keep their results."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.model import blocks
+
+LEAST_S = 0.005
+"""Seconds that the calls of one timing should fill; fast ones are repeated."""
+MOST = 20
+"""Most calls made for each call asked for."""
+NOISY = 0.2
+"""Interquartile range over median above which a timing is marked in tables."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds for one estimate: median and interquartile range over calls."""
+
+    median_s: float
+    iqr_s: float
+    samples_s: tuple[float, ...] = ()
+    """Seconds of each call, in order."""
+
+    @property
+    def calls(self) -> int:
+        """Calls made, the warm-up included."""
+        return len(self.samples_s) + 1
+
+    @property
+    def spread(self) -> float:
+        """Interquartile range over median."""
+        return self.iqr_s / self.median_s
+
+
+def timed(
+    call: Callable[[int], np.ndarray], count: int, least_s: float = LEAST_S, most: int = MOST
+) -> tuple[list[np.ndarray], Timing]:
+    """Return results and seconds of ``call(0) ... call(count - 1)``, after one warm-up call that is thrown away.
+
+    Where these take less than ``least_s`` in all, calls are repeated until they do, ``most`` times each at most. Calls
+    must return finished NumPy arrays, so that no work is left on a device when the clock stops.
+    """
+    call(0)
+    results: list[np.ndarray] = []
+    seconds: list[float] = []
+    while len(seconds) < count or (sum(seconds) < least_s and len(seconds) < most * count):
+        start = time.perf_counter()
+        result = call(len(seconds) % count)
+        seconds.append(time.perf_counter() - start)
+        if len(results) < count:
+            results.append(result)
+    low, median, high = np.percentile(seconds, [25, 50, 75])
+    return results, Timing(float(median), float(high - low), tuple(seconds))
+
+
+def conditions() -> dict[str, Any]:
+    """Return the conditions that times depend on: processor, cores and threads this process may use, other load."""
+    torch = sys.modules.get("torch")
+    return {
+        "processor": _processor(),
+        "cores": os.cpu_count(),
+        "affinity": sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None,
+        "cache_bytes_per_core": blocks.cache_bytes(),
+        "threads": {
+            "blocks": blocks.cores(),
+            "xla_per_block": 1,
+            "torch": torch.get_num_threads() if torch else None,
+            "environment": {name: os.environ[name] for name in sorted(os.environ) if name.endswith("_NUM_THREADS")},
+        },
+        "load_average": load_average(),
+    }
+
+
+def load_average() -> list[float] | None:
+    """Return the mean number of running or waiting processes over the last 1, 5 and 15 minutes; None if unknown."""
+    return list(os.getloadavg()) if hasattr(os, "getloadavg") else None
+
+
+@cache
+def load_at_start() -> list[float] | None:
+    """Return the load average at the first call of this function."""
+    return load_average()
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor()
+
+
+def reset_peak_memory() -> None:
+    """Make :func:`peak_memory_mb` count from now (Linux; elsewhere nothing happens)."""
+    with suppress(OSError):
+        # 5 resets the peak VmHWM, see proc_pid_clear_refs(5)
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak_memory_mb() -> float:
+    """Return the largest resident set of this process since the reset, libraries included, in MB; NaN if unknown."""
+    with suppress(OSError, IndexError, ValueError):
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("VmHWM:")[2].split()[0]) / 1024
+    return float("nan")

@@ -1,0 +1,74 @@
+"""The contracts between the parts: everything that plugin authors import.
+
+A plugin is a frozen dataclass. Its fields are its parameters, declared with :func:`param` (default, meaning, unit, bounds);
+its class variables are facts about it that the conformance kit verifies.
+
+Arrays are component-first and batch-last: generalised positions ``q (n_q, B)``, velocities ``v (n_v, B)``, controls
+``(m, B)``, ``theta (d, B)``, noise ``w (n_w, B)``, costs ``(B,)``. Scenes, contact laws and integrators are written once,
+against the array namespace ``ops.xp`` of whichever backend runs them. A parameter annotated ``float`` may be a traced value,
+so never branch on it in Python; every other type is static.
+"""
+
+from bench.errors import Unsupported
+from bench.model.backend import Backend
+from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
+from bench.model.dynamics import Dynamics
+from bench.model.estimator import Estimator, SampleMean, columns, halves, per_repeat
+from bench.model.integrator import Integrator
+from bench.model.ops import Array, LoopOps, Ops, State
+from bench.model.parameters import Plugin, param
+from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
+from bench.model.program import Decision, FunctionProgram, Program, Rollout, compose, rollout
+from bench.model.scene import (
+    ContactScene,
+    DampedScene,
+    EngineScene,
+    EngineTwin,
+    FrictionScene,
+    FunctionScene,
+    MechanicalScene,
+    Oscillator,
+    Scene,
+)
+
+__all__ = [
+    "Array",
+    "Backend",
+    "Compilations",
+    "Contact",
+    "ContactLaw",
+    "ContactScene",
+    "DampedScene",
+    "Decision",
+    "Dynamics",
+    "EngineScene",
+    "EngineTwin",
+    "Estimator",
+    "ForceLaw",
+    "FrictionScene",
+    "FunctionProgram",
+    "FunctionScene",
+    "ImpulseLaw",
+    "Integrator",
+    "Jacobians",
+    "LoopOps",
+    "MechanicalScene",
+    "Ops",
+    "Oscillator",
+    "Plugin",
+    "Problem",
+    "Program",
+    "Rollout",
+    "SampleMean",
+    "Scene",
+    "State",
+    "Trajectory",
+    "Unsupported",
+    "Usage",
+    "columns",
+    "compose",
+    "halves",
+    "param",
+    "per_repeat",
+    "rollout",
+]

@@ -1,0 +1,75 @@
+"""Contact laws: how touching bodies push on each other."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+from bench.model.ops import Array, Ops, State
+from bench.model.parameters import Plugin
+
+
+@dataclass(frozen=True)
+class ContactLaw(Plugin):
+    """A law for how touching bodies push on each other."""
+
+    kind: ClassVar[str] = "contacts"
+    smoothing: ClassVar[str] = ""
+    """Name of the parameter that smooths the law, if it has one (``beta``, ``kappa``)."""
+    needs_root: ClassVar[bool] = False
+    """Whether the law solves an equation each step, so that only backends with ``root`` can run it."""
+
+    @property
+    def continuous(self) -> bool:
+        """Whether the state after a step is continuous in the state before it."""
+        return True
+
+
+@dataclass(frozen=True)
+class ForceLaw(ContactLaw):
+    """A law whose force depends on gap and gap rate, and enters the acceleration."""
+
+    @abstractmethod
+    def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
+        """Return the normal force ``(n_contacts, B)`` [N], positive in repulsion."""
+
+    def spring(self) -> tuple[float, float] | None:
+        """Return stiffness [N/m] and damping [N s/m] of the linear spring that the law is in deep contact, or None."""
+        return None
+
+
+class Contact(NamedTuple):
+    """The scene's contact geometry, as an impulse law sees it. Fields are functions; see :class:`ContactScene`."""
+
+    gap: Callable[[Array], Array]
+    gap_rate: Callable[[Array, Array], Array]
+    acceleration: Callable[[Array, Array], Array]
+    restitution: Any
+
+    def response(self, xp: Any, q: Array) -> Array:
+        """Return gap acceleration per unit of a contact's own force, diag(J M^-1 J^T), ``(n_contacts, B)`` [1/kg]."""
+        gap = self.gap(q)
+        rows = []
+        for i in range(gap.shape[0]):
+            # 0 times the gap gives the batch shape, type and library of the backend's arrays
+            unit = xp.stack([0.0 * gap[j] + float(i == j) for j in range(gap.shape[0])])
+            rows.append(self.gap_rate(q, self.acceleration(q, unit))[i])
+        return xp.stack(rows)
+
+
+@dataclass(frozen=True)
+class ImpulseLaw(ContactLaw):
+    """A law that changes velocities (and positions) within a step instead of adding a force."""
+
+    @abstractmethod
+    def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: Any) -> State:
+        """Return the change of velocity, and of position beyond ``dt`` times the new velocity, over one step.
+
+        ``before`` is the state at the start of the step; ``free`` is the state that a contact-free step would reach.
+        """
+
+    def finds_time_of_impact(self) -> bool:
+        """Return whether a free flight into one surface ends as if the impulse acted at the very time of impact."""
+        return False

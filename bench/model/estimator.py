@@ -1,0 +1,80 @@
+"""Estimators: how sampled costs, gradients and scores become estimates of grad J."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from bench.model.parameters import Plugin
+from bench.model.problem import Problem
+from bench.model.program import Program
+
+
+@dataclass(frozen=True)
+class Estimator(Plugin):
+    """Turns sampled costs and gradients into independent estimates of grad J."""
+
+    kind: ClassVar[str] = "estimators"
+    needs: ClassVar[frozenset[str]] = frozenset({"value"})
+    """Backend capabilities used, out of ``value``, ``grad`` and ``score``."""
+    target: ClassVar[str] = "smoothed"
+    """The quantity estimated: ``smoothed`` grad J_sigma, or the ``plain`` grad f."""
+    unbiased: ClassVar[bool] = True
+    """Whether the expectation is the target for continuous costs."""
+    across_jumps: ClassVar[bool] = False
+    """Whether it is also unbiased when the cost jumps in theta."""
+
+    @abstractmethod
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return R independent estimates ``(R, d)`` at ``theta (d,)`` from standard normal ``noise (R, N, n_w)``.
+
+        All randomness comes from ``noise``: estimate r depends on ``noise[r]`` and on nothing else random.
+        """
+
+    def refuses(self, program: Program) -> str | None:
+        """Return why this estimator cannot be used on the program, or None."""
+        return None
+
+
+@dataclass(frozen=True)
+class SampleMean(Estimator):
+    """An estimator that is the mean of one term per sample."""
+
+    @abstractmethod
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return per-sample terms ``(d, B)`` for noise ``w (n_w, B)``."""
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the mean of the terms over the samples of each repeat."""
+        return per_repeat(self.terms(problem, theta, columns(noise)), noise).mean(axis=1)
+
+
+def columns(noise: np.ndarray) -> np.ndarray:
+    """Reshape noise ``(R, N, n_w)`` to the batch ``(n_w, R * N)`` that problems take."""
+    return np.moveaxis(noise, -1, 0).reshape(noise.shape[-1], -1)
+
+
+def per_repeat(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Reshape batch results ``(d, R * N)`` to ``(R, N, d)``, or ``(R * N,)`` to ``(R, N)``."""
+    repeats, samples = noise.shape[:2]
+    if values.ndim == 1:
+        return values.reshape(repeats, samples)
+    return np.moveaxis(values.reshape(-1, repeats, samples), 0, -1)
+
+
+def halves(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return first-order terms of the first half of the samples, zeroth-order terms of the rest, each ``(R, N/2, d)``.
+
+    The zeroth-order terms are (f - f at w = 0) times the score. Raises ValueError below 4 samples.
+    """
+    half = noise.shape[1] // 2
+    if half < 2:
+        raise ValueError(f"needs at least 4 samples, got {noise.shape[1]}")
+    a, b = noise[:, :half], noise[:, half:]
+    first = per_repeat(problem.grad(theta, columns(a)), a)
+    w = columns(b)
+    cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))
+    return first, per_repeat(cost * problem.score(theta, w), b)

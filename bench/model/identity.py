@@ -1,0 +1,82 @@
+"""Plugins as text: identity strings for people, and JSON that keeps every parameter for programs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from bench.errors import UserError
+from bench.model.parameters import Plugin, parameters, values
+
+
+def identity(name: str, given: Mapping[str, Any]) -> str:
+    """Return an identity string, or the bare name without values.
+
+    >>> identity("alpha_order", {"gamma": 0.01, "delta": 0.1})
+    'alpha_order[delta=0.1,gamma=0.01]'
+    """
+    text = ",".join(f"{key}={text_of(given[key])}" for key in sorted(given))
+    return f"{name}[{text}]" if text else name
+
+
+def text_of(value: Any) -> str:
+    """Return a parameter value as it is written on the command line.
+
+    >>> [text_of(value) for value in (None, True, 0.5, 1e6, 10.0)]
+    ['null', 'true', '0.5', '1e+06', '10']
+    """
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value) if isinstance(value, float) and not value.is_integer() else _short(value)
+
+
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else str(value)
+
+
+def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
+    """Return the name and raw values of an identity string; raises :class:`UserError` when it is malformed."""
+    import yaml
+
+    name, bracket, rest = str(text).partition("[")
+    raw: dict[str, Any] = {}
+    if bracket:
+        if not rest.endswith("]"):
+            raise UserError(f"'{text}' is not a plugin: write name or name[parameter=value,...]")
+        for item in filter(None, rest[:-1].split(",")):
+            key, equals, value = item.partition("=")
+            if not equals:
+                raise UserError(f"'{item}' in '{text}' is not parameter=value")
+            raw[key.strip()] = yaml.safe_load(value)
+    return name.strip(), raw
+
+
+def changed(plugin: Plugin, given: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the parameters that differ from their defaults, or from ``given``."""
+    given = given or {}
+    return {
+        name: getattr(plugin, name)
+        for name, parameter in parameters(type(plugin)).items()
+        if getattr(plugin, name) != given.get(name, parameter.default)
+    }
+
+
+def label(plugin: Plugin | None, given: Mapping[str, Any] | None = None, without: tuple[str, ...] = ()) -> str:
+    """Return the identity string of a plugin without the parameters ``without``; ``none`` for no plugin."""
+    if plugin is None:
+        return "none"
+    return identity(plugin.name, {k: v for k, v in changed(plugin, given).items() if k not in without})
+
+
+def described(plugin: Plugin | None) -> dict[str, Any] | None:
+    """Return name and every parameter of a plugin, defaults included, fit for strict JSON: infinities are strings."""
+    if plugin is None:
+        return None
+    return {"name": plugin.name} | {name: _plain(value) for name, value in values(plugin).items()}
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

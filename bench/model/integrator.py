@@ -1,0 +1,41 @@
+"""Integrators: time-stepping maps."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.model.dynamics import Dynamics
+from bench.model.ops import Array, State
+from bench.model.parameters import Plugin
+
+
+@dataclass(frozen=True)
+class Integrator(Plugin):
+    """A time-stepping map."""
+
+    kind: ClassVar[str] = "integrators"
+    order: ClassVar[int] = 1
+    """Order of the global error in dt on smooth dynamics."""
+    takes_impulses: ClassVar[bool] = False
+    """Whether a step can take an :class:`ImpulseLaw`."""
+    needs_root: ClassVar[bool] = False
+    """Whether a step solves an equation, so that only backends with ``root`` can run it."""
+
+    @abstractmethod
+    def step(self, dynamics: Dynamics, state: State, u: Array, dt: Any) -> State:
+        """Return the state ``dt`` later under the constant control ``u (n_u, B)``."""
+
+    @abstractmethod
+    def amplification(self, z: complex) -> complex:
+        """Return the stability function: the factor of one step on v' = a v (no positions) with z = a dt."""
+
+    @abstractmethod
+    def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
+        """Return the matrix ``(2, 2)`` of one step on q' = v, v' = -stiffness q - damping v with that velocity factor.
+
+        The step is stable while the spectral radius is at most 1.
+        """

@@ -1,0 +1,60 @@
+"""Arrays, the operations a backend lends to model code, and the state of a mechanical system."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from bench.errors import Unsupported
+
+Array = Any
+"""An array of the backend in use: NumPy, torch or JAX."""
+
+
+class Ops(Protocol):
+    """The operations that a backend lends to model code."""
+
+    @property
+    def xp(self) -> Any:
+        """Array namespace following the Python array API standard (numpy, torch via array-api-compat, jax.numpy)."""
+
+    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
+        """Fold ``carry = step(carry, x)`` over the leading axis of each leaf of ``xs``; return the last carry."""
+
+    def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
+        """Return ``z (n, B)`` with ``residual(z, args) = 0``; column b of the residual depends only on column b of z.
+
+        Its derivative comes from the implicit-function theorem. Raises :class:`Unsupported` on backends without it.
+        """
+
+
+class LoopOps:
+    """A Python loop and no equation solver, over any array namespace; backends may subclass it.
+
+    Raises :class:`Unsupported` where a program solves an equation.
+    """
+
+    def __init__(self, xp: Any = np) -> None:
+        self.xp = xp
+
+    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
+        """Loop over the leading axis."""
+        for t in range(length):
+            carry = step(carry, tuple(x[t] for x in xs))
+        return carry
+
+    def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
+        """Refuse: only backends that provide ``root`` solve equations."""
+        raise Unsupported(NO_ROOT)
+
+
+NO_ROOT = "a step solves an equation, and this backend has no root finder: use one that provides root (see `python -m bench list backends`)"
+
+
+class State(NamedTuple):
+    """Generalised positions ``q (n_q, B)`` and velocities ``v (n_v, B)``."""
+
+    q: Array
+    v: Array

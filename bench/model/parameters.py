@@ -1,0 +1,156 @@
+"""Plugins and their parameters: how they are declared, checked and built from values."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from abc import ABC
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar, TypeVar, cast
+
+from bench.errors import UserError, unknown
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def remember(function: Function) -> Function:
+    """Cache as ``functools.cache`` does, and keep the function's own type."""
+    return cast(Function, cache(function))
+
+
+def param(
+    default: Any,
+    doc: str = "",
+    unit: str = "",
+    *,
+    positive: bool = False,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] | None = None,
+) -> Any:
+    """Declare a plugin parameter: its default, meaning and unit, and the values it may take.
+
+    ``positive`` asks for a value above 0; ``low`` and ``high`` are inclusive bounds; ``choices`` are the strings
+    allowed.
+    """
+    return dataclasses.field(
+        default=default,
+        metadata=dict(doc=doc, unit=unit, positive=positive, low=low, high=high, choices=choices),
+    )
+
+
+@dataclass(frozen=True)
+class Plugin(ABC):  # noqa: B024, each kind has abstract methods of its own
+    """The base of all plugins: a name, and parameters as dataclass fields."""
+
+    kind: ClassVar[str] = ""
+    """The plural of its axis: scenes, contacts, integrators, backends, estimators, studies, or a kind of your own."""
+    name: ClassVar[str] = ""
+    """The one name used on the command line, in tables, legends and caches."""
+    requires: ClassVar[tuple[str, ...]] = ()
+    """Modules that must be installed for the plugin to be available, as ``module`` or ``module=distribution``."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a plugin."""
+
+    name: str
+    type: Any
+    default: Any
+    unit: str = ""
+    doc: str = ""
+    positive: bool = False
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] | None = None
+
+
+@remember
+def parameters(plugin: type[Plugin]) -> dict[str, Parameter]:
+    """Return the parameters of a plugin class by name."""
+    hints = typing.get_type_hints(plugin)
+    return {
+        f.name: Parameter(
+            f.name, hints[f.name], f.default, **{k: v for k, v in f.metadata.items() if k in Parameter.__annotations__}
+        )
+        for f in dataclasses.fields(plugin)
+    }
+
+
+def values(plugin: Plugin) -> dict[str, Any]:
+    """Return all parameters of a plugin with their values, defaults included."""
+    return {name: getattr(plugin, name) for name in parameters(type(plugin))}
+
+
+def traced(plugin: Plugin) -> list[str]:
+    """Return the names of the float parameters: those that a backend may trace and that theta may name."""
+    return [f.name for f in dataclasses.fields(plugin) if f.type in ("float", float)]
+
+
+def build(plugin: type[Plugin], values: Mapping[str, Any]) -> Plugin:
+    """Build an instance with checked parameter values; raises :class:`UserError` for a bad name, type or value."""
+    declared = parameters(plugin)
+    checked = {}
+    for name, value in values.items():
+        if name not in declared:
+            raise unknown(f"parameter of {singular(plugin.kind)} {plugin.name}", name, declared)
+        checked[name] = check(declared[name], value, f"{plugin.name}.{name}")
+    return plugin(**checked)
+
+
+def singular(kind: str) -> str:
+    """Return the axis of a kind: ``scene`` for ``scenes``, ``study`` for ``studies``.
+
+    >>> singular("scenes"), singular("studies")
+    ('scene', 'study')
+    """
+    return f"{kind.removesuffix('ies')}y" if kind.endswith("ies") else kind.removesuffix("s")
+
+
+def check(parameter: Parameter, value: Any, where: str) -> Any:
+    """Return ``value`` as the parameter's type; raises :class:`UserError` for another type or a value out of bounds."""
+    kinds = typing.get_args(parameter.type) if isinstance(parameter.type, types.UnionType) else (parameter.type,)
+    if value is None and type(None) in kinds:
+        return None
+    kind = next(k for k in kinds if k is not type(None))
+    result = coerce(kind, value, where)
+    if isinstance(result, int | float) and not isinstance(result, bool):
+        if parameter.positive and not result > 0:
+            raise UserError(f"{where}={value} must be greater than 0")
+        if parameter.low is not None and result < parameter.low:
+            raise UserError(f"{where}={value} must be at least {parameter.low}")
+        if parameter.high is not None and result > parameter.high:
+            raise UserError(f"{where}={value} must be at most {parameter.high}")
+    if parameter.choices is not None and result not in parameter.choices:
+        raise unknown(f"value for {where}:", result, parameter.choices)
+    return result
+
+
+def coerce(kind: Any, value: Any, where: str) -> Any:
+    """Return ``value`` as ``kind`` (bool, int, float or str) where that loses nothing; else raise :class:`UserError`.
+
+    >>> coerce(int, 3.0, "samples"), coerce(float, "1e3", "stiffness")
+    (3, 1000.0)
+    """
+    # bool is an int in Python, but true is not a number here
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if kind is float:
+        if isinstance(value, str):
+            try:
+                value, number = float(value), True
+            except ValueError:
+                number = False
+        if number and not math.isnan(value):
+            return float(value)
+    elif kind is int:
+        if number and float(value).is_integer():
+            return int(value)
+    elif (kind is bool and isinstance(value, bool)) or (kind is str and isinstance(value, str)):
+        return value
+    article = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}.get(kind, str(kind))
+    raise UserError(f"{where}={value!r} must be {article}, not {type(value).__name__}")

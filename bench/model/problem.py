@@ -1,0 +1,177 @@
+"""A compiled program: costs, gradients and scores of batches of rollouts, and the work they took."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bench.errors import Unsupported
+from bench.model import blocks
+from bench.model.program import Program
+
+
+class Trajectory(NamedTuple):
+    """The states x = (q, v) and the controls of rollouts."""
+
+    states: np.ndarray
+    """``(horizon + 1, n, B)``."""
+    controls: np.ndarray
+    """``(horizon, n_u, B)``."""
+
+
+class Jacobians(NamedTuple):
+    """Derivatives of the step map x_{k+1} = F(x_k, u_k), x = (q, v), along rollouts."""
+
+    states: np.ndarray
+    """``(horizon + 1, n, B)``."""
+    controls: np.ndarray
+    """``(horizon, n_u, B)``."""
+    a: np.ndarray
+    """dF/dx, ``(horizon, n, n, B)``."""
+    b: np.ndarray
+    """dF/du, ``(horizon, n, n_u, B)``."""
+
+
+@dataclass
+class Usage:
+    """The cost of some work: rollouts, gradients and the compile time it needed.
+
+    ``compile_s`` includes ``trace_s``, running the Python code once, and ``lower_s``, turning it into the compiler's
+    input.
+    """
+
+    rollouts: int = 0
+    gradients: int = 0
+    compile_s: float = 0.0
+    trace_s: float = 0.0
+    lower_s: float = 0.0
+
+
+@dataclass
+class Compilations:
+    """The compiled programs of one session: where they are kept between runs, and how many were made.
+
+    Backends that compile count here; code that builds several problems hands the same object to all of them.
+    """
+
+    folder: Path | None = None
+    """Where compiled programs are kept between runs; None for nowhere."""
+    made: int = 0
+    """Number of compilations, not counting programs loaded from the folder."""
+    shapes: set[str] = field(default_factory=set)
+    """Requests for programs: a hash for each program structure, function and shape."""
+
+    def restart(self) -> None:
+        """Count from zero."""
+        self.made = 0
+        self.shapes.clear()
+
+
+class Problem(ABC):
+    """A compiled program: costs, gradients and scores of batches of rollouts, in NumPy float64 arrays.
+
+    ``theta`` is ``(d,)`` for one theta shared by all samples or ``(d, B)``; ``w`` is ``(n_w, B)``. Larger batches than
+    ``block`` columns are evaluated block by block, so that memory stays flat; blocks are filled up to a multiple of
+    ``grain`` columns, so that few shapes occur, and ``threads`` of them run at once.
+    """
+
+    block: int = 1 << 16
+    grain: int = 1
+    threads: int = 1
+    device: str = "cpu"
+    """The device that the program runs on."""
+    provides: frozenset[str] = frozenset({"value", "grad", "score"})
+    """Capabilities of the backend that compiled it."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self.usage = Usage()
+        self.compilations = Compilations()
+        self._charged: set[object] = set()
+        self._measured = False
+
+    def reset_usage(self) -> None:
+        """Count usage from zero; from now on, programs are compiled afresh, bypassing the folder."""
+        self._measured = True
+        self.usage = Usage()
+        self._charged.clear()
+
+    def fit_blocks(self, column_bytes: int) -> None:
+        """Choose the block size so that each core's block fits in its cache, at ``column_bytes`` per rollout."""
+        self.block, self.threads = blocks.fitting(column_bytes, self.grain), blocks.cores()
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the noise in J."""
+        return float(self.program.scene.sigma)
+
+    @property
+    def dim(self) -> int:
+        """d, the length of theta."""
+        return self.program.dim
+
+    @property
+    def noise_on_theta(self) -> bool:
+        """Whether the noise of J is noise on theta: true except for action noise under a feedback policy."""
+        return self.program.noise_on_theta
+
+    def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return the costs f(theta, w), ``(B,)``."""
+        self.usage.rollouts += w.shape[1]
+        return self._blocks(self._value, theta, w, ())
+
+    def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return per-sample gradients df/dtheta, ``(d, B)``."""
+        self.usage.gradients += w.shape[1]
+        return self._blocks(self._grad, theta, w, (self.dim,))
+
+    def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return per-sample scores d log p(actions | theta)/dtheta, ``(d, B)``; w / sigma where noise is on theta."""
+        if self.noise_on_theta:
+            return w / self.sigma
+        return self._blocks(self._score, theta, w, (self.dim,))
+
+    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
+        """Return states and controls along each rollout; raises :class:`Unsupported` where there are none."""
+        raise Unsupported(
+            f"{type(self).__name__} does not expose the states of a rollout: use a backend with trajectory()"
+        )
+
+    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
+        """Return states, controls and step Jacobians along each rollout; raises :class:`Unsupported` without steps."""
+        raise Unsupported(f"{type(self).__name__} gives no step Jacobians: use a backend with jacobians()")
+
+    def directions(self, w: np.ndarray) -> np.ndarray:
+        """Return standard normal directions in theta space made from ``w``, ``(d, B)``.
+
+        Raises :class:`Unsupported` when a sample carries fewer than d normal numbers.
+        """
+        if w.shape[0] < self.dim:
+            raise Unsupported(f"needs {self.dim} normal numbers per sample, this noise model has {w.shape[0]}")
+        return w[: self.dim]
+
+    def displaced(self, shift: np.ndarray, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return the costs at ``theta + shift`` with ``shift (d, B)`` and the noise ``w`` of the cost, ``(B,)``."""
+        return self.value(np.asarray(theta).reshape(self.dim, -1) + shift, w)
+
+    def _blocks(
+        self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray, lead: tuple[int, ...]
+    ) -> np.ndarray:
+        theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
+        w = np.asarray(w, dtype=np.float64)
+        columns = blocks.size(w.shape[1], self.block, self.grain, self.threads)
+        return blocks.evaluate(function, theta, w, columns, self.threads, lead)
+
+    @abstractmethod
+    def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...
+
+    @abstractmethod
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...
+
+    @abstractmethod
+    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...

@@ -1,0 +1,430 @@
+"""Scene x contact law x integrator: the discrete program that a backend runs and differentiates."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bench.errors import Unsupported, UserError, unknown
+from bench.model.contact import ContactLaw, ImpulseLaw
+from bench.model.dynamics import Dynamics
+from bench.model.integrator import Integrator
+from bench.model.ops import Array, Ops, State
+from bench.model.parameters import Plugin, traced
+from bench.model.scene import EngineScene, FunctionScene, MechanicalScene, Scene
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The meaning of theta, and the point at which gradients are taken.
+
+    Without ``names`` theta is the scene's own decision variable; with ``names`` it is those float parameters of the
+    scene or its contact law (``mass``, or ``pushing.mass`` and ``penalty.stiffness`` where both have one), and noise is
+    on theta. ``at`` replaces the value at which gradients are taken.
+    """
+
+    names: tuple[str, ...] = ()
+    at: tuple[float, ...] | None = None
+
+
+OWN = Decision()
+"""The scene's own theta, where the scene puts it."""
+
+
+class Program(ABC):
+    """The discrete map (theta, w) -> cost, written against an array namespace; made by :func:`compose`.
+
+    Contact law and integrator are None where the scene has none.
+    """
+
+    def __init__(
+        self, scene: Scene, contact: ContactLaw | None, integrator: Integrator | None, decision: Decision = OWN
+    ) -> None:
+        self.scene = scene
+        self.contact = contact
+        self.integrator = integrator
+        self.decision = decision
+        self._named = tuple(self._place(name) for name in decision.names)
+        self._varying: tuple[tuple[str, str], ...] = ()
+        """Parameters (axis, name) that are arrays ``(B,)``: those named by theta, once their values are filled in."""
+        if isinstance(contact, ImpulseLaw) and integrator is not None and not integrator.takes_impulses:
+            raise Unsupported(
+                f"integrator {integrator.name} has no place for the impulses of contact law {contact.name}"
+            )
+        # taken here, since the parameters of a bound program may be traced values
+        self._scene_theta0 = scene.theta0() if self._named else np.empty(0)
+        if decision != OWN:
+            self._check_decision()
+
+    def _check_decision(self) -> None:
+        names, at = list(self.decision.names), self.decision.at
+        if len(set(self._named)) < len(names):
+            raise UserError(f"theta={names} names a parameter twice")
+        if at is not None and len(at) != self.dim:
+            raise UserError(f"theta0 has {len(at)} values, theta of scene {self.scene.name} has {self.dim}")
+        if not np.isfinite(self.theta0).all():
+            raise UserError(f"theta={names} starts at {self.theta0.tolist()}: give finite values by theta0=[..]")
+
+    # ------------------------------------------------------------------------------------------ structure
+
+    @property
+    def parts(self) -> dict[str, Plugin]:
+        """The plugins that make the program, by axis."""
+        parts = {"scene": self.scene, "contact": self.contact, "integrator": self.integrator}
+        return {axis: plugin for axis, plugin in parts.items() if plugin is not None}
+
+    @property
+    def needs_root(self) -> bool:
+        """Whether a step solves an equation."""
+        return any(part is not None and part.needs_root for part in (self.contact, self.integrator))
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """Capabilities that a backend must provide to run the program: ``root``, ``physics`` or neither."""
+        needs = {"root"} if self.needs_root else set()
+        if isinstance(self.scene, EngineScene):
+            needs.add("physics")
+        return frozenset(needs)
+
+    @property
+    def continuous(self) -> bool:
+        """Whether the cost is continuous in theta."""
+        return self.scene.continuous and (self.contact is None or self.contact.continuous)
+
+    @cached_property
+    def theta0(self) -> np.ndarray:
+        """The decision variable at which gradients are taken, ``(d,)``."""
+        if self.decision.at is not None:
+            return np.array(self.decision.at, dtype=np.float64)
+        if self._named:
+            return np.array([getattr(self.parts[axis], name) for axis, name in self._named], dtype=np.float64)
+        return self.scene.theta0()
+
+    @cached_property
+    def dim(self) -> int:
+        """d, the length of theta."""
+        return len(self._named) or int(self.scene.theta0().size)
+
+    @property
+    def noise(self) -> str:
+        """The noise model: ``parameter`` or ``action``; always ``parameter`` where theta names parameters."""
+        return "parameter" if self._named else self.scene.noise
+
+    @property
+    def action_noise(self) -> bool:
+        """Whether noise enters at the actions."""
+        return self.noise == "action"
+
+    @property
+    def noise_on_theta(self) -> bool:
+        """Whether the noise of J is noise on theta, so that the score is w / sigma.
+
+        True for parameter noise, and for action noise where theta is the controls themselves; false under a feedback
+        policy.
+        """
+        return not self.action_noise
+
+    @property
+    def n_noise(self) -> int:
+        """n_w, the count of normal numbers in one rollout."""
+        return self.dim
+
+    @cached_property
+    def structure(self) -> tuple[Any, ...]:
+        """Everything that decides the shape of the computation: equal structures differ only in :meth:`parameters`."""
+        parts = []
+        for axis, plugin in self.parts.items():
+            changing = set(traced(plugin))
+            static = [(f.name, getattr(plugin, f.name)) for f in dataclasses.fields(plugin) if f.name not in changing]
+            parts.append((axis, type(plugin), tuple(static)))
+        return (*parts, self._named, self._scene_theta0.tobytes()) if self._named else tuple(parts)
+
+    def parameters(self) -> np.ndarray:
+        """Return the float parameters of all parts, ``(p,)``: the values that may be traced."""
+        return np.array(
+            [getattr(plugin, name) for plugin in self.parts.values() for name in traced(plugin)], dtype=np.float64
+        )
+
+    def bind(self, parameters: Any) -> Program:
+        """Return this program with other values, possibly traced ones, for :meth:`parameters`."""
+        places = [(axis, name) for axis, plugin in self.parts.items() for name in traced(plugin)]
+        return self._with(dict(zip(places, parameters, strict=False)))
+
+    def _with(self, values: dict[tuple[str, str], Any]) -> Program:
+        """Return this program with other values for some parameters, by axis and name."""
+        bound = copy.copy(self)
+        for axis, plugin in self.parts.items():
+            # plugins are frozen: values are set on a copy that only this program holds
+            twin = copy.copy(plugin)
+            for name in traced(plugin):
+                if (axis, name) in values:
+                    object.__setattr__(twin, name, values[axis, name])
+            setattr(bound, axis, twin)
+        return bound
+
+    def _place(self, name: str) -> tuple[str, str]:
+        """Return the axis and parameter that a name in theta means; raises :class:`UserError` if there is none."""
+        owner, _, parameter = name.rpartition(".")
+        parts = {axis: part for axis, part in (("scene", self.scene), ("contact", self.contact)) if part is not None}
+        known = {axis: [f for f in traced(part) if f != "sigma"] for axis, part in parts.items()}
+        places = [a for a, names in known.items() if parameter in names and owner in ("", a, parts[a].name)]
+        if not places:
+            names = [f"{parts[a].name}.{f}" if owner else f for a, fields in known.items() for f in fields]
+            raise unknown(f"parameter in theta of scene {self.scene.name}:", name, names)
+        if len(places) > 1:
+            both = " or ".join(f"{parts[axis].name}.{parameter}" for axis in places)
+            raise UserError(f"theta names '{name}', a parameter of both scene and contact law: write {both}")
+        if places[0] == "scene":
+            self._check_moves_program(parameter)
+        return places[0], parameter
+
+    def _check_moves_program(self, parameter: str) -> None:
+        """Refuse a parameter that only sets the scene's own theta: its derivative would be 0 and look like a result."""
+        value = getattr(self.scene, parameter)
+        if not np.isfinite(value):
+            return
+        moved = copy.copy(self.scene)
+        object.__setattr__(moved, parameter, value * (1 + 1e-6) + 1e-9)
+        if not np.array_equal(moved.theta0(), self.scene.theta0()):
+            raise UserError(
+                f"theta names '{parameter}', which sets where scene {self.scene.name} puts its own theta: leave theta "
+                "out and give theta0=[..]"
+            )
+
+    # ------------------------------------------------------------------------------- what the scene knows
+
+    @property
+    def _as_declared(self) -> bool:
+        """Whether the scene's statements about its own theta0 hold for this program."""
+        return self.decision == OWN
+
+    def closed_form_gradient(self) -> np.ndarray | None:
+        """Return grad J_sigma at theta0, or None where the scene does not know it."""
+        return self.scene.closed_form_gradient(self.contact, self.integrator) if self._as_declared else None
+
+    def physical_gradient(self) -> np.ndarray | None:
+        """Return grad f at theta0 of the physics, or None where the scene does not know it."""
+        return self.scene.physical_gradient() if self._as_declared else None
+
+    def physical_cost(self) -> float | None:
+        """Return f at theta0 of the physics, or None where the scene does not know it."""
+        return self.scene.physical_cost() if self._as_declared else None
+
+    def breakpoints(self) -> tuple[tuple[float, ...], ...]:
+        """Return, per coordinate of theta, where the cost jumps or has a kink, as far as the scene knows."""
+        return () if self._named else self.scene.breakpoints()
+
+    # ------------------------------------------------------------------------------------------ evaluation
+
+    @abstractmethod
+    def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
+        """Return f(theta, w) for ``theta (d, 1)`` or ``(d, B)`` and ``w (n_w, B)``: ``(B,)``."""
+
+    @abstractmethod
+    def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
+        """Return ``(B,)`` whose gradient by ``theta_scored`` at ``theta_scored = theta`` is the score.
+
+        Needed only where noise is on the actions of a policy; elsewhere the score is w / sigma.
+        """
+
+    def _own_theta(self, xp: Any, theta: Array, w: Array) -> tuple[Program, Array]:
+        """Return the program with the parameter values in theta, ``(B,)`` each, and the scene's theta ``(d', B)``."""
+        noisy = theta + self.scene.sigma * w
+        values = {place: noisy[i] for i, place in enumerate(self._named)}
+        bound = self._with(values)
+        bound.decision, bound._named, bound._varying = OWN, (), self._named
+        bound.__dict__["dim"] = self._scene_theta0.size
+        own = xp.asarray(self._scene_theta0[:, None], dtype=noisy.dtype) + 0.0 * noisy[0]
+        return bound, own
+
+
+class FunctionProgram(Program):
+    """The program of a scene that is a plain function."""
+
+    scene: FunctionScene
+
+    def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
+        """Return the scene's cost at theta + sigma w."""
+        if self._named:
+            bound, own = self._own_theta(ops.xp, theta, w)
+            assert isinstance(bound.scene, FunctionScene)
+            return bound.scene.cost(ops.xp, own)
+        return self.scene.cost(ops.xp, theta + self.scene.sigma * w)
+
+    def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
+        """Return w . theta_scored / sigma."""
+        return ops.xp.sum(w * theta_scored, axis=0) / self.scene.sigma
+
+
+class Rollout(Program):
+    """The program of a mechanical scene: ``horizon`` steps of an integrator."""
+
+    scene: MechanicalScene
+    integrator: Integrator
+
+    @property
+    def noise_on_theta(self) -> bool:
+        """Whether noise is on theta: parameter noise, or action noise where theta is the controls themselves."""
+        return not self.action_noise or self.scene.open_loop
+
+    @property
+    def n_noise(self) -> int:
+        """n_w: one number per control of each step, or one per coordinate of theta."""
+        return self.scene.horizon * self.scene.n_u if self.action_noise else self.dim
+
+    def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
+        """Return the stage costs and the terminal cost of the rollout."""
+        program, theta, w = self.resolved(ops, theta, w)
+        return program._rollout(ops, theta, w, None)[0]
+
+    def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
+        """Return sum_t w_t . pi(theta_scored, x_t) / sigma along the states x_t that theta and w lead to.
+
+        This is the part of log p(actions | states) that is linear in the policy's change.
+        """
+        return self._rollout(ops, theta, w, theta_scored)[1] / self.scene.sigma
+
+    def resolved(self, ops: Ops, theta: Array, w: Array) -> tuple[Rollout, Array, Array]:
+        """Return program, theta and noise with the parameters named by theta filled in; unchanged if it names none."""
+        if not self._named:
+            return self, theta, w
+        bound, own = self._own_theta(ops.xp, theta, w)
+        assert isinstance(bound, Rollout)
+        return bound, own, ops.xp.zeros((bound.n_noise, own.shape[1]), dtype=own.dtype)
+
+    def step(self, ops: Ops, state: State, u: Array) -> State:
+        """Take one step of the map."""
+        if self._varying and self.needs_root:
+            ops = _VaryingOps(ops, [(self.parts[axis], name) for axis, name in self._varying])
+        return self.integrator.step(Dynamics(ops, self.scene, self.contact), state, u, self.scene.dt)
+
+    def steps(self, ops: Ops, theta: Array, w: Array) -> Iterator[tuple[State, Array]]:
+        """Yield (state, control) before each step, then the final state with the last control."""
+        program, theta, w = self.resolved(ops, theta, w)
+        theta, state, scanned = program.start(ops, theta, w)
+        u = None
+        for t in range(self.scene.horizon):
+            u = program.control(ops, theta, state, tuple(x[t] for x in scanned))
+            yield state, u
+            state = program.step(ops, state, u)
+        yield state, u
+
+    def start(self, ops: Ops, theta: Array, w: Array) -> tuple[Array, State, tuple[Array, ...]]:
+        """Return theta with parameter noise, the initial state, and the control law's per-step inputs (plan, noise)."""
+        scene, xp = self.scene, ops.xp
+        shape = (scene.horizon, scene.n_u, w.shape[1])
+        scanned = []
+        if self.action_noise:
+            scanned.append(xp.reshape(w, shape))
+        else:
+            theta = theta + scene.sigma * w
+        planned = scene.planned_controls(xp, theta)
+        if planned is not None:
+            scanned.insert(0, xp.broadcast_to(planned, shape))
+        start = scene.initial_state(xp, theta)
+        # theta (d, 1) gives a single column, but the carry of the scan has all B
+        state = State(*(xp.broadcast_to(part, (part.shape[0], w.shape[1])) for part in start))
+        return theta, state, tuple(scanned)
+
+    def control(self, ops: Ops, theta: Array, state: State, slices: tuple[Array, ...]) -> Array:
+        """Return u_t = plan + feedback + sigma w_t, ``(n_u, B)``."""
+        scene, xp = self.scene, ops.xp
+        parts = list(slices)
+        if self.action_noise:
+            parts[-1] = scene.sigma * parts[-1]
+        back = scene.feedback(xp, theta, state.q, state.v)
+        if back is not None:
+            parts.append(back)
+        return sum(parts[1:], parts[0]) if parts else xp.zeros((scene.n_u, state.v.shape[1]), dtype=state.v.dtype)
+
+    def _rollout(self, ops: Ops, theta: Array, w: Array, theta_scored: Array | None) -> tuple[Array, Array]:
+        scene, xp = self.scene, ops.xp
+        theta, state, scanned = self.start(ops, theta, w)
+        planned_scored = None if theta_scored is None else scene.planned_controls(xp, theta_scored)
+        extra = () if planned_scored is None else (planned_scored,)
+        # a scan's carry must keep its shape and type from the first step on
+        zero = xp.zeros_like(w[0, :])
+
+        def step(carry: tuple[State, Array, Array], slices: tuple[Array, ...]) -> tuple[State, Array, Array]:
+            state, cost, logp = carry
+            drawn = slices[: len(scanned)]
+            u = self.control(ops, theta, state, drawn)
+            if theta_scored is not None:
+                scored = [*slices[len(scanned) :], scene.feedback(xp, theta_scored, state.q, state.v)]
+                logp = logp + sum(xp.sum(drawn[-1] * part, axis=0) for part in scored if part is not None)
+            cost = cost + scene.stage_cost(xp, state.q, state.v, u)
+            return self.step(ops, state, u), cost, logp
+
+        state, cost, logp = ops.scan(step, (state, zero, zero), scanned + extra, scene.horizon)
+        return cost + scene.terminal_cost(xp, state.q, state.v), logp
+
+
+class _VaryingOps:
+    """Operations for a program in which some parameters differ between columns.
+
+    A residual reads its parameters from the scene and the law. A solver that takes columns one by one would find the
+    values of all columns there, so the solver gets the values as arguments, and each residual reads those of its own
+    column.
+    """
+
+    def __init__(self, ops: Ops, places: list[tuple[Plugin, str]]) -> None:
+        self._ops = ops
+        self._places = places
+
+    @property
+    def xp(self) -> Any:
+        """The array namespace."""
+        return self._ops.xp
+
+    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
+        """Scan as the backend does."""
+        return self._ops.scan(step, carry, xs, length)
+
+    def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
+        """Find the root as the backend does, with the parameters among the arguments."""
+        whole = [getattr(plugin, name) for plugin, name in self._places]
+
+        def of_columns(z: Array, both: Any) -> Array:
+            own_args, own_values = both
+            self._set(own_values)
+            try:
+                return residual(z, own_args)
+            finally:
+                self._set(whole)
+
+        return self._ops.root(of_columns, guess, (args, whole))
+
+    def _set(self, values: list[Array]) -> None:
+        # these are the copies that belong to one evaluation, see Program._with
+        for (plugin, name), value in zip(self._places, values, strict=True):
+            object.__setattr__(plugin, name, value)
+
+
+def compose(
+    scene: Scene, contact: ContactLaw | None = None, integrator: Integrator | None = None, decision: Decision = OWN
+) -> Program:
+    """Return the program of a scene under a contact law and an integrator (None where the scene has none).
+
+    Raises :class:`Unsupported` for combinations without meaning and :class:`UserError` for a theta that does not exist.
+    """
+    if isinstance(scene, FunctionScene):
+        return FunctionProgram(scene, contact, integrator, decision)
+    if isinstance(scene, MechanicalScene):
+        return Rollout(scene, contact, integrator, decision)
+    raise Unsupported(
+        f"scene {scene.name} is neither a FunctionScene nor a MechanicalScene: derive it from one of them"
+    )
+
+
+def rollout(program: Program) -> Rollout:
+    """Narrow the program to one with time steps; raises :class:`Unsupported` for a plain function."""
+    if not isinstance(program, Rollout):
+        raise Unsupported(f"scene {program.scene.name} is a plain function: it has no time steps")
+    return program

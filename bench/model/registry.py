@@ -1,0 +1,200 @@
+"""Finds plugins and reports whether they can be used here.
+
+Built-in plugins are the files under ``plugins/<kind>/`` and the folders under ``bench/studies/``; others come from
+folders that :func:`add_folder` names, and through the entry-point group ``bench.plugins``, each entry naming a plugin
+class. Importing a plugin must stay cheap: heavy libraries are named in ``requires`` and imported by the plugin when it
+is used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.machinery
+import importlib.util
+import inspect
+import pkgutil
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from bench.errors import UserError, unknown
+from bench.model.parameters import Plugin, build, remember, singular
+
+BUILT_IN = ("bench.plugins", "bench.studies")
+KINDS = ("scenes", "contacts", "integrators", "backends", "estimators", "studies")
+"""The kinds that come with the package, in the order in which they are listed; a plugin may declare another."""
+ENTRY_POINT_GROUP = "bench.plugins"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One registered plugin: its class, or why it could not be loaded."""
+
+    kind: str
+    name: str
+    plugin: type[Plugin] | None
+    reason: str = ""
+    """Why it is unavailable, with the install command; empty when it is available."""
+
+    @property
+    def available(self) -> bool:
+        """Whether it can be used."""
+        return not self.reason
+
+
+Table = dict[str, dict[str, Entry]]
+_folders: list[Path] = []
+
+
+def add_folder(path: Path) -> None:
+    """Find plugins in a folder's ``.py`` files and its subfolders too; raises :class:`UserError` for a non-folder."""
+    path = path.expanduser().absolute()
+    if not path.is_dir():
+        raise UserError(f"plugins={path} is not a folder")
+    if path not in _folders:
+        _folders.append(path)
+        package = ModuleType(_package(path), f"Plugins from {path}.")
+        package.__path__ = [str(path)]
+        sys.modules[package.__name__] = package
+        entries.cache_clear()  # type: ignore[attr-defined]
+
+
+def folders() -> tuple[Path, ...]:
+    """Return the folders that were added."""
+    return tuple(_folders)
+
+
+def _package(path: Path) -> str:
+    """Return a package name unique to the folder and equal in every process, so that its plugins can be pickled."""
+    return f"bench_folder_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+
+
+@remember
+def entries() -> Table:
+    """Return all plugins by kind and name."""
+    table: Table = {kind: {} for kind in KINDS}
+    for name in (*BUILT_IN, *map(_package, _folders)):
+        for kind, module in _modules(importlib.import_module(name)):
+            _load_module(table, kind, module)
+    for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name):
+        try:
+            plugin = point.load()
+            if not (isinstance(plugin, type) and issubclass(plugin, Plugin) and plugin.kind):
+                raise TypeError(f"{point.value} is not a plugin class")
+        except Exception as error:
+            _fail(table, _guessed_kind(point.name), point.name, error)
+        else:
+            _add(table, plugin)
+    return table
+
+
+def kinds() -> list[str]:
+    """Return the kinds of all plugins, those of the package first."""
+    return list(entries())
+
+
+def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
+    """Yield kind (the folder's name where that is one) and name of each module of a package and of its folders."""
+    for module in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
+        name = f"{package.__name__}.{module.name}"
+        if module.name in KINDS:
+            yield from ((module.name, path) for _, path in _modules(importlib.import_module(name)))
+        else:
+            yield package.__name__.rpartition(".")[2], name
+    for folder in sorted(path for place in package.__path__ for path in Path(place).iterdir()):
+        # folders without __init__.py are packages too, and pkgutil does not list them
+        bare = folder.is_dir() and folder.name.isidentifier() and not (folder / "__init__.py").exists()
+        if bare and any(folder.glob("*.py")):
+            space = importlib.import_module(f"{package.__name__}.{folder.name}")
+            for module in sorted(pkgutil.iter_modules(space.__path__), key=lambda m: m.name):
+                yield folder.name, f"{space.__name__}.{module.name}"
+
+
+def _load_module(found: Table, kind: str, path: str) -> None:
+    try:
+        module = importlib.import_module(path)
+    except Exception as error:
+        # one broken plugin must not hide the others: it is listed with its error
+        _fail(found, kind if kind in found else "estimators", path.rpartition(".")[2], error)
+        return
+    for plugin in vars(module).values():
+        own = isinstance(plugin, type) and plugin.__module__.startswith(module.__name__)
+        if own and issubclass(plugin, Plugin) and plugin.kind and plugin.name:
+            _add(found, plugin)
+
+
+def _guessed_kind(name: str) -> str:
+    return next((kind for kind in KINDS if name.startswith(kind)), "estimators")
+
+
+def _fail(found: Table, kind: str, name: str, error: Exception) -> None:
+    found[kind][name] = Entry(kind, name, None, f"import failed: {type(error).__name__}: {error}")
+
+
+def _add(found: Table, plugin: type[Plugin]) -> None:
+    table = found.setdefault(plugin.kind, {})
+    taken = table.get(plugin.name)
+    if taken is not None and taken.plugin is not plugin:
+        where = f"{plugin.__module__}.{plugin.__qualname__}"
+        table[f"{plugin.name} of {where}"] = Entry(
+            plugin.kind, plugin.name, None, f"the name is taken by {taken.plugin}"
+        )
+    elif inspect.isabstract(plugin):
+        missing = ", ".join(sorted(plugin.__abstractmethods__))
+        table[plugin.name] = Entry(plugin.kind, plugin.name, None, f"{plugin.__qualname__} does not define {missing}")
+    else:
+        table[plugin.name] = Entry(plugin.kind, plugin.name, plugin, _missing(plugin))
+
+
+def _missing(plugin: type[Plugin]) -> str:
+    missing = []
+    for requirement in plugin.requires:
+        module, _, distribution = requirement.partition("=")
+        if not installed(module):
+            missing.append(distribution or module)
+    return f"not installed: {', '.join(missing)}; pip install {' '.join(missing)}" if missing else ""
+
+
+def installed(module: str) -> bool:
+    """Return whether a module can be imported, without importing it or its parents."""
+    first, *inner = module.split(".")
+    spec = importlib.util.find_spec(first)
+    for part in inner:
+        if spec is None:
+            return False
+        spec = importlib.machinery.PathFinder.find_spec(f"{spec.name}.{part}", spec.submodule_search_locations)
+    return spec is not None
+
+
+def find(kind: str, name: str) -> Entry:
+    """Return the entry of that name; raises :class:`UserError` with the nearest name if there is none."""
+    table = entries().get(kind, {})
+    if name not in table:
+        raise unknown(singular(kind), name, table)
+    return table[name]
+
+
+def usable(kind: str, name: str) -> type[Plugin]:
+    """Return the plugin class of that name; raises :class:`UserError` if it does not exist or could not be loaded."""
+    entry = find(kind, name)
+    if entry.plugin is None:
+        raise UserError(f"{singular(kind)} '{name}' cannot be used: {entry.reason}")
+    return entry.plugin
+
+
+def make(kind: str, name: str, values: Mapping[str, Any] | None = None) -> Any:
+    """Return an instance of the plugin of that name with checked parameter values."""
+    return build(usable(kind, name), values or {})
+
+
+def kind_of(axis: str) -> str:
+    """Return the kind of plugins on an axis: ``scenes`` for ``scene``; raises :class:`UserError` if there is none."""
+    kind = next((kind for kind in kinds() if singular(kind) == axis), None)
+    if kind is None:
+        raise unknown("axis", axis, map(singular, kinds()))
+    return kind

@@ -1,0 +1,46 @@
+"""Writes files from stored rows: tables, charts, the record of the run and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from bench.errors import UserError, printable
+from bench.report import web
+from bench.report.views import latest
+from bench.sweep.execute import Finished, store_of
+from bench.sweep.experiment import Experiment
+from bench.sweep.record import record
+from bench.sweep.store import ordered
+from bench.sweep.study import study_of
+
+
+def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, list[Path]]:
+    """Write the files of a run (the record first); returns its rows in the order of its cells, and the files."""
+    keys = finished.keys
+    rows = finished.store.load()
+    rows = ordered(rows[rows["key"].isin(keys)], keys)
+    simulated = any(item.runs for item in finished.planned)
+    path = record(finished.experiment, rows, list(words), finished.seconds, simulated)
+    return rows, [*write(finished.experiment, rows), path]
+
+
+def report(experiment: Experiment) -> tuple[pd.DataFrame, list[Path]]:
+    """Write the files of an experiment again from its newest stored rows; nothing is simulated."""
+    rows = latest(store_of(experiment).load())
+    return rows, write(experiment, rows)
+
+
+def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+    """Write the study's tables and charts, and the page; raises :class:`UserError` where there are no rows."""
+    if rows.empty:
+        raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
+    return [*study_of(experiment).write(experiment, rows), web.write(experiment, rows)]
+
+
+def shown(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows whose strings are fit for a terminal, whatever a plugin or an error has put into them."""
+    texts = [name for name in rows if rows[name].map(type).eq(str).all()]
+    return rows.assign(**{str(name): rows[name].map(printable) for name in texts if name != "parameters"})

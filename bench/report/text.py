@@ -1,0 +1,63 @@
+"""Numbers and names as text: the same in tables, charts, pages and on the terminal."""
+
+from __future__ import annotations
+
+import math
+
+from bench.errors import printable as one_line
+
+__all__ = ["axis_value", "counted", "duration", "number", "one_line"]
+
+
+def number(value: float, digits: int = 2) -> str:
+    """Write a number in few characters; ``-`` for a missing one.
+
+    >>> number(0.0213), number(350.0), number(123456.0), number(math.nan)
+    ('0.021', '350', '1.2e5', '-')
+    """
+    if not math.isfinite(value):
+        return "-" if math.isnan(value) else str(float(value))
+    if value == 0:
+        return "0"
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    power = int(exponent)
+    if -4 < power < max(digits, 4):
+        return f"{float(f'{mantissa}e{power}'):.{max(digits - 1 - power, 0)}f}"
+    return f"{mantissa}e{power}"
+
+
+def axis_value(value: float) -> str:
+    """Write a value of an axis.
+
+    >>> axis_value(0.01), axis_value(3000.0), axis_value(1e4)
+    ('0.01', '3000', '1e4')
+    """
+    if not math.isfinite(value):
+        return "-"
+    if value == 0 or 1e-3 <= abs(value) < 1e4:
+        return f"{value:g}"
+    mantissa, exponent = f"{value:e}".split("e")
+    return f"{mantissa.rstrip('0').rstrip('.')}e{int(exponent)}"
+
+
+def duration(seconds: float) -> str:
+    """Write seconds in a unit that fits.
+
+    >>> duration(0.00021), duration(0.0123), duration(1.5)
+    ('210 us', '12 ms', '1.5 s')
+    """
+    if not math.isfinite(seconds):
+        return "-"
+    for unit, factor in (("us", 1e6), ("ms", 1e3)):
+        if seconds * factor < 999.5:
+            return f"{number(seconds * factor)} {unit}"
+    return f"{number(seconds)} s"
+
+
+def counted(count: int, one: str, many: str = "") -> str:
+    """Write a count with its noun.
+
+    >>> counted(1, "cell"), counted(3, "cell")
+    ('1 cell', '3 cells')
+    """
+    return f"{count} {one if count == 1 else many or one + 's'}"

@@ -1,0 +1,65 @@
+"""Bias, variance and cost of estimators against the certified gradient: the main study."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from bench.model import param
+from bench.studies.bias_variance.columns import COLUMNS
+from bench.sweep.cell import Cell
+from bench.sweep.columns import Columns
+from bench.sweep.experiment import Experiment
+from bench.sweep.session import Session
+from bench.sweep.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class BiasVariance(Study):
+    """Measures bias and variance of estimates against the reference gradient, and the cost of an estimate."""
+
+    name = "bias_variance"
+    columns: ClassVar[Columns] = COLUMNS
+    timed: ClassVar[bool] = True
+
+    timed_calls: int = param(
+        5, "estimates timed one by one on backends that do not compile; the other repeats are evaluated together",
+        positive=True,
+    )  # fmt: skip
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Measure the estimates of one cell and their statistics."""
+        from bench.studies.bias_variance.measure import measure
+
+        return measure(cell, session, self.timed_calls)
+
+    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+        """Write the main table, error against time, the charts, and the fastest methods where samples were swept."""
+        from bench.studies.bias_variance import charts, fastest, tables
+
+        paths = tables.write(experiment, rows) + charts.write(experiment, rows)
+        return paths + fastest.write(experiment, rows)
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
+        """Print the digest: the main table, condensed where it is long, and the findings from it."""
+        from bench.studies.bias_variance import fastest, terminal
+
+        terminal.show(experiment, rows)
+        fastest.show(experiment, rows)
+
+    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
+        """Return the finding, what to use where, and the charts."""
+        from bench.studies.bias_variance.page import content
+
+        return content(experiment, rows)
+
+    def chart(self, experiment: Experiment, rows: pd.DataFrame) -> Sequence[str]:
+        """Return the name of the chart along the longest axis."""
+        from bench.studies.bias_variance.charts import along_longest
+
+        return [experiment.name, *along_longest(experiment, rows)]

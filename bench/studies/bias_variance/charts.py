@@ -1,0 +1,134 @@
+"""Chooses an experiment's charts: bias and variance along each swept axis, error against time, or an overview.
+
+An estimator has one colour and marker in every chart, by its position among all registered estimators. Backends that
+agree are one line. Relative means in units of the reference gradient's norm.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from bench.model import registry
+from bench.report.figures import save, styled
+from bench.report.style import Look, symbol
+from bench.report.views import CATEGORIES, Family, along, arranged, families, ran
+from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost
+from bench.studies.bias_variance.panels import bias_variance, overview, speed_accuracy
+from bench.sweep.axes import Axis
+from bench.sweep.experiment import Experiment
+
+ROOM = 4
+"""Number of problems beyond which a chart shows only some of them."""
+SAMPLES = Axis("samples", ("samples",))
+
+
+def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+    """Draw every chart that the rows can fill, in the experiment's formats; returns the files' paths."""
+    paths = []
+    with styled():
+        for name, figure in figures(experiment, rows).items():
+            figure.canvas.draw()
+            figure.set_layout_engine("none")
+            paths += save(figure, experiment.directory / name, experiment.formats)
+    return paths
+
+
+def file_name(axis: Axis) -> str:
+    """Return the file name of the chart along an axis, without ending."""
+    return "bias_variance_" + re.sub(r"\W", "_", axis.column)
+
+
+def along_longest(experiment: Experiment, rows: pd.DataFrame) -> list[str]:
+    """Return the names of the charts along swept axes, the longest axis first."""
+    swept = arranged(experiment, rows).swept()
+    return [file_name(axis) for axis in sorted(swept, key=lambda axis: -swept[axis])]
+
+
+def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
+    """Return the charts by file name."""
+    shown = arranged(experiment, rows)
+    rows = shown.rows
+    look = Look(rows, sorted(registry.entries()["estimators"]))
+    seeds = rows["seed"].nunique()
+    merged = [f"medians over {seeds} seeds"] if seeds > 1 else []
+    drawings: dict[str, Figure] = {}
+
+    def problems(axis: Axis | None, drawable: Callable[[pd.DataFrame], bool]) -> list[Family]:
+        return [p for p in families(shown, along(shown, axis)) if drawable(p.rows)]
+
+    for axis in shown.swept():
+        chosen, held = choose(problems(axis, lambda part: ran(part)["x"].nunique() > 1))
+        if chosen:
+            drawings[file_name(axis)] = bias_variance(chosen, held + merged, look, axis, shown.marks(axis))
+    nothing_swept = not drawings
+    good = rows[rows["status"] == "ok"]
+    if good["samples"].nunique() > 1 or good["backend"].nunique() > 1:
+        for name, cost in (
+            ("speed_accuracy", TIME_COMPILED if experiment.compile_time else TIME),
+            ("rollouts_accuracy", ROLLOUTS),
+        ):
+            costed = problems(SAMPLES, partial(_costed, cost))
+            curves = [problem for problem in costed if ran(problem.rows)["x"].nunique() > 1]
+            chosen, held = choose(curves or costed)
+            if chosen and (cost is not ROLLOUTS or good["samples"].nunique() > 1):
+                drawings[name] = speed_accuracy(chosen, held + merged, look, cost)
+    if nothing_swept:
+        chosen = problems(None, lambda part: len(ran(part)) > 0)
+        if chosen:
+            drawings["overview"] = overview(chosen, merged, look)
+    return drawings
+
+
+def _costed(cost: Cost, rows: pd.DataFrame) -> bool:
+    return len(cost.known(rows)) > 1
+
+
+def choose(problems: Sequence[Family], room: int = ROOM) -> tuple[list[Family], list[str]]:
+    """Choose the problems to draw if there are more than fit, and report how many values of each number are shown.
+
+    Every scene and contact law is drawn. The number with most values gets the remaining room, at evenly spaced ranks
+    among the values that were run most, not at their ends; the other numbers are fixed at a middle one of those values.
+    """
+    if len(problems) <= room:
+        return list(problems), []
+    kinds: dict[tuple[Any, ...], list[Family]] = {}
+    for problem in problems:
+        kinds.setdefault(tuple(problem.identity.get(k) for k in CATEGORIES), []).append(problem)
+    kept = {p for members in kinds.values() for p in _thinned(members, problems, max(1, room // len(kinds)))}
+    notes = []
+    for name in _numbers(problems):
+        every, drawn = ({p.identity[name] for p in some if name in p.identity} for some in (problems, kept))
+        if drawn != every:
+            notes.append(f"{len(drawn)} of {len(every)} values of {symbol(name) or name} shown")
+    return [problem for problem in problems if problem in kept], notes
+
+
+def _numbers(problems: Iterable[Family]) -> list[str]:
+    return list(dict.fromkeys(k for p in problems for k in p.identity if k not in CATEGORIES))
+
+
+def _thinned(members: Sequence[Family], problems: Sequence[Family], room: int) -> list[Family]:
+    """Return the problems of one scene and contact law that :func:`choose` keeps."""
+
+    def values(some: Iterable[Family], name: str) -> list[float]:
+        return [float(problem.identity.get(name, -math.inf)) for problem in some]
+
+    kept = list(members)
+    for name in sorted(_numbers(members), key=lambda n: (-len(set(values(members, n))), n)):
+        everywhere = Counter(values(problems, name))
+        counts = {value: everywhere[value] for value in values(kept, name)}
+        run_most = sorted(v for v, count in counts.items() if count == max(counts.values()))
+        taken = min(room, len(run_most))
+        wanted = {run_most[int((2 * i + 1) * len(run_most) / (2 * taken))] for i in range(taken)}
+        kept = [problem for problem, value in zip(kept, values(kept, name), strict=True) if value in wanted]
+        room //= taken
+    return kept

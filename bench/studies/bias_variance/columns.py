@@ -1,0 +1,47 @@
+"""The columns of the main table, which users' scripts rely on."""
+
+from bench.sweep.columns import Column, Columns, Judged, numbers, text
+
+TABLE = (
+    "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise",
+    "horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats", "dim", "seed", "status", "reason",
+    "grad_norm", "reference_norm", "reference_method", "reference_se", "bias", "bias_low", "bias_high",
+    "bias_rel", "variance", "variance_per_sample", "rmse", "rmse_rel", "cosine", "sign_agreement",
+    "finite_fraction", "model_error", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients",
+    "peak_memory_mb", "dtype", "device", "versions", "key",
+)  # fmt: skip
+COLUMNS = Columns.ordered(
+    TABLE,
+    Column("grad_norm", "norm of the mean estimate"),
+    Column("reference_norm", "norm of the reference gradient"),
+    text("reference_method", "how the reference was computed: closed_form, quadrature or sampling, with its settings"),
+    Column("reference_se", "standard error of the reference, as the root of the trace of its covariance"),
+    Column("bias", "norm of the bias, corrected for its own noise", judged=Judged("interval", "bias")),
+    Column("bias_low", "lower end of its 95% interval; 0 where the bias is not distinguishable from 0"),
+    Column("bias_high", "upper end of its 95% interval"),
+    Column("bias_rel", "bias / reference_norm"),
+    Column("variance", "trace of the covariance of one estimate", judged=Judged("spread", "variance")),
+    Column("variance_low", "lower end of its 95% interval", table=False),
+    Column("variance_high", "upper end of its 95% interval", table=False),
+    Column("variance_per_sample", "samples * variance"),
+    Column("rmse", "root mean squared distance of one estimate from the reference"),
+    Column("rmse_rel", "rmse / reference_norm; above 1 an estimate is worse than answering zero"),
+    Column("cosine", "mean cosine between one estimate and the reference"),
+    Column("sign_agreement", "share of coordinates of one estimate whose sign is the reference's"),
+    Column("finite_fraction", "share of repeats that are finite"),
+    Column("model_error", "norm of (program's gradient - physics' gradient) at w = 0"),
+    Column("time_s", "one estimate of N samples, steady state, median over calls", "s", measured=True,
+           judged=Judged("time", "time")),
+    Column("time_iqr_s", "interquartile range over calls", "s", measured=True),
+    Column("compile_s", "compilation that the estimates needed", "s", measured=True),
+    Column("rollouts", "costs that one estimate evaluates"),
+    Column("gradients", "gradients that one estimate evaluates"),
+    Column("peak_memory_mb", "largest resident memory of the process, libraries included", "MB", measured=True),
+    text("device", "what the program ran on"),
+    numbers("time_samples", "seconds of each call", "s", table=False, measured=True),
+    Column("estimates_s", "seconds of all estimates together", "s", table=False, measured=True),
+    Column("compilations", "programs compiled for the cell", table=False, measured=True),
+    text("shapes", "hashes of the programs asked for", table=False, measured=True),
+    numbers("mean_estimate", "mean estimate, signed, by coordinate of theta", table=False),
+    numbers("reference_gradient", "reference gradient, signed, by coordinate of theta", table=False),
+)  # fmt: skip

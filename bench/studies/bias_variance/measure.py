@@ -1,0 +1,88 @@
+"""Estimates of one cell against the certified gradient, timed."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from bench.measure import noise, statistics, timing
+from bench.model import Problem
+from bench.sweep.cell import Cell
+from bench.sweep.session import Session
+
+
+def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
+    """Measure one cell's estimates; ``timed_calls`` of them are timed one by one on backends that do not compile."""
+    session.compilations.restart()
+    program = cell.program()
+    theta = program.theta0
+    truth = session.references.of(cell)
+    problem = session.problem(cell)
+    w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, program.n_noise)
+
+    def estimate(block: np.ndarray) -> np.ndarray:
+        result = np.asarray(cell.estimator.estimate(problem, theta, block), dtype=np.float64)
+        if result.shape != (block.shape[0], problem.dim):
+            raise ValueError(
+                f"{cell.estimator.name} returned shape {result.shape}, not {(block.shape[0], problem.dim)}"
+            )
+        return result
+
+    timing.reset_peak_memory()
+    calls = cell.repeats if cell.backend.compiles else min(timed_calls, cell.repeats)
+    # usage covers the timed calls only: the reference may have used the same problem
+    problem.reset_usage()
+    started = time.perf_counter()
+    parts, clock = timing.timed(lambda r: estimate(w[r : r + 1]), calls)
+    # a copy, since the remaining estimates count on
+    usage = replace(problem.usage)
+    if calls < cell.repeats:
+        parts.append(estimate(w[calls:]))
+    spent = time.perf_counter() - started
+    estimates = np.concatenate(parts)
+
+    result: dict[str, Any] = {
+        "status": "ok",
+        "reference_method": truth.method,
+        "model_error": truth.model_error,
+        "time_s": clock.median_s,
+        "time_iqr_s": clock.iqr_s,
+        "time_samples": list(clock.samples_s),
+        "estimates_s": spent,
+        "compile_s": usage.compile_s,
+        "rollouts": usage.rollouts / clock.calls,
+        "gradients": usage.gradients / clock.calls,
+        "peak_memory_mb": timing.peak_memory_mb(),
+        "device": problem.device,
+        "compilations": session.compilations.made,
+        "shapes": " ".join(sorted(session.compilations.shapes)),
+        "mean_estimate": estimates.mean(axis=0).tolist(),
+        "reference_gradient": truth.gradient.tolist(),
+    }
+    if not np.isfinite(truth.batches).all():
+        return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}
+    summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
+    result |= {"reason": summary.pop("note"), **summary}
+    bad = ~np.isfinite(estimates).all(axis=1)
+    if bad.any():
+        result["status"] = "nonfinite"
+        result["reason"] += f"; {first_bad(cell, problem, w, int(np.argmax(bad)))}"
+    return result
+
+
+def first_bad(cell: Cell, problem: Problem, w: np.ndarray, repeat: int) -> str:
+    """Return where an estimate that is not finite comes from, so that it can be repeated: theta, seed and sample.
+
+    The sample is the first of the repeat ``w[repeat]`` whose own cost or gradient is not finite; an estimator may
+    also spoil finite ones, or displace theta.
+    """
+    theta, samples = problem.program.theta0, w[repeat].T
+    spoilt = ~np.isfinite(problem.value(theta, samples))
+    if "grad" in cell.backend.provides:
+        spoilt |= ~np.isfinite(problem.grad(theta, samples)).all(axis=0)
+    sample = f"sample {int(np.argmax(spoilt))}" if spoilt.any() else "no single sample, costs and gradients are finite"
+    text = np.array2string(theta, precision=17, threshold=8, separator=", ").replace("\n", "")
+    return f"the first at seed {cell.seed}, repeat {repeat}, {sample}, theta {text}"

@@ -1,0 +1,324 @@
+"""The page of the main study: error against time, bias and variance along each axis, and the two against each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from bench.model import registry
+from bench.report.style import Look
+from bench.report.text import counted, duration, number
+from bench.report.views import (
+    CATEGORIES,
+    Arranged,
+    Family,
+    Line,
+    along,
+    arranged,
+    families,
+    lines,
+    ran,
+    resolved,
+    unsteady,
+)
+from bench.report.web.content import (
+    DASHES,
+    STATUS,
+    SYMBOLS,
+    Axis,
+    Chart,
+    Column,
+    Content,
+    identity_columns,
+    look,
+    nothing_ran,
+    titled,
+)
+from bench.studies.bias_variance.findings import lowest, problems, span, winners
+from bench.studies.bias_variance.panels import FLOOR
+from bench.studies.bias_variance.tables import problem
+from bench.sweep import axes
+from bench.sweep.experiment import Experiment
+
+BIAS = Axis(
+    "bias_shown", "relative bias |bias| / |∇J|", True, "bias_from", "bias_to", "bias_limit", "larger than the gradient"
+)
+VARIANCE = Axis("variance_rel", "relative variance of one estimate", True, "variance_from", "variance_to")
+RMSE = Axis("rmse_rel", "relative RMSE of one estimate", above_one="worse than answering zero")
+TIMES = (
+    Axis("time_s", "time of one estimate [s]"),
+    Axis("time_total_s", "time of the first estimate, with compilation [s]"),
+    Axis("rollouts", "rollouts of one estimate"),
+)
+RESULTS = [
+    Column("bias_shown", "rel. bias", "limit", "bias_limit"),
+    Column("variance_rel", "rel. variance"),
+    Column("rmse_rel", "rel. RMSE"),
+    Column("cosine", "cosine"),
+    Column("time_s", "time", "seconds", "unsteady"),
+    Column("compile_s", "compile", "seconds"),
+    Column("rollouts", "rollouts"),
+]
+GOAL = 0.1
+"""Relative RMSE for which the fastest method is named."""
+EXCEPTIONS = 2
+"""Most settings with another best estimator that the finding names."""
+
+
+def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
+    """Return the finding, what to use where, and the charts."""
+    shown = arranged(experiment, rows)
+    summaries = [ProblemSummary(axis, family) for axis, family in problems(shown)]
+    table_ = derived(rows)
+    labelled = derived(shown.rows)
+    charts = [
+        Chart(
+            "Error against time",
+            "Each point is one cell. Lower left is better; above 1 an estimate is worse than answering zero. "
+            "Points with a ring are not beaten in both by any point shown of the same problem.",
+            TIMES,
+            [RMSE, BIAS],
+            facet="problem",
+            front="setting",
+        )
+    ]
+    tables = {}
+    swept = shown.swept()
+    for axis in sorted(swept, key=lambda a: -swept[a]):
+        name = axis.column
+        table = _along(replace(shown, rows=labelled), axis)
+        if not table.empty:
+            tables[name] = table
+            marks = dict(shown.marks(axis))
+            text = "Bars are 95% intervals. A hollow marker is the upper limit of a bias that cannot be distinguished from 0."
+            shape = {"table": name, "facet": "facet", "line": "line", "marks": marks}
+            x = [Axis("x", axis.title)]
+            charts.append(Chart(f"Bias and variance along {name}", text, x, [BIAS, VARIANCE, RMSE], **shape))  # type: ignore[arg-type]
+    charts.append(
+        Chart(
+            "Bias against variance",
+            "Towards the left more samples do not help; towards the top the error is bias.",
+            [VARIANCE],
+            [BIAS],
+            facet="problem",
+        )
+    )
+    return Content(
+        finding=nothing_ran(rows) or "; ".join(filter(None, [finding(summaries), fastest(rows), refused(rows)])) + ".",
+        rows=table_,
+        columns=[*identity_columns(rows), *RESULTS, *STATUS],
+        charts=charts,
+        answers=answers(summaries),
+        tables=tables,
+        looks=estimator_looks(rows),
+    )
+
+
+def derived(rows: pd.DataFrame) -> pd.DataFrame:
+    """Add the columns that charts draw: errors in units of |grad J|, and labels that distinguish points and lines."""
+    norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
+    limit = ~resolved(rows)
+    values = {
+        "bias_shown": (rows["bias"].where(~limit, rows["bias_high"]) / norm).clip(lower=FLOOR),
+        "bias_from": (rows["bias_low"] / norm).clip(lower=FLOOR),
+        "bias_to": rows["bias_high"] / norm,
+        "variance_rel": rows["variance"] / norm**2,
+        "variance_from": rows["variance_low"] / norm**2,
+        "variance_to": rows["variance_high"] / norm**2,
+        "time_total_s": rows["time_s"] + rows["compile_s"].fillna(0.0),
+    }
+    good = rows["status"] == "ok"
+    texts = {
+        "bias_limit": limit.astype(float),
+        "unsteady": unsteady(rows).astype(float),
+        "series": _label(rows),
+        "problem": titled(rows, ["scene", "contact"]),
+        "line": rows["backend"] + " " + rows["dtype"] + " " + _label(rows),
+        "setting": problem(rows).astype(str),
+    }
+    return rows.assign(**{name: column.where(good) for name, column in values.items()}, **texts)
+
+
+def _label(rows: pd.DataFrame) -> pd.Series:
+    params = rows["estimator_params"]
+    return rows["estimator"].where(params == "", rows["estimator"] + "[" + params + "]")
+
+
+def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
+    """Return the rows along an axis, seeds merged, by problem; only problems with at least two values of it."""
+    rows = shown.rows
+    place = pd.Series(range(len(rows)), index=rows["key"])
+    drawn = [BIAS.column, BIAS.low, BIAS.high, BIAS.limit, VARIANCE.column, VARIANCE.low, VARIANCE.high, RMSE.column]
+    merged = rows["seed"].nunique() > 1
+    parts = []
+    for family in families(shown, along(shown, axis), ("scene", "contact")):
+        part = family.rows[family.rows["status"] == "ok"]
+        if part["x"].nunique() > 1:
+            part = part.sort_values(["line", "x"], kind="stable").assign(
+                facet=family.title(), row=part["key"].map(place), series=_label(part)
+            )
+            parts.append(part[["row", "x", "facet", "series", "line", *(drawn if merged else [])]])
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
+
+
+def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
+    """Return the charts' own colour, marker and line style of every estimator in the rows."""
+    styles = Look(rows, sorted(registry.entries()["estimators"]))
+    looks = {}
+    for estimator, params in dict.fromkeys(zip(rows["estimator"], rows["estimator_params"], strict=True)):
+        line = Line(estimator, params, {}, rows.iloc[:0], {}, frozenset(), 0)
+        style = styles.marked(line)
+        looks[line.label] = look(style["color"], SYMBOLS[style["marker"]], DASHES[str(style["linestyle"])])
+    return looks
+
+
+# ------------------------------------------------------------------------------------------------------ finding
+
+
+class ProblemSummary:
+    """One problem along an axis: which estimators are best, and where."""
+
+    def __init__(self, axis: axes.Axis | None, family: Family) -> None:
+        self.axis, self.title = axis, family.title()
+        self.kind = ", ".join(str(value) for name, value in family.identity.items() if name in CATEGORIES)
+        self.lines = lines(family.rows)
+        self.lowest = lowest(self.lines)
+        self.winners = winners(self.lines)
+
+    def errors(self, label: str, places: Iterable[float]) -> list[float]:
+        """Return the relative RMSEs of an estimator at some places, on every backend whose numbers differ."""
+        rows = [line.at[x] for x in places for line in self.lines if line.label == label and x in line.at]
+        return [row["rmse_rel"] for row in rows if row["status"] == "ok" and math.isfinite(row["rmse_rel"])]
+
+    def where(self, places: Sequence[float]) -> str:
+        """Write where this holds: ``stiffness >=1e4``, or nothing for everywhere."""
+        text = span({x: x in places for x in self.lowest})
+        return f"{self.axis.column} {text}" if self.axis and text else ""
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """A place where the estimator that is best most often is not: what to use instead, and the errors of both."""
+
+    problem: str
+    kind: str
+    where: str
+    use: str
+    errors: list[float]
+    instead_of: list[float]
+
+    @property
+    def factor(self) -> float:
+        """How many times larger the error of the usual estimator would be."""
+        worse = max(self.instead_of, default=math.inf)
+        return worse / min(self.errors) if min(self.errors) > 0 else math.inf
+
+    def sentence(self, main: str) -> str:
+        """Write the exception: ``pushing, penalty, stiffness >=1e4: use reinforce (0.5, where fobg has 300)``."""
+        where = ", ".join(filter(None, [self.problem, self.where])) or "elsewhere"
+        return f"{where}: use {self.use} ({between(self.errors)}, where {main} has {between(self.instead_of)})"
+
+
+def finding(summaries: Sequence[ProblemSummary]) -> str:
+    """Write one sentence: the estimator that has the lowest error most often, and where to use another."""
+    settings = [(one, x) for one in summaries for x in one.lowest]
+    if not settings:
+        return "No cell has an error that could be compared"
+    labels = list(dict.fromkeys(line.label for one in summaries for line in one.lines))
+    wins = {label: [(one, x) for one, x in settings if label in one.winners[x]] for label in labels}
+    main = min(labels, key=lambda label: (-len(wins[label]), labels.index(label)))
+    errors = [one.lowest[x] for one, x in wins[main]]
+    share = f"{len(errors)} of {counted(len(settings), 'setting')}"
+    if len(errors) == len(settings):
+        share = f"all {counted(len(settings), 'setting')}" if len(settings) > 1 else "the one setting"
+    text = f"Use {main}: lowest relative RMSE in {share} ({between(errors)})"
+    if min(errors) >= 1:
+        text = f"Nothing beats answering zero: even {main}, lowest in {share}, has a relative RMSE of {between(errors)}"
+    others = elsewhere(summaries, main)
+    left = counted(len(others) - EXCEPTIONS, "further exception") if len(others) > EXCEPTIONS else ""
+    return "; ".join(filter(None, [text, *(other.sentence(main) for other in others[:EXCEPTIONS]), left]))
+
+
+def fastest(rows: pd.DataFrame) -> str:
+    """Write which estimator on which backend reaches GOAL first most often; nothing if there is only one backend."""
+    good = rows[(rows["status"] == "ok") & (rows["rmse_rel"] <= GOAL) & np.isfinite(rows["time_s"])]
+    if rows["backend"].nunique() < 2 or good.empty:
+        return ""
+    settings = good["time_s"].groupby(problem(good))
+    first = good.loc[settings.idxmin()]
+    ways = _label(first) + " on " + first["backend"]
+    way = ways.value_counts().index[0]
+    times = sorted(first.loc[ways == way, "time_s"])
+    if len(first) < 2:
+        return ""
+    share = f"{len(times)} of the {counted(len(first), 'setting')} where any does"
+    return f"a relative RMSE of {GOAL:g} is reached first by {way} in {share} ({duration(times[0])} to {duration(times[-1])})"
+
+
+def refused(rows: pd.DataFrame) -> str:
+    """Write which backends refused every cell, with the commonest reason; nothing if none did."""
+    left = rows[(rows["status"] == "unsupported") & ~rows["backend"].isin(ran(rows)["backend"])]
+    reasons = left.groupby("backend", sort=False)["reason"].agg(lambda reasons: reasons.mode().iloc[0])
+    return "; ".join(f"{backend} refuses: {reason}" for backend, reason in reasons.items())
+
+
+def elsewhere(summaries: Sequence[ProblemSummary], main: str) -> list[Elsewhere]:
+    """Return the settings where another estimator than ``main`` is best, the largest difference first.
+
+    A statement true of every problem with the same scene and law is printed once.
+    """
+    exceptions = []
+    for one in summaries:
+        places = [x for x, labels in one.winners.items() if main not in labels]
+        for use in dict.fromkeys(one.winners[x][0] for x in places):
+            mine = [x for x in places if one.winners[x][0] == use]
+            errors, instead_of = [one.lowest[x] for x in mine], one.errors(main, mine)
+            exceptions.append(Elsewhere(one.title, one.kind, one.where(mine), use, errors, instead_of))
+    merged = []
+    for other in exceptions:
+        alike = [e for e in exceptions if (e.kind, e.where, e.use) == (other.kind, other.where, other.use)]
+        if len(alike) < sum(one.kind == other.kind for one in summaries):
+            merged.append(other)
+        elif alike[0] is other:
+            both = [[v for e in alike for v in getattr(e, name)] for name in ("errors", "instead_of")]
+            merged.append(Elsewhere(other.kind, other.kind, other.where, other.use, *both))
+    return sorted(merged, key=lambda other: -other.factor)
+
+
+def answers(summaries: Sequence[ProblemSummary]) -> pd.DataFrame:
+    """Return what to use where: a line per problem and stretch of its axis with the same best estimators."""
+    entries = []
+    for one in summaries:
+        groups: dict[tuple[str, ...], list[float]] = {}
+        for x, names in one.winners.items():
+            groups.setdefault(tuple(names), []).append(x)
+        every = list(dict.fromkeys(line.label for line in one.lines))
+        for labels, places in groups.items():
+            errors = {label: one.errors(label, places) for label in every}
+            rest = {label: float(np.median(errors[label])) for label in every if label not in labels and errors[label]}
+            following = min(rest, key=lambda label: rest[label], default="")
+            useless = [label for label in every if errors[label] and min(errors[label]) >= 1]
+            entries.append(
+                {
+                    "problem": one.title,
+                    "where": one.where(places) or "everywhere",
+                    "use": ", ".join(labels),
+                    "relative RMSE": between(one.lowest[x] for x in places),
+                    "next best": f"{following} ({number(rest[following])})" if following else "-",
+                    "worse than answering zero": ", ".join(useless) or "-",
+                }
+            )
+    return pd.DataFrame(entries)
+
+
+def between(values: Iterable[float]) -> str:
+    """Write a range: ``0.12``, or ``0.10 to 0.15``; ``no result`` for no values."""
+    numbers = list(values)
+    if not numbers:
+        return "no result"
+    low, high = number(min(numbers)), number(max(numbers))
+    return low if low == high else f"{low} to {high}"

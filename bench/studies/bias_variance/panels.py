@@ -1,0 +1,256 @@
+"""The three kinds of charts: bias and variance along an axis, error against time, and an overview."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.path import Path
+from matplotlib.transforms import Transform
+
+from bench.report.page import columns, page, shared
+from bench.report.scales import above, extent, log_axis, mark_values, scale_x, scale_y, shifts
+from bench.report.style import CROSS, DEVIANT, FRONT, GREY, MARKS, SHADE, TICK, Look, axis_name, plain, quantity, twin
+from bench.report.views import Family, Line, lines, pareto, resolved
+from bench.studies.bias_variance.costs import Cost
+from bench.sweep.axes import Axis
+
+ALIKE = 0.03
+"""Backends within this relative difference are one line: less could not be seen."""
+FLOOR = 1e-4
+"""Relative biases below this, and variances below its square, are drawn at the lower edge."""
+DOWN, LEFT = (
+    Path(ends, [Path.MOVETO, Path.LINETO, Path.MOVETO, Path.LINETO, Path.LINETO])
+    for ends in (
+        [(0, -0.25), (0, -1), (-0.17, -0.78), (0, -1), (0.17, -0.78)],
+        [(-0.25, 0), (-1, 0), (-0.78, -0.17), (-1, 0), (-0.78, 0.17)],
+    )
+)
+"""Arrows from upper limits towards 0, of a fixed length on paper."""
+
+
+def bias_variance(
+    problems: Sequence[Family], notes: Sequence[str], look: Look, axis: Axis, marks: Mapping[str, float]
+) -> Figure:
+    """Draw relative bias above, relative variance below, against one axis; a column of panels per problem."""
+    drawn = [lines(problem.rows, ALIKE) for problem in problems]
+    across = columns(len(problems), 4)
+    figure, panels = page(
+        problems, across, 3.3, ("|bias| / |∇J|", "variance / |∇J|²"),
+        f"Relative bias and variance along {axis_name(axis).split(' [')[0].split(',')[0]}", [*shared(problems, axis.column), *notes],
+        _line_legends(drawn, look, axis, marks),
+    )  # fmt: skip
+    for (upper, lower), curves in zip(panels, drawn, strict=True):
+        values = np.array(sorted({x for line in curves for x in line.at}))
+        for line, shift in zip(curves, shifts(values, len(curves), across), strict=True):
+            style = look.marked(line) | _deviation(line, curves)
+            _draw_errors(upper, line, shift + upper.transData, style, "bias", 1)
+            _draw_errors(lower, line, shift + lower.transData, style, "variance", 2)
+        for panel in (upper, lower):
+            scale_x(panel, values)
+            mark_values(panel, marks)
+        upper.tick_params(labelbottom=False)
+        lower.set_xlabel(axis_name(axis))
+    together = len({problem.rows["scene"].iloc[0] for problem in problems}) == 1
+    step = across if together else 1
+    for start in range(0, len(panels), step):
+        for row in zip(*panels[start : start + step], strict=True):
+            scale_y(row)
+    return figure
+
+
+def _deviation(line: Line, curves: Sequence[Line]) -> dict[str, Any]:
+    """Return the line style of backends whose numbers differ from the first backend's."""
+    place = twin(line, curves)
+    return {"linestyle": DEVIANT[(place - 1) % len(DEVIANT)]} if place else {}
+
+
+def _estimates(rows: pd.DataFrame, column: str, power: int) -> pd.DataFrame:
+    """Return rows with a bias or variance: value and interval relative to |grad J|, and whether it is a limit."""
+    scale = _scale(rows, power)
+    ends = {"value": "", "low": "_low", "high": "_high"}
+    table = pd.DataFrame({name: rows[column + end] / scale for name, end in ends.items()})
+    limit = ~resolved(rows) & (column == "bias")
+    table["value"] = table["value"].where(~limit, table["high"])
+    floor = FLOOR**power
+    table["limit"] = limit | (table["value"] <= floor)
+    table = table[(rows["status"] == "ok") & np.isfinite(table["value"])]
+    return table.assign(value=table["value"].clip(lower=floor), low=table["low"].clip(lower=floor))
+
+
+def _scale(rows: pd.DataFrame, power: int) -> pd.Series:
+    """Return a power of |grad J|, or 1 where that is 0."""
+    norm = rows["reference_norm"]
+    return norm.where((norm > 0) & np.isfinite(norm), 1.0) ** power
+
+
+def _draw_errors(panel: Axes, line: Line, place: Transform, style: Mapping[str, Any], column: str, power: int) -> None:
+    """Draw one estimator's bias or variance along the axis at ``place``, and crosses where cells were lost."""
+    points, at = _estimates(line.rows, column, power), line.rows.index.to_numpy(float)
+    has = line.rows.index.isin(points.index)
+    curve = {**style, "marker": "", "alpha": 0.75}
+    panel.plot(at[has], points["value"], label=line.label, transform=place, **curve)
+    _draw_points(panel, at[has], points, {**style, "transform": place})
+    lost = at[~has | (line.rows["lost"] > 0)]
+    if len(lost):
+        height = 0.955 - 0.05 * (sum(other.get_marker() == "x" for other in panel.lines) % 4)
+        panel.plot(
+            lost, [height] * len(lost), transform=above(panel, place), color=style["color"], clip_on=False,
+            zorder=4, **CROSS,
+        )  # fmt: skip
+
+
+def _draw_points(
+    panel: Axes, at: np.ndarray, values: pd.DataFrame, style: Mapping[str, Any], lying: bool = False
+) -> None:
+    """Draw full markers with intervals, hollow ones with arrows at upper limits; ``lying``: values to the right."""
+    mark: Any = {
+        "color": style["color"],
+        "linestyle": "none",
+        "zorder": 3,
+        "transform": style.get("transform", panel.transData),
+    }
+    limit = values["limit"].to_numpy()
+    clear = values[~limit]
+    bars = np.array([clear["value"] - clear["low"], clear["high"] - clear["value"]])
+    bars = np.nan_to_num(bars, posinf=0.0).clip(min=0.0)
+    points: Any = (at[~limit], clear["value"])
+    limits: Any = (at[limit], values["value"][limit])
+    if lying:
+        points, limits = points[::-1], limits[::-1]
+    error: Any = {"xerr": bars} if lying else {"yerr": bars}
+    panel.errorbar(points[0], points[1], elinewidth=0.8, marker=style["marker"], **error, **mark)
+    panel.plot(*limits, marker=style["marker"], markerfacecolor="white", markeredgewidth=0.9, **mark)
+    panel.plot(*limits, marker=LEFT if lying else DOWN, markersize=18, markerfacecolor="none", **mark)
+
+
+def _line_legends(
+    drawn: Sequence[Sequence[Line]], look: Look, axis: Axis, marks: Mapping[str, float]
+) -> tuple[list[Any], list[Any]]:
+    """Return legend handles: estimators, then the meaning of symbols."""
+    every = [(line, curves) for curves in drawn for line in curves]
+    entries = {line.label: _handle(line.label, **look.marked(line)) for line, _ in every}
+    deviants: dict[Any, list[str]] = {}
+    for line, curves in every:
+        if style := _deviation(line, curves):
+            deviants.setdefault(style["linestyle"], []).extend(line.backends)
+    symbols: list[Any] = []
+    for dashes, names in deviants.items():
+        symbols.append(_handle(f"{', '.join(dict.fromkeys(names))}, where different", linestyle=dashes))
+    rows = pd.concat([line.rows for line, _ in every])
+    good = rows[rows["status"] == "ok"]
+    texts = ["bias not distinguishable from 0: 95% limit"] * bool((~resolved(good)).any())
+    texts += ["below the scale"] * bool(_estimates(rows, "variance", 2)["limit"].any())
+    if texts:
+        symbols.append(_handle(", or ".join(texts), marker="o", markerfacecolor="white", linestyle="none"))
+    if (rows["lost"] > 0).any():
+        symbols.append(_handle("cell failed", **CROSS))
+    symbols.append(Patch(label="error exceeds |∇J|", **SHADE))
+    for (text, value), dashes in zip(marks.items(), MARKS * len(marks), strict=False):
+        label = f"{plain(text)}, {quantity(axis.column, value)}"
+        symbols.append(Line2D([], [], color="#595959", linewidth=0.9, linestyle=dashes, label=label))
+    return list(entries.values()), symbols
+
+
+def _handle(text: str, color: str = GREY, **style: Any) -> Line2D:
+    return Line2D([], [], label=plain(text), color=color, **style)
+
+
+def speed_accuracy(problems: Sequence[Family], notes: Sequence[str], look: Look, cost: Cost) -> Figure:
+    """Draw relative RMSE of one estimate against its cost, a panel per problem, a curve per estimator and backend."""
+    drawn = [lines(problem.rows, close=None) for problem in problems]
+    every = [line for curves in drawn for line in curves]
+    entries = {line.label: _handle(line.label, **look.line(line)) for line in every}
+    backends = dict.fromkeys(line.rows["backend"].iloc[0] for line in every)
+    symbols: list[Any] = [_handle(name, marker=look.backend(name), linestyle="none") for name in backends]
+    symbols += [Line2D([], [], **FRONT), Patch(label="worse than answering zero", **SHADE)]
+    samples = sorted({int(x) for line in every for x in line.at})
+    curve = [f"along a curve $N$ = {', '.join(map(str, samples))}"] if len(samples) > 1 else []
+    figure, panels = page(
+        problems, columns(len(problems), 3), 2.4, ("relative RMSE",),
+        f"Relative RMSE of one estimate against {cost.name}", [*shared(problems, "samples"), *notes, *curve],
+        (list(entries.values()), symbols),
+    )  # fmt: skip
+    for (panel,), problem, curves in zip(panels, problems, drawn, strict=True):
+        for line in curves:
+            _draw_curve(panel, line, cost, {**look.line(line), "marker": look.backend(line.rows["backend"].iloc[0])})
+        _draw_front(panel, cost.known(problem.rows), cost)
+        panel.set_xlabel(cost.label)
+    return figure
+
+
+def _draw_curve(panel: Axes, line: Line, cost: Cost, style: Mapping[str, Any]) -> None:
+    rows = cost.known(line.rows)
+    spread, at = cost.spread(rows), cost.of(rows)
+    bars = [np.minimum(spread, 0.9 * at), spread]
+    panel.errorbar(at, rows["rmse_rel"], xerr=bars, elinewidth=0.7, label=line.label, **style)
+
+
+def _draw_front(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
+    """Draw the Pareto front as steps from the cheapest point down to the most accurate, and set the panel's scales."""
+    at = cost.of(rows)
+    front = rows.assign(at=at)[pareto(at, rows["rmse_rel"])].sort_values(["at", "rmse_rel"])
+    low, high = rows["rmse_rel"].min(), rows["rmse_rel"].max()
+    spread = np.minimum(cost.spread(rows), at / 2)
+    first, last = (at - spread).min(), (at + spread).max()
+    tall, wide = max(high / low, 4.0) ** 0.08, max(last / first, 4.0) ** 0.08
+    log_axis(panel, "x", first / wide, last * wide, text=cost.text)
+    log_axis(panel, "y", low / tall, high * tall)
+    if high * tall > 1:
+        panel.axhspan(1.0, high * tall, zorder=0, **SHADE)
+    x = [front["at"].iloc[0], *front["at"], last * wide]
+    y = [high * tall, *front["rmse_rel"], front["rmse_rel"].iloc[-1]]
+    panel.step(x, y, where="post", zorder=0.5, solid_capstyle="butt", **FRONT)
+
+
+def overview(problems: Sequence[Family], notes: Sequence[str], look: Look) -> Figure:
+    """Draw relative bias and RMSE of every estimator, a panel per problem."""
+    drawn = [{_row_label(line, curves): line for line in curves} for curves in (lines(p.rows, ALIKE) for p in problems)]
+    labels = list(dict.fromkeys(label for curves in drawn for label in curves))
+    symbols: list[Any] = [
+        _handle("relative bias, 95% interval", marker="o", linestyle="none"),
+        _handle("not distinguishable from 0", marker="o", markerfacecolor="white", linestyle="none"),
+        _handle("relative RMSE", **TICK),
+        Patch(label="error exceeds |∇J|", **SHADE),
+    ]
+    if any(line.failed for curves in drawn for line in curves.values()):
+        symbols.append(_handle("cell failed", **CROSS))
+    figure, panels = page(
+        problems, columns(len(problems), 3), 0.55 + 0.24 * len(labels), ("",),
+        "Relative bias and RMSE of one estimate", [*shared(problems, ""), *notes], ([], symbols), sharey=True,
+    )  # fmt: skip
+    for (panel,), curves in zip(panels, drawn, strict=True):
+        for label, line in curves.items():
+            _draw_dot(panel, line, len(labels) - 1 - labels.index(label), look.line(line)["color"])
+        low, high = extent([panel], "x", 0.3, 2.0)
+        margin = (high / low) ** 0.08
+        log_axis(panel, "x", low / margin**2, high * margin)
+        panel.axvspan(1.0, high * margin, zorder=0, **SHADE)
+        panel.set_ylim(-0.6, len(labels) - 0.4)
+        panel.set_yticks(range(len(labels)), [plain(label) for label in reversed(labels)])
+        panel.tick_params(axis="y", length=0)
+        panel.set_xlabel("in units of |∇J|")
+    return figure
+
+
+def _row_label(line: Line, curves: Sequence[Line]) -> str:
+    unique = sum(other.label == line.label for other in curves) == 1
+    return line.label if unique else f"{line.label}, {'/'.join(line.backends)}"
+
+
+def _draw_dot(panel: Axes, line: Line, height: int, colour: str) -> None:
+    panel.axhline(height, color="#e5e5e5", linewidth=0.6, zorder=0)
+    rows = line.rows
+    error = rows["rmse"] / _scale(rows, 1)
+    good = (rows["status"] == "ok") & np.isfinite(error)
+    points = _estimates(rows[good], "bias", 1)
+    _draw_points(panel, np.full(len(points), height), points, {"color": colour, "marker": "o"}, lying=True)
+    panel.plot(error[good].clip(lower=FLOOR), [height] * good.sum(), color=colour, label=line.label, **TICK)
+    if not good.all() or (rows["lost"] > 0).any():
+        panel.plot([0.97], [height], transform=panel.get_yaxis_transform(), color=colour, **CROSS)

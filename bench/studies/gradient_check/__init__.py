@@ -1,0 +1,82 @@
+"""Is the program's gradient the derivative of its cost, away from contact switches and on both sides of one?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from bench.measure.gradcheck import FAULTS, VERDICTS
+from bench.model import param
+from bench.sweep.cell import Cell
+from bench.sweep.columns import Column, Columns, Judged, numbers, text
+from bench.sweep.experiment import Experiment
+from bench.sweep.session import Session
+from bench.sweep.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class GradientCheck(Study):
+    """Checks the program's gradient against differences of its cost, at the start and around a contact switch."""
+
+    name = "gradient_check"
+    columns: ClassVar[Columns] = Columns.of(
+        Column("best_error", "smallest relative error over all steps, of the worst check"),
+        Column("best_eps", "step of that error, in units of the natural scale"),
+        Column("scale", "natural scale of displacements of theta: its norm, at least 1"),
+        text("verdict", "the worst verdict of the checks", judged=Judged("verdict", "verdict", order=VERDICTS)),
+        text("command", "a line for the shell that repeats the checks"),
+        text("device", "what the program ran on"),
+        numbers("point", "where each check was made: start, or before, at or after a contact switch"),
+        numbers("sample", "of each check, 0 without noise, 1 with it"),
+        numbers("direction", "of each check, the number of its direction"),
+        numbers("derivative_program", "of each check, the program's directional derivative"),
+        numbers("check_verdict", "of each check, its verdict"),
+        numbers("check_error", "of each check, the smallest relative error over all steps"),
+        numbers("check_eps", "of each check, the step of that error"),
+        numbers("eps", "the steps of the differences, in units of the scale"),
+        numbers("derivative_differences", "of each check and step, the central difference"),
+        numbers("relative_error", "of each check and step, its relative error"),
+        numbers("mode_minus", "of each check and step, the contact mode on the minus side"),
+        numbers("mode_plus", "of each check and step, the contact mode on the plus side"),
+    )
+
+    directions: int = param(2, "directions of the checks at the start, and of those at a switch", positive=True)
+    drawn: int = param(16, "directions along which a contact switch is looked for", positive=True)
+    reach: float = param(
+        2.0, "how far along a direction a switch is looked for, in units of the scale of theta", positive=True
+    )
+    aside: float = param(
+        1e-4, "how far before and after a switch gradients are checked, in the same units", positive=True
+    )
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Make all checks of one cell."""
+        from bench.studies.gradient_check.measure import Search, measure
+
+        return measure(cell, session, Search(self.directions, self.drawn, self.reach, self.aside))
+
+    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+        """Write the tables and charts."""
+        from bench.studies.gradient_check import report
+
+        return report.write(experiment, rows)
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
+        """Print the counts of verdicts and every fault."""
+        from bench.studies.gradient_check import report
+
+        report.show(experiment, rows)
+
+    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
+        """Return the finding, its table and the charts."""
+        from bench.studies.gradient_check.page import content
+
+        return content(experiment, rows)
+
+    def faults(self, rows: pd.DataFrame) -> int:
+        """Count rows on which a check found a gradient that must not be used."""
+        return int(rows["verdict"].isin(FAULTS).sum())

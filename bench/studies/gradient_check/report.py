@@ -1,0 +1,249 @@
+"""Writes gradient checks as files: a long table, a summary with the command that repeats each fault, and a chart."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+
+from bench.measure.gradcheck import FAULTS, VERDICTS
+from bench.report.figures import save, styled
+from bench.report.style import GREY, STYLE, colour, plain
+from bench.report.tables import escape_markdown
+from bench.report.text import counted, number
+from bench.report.views import Arranged, arranged
+from bench.report.web.content import columns_of, grouped, problems, shown_as, telling, together
+from bench.studies.gradient_check import GradientCheck
+from bench.sweep.axes import parsed, with_axes
+from bench.sweep.columns import IDENTITY
+from bench.sweep.experiment import Experiment
+from bench.sweep.files import write_all
+
+POINTS: dict[str, Any] = {"start": "-", "before": (0, (4, 1.5)), "at": (0, (1, 1.2)), "after": (0, (6, 1.5, 1, 1.5))}
+"""Line styles of the points at which gradients are checked."""
+FLOOR, CEILING = 1e-16, 1e2
+"""Errors beyond these are drawn at the edge."""
+ACROSS = 4
+CHECK = ["point", "sample", "direction", "derivative_program"]
+EACH = ["derivative_differences", "relative_error", "mode_minus", "mode_plus"]
+ORDER = [*CHECK, "eps", *EACH, "verdict"]
+PROBLEM = ("scene", "contact", "integrator")
+
+
+def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+    """Write ``gradient_check`` (.csv, .md) and the chart; returns the files' paths."""
+    shown = arranged(experiment, rows)
+    table = long_table(with_axes(experiment, rows))
+    contents = {
+        "gradient_check.csv": table.to_csv(index=False, lineterminator="\n"),
+        "gradient_check.md": markdown(shown),
+    }
+    paths = write_all(experiment.directory, contents)
+    if (table["eps"].notna() & np.isfinite(table["relative_error"])).any():
+        with styled():
+            paths += save(figure(shown), experiment.directory / "gradient_check", experiment.formats)
+    return paths
+
+
+# ------------------------------------------------------------------------------------------------------ tables
+
+
+def checks(rows: pd.DataFrame) -> Iterator[tuple[dict[str, Any], int, str]]:
+    """Yield each check of each row: the row, the number of the check in it, and its verdict."""
+    for row in rows.to_dict("records"):
+        for i, verdict in enumerate(row["check_verdict"]):
+            yield {str(name): value for name, value in row.items()}, i, verdict
+
+
+def long_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one line per cell, check and eps; one line for a cell that could not be checked.
+
+    Columns that belong to no study, such as swept parameters, come last. The cell's parameters are in ``rows.parquet``
+    under its key; here they would be on every line.
+    """
+    whole = ["experiment", *IDENTITY, "dim", "status", "reason"]
+    added = [name for name in rows if name not in GradientCheck.columns.by_name]
+    last = list(dict.fromkeys(["key", *map(str, added), *(name for name in ("study",) if name in rows)]))
+    lines = []
+    for row, i, verdict in checks(rows):
+        check = {name: row[name] for name in whole} | {name: row[name][i] for name in CHECK}
+        end = {"verdict": verdict} | {name: row[name] for name in last}
+        count = len(row["eps"])
+        for k in range(count):
+            values = {name: row[name][i * count + k] for name in EACH}
+            lines.append(check | {"eps": row["eps"][k]} | values | end)
+    unchecked = rows[[len(verdicts) == 0 for verdicts in rows["check_verdict"]]]
+    lines += unchecked[[*whole, "verdict", *last]].to_dict("records")  # type: ignore[arg-type]
+    table = pd.DataFrame(lines, columns=[*whole, *ORDER, *last])
+    counts = ["horizon", "samples", "repeats", "dim", "seed", "sample", "direction"]
+    return table.astype(dict.fromkeys(counts, "Int64"))
+
+
+def by_point(rows: pd.DataFrame) -> pd.DataFrame:
+    """Merge the checks of each cell and point into one line: the worst verdict, the largest best error with its eps.
+
+    ``row`` is the position of the cell in ``rows``; ``problem`` is the same number where scene, contact law and
+    integrator have the same parameters.
+    """
+    lines = []
+    shown = ("scene", "contact", "integrator", "backend", "horizon", "dtype", "key", "command")
+    for row, i, verdict in checks(rows.assign(row=range(len(rows)), problem=grouped(rows, PROBLEM))):
+        cell = {name: row[name] for name in (*shown, "row", "problem")}
+        result = {"verdict": verdict, "error": row["check_error"][i], "eps": row["check_eps"][i]}
+        lines.append(cell | {"point": row["point"][i], "rank": VERDICTS.index(verdict)} | result)
+    names = [*shown, "row", "problem", "point", "verdict", "error", "eps", "rank"]
+    table = pd.DataFrame(lines, columns=names)
+    table = table.sort_values(["rank", "error"], ascending=[True, False], kind="stable")
+    first = table.drop_duplicates(["row", "point"])
+    return first.sort_index()
+
+
+def markdown(shown: Arranged) -> str:
+    """Write the verdict of each cell and point, agreeing backends on one line, and commands that repeat each fault."""
+    rows, summary = shown.rows, by_point(shown.rows)
+    title = shown.experiment.question or shown.experiment.name
+    out = [f"# {escape_markdown(title)}", ""]
+    always = (*PROBLEM, "horizon")
+    named = telling(rows, grouped(rows, PROBLEM), columns_of(shown, PROBLEM), always)
+    named = [*always, *(name for name in named if name not in always)]
+    headers = [*named, "point", "backends", "verdict", "best error", "best eps"]
+    texts = [rows[name].map(type).eq(str).all() for name in named]
+    out.append("| " + " | ".join(headers) + " |")
+    out.append("|" + "".join("---|" if text else "--:|" for text in texts) + "---|---|---|--:|--:|")
+    groups = summary.groupby(["problem", "point", "verdict"], sort=False)
+    for _, group in groups:
+        worst = group.loc[group["error"].idxmax()] if group["error"].notna().any() else group.iloc[0]
+        backends = ", ".join(dict.fromkeys(group["backend"]))
+        cells = [shown_as(rows[name].iloc[worst["row"]]) for name in named]
+        cells += [worst["point"], backends, worst["verdict"], number(worst["error"]), f"{worst['eps']:.0e}"]
+        out.append("| " + " | ".join(escape_markdown(cell) for cell in cells) + " |")
+    out += [
+        "",
+        "- best error: the smallest |a - b| / max(1, |a|, |b|) of derivative and central differences over all eps; of the "
+        "directions, samples and backends of a line the largest. eps is relative to max(1, |theta|).",
+        f"- verdict: the worst of a line's checks. `before` and `after` are {aside(rows)} from a switch of contact mode, "
+        "`at` is on it.",
+    ]  # fmt: skip
+    lost = rows[rows["status"] != "ok"]
+    if not lost.empty:
+        out += ["", "Not checked:", ""]
+        for reason, part in lost.groupby("reason", sort=False):
+            out.append(f"- {len(part)} {part['status'].iloc[0]}: {escape_markdown(str(reason))}")
+    faults = summary[summary["verdict"].isin(FAULTS)]
+    if not faults.empty:
+        out += ["", "Faults, and the command that repeats each:", ""]
+        for (verdict, line), _ in faults.groupby(["verdict", "command"], sort=False):
+            out += [f"- {verdict}", "", f"      {line}", ""]
+    return "\n".join(out).rstrip("\n") + "\n"
+
+
+def aside(rows: pd.DataFrame) -> str:
+    """Write how far from a switch of contact mode rows were checked before and after it, as their study says."""
+    distances = dict.fromkeys(given["study"]["aside"] for given in parsed(rows) if given)
+    return " or ".join(_power(value) for value in distances)
+
+
+def _power(value: float) -> str:
+    """Write ``1e-4``: one digit and a power, if that writes the value exactly."""
+    mantissa, _, power = f"{value:e}".partition("e")
+    return f"{float(mantissa):g}e{int(power)}"
+
+
+def show(experiment: Experiment, rows: pd.DataFrame) -> None:
+    """Print the counts of verdicts of each problem, and a command that repeats each fault."""
+    print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
+    counts = rows["status"].value_counts()
+    print(f"{counted(len(rows), 'cell')}: " + ", ".join(f"{count} {status}" for status, count in counts.items()))
+    shown = arranged(experiment, rows)
+    names = problem_of(shown)
+    summary = by_point(rows)
+    for name, part in summary.groupby(names.to_numpy()[summary["row"].astype(int)], sort=False):
+        parts = []
+        for point in POINTS:
+            tally = Counter(part["verdict"][part["point"] == point])
+            if tally:
+                parts.append(f"{point} " + ", ".join(f"{tally[v]} {v}" for v in VERDICTS if v in tally))
+        print(f"  {name}: " + "; ".join(parts))
+    faults = summary[summary["verdict"].isin(FAULTS)]
+    for (verdict, line), part in faults.groupby(["verdict", "command"], sort=False):
+        print(f"\n{verdict} ({', '.join(dict.fromkeys(part['point']))}); repeat with\n  {line}")
+
+
+def problem_of(shown: Arranged) -> pd.Series:
+    """Return, per row, the name of its problem, the same at every horizon."""
+    return problems(shown, PROBLEM, together(shown, "horizon"), ("scene", "contact"))
+
+
+# ------------------------------------------------------------------------------------------------------- chart
+
+
+def figure(shown: Arranged) -> Figure:
+    """Draw relative error against eps, a panel per problem, a curve per horizon and point: the worst of its checks."""
+    table = long_table(shown.rows.assign(problem=problem_of(shown)))
+    table = table[table["eps"].notna() & np.isfinite(table["relative_error"])]
+    parts = list(table.groupby("problem", sort=False))
+    across = min(ACROSS, len(parts))
+    down = math.ceil(len(parts) / across)
+    size = (7.4 if across > 1 else 4.6, 0.85 + 1.55 * down)
+    chart = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03))
+    FigureCanvasAgg(chart)
+    panels = chart.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+    horizons = sorted(table["horizon"].unique())
+    colours = {horizon: colour(i) for i, horizon in enumerate(horizons)}
+    for panel, (problem, part) in zip(panels.flat, parts, strict=False):
+        _curves(panel, part, colours)
+        panel.set_title("\n".join(map(plain, str(problem).split(", "))), pad=3)
+    for spare in panels.flat[len(parts) :]:
+        spare.remove()
+    _scale(panels[0, 0], table)
+    for column in range(across):
+        lowest = panels[(len(parts) - 1 - column) // across, column]
+        lowest.tick_params(labelbottom=True)
+    for panel in panels[-1, : len(parts) - across * (down - 1)]:
+        panel.set_xlabel("eps / scale of theta")
+    chart.supylabel("relative error, the worst check", fontsize=STYLE["font.size"])
+    points = [point for point in POINTS if point in set(table["point"])]
+    handles = [Line2D([], [], color=colours[h], label=_horizon(h)) for h in horizons]
+    handles += [Line2D([], [], color=GREY, linestyle=POINTS[p], label=_place(p)) for p in points]
+    handles.append(Line2D([], [], color=GREY, marker="o", markersize=3.5, linestyle="none", label="best eps"))
+    chart.legend(handles=handles, loc="outside lower center", ncols=4 if across > 1 else 2, columnspacing=1.2)
+    chart.suptitle("Program's gradient against central differences of its cost", fontsize=9, fontweight="bold")
+    return chart
+
+
+def _horizon(steps: int) -> str:
+    return "no steps" if steps == 0 else f"{steps} step{'' if steps == 1 else 's'}"
+
+
+def _place(point: str) -> str:
+    return point if point == "start" else f"{point} contact switch"
+
+
+def _scale(panel: Axes, table: pd.DataFrame) -> None:
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    largest = min(CEILING, max(1.0, float(table["relative_error"].max())))
+    panel.set_ylim(FLOOR / 2, 4 * largest)
+    panel.set_xticks([1e-10, 1e-6, 1e-2])
+    panel.set_yticks([1e-15, 1e-10, 1e-5, 1.0])
+    panel.minorticks_off()
+
+
+def _curves(panel: Axes, part: pd.DataFrame, colours: dict[int, str]) -> None:
+    for (horizon, point), checked in part.groupby(["horizon", "point"]):
+        worst = checked.groupby("eps")["relative_error"].max().clip(FLOOR, CEILING)
+        style: dict[str, Any] = {"color": colours[horizon], "linewidth": 1.0}
+        panel.plot(worst.index, worst, linestyle=POINTS[point], **style)
+        if point == "start":
+            panel.plot([worst.idxmin()], [worst.min()], marker="o", markersize=3.5, clip_on=False, **style)
+    panel.grid(axis="y", color="#e5e5e5", linewidth=0.5)

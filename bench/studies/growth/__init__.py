@@ -1,0 +1,55 @@
+"""How gradients grow with the horizon: their norm, the step Jacobians' product, and what both do to the variance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from bench.model import param
+from bench.studies.growth.columns import COLUMNS
+from bench.sweep.cell import Cell
+from bench.sweep.columns import Columns
+from bench.sweep.experiment import Experiment
+from bench.sweep.session import Session
+from bench.sweep.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Growth(Study):
+    """Measures norms of sampled gradients, the product of the step Jacobians, and variances of both orders."""
+
+    name = "growth"
+    columns: ClassVar[Columns] = COLUMNS
+
+    rollouts: int = param(
+        64, "rollouts whose step Jacobians are multiplied: rates are known to 1/8 of their spread", low=2
+    )
+    lags: int = param(40, "most lags whose gain is stored", positive=True)
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Measure gradients, Jacobian products and variances of one problem over its noise."""
+        from bench.studies.growth.measure import measure
+
+        return measure(cell, session, self.rollouts, self.lags)
+
+    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+        """Write the tables and charts."""
+        from bench.studies.growth import report
+
+        return report.write(experiment, rows)
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
+        """Print the table."""
+        from bench.studies.growth import report
+
+        report.show(experiment, rows)
+
+    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
+        """Return the finding, its table and the charts."""
+        from bench.studies.growth.page import content
+
+        return content(experiment, rows)

@@ -1,0 +1,33 @@
+"""The columns of the growth study."""
+
+from bench.studies.growth.measure import QUANTILES
+from bench.sweep.columns import Column, Columns, Judged, numbers, text
+
+ORDERS = {"first_order": "first-order", "zeroth_order": "zeroth-order"}
+COLUMNS = Columns.of(
+    Column("time_horizon", "duration of the rollout", "s"),
+    *(Column(f"gradient_{name}", f"norm of one sample's gradient, {q:.0%} quantile") for name, q in QUANTILES.items()),
+    Column("gradient_mean", "norm of the mean gradient"),
+    Column("finite_fraction", "share of rollouts whose cost and gradient are finite"),
+    Column("stretch_rate", "log of the largest singular value of dx_N/dx_0, per step",
+           judged=Judged("interval", "growth rate", neutral=True)),
+    Column("stretch_low", "lower end of its 95% interval"),
+    Column("stretch_high", "upper end of its 95% interval"),
+    Column("spectral_rate", "log of the spectral radius of dx_N/dx_0, per step"),
+    Column("spectral_low", "lower end of its 95% interval"),
+    Column("spectral_high", "upper end of its 95% interval"),
+    *(
+        Column(f"{order}_variance{end}", f"variance of one {name} term, {what}")
+        for order, name in ORDERS.items()
+        for end, what in (("", "median over repeats"), ("_low", "5% quantile"), ("_high", "95% quantile"))
+    ),
+    Column("first_order_variance_mean", "variance of one first-order term, mean over repeats"),
+    Column("zeroth_order_variance_mean", "variance of one zeroth-order term, mean over repeats"),
+    text("growth", "exploding, neutral or vanishing"),
+    text("gain_of", "what the gain is by: controls or states"),
+    numbers("lags", "steps before the end", "steps"),
+    numbers("gain", "largest singular value of the effect on the end state, by lag, median"),
+    numbers("gain_low", "5% quantile over rollouts"),
+    numbers("gain_high", "95% quantile over rollouts"),
+    numbers("singular_values", "singular values of dx_N/dx_0, median"),
+)  # fmt: skip

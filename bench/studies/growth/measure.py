@@ -1,0 +1,141 @@
+"""How gradients grow with the horizon: their norm, the step Jacobians' product, and what both do to the variance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.measure import noise
+from bench.model import Jacobians, Problem, Rollout, columns
+from bench.sweep.cell import Cell
+from bench.sweep.session import Session
+
+QUANTILES = {"low": 0.05, "quarter": 0.25, "median": 0.5, "three_quarters": 0.75, "high": 0.95}
+"""Quantiles over noise samples that are stored for heavy-tailed quantities."""
+ROUNDING = 1e-6
+"""Relative rounding error of the logarithm of a product's spectral radius: sqrt(eps), as for a defective eigenvalue."""
+
+
+def measure(cell: Cell, session: Session, rollouts: int, most_lags: int) -> dict[str, Any]:
+    """Measure gradients, Jacobian products (of ``rollouts`` rollouts) and variances of one problem over its noise."""
+    problem = session.problem(cell)
+    program = problem.program
+    draws = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, problem.program.n_noise)
+    theta, w = program.theta0, columns(draws)
+    first = problem.grad(theta, w)
+    centre = problem.value(theta, np.zeros((w.shape[0], 1)))
+    zeroth = (problem.value(theta, w) - centre) * problem.score(theta, w)
+    good = np.isfinite(first).all(axis=0) & np.isfinite(zeroth).all(axis=0)
+    result: dict[str, Any] = {
+        "status": "ok" if good.all() else "nonfinite",
+        "reason": "" if good.all() else f"{(~good).sum()} of {good.size} rollouts or gradients are not finite",
+        "finite_fraction": float(good.mean()),
+        "time_horizon": program.scene.horizon * program.scene.dt if isinstance(program, Rollout) else math.nan,
+    }
+    if not good.any():
+        return result
+    norms = np.linalg.norm(first[:, good], axis=0)
+    result |= {f"gradient_{name}": float(np.quantile(norms, q)) for name, q in QUANTILES.items()}
+    result["gradient_mean"] = float(np.linalg.norm(first[:, good].mean(axis=1)))
+    for name, terms in (("first_order", first), ("zeroth_order", zeroth)):
+        result |= variances(np.where(good, terms, math.nan).reshape(len(theta), cell.repeats, cell.samples), name)
+    return result | _product_columns(problem, w[:, good][:, :rollouts], most_lags)
+
+
+def variances(terms: np.ndarray, name: str) -> dict[str, float]:
+    """Return the variance per sample of terms ``(d, R, N)``: median over repeats with its quantiles, and mean."""
+    with np.errstate(over="ignore"):
+        found = np.nansum(np.nanvar(terms, axis=2, ddof=1), axis=0)
+    return {
+        f"{name}_variance": float(np.median(found)),
+        f"{name}_variance_low": float(np.quantile(found, QUANTILES["low"])),
+        f"{name}_variance_high": float(np.quantile(found, QUANTILES["high"])),
+        f"{name}_variance_mean": float(found.mean()),
+    }
+
+
+# ------------------------------------------------------------------------------------------------ products
+
+
+@dataclass(frozen=True)
+class Products:
+    """Logarithms of the rollouts' Jacobian products, so that nothing overflows."""
+
+    gain: np.ndarray
+    """log of the largest singular value of dx_N/du_i (of dx_N/dx_i without controls) at lag N - i, ``(N, B)``."""
+    singular: np.ndarray
+    """log of the singular values of dx_N/dx_0, ``(B, n)``; -inf where the product is singular."""
+    spectral: np.ndarray
+    """log of the spectral radius of dx_N/dx_0, ``(B,)``."""
+
+
+def products(jacobians: Jacobians) -> Products:
+    """Compute A_{N-1} ... A_{i+1} B_i for every i by one backward scan, normalising the product at each step."""
+    a, b = np.moveaxis(jacobians.a, -1, 1), np.moveaxis(jacobians.b, -1, 1)
+    horizon, batch, n = a.shape[:3]
+    product = np.broadcast_to(np.eye(n), (batch, n, n))
+    scale = np.zeros(batch)
+    gain = np.empty((horizon, batch))
+    for i in range(horizon - 1, -1, -1):
+        after = product @ a[i]
+        effect = product @ b[i] if b.shape[-1] else after
+        gain[horizon - 1 - i] = scale + _log(np.linalg.norm(effect, ord=2, axis=(1, 2)))
+        norm = np.linalg.norm(after, axis=(1, 2))
+        # a product of 0 stays 0 and adds nothing to the scale
+        norm = np.where(norm > 0, norm, 1.0)
+        product, scale = after / norm[:, None, None], scale + np.log(norm)
+    singular = scale[:, None] + _log(np.linalg.svd(product, compute_uv=False))
+    spectral = scale + _log(np.abs(np.linalg.eigvals(product)).max(axis=1))
+    return Products(gain, singular, spectral)
+
+
+def _log(values: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.log(values)
+
+
+def rate(logarithms: np.ndarray, steps: int) -> tuple[float, float, float]:
+    """Return the mean growth per step over noise samples ``(B,)`` of log |product|, with its 95% interval (Student)."""
+    from scipy.special import stdtrit
+
+    rates = logarithms[np.isfinite(logarithms)] / steps
+    if rates.size < 2:
+        return math.nan, -math.inf, math.inf
+    reach = float(stdtrit(rates.size - 1, 0.975)) * float(rates.std(ddof=1)) / math.sqrt(rates.size)
+    mean = float(rates.mean())
+    return mean, mean - reach, mean + reach
+
+
+def classify(stretch_high: float, spectral_low: float, tolerance: float) -> str:
+    """Return ``exploding`` if the spectral radius surely grows, ``vanishing`` if the norm surely falls, or ``neutral``.
+
+    The spectral radius never exceeds the norm, and does not depend on the units of the state. By its norm a free mass
+    would be called exploding, although its product [[1, t], [0, 1]] only grows like t and has spectral radius 1.
+    """
+    if spectral_low > tolerance:
+        return "exploding"
+    return "vanishing" if stretch_high < -tolerance else "neutral"
+
+
+def _product_columns(problem: Problem, w: np.ndarray, most_lags: int) -> dict[str, Any]:
+    """Return gains, singular values, rates and class of the Jacobian product."""
+    found = problem.jacobians(problem.program.theta0, w)
+    steps = found.a.shape[0]
+    product = products(found)
+    stretch, spectral = rate(product.singular[:, 0], steps), rate(product.spectral, steps)
+    lags = np.unique(np.round(np.geomspace(1, steps, most_lags)).astype(int))
+    low, middle, high = np.exp(np.quantile(product.gain[lags - 1], [0.05, 0.5, 0.95], axis=1))
+    return {
+        **dict(zip(("stretch_rate", "stretch_low", "stretch_high"), stretch, strict=True)),
+        **dict(zip(("spectral_rate", "spectral_low", "spectral_high"), spectral, strict=True)),
+        "growth": classify(stretch[2], spectral[1], ROUNDING / steps),
+        "gain_of": "controls" if found.b.shape[2] else "states",
+        "lags": lags.tolist(),
+        "gain": middle.tolist(),
+        "gain_low": low.tolist(),
+        "gain_high": high.tolist(),
+        "singular_values": np.exp(np.median(product.singular, axis=0)).tolist(),
+    }

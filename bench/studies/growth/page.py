@@ -1,0 +1,165 @@
+"""The page of growth with the horizon: gradient norms, variances of both orders, and gains by lag."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from bench.report.style import PALETTE
+from bench.report.text import axis_value, number
+from bench.report.views import Arranged, arranged
+from bench.report.web.content import (
+    STATUS,
+    Axis,
+    Chart,
+    Column,
+    Content,
+    identity_columns,
+    look,
+    looks,
+    nothing_ran,
+)
+from bench.studies.growth.report import problem_of
+from bench.sweep.experiment import Experiment
+
+HORIZON = [Axis("time_horizon", "horizon [s]"), Axis("horizon", "horizon [steps]")]
+RESULTS = [
+    Column("growth", "growth", "text"),
+    Column("gradient_median", "|gradient|, median"),
+    Column("stretch_rate", "stretch / step"),
+    Column("spectral_rate", "spectral / step"),
+    Column("first_order_variance", "variance, first order"),
+    Column("zeroth_order_variance", "variance, zeroth order"),
+]
+ORDERS = {"first_order": "first order", "zeroth_order": "zeroth order"}
+
+
+def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
+    """Return what grows and what vanishes, and where the zeroth order has the lower variance."""
+    shown = arranged(experiment, rows)
+    problem = problem_of(shown)
+    table = shown.rows.assign(series=problem, problem=problem)
+    norms = Chart(
+        "Norm of one sample's gradient against the horizon",
+        "Median over noise samples; bars from 5% to 95% of them.",
+        HORIZON,
+        [
+            Axis("gradient_median", "norm of one sample's gradient", True, "gradient_low", "gradient_high"),
+            Axis(
+                "spectral_rate", "growth per step: log of the spectral radius", False, "spectral_low", "spectral_high"
+            ),
+            Axis(
+                "stretch_rate",
+                "growth per step: log of the largest singular value",
+                False,
+                "stretch_low",
+                "stretch_high",
+            ),
+        ],
+        line="problem",
+    )
+    variances = Chart(
+        "Variance per sample of both orders",
+        "Where the lines cross the zeroth order becomes the better one.",
+        HORIZON,
+        [Axis("variance", "variance per sample", True, "low", "high")],
+        table="variances",
+        facet="problem",
+        line="series",
+    )
+    gains = Chart(
+        "How far back does a gradient reach?",
+        "Largest singular value of the Jacobian product over that many steps: median and 5% to 95% of the rollouts.",
+        [Axis("lag", "lag [steps]")],
+        [Axis("gain", "gain", True, "gain_low", "gain_high")],
+        table="gains",
+        line="line",
+    )
+    return Content(
+        finding=nothing_ran(rows) or finding(answers(shown)),
+        rows=table,
+        columns=[*identity_columns(table, [axis.column for axis in shown.axes]), *RESULTS, *STATUS],
+        charts=[norms, variances, gains],
+        answers=answers(shown),
+        answers_title="What becomes of the gradient",
+        tables={"variances": variances_of(table), "gains": gains_of(table)},
+        looks={
+            **looks(list(problem)),
+            "first order": look(PALETTE[2], "diamond"),
+            "zeroth order": look(PALETTE[5], "cross", "dash"),
+        },
+    )
+
+
+def variances_of(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per row and order."""
+    rows = rows.assign(row=range(len(rows))).sort_values("horizon", kind="stable")
+    parts = [
+        pd.DataFrame(
+            {
+                "row": rows["row"],
+                "problem": rows["problem"],
+                "series": name,
+                "variance": rows[f"{order}_variance"],
+                "low": rows[f"{order}_variance_low"],
+                "high": rows[f"{order}_variance_high"],
+            }
+        )
+        for order, name in ORDERS.items()
+    ]
+    return pd.concat(parts, ignore_index=True)
+
+
+def gains_of(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per row and lag, of the longest horizon of each problem."""
+    longest = (
+        rows.assign(row=range(len(rows))).sort_values("horizon", kind="stable").drop_duplicates("problem", keep="last")
+    )
+    names = ["row", "series", "line", "lag", "gain", "gain_low", "gain_high"]
+    lines = [
+        (row["row"], row["series"], row["problem"], *values)
+        for row in longest.sort_values("row").to_dict("records")
+        for values in zip(row["lags"], row["gain"], row["gain_low"], row["gain_high"], strict=True)
+    ]
+    return pd.DataFrame(lines, columns=names)
+
+
+def finding(table: pd.DataFrame) -> str:
+    """Write which problems explode and vanish, and from which horizon on the zeroth order has the lower variance."""
+    parts = []
+    for growth, verb in (("exploding", "explode"), ("vanishing", "vanish"), ("neutral", "do neither")):
+        names = table.loc[table["growth"] == growth, "problem"]
+        if len(names):
+            parts.append(f"{verb} on {', '.join(names)}")
+    better = table[table["zeroth order has less variance"] != "nowhere"]
+    text = "Gradients through time " + ", ".join(parts)
+    crossing = ", ".join(
+        f"{problem} {where}"
+        for problem, where in zip(better["problem"], better["zeroth order has less variance"], strict=True)
+    )
+    return f"{text}; the zeroth order has the lower variance " + (f"on {crossing}." if crossing else "nowhere.")
+
+
+def answers(shown: Arranged) -> pd.DataFrame:
+    """Return, by problem, growth at the longest horizon, norms at both ends, and where the zeroth order wins."""
+    lines = []
+    good = shown.rows[np.isfinite(shown.rows["gradient_median"])]
+    for problem, part in good.groupby(problem_of(shown, good), sort=False):
+        part = part.sort_values("time_horizon")
+        first, last = part.iloc[0], part.iloc[-1]
+        wins = (part["zeroth_order_variance"] < part["first_order_variance"]).to_numpy()
+        losing = np.flatnonzero(~wins)
+        first_win = int(losing[-1]) + 1 if len(losing) else 0
+        from_ = f"from {axis_value(part['horizon'].iloc[first_win])} steps" if first_win < len(part) else "nowhere"
+        lines.append(
+            {
+                "problem": str(problem),
+                "growth": last["growth"],
+                "per second": number(last["spectral_rate"] / last["dt"]),
+                "norm, shortest": f"{number(first['gradient_median'])} at {axis_value(first['horizon'])} steps",
+                "norm, longest": f"{number(last['gradient_median'])} at {axis_value(last['horizon'])} steps",
+                "zeroth order has less variance": from_,
+            }
+        )
+    names = ["problem", "growth", "per second", "norm, shortest", "norm, longest", "zeroth order has less variance"]
+    return pd.DataFrame(lines, columns=names)

@@ -1,0 +1,76 @@
+"""Where a gradient is right, wrong or lost, over step size and stiffness: the stability map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from bench.model import param
+from bench.sweep.cell import Cell
+from bench.sweep.columns import Column, Columns, Judged, numbers, text
+from bench.sweep.experiment import Experiment
+from bench.sweep.session import Session
+from bench.sweep.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+WORST_FIRST = ("nonfinite", "diverged", "wrong_sign", "zero", "inaccurate", "unresolved", "ok")
+
+
+@dataclass(frozen=True)
+class Stability(Study):
+    """Measures where a program's gradient is right, inaccurate, of wrong sign, zero or lost, one rollout per cell."""
+
+    name = "stability"
+    columns: ClassVar[Columns] = Columns.of(
+        Column("first_bad_step", "first step at which the state diverged or was not finite"),
+        Column("growth_factor", "measured growth of the state per step, where the motion is linear"),
+        Column("spectral_radius", "of one step on the cell's oscillator, in theory"),
+        Column("stiffness_limit", "stiffness at which that radius leaves 1", "N/m"),
+        Column("relative_error", "norm of (gradient - truth) / norm of the truth", judged=Judged("exact", "error")),
+        Column("cosine", "cosine between gradient and truth"),
+        Column("grad_norm", "norm of the gradient"),
+        Column("truth_norm", "norm of the truth"),
+        Column("truth_error", "relative change of the truth on its last refinement"),
+        text("verdict", "ok, or what is wrong", judged=Judged("verdict", "verdict", order=WORST_FIRST)),
+        text("truth", "how the truth was computed: physical or refined"),
+        numbers("state_at_first_bad_step", "the state at the first bad step"),
+    )
+
+    diverged: float = param(
+        10.0, "multiple of the initial scale beyond which a state component has diverged", positive=True
+    )
+    grown: float = param(
+        1.1, "growth over the rollout of a state that cannot grow, from which it has diverged", low=1.0
+    )
+    inaccurate: float = param(0.1, "relative error of the gradient above which it is wrong", positive=True)
+    fine_steps: int = param(
+        1 << 14, "fewest steps of the refined truth; half as many say how far it has converged", low=2
+    )
+    finer: int = param(4, "fewest steps of the refined truth to one of the cell's", positive=True)
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Return the verdict on one cell."""
+        from bench.studies.stability.measure import Limits, measure
+
+        return measure(cell, session, Limits(self.diverged, self.grown, self.inaccurate, self.fine_steps, self.finer))
+
+    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+        """Write the tables and charts."""
+        from bench.studies.stability import report
+
+        return report.write(experiment, rows)
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
+        """Print the shares of the verdicts, and the boundaries of the oscillators without contact."""
+        from bench.studies.stability import report
+
+        report.show(experiment, rows)
+
+    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
+        """Return the finding, its table and the charts."""
+        from bench.studies.stability.page import content
+
+        return content(experiment, rows)

@@ -1,0 +1,268 @@
+"""Where a gradient is right, wrong or lost, over step size and stiffness: the stability map.
+
+Each cell simulates one rollout without noise and compares its gradient with the truth for the same duration. The truth
+is the scene's physical gradient or, where it has none, the gradient of the same program at a much finer step.
+Estimators play no part: the gradient is the backend's own at w = 0. Where the motion is linear the growth of the state
+is measured as well, so that an instability too slow to show within the rollout is still seen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from bench.model import (
+    Backend,
+    ContactScene,
+    DampedScene,
+    Dynamics,
+    ForceLaw,
+    Integrator,
+    LoopOps,
+    Oscillator,
+    Program,
+    Rollout,
+    Trajectory,
+    Unsupported,
+    rollout,
+)
+from bench.sweep.cell import Cell
+from bench.sweep.referees import reference_backends
+from bench.sweep.session import Session
+
+NEGLIGIBLE = 1e-9
+"""Share of the truth's norm below which one of its components counts as 0."""
+NEUTRAL = 1 + 1e-9
+"""Spectral radius up to which a step counts as stable, in theory and as measured: 1 and rounding."""
+REACH = np.logspace(-3, 4, 141)
+"""Values of dt^2 stiffness that the search for the stability limit tries."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a rollout counts as diverged and a gradient as wrong, and how fine the truth is; see the parameters."""
+
+    diverged: float
+    grown: float
+    inaccurate: float
+    fine_steps: int
+    finer: int
+
+
+def measure(cell: Cell, session: Session, limits: Limits) -> dict[str, Any]:
+    """Return the verdict on one cell; raises :class:`Unsupported` without time steps, step states or a truth."""
+    program = rollout(cell.program())
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows becomes a status
+        return _measured(cell, program, session, limits)
+
+
+def _measured(cell: Cell, program: Rollout, session: Session, limits: Limits) -> dict[str, Any]:
+    problem, scene = session.problem(cell), program.scene
+    theta, still = program.theta0, np.zeros((problem.program.n_noise, 1))
+    gradient = problem.grad(theta, still)[:, 0]
+    found = problem.trajectory(theta, still)
+    states, largest = found.states[:, :, 0], bounds(program, found, limits.diverged)
+    growth = growth_factor(states) if isinstance(scene, Oscillator) else math.nan
+    result = {"status": "ok", "grad_norm": float(np.linalg.norm(gradient)), "growth_factor": growth, **theory(cell)}
+    bad = first_bad_step(states, largest, growth, limits)
+    if bad is not None:
+        step, verdict, what = bad
+        reason = f"state at step {step} of {scene.horizon} {what}"
+        result |= {"status": verdict, "verdict": verdict, "first_bad_step": step, "reason": reason}
+        return result | {"state_at_first_bad_step": states[step].tolist()}
+    if not np.isfinite(gradient).all():
+        return result | {"status": "nonfinite", "verdict": "nonfinite", "reason": "the gradient of a finite rollout"}
+    kind, truth, error = truth_of(cell, limits)
+    result |= {"truth": kind, "truth_norm": float(np.linalg.norm(truth)), "truth_error": error}
+    resolved = limits.inaccurate / 2
+    if not error <= resolved:
+        reason = f"halving the finest step moves the truth by {error:.1%}, more than {resolved:.0%}"
+        return result | {"verdict": "unresolved", "reason": reason}
+    return result | compare(gradient, truth, limits.inaccurate)
+
+
+# ---------------------------------------------------------------------------------------------- trajectories
+
+
+def first_bad_step(
+    states: np.ndarray, largest: np.ndarray, growth: float, limits: Limits
+) -> tuple[int, str, str] | None:
+    """Find the first bad step of ``states (T + 1, n)``, whether it ``diverged`` or is ``nonfinite``, and why; or None.
+
+    A step is bad when a component exceeds its ``largest`` value ``(n,)``, or when growing by the factor ``growth`` at
+    every step has come to ``limits.grown``, whichever is first.
+    """
+    steps = len(states)
+    outside = ~(np.abs(states) <= largest).all(axis=1)
+    left = int(np.argmax(outside)) if outside.any() else steps
+    slow = math.ceil(math.log(limits.grown) / math.log(growth)) if growth > NEUTRAL else steps
+    step = min(left, slow)
+    if step >= steps:
+        return None
+    if not np.isfinite(states[step]).all():
+        return step, "nonfinite", "is not finite"
+    if slow < left:
+        return step, "diverged", f"has grown by {limits.grown - 1:.0%}, {growth - 1:.2g} a step"
+    beyond = limits.diverged * float((np.abs(states[step]) / largest).max())
+    return step, "diverged", f"is {beyond:.3g} times the initial scale"
+
+
+def growth_factor(states: np.ndarray) -> float:
+    """Return the growth per step of ``states (T + 1, n)`` that follow one linear map: its spectral radius.
+
+    The map is fitted to all pairs of neighbouring states by least squares, each pair scaled to the size of its first
+    state (dynamic mode decomposition; Schmid 2010).
+    """
+    finite = np.isfinite(states).all(axis=1)
+    count = len(states) if finite.all() else int(np.argmin(finite))
+    if count < 3:
+        return math.nan
+    scaled = states[:count] / np.maximum(np.abs(states[:count]).max(axis=0), np.finfo(float).tiny)
+    size = np.linalg.norm(scaled[:-1], axis=1, keepdims=True)
+    moving = size[:, 0] > 0
+    before, after = (part[moving] / size[moving] for part in (scaled[:-1], scaled[1:]))
+    fitted = np.linalg.lstsq(before, after, rcond=None)[0]
+    return float(np.abs(np.linalg.eigvals(fitted)).max())
+
+
+def bounds(program: Rollout, found: Trajectory, factor: float) -> np.ndarray:
+    """Return ``factor`` times the initial scale of each component, ``(n,)``.
+
+    Positions: |q_0| + T |v_0|, the distance that the start reaches. Velocities: |v_0| + sqrt(|a_0| times that
+    distance), the speed that the first acceleration gives over it; largest components of each. A scale of 0 counts as
+    1.
+    """
+    scene = program.scene
+    q, v = np.split(found.states[0], [scene.n_q])
+    u = found.controls[0]
+    a = Dynamics(LoopOps(), scene, program.contact).acceleration(q, v, u)
+    speed = float(np.abs(v).max(initial=0.0))
+    length = float(np.abs(q).max(initial=0.0)) + scene.horizon * scene.dt * speed
+    scales = [length or 1.0, speed + math.sqrt(float(np.abs(a).max(initial=0.0)) * length) or 1.0]
+    return factor * np.repeat(scales, [len(q), len(v)])
+
+
+# ---------------------------------------------------------------------------------------------------- truth
+
+
+def truth_of(cell: Cell, limits: Limits) -> tuple[str, np.ndarray, float]:
+    """Return how the truth was obtained, the gradient ``(d,)``, and its relative error as far as known."""
+    program = rollout(cell.program())
+    physical = program.physical_gradient()
+    if physical is not None:
+        return "physical", np.asarray(physical), 0.0
+    steps = max(limits.fine_steps, limits.finer * program.scene.horizon)
+    coarse, fine = _gradient_at(cell, steps // 2), _gradient_at(cell, steps)
+    change = float(np.linalg.norm(fine - coarse))
+    return "refined", fine, change / float(np.linalg.norm(fine)) if change else 0.0
+
+
+def _gradient_at(cell: Cell, steps: int) -> np.ndarray:
+    """Return the cell's gradient with its duration cut into ``steps`` steps, keeping numerical damping per second."""
+    program = rollout(cell.program())
+    scene = program.scene
+    dt = scene.horizon * scene.dt / steps
+    values: dict[str, Any] = {"horizon": steps, "dt": dt}
+    if isinstance(scene, DampedScene):
+        values["velocity_factor"] = scene.velocity_factor ** (dt / scene.dt)
+    fine = cell.with_part("scene", replace(scene, **values))
+    if fine.program().dim != program.dim:
+        raise Unsupported(f"theta of scene {scene.name} changes with the horizon, so that no finer step has the truth")
+    key = fine.program_key
+    if key not in _fine_gradients:
+        if len(_fine_gradients) >= KEPT:
+            del _fine_gradients[next(iter(_fine_gradients))]
+        _fine_gradients[key] = _gradient(next(reference_backends(fine)), fine.program())
+    return _fine_gradients[key]
+
+
+KEPT = 64
+_fine_gradients: dict[str, np.ndarray] = {}
+"""Gradients at fine steps by program, shared by all cells whose fine program is the same."""
+
+
+def _gradient(backend: Backend, program: Program) -> np.ndarray:
+    return backend.compile(program).grad(program.theta0, np.zeros((program.n_noise, 1)))[:, 0]
+
+
+def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[str, Any]:
+    """Return verdict, relative error and cosine of a finite gradient; the verdict is the first that holds.
+
+    ``zero``: a component is exactly 0 where the truth's is not. ``wrong_sign``: the directional derivative along the
+    truth is negative. ``inaccurate``: off by more than that share of the truth. Otherwise ``ok``.
+    """
+    norm, size = float(np.linalg.norm(truth)), float(np.linalg.norm(gradient))
+    away = float(np.linalg.norm(gradient - truth))
+    error = away / norm if norm else math.inf if away else 0.0
+    cosine = float(gradient / size @ (truth / norm)) if norm and size else math.nan
+    if ((gradient == 0) & (np.abs(truth) > NEGLIGIBLE * norm)).any():
+        verdict = "zero"
+    elif cosine < 0:
+        verdict = "wrong_sign"
+    else:
+        verdict = "ok" if error <= inaccurate else "inaccurate"
+    return {"verdict": verdict, "relative_error": error, "cosine": cosine}
+
+
+# --------------------------------------------------------------------------------------------------- theory
+
+
+def theory(cell: Cell) -> dict[str, float]:
+    """Return the spectral radius of a step on the cell's oscillator, and the stiffness at which it exceeds 1.
+
+    The limit is 0 for a step that is never stable and infinite for one that always is. Empty without an oscillator.
+    """
+    found = oscillator(cell)
+    if found is None:
+        return {}
+    assert cell.integrator is not None
+    stiffness, damping, factor = found
+    dt = float(rollout(cell.program()).scene.dt)
+    limit = stiffness_limit(cell.integrator, dt, damping, factor)
+    radius = spectral_radius(cell.integrator, dt, stiffness, damping, factor)
+    return {"spectral_radius": radius, "stiffness_limit": limit * cell.columns()["stiffness"] / stiffness}
+
+
+def oscillator(cell: Cell) -> tuple[float, float, float] | None:
+    """Return the cell's oscillator: stiffness [1/s^2] and damping [1/s] per unit of mass, velocity factor; or None.
+
+    It is the scene's own ``oscillator()``, or else the scene's only contact while it lasts, if a spring law acts in it.
+    """
+    scene, law = cell.scene, cell.contact
+    if isinstance(scene, Oscillator):
+        stiffness, damping, factor = scene.oscillator()
+        return float(stiffness), float(damping), float(factor)
+    if not isinstance(scene, ContactScene) or not isinstance(law, ForceLaw) or scene.n_contacts != 1:
+        return None
+    start = scene.initial_state(np, scene.theta0()[:, None])
+    response = float(scene.gap_rate(np, start.q, scene.contact_acceleration(np, start.q, np.ones((1, 1))))[0, 0])
+    spring = law.spring()
+    factor = scene.velocity_factor if isinstance(scene, DampedScene) else 1.0
+    return None if spring is None else (spring[0] * response, spring[1] * response, float(factor))
+
+
+def spectral_radius(integrator: Integrator, dt: float, stiffness: float, damping: float, factor: float) -> float:
+    """Return the largest modulus of the eigenvalues of one step on the oscillator."""
+    matrix = integrator.transition(dt, stiffness, damping, factor)
+    return float(np.abs(np.linalg.eigvals(matrix)).max())
+
+
+def stiffness_limit(integrator: Integrator, dt: float, damping: float, factor: float) -> float:
+    """Return the stiffness [1/s^2] at which the step becomes unstable: 0 if it always is, inf if never within REACH."""
+
+    def unstable(reach: float) -> bool:
+        return spectral_radius(integrator, dt, reach / dt**2, damping, factor) > NEUTRAL
+
+    first = next((i for i, reach in enumerate(REACH) if unstable(reach)), None)
+    if first is None:
+        return math.inf
+    if first == 0:
+        return 0.0
+    low, high = REACH[first - 1], REACH[first]
+    for _ in range(40):
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if unstable(middle) else (middle, high)
+    return float(low) / dt**2

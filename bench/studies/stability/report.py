@@ -1,0 +1,441 @@
+"""Writes the stability map: a heat map per integrator, tables, and the short table that is printed.
+
+It does not depend on any plugin: the theoretical boundary is the column ``stiffness_limit`` of the rows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import FixedLocator, NullLocator
+from rich.console import Console
+from rich.table import Table
+
+from bench.report.figures import save, styled
+from bench.report.page import WIDTH, columns
+from bench.report.style import PALETTE, axis_name, plain
+from bench.report.tables import escape_markdown
+from bench.report.text import axis_value, counted
+from bench.report.views import Arranged, arranged, ran
+from bench.report.web.content import columns_of, grouped, problems, shown_as, telling, together
+from bench.sweep.axes import Axis, parsed, table
+from bench.sweep.columns import COMMON
+from bench.sweep.experiment import Experiment
+from bench.sweep.files import write_all
+
+BLUE, BLACK, RED, GREEN, PINK, ORANGE, SKY, _ = PALETTE
+VERDICTS = {
+    "ok": ("ok", "#cfe8df", "within {inaccurate} of the truth"),
+    "inaccurate": ("x", ORANGE, "off by more than {inaccurate}"),
+    "wrong_sign": ("S", PINK, "wrong sign"),
+    "zero": ("0", SKY, "exactly 0 where the truth is not"),
+    "diverged": ("D", RED, "state diverged"),
+    "nonfinite": ("N", BLACK, "state or gradient not finite"),
+    "unresolved": ("?", "#d9d9d9", "truth not resolved"),
+    "": ("", "#ffffff", "not run"),
+}
+"""Per verdict: the letter in its cells, their colour, and its meaning, where the study's limits are filled in."""
+DARK = ("nonfinite", "diverged")
+"""Verdicts whose cells take white letters."""
+LOST = ("diverged", "nonfinite")
+"""Verdicts on the far side of the measured stability boundary."""
+GROWING = 1 + 1e-9
+"""Measured growth per step above which a state counts as growing: 1 plus rounding."""
+ACROSS = 3
+"""Most panels side by side."""
+
+
+PLACES = ("dt", "stiffness")
+"""The columns that the maps are drawn over."""
+STEP = ("scene", "contact", "integrator")
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """The map of one integrator and problem, on the backends that agree on every verdict."""
+
+    integrator: str
+    """Identity string of the integrator, as are the scene's and the contact law's."""
+    scene: str
+    contact: str
+    values: Mapping[str, str]
+    """Values, as texts, of the :func:`more` columns that distinguish it from other maps."""
+    kind: tuple[str, ...]
+    """Names of integrator, scene and law, whatever their parameters."""
+    backends: tuple[str, ...]
+    rows: pd.DataFrame
+
+    @property
+    def title(self) -> str:
+        """The map in words: ``bouncing_ball, penalty, damping=0``; without the contact law where there is none."""
+        values = (f"{name}={value}" for name, value in self.values.items() if value != "-")
+        return ", ".join([self.scene, *([] if self.contact == "none" else [self.contact]), *values])
+
+    @property
+    def measured(self) -> str:
+        """How it was measured: ``jax, torch; truth: physical``."""
+        truth = ", ".join(text for text in self.rows["truth"].unique() if text)
+        return ", ".join(self.backends) + (f"; truth: {truth}" if truth else "")
+
+    @cached_property
+    def boundary(self) -> pd.DataFrame:
+        """By dt: the theoretical ``limit``, the largest stiffness below the first unstable one, and that one.
+
+        A cell is unstable if it diverged or was measured to grow. ``low`` is 0 where even the softest is unstable, and
+        ``high`` is infinite where none is. ``agrees`` is true where the limit lies between them, widened by one cell of
+        the grid.
+        """
+        limits = {}
+        for dt, part in self.rows.dropna(subset=["stiffness", "stiffness_limit"]).groupby("dt"):
+            part = part.sort_values("stiffness")
+            k, lost = part["stiffness"].to_numpy(), unstable(part).to_numpy()
+            first = int(np.argmax(lost)) if lost.any() else len(k)
+            padded = np.concatenate([[0.0, 0.0], k, [math.inf, math.inf]])
+            limit = float(part["stiffness_limit"].median())
+            agrees = padded[first] <= limit <= padded[first + 3]
+            limits[dt] = {"limit": limit, "low": padded[first + 1], "high": padded[first + 2], "agrees": agrees}
+        columns = ["limit", "low", "high", "agrees"]
+        return pd.DataFrame([list(row.values()) for row in limits.values()], list(limits), columns).astype(float)
+
+
+def unstable(rows: pd.DataFrame) -> pd.Series:
+    """Return a mask of the cells that diverged, or whose state grows however slowly where that was measured."""
+    return rows["verdict"].isin(LOST) | (rows["growth_factor"] > GROWING)
+
+
+def placed(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
+    """Arrange rows for reading, with every cell's step size and stiffness as stored, whatever else was swept."""
+    shown = arranged(experiment, rows)
+    return replace(shown, rows=shown.rows.assign(**{name: rows[name] for name in PLACES}))
+
+
+def panels(shown: Arranged) -> list[Panel]:
+    """Return the maps, grouped by scene and law; backends that refused a whole problem are left out, equal ones merged.
+
+    A map has all rows with equal parameters of scene, contact law and integrator, except step size and stiffness.
+    """
+    over = together(shown, *PLACES)
+    rows = shown.rows.assign(
+        map=grouped(shown.rows, STEP, over),
+        kind=[
+            tuple(name_of(given.get(part)) for part in ("integrator", "scene", "contact"))
+            for given in parsed(shown.rows)
+        ],
+        machine=problems(shown, ["backend"], always=["backend"]),
+    )
+    added = more(shown, over)
+    maps: list[Panel] = []
+    for _, part in rows.groupby("map", sort=False):
+        groups: list[tuple[pd.DataFrame, list[str]]] = []
+        for backend, mine in part.groupby("machine", sort=False):
+            mine = mine.drop_duplicates(list(PLACES), keep="last").sort_values(list(PLACES))
+            if ran(mine).empty:
+                continue
+            alike = next((g for g in groups if _same(g[0], mine)), None)
+            if alike is None:
+                groups.append((mine, [str(backend)]))
+            else:
+                alike[1].append(str(backend))
+        first = part.iloc[0]
+        integrator, scene, contact = (str(first[name]) for name in ("integrator", "scene", "contact"))
+        values = {name: shown_as(first[name]) for name in added}
+        maps += [
+            Panel(integrator, scene, contact, values, first["kind"], tuple(names), table) for table, names in groups
+        ]
+    kinds = list(dict.fromkeys(panel.kind for panel in maps))
+    return sorted(maps, key=lambda panel: kinds.index(panel.kind))
+
+
+def more(shown: Arranged, over: Sequence[Axis]) -> list[str]:
+    """Return the columns, besides integrator, scene and law, that two maps need to have different names."""
+    basic = ("integrator", "scene", "contact")
+    names = [*basic, *(name for name in columns_of(shown, STEP, over) if name not in (*basic, *PLACES, "horizon"))]
+    return [name for name in telling(shown.rows, grouped(shown.rows, STEP, over), names, basic) if name not in basic]
+
+
+def name_of(part: Any) -> str:
+    """Return the name of a plugin in a row's parameters."""
+    return "none" if part is None else str(part["name"])
+
+
+def limits(rows: pd.DataFrame) -> dict[str, str]:
+    """Return the limits that judged the rows, as texts: ``{"inaccurate": "10%"}``; several if studies differ."""
+    texts = dict.fromkeys(given["study"]["inaccurate"] for given in parsed(rows) if given)
+    return {"inaccurate": " or ".join(f"{100 * limit:g}%" for limit in texts)}
+
+
+def meaning(verdict: str, rows: pd.DataFrame) -> str:
+    """Return the meaning of a verdict for these rows."""
+    return VERDICTS[verdict][2].format(**limits(rows))
+
+
+def _same(a: pd.DataFrame, b: pd.DataFrame) -> bool:
+    """Return whether two maps have the same cells and verdicts."""
+    named = ["dt", "stiffness", "verdict", "status"]
+    return a[named].reset_index(drop=True).equals(b[named].reset_index(drop=True))
+
+
+# ---------------------------------------------------------------------------------------------------- files
+
+
+def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+    """Write ``stability_map`` (.csv, .md) and a heat map per integrator."""
+    directory = experiment.directory
+    shown = placed(experiment, rows)
+    maps = panels(shown)
+    contents = {
+        "stability_map.csv": table(experiment, rows).to_csv(index=False, lineterminator="\n"),
+        "stability_map.md": markdown(shown, maps),
+    }
+    paths = write_all(directory, contents)
+    with styled():
+        for integrator in dict.fromkeys(panel.integrator for panel in maps):
+            figure = heat_map(integrator, [panel for panel in maps if panel.integrator == integrator], shown.axes)
+            name = "".join(letter if letter.isalnum() else "_" for letter in integrator).strip("_")
+            paths += save(figure, directory / f"stability_map_{name}", experiment.formats)
+    return paths
+
+
+def shares(maps: Sequence[Panel]) -> dict[str, float]:
+    """Return each verdict's share of the cells of some maps that ran, and the share of unstable ones."""
+    cells = pd.concat([ran(panel.rows) for panel in maps])
+    by_verdict = {name: float((cells["verdict"] == name).mean()) for name in VERDICTS if name}
+    return by_verdict | {"unstable": float(unstable(cells).mean())}
+
+
+def markdown(shown: Arranged, maps: Sequence[Panel]) -> str:
+    """Write a line per map: shares of the verdicts, and the measured beside the theoretical boundary."""
+    names = [*(name for name in VERDICTS if name), "unstable"]
+    labels = ["integrator", "scene", "contact", *more(shown, together(shown, *PLACES)), "backends"]
+    heads = [*labels, "cells", *names, "dt", "theory", "measured", "agree"]
+    out = [f"# {escape_markdown(shown.experiment.name)}: shares of verdicts and stability limits", ""]
+    rule = "|" + "---|" * len(labels) + "--:|" * (len(heads) - len(labels))
+    out += ["| " + " | ".join(map(escape_markdown, heads)) + " |", rule]
+    for panel in maps:
+        cells = [panel.integrator, panel.scene, panel.contact, *panel.values.values(), ", ".join(panel.backends)]
+        cells += [str(len(ran(panel.rows))), *(_percent(share) for share in shares([panel]).values()), *_limits(panel)]
+        out.append("| " + " | ".join(map(escape_markdown, cells)) + " |")
+    out += ["", *(f"- {escape_markdown(note)}" for note in notes(shown.rows))]
+    return "\n".join(out) + "\n"
+
+
+def notes(rows: pd.DataFrame) -> list[str]:
+    """Explain the columns of the table, with the limits that its rows were judged by."""
+    return [
+        "ok: " + ", ".join(f"{n}: {meaning(n, rows)}" for n in VERDICTS if n).removeprefix("ok: ") + ".",
+        "unstable: diverged, or, without contact, a state measured to grow by more than 1e-9 per step: it diverges at a longer "
+        "horizon, whatever the verdict on the gradient at this one.",
+        "theory: stiffness at which the step's spectral radius on the oscillator exceeds 1, at that dt; for a contact, while "
+        "it lasts. measured: the largest stiffness before the first that is unstable, and that one.",
+        "agree: step sizes at which theory and measurement are within one cell of the grid.",
+    ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f}%" if share else "-"
+
+
+def _limits(panel: Panel) -> list[str]:
+    """Return a dt, both boundaries there, and the number of dt at which they agree."""
+    limits = panel.boundary
+    if limits.empty:
+        return ["-"] * 4
+    inside = (limits["low"] > 0) & np.isfinite(limits["high"])
+    chosen = limits[inside] if inside.any() else limits
+    dt = chosen.index[len(chosen) // 2]
+    row = chosen.loc[dt]
+    theory = {0.0: "never stable", math.inf: "always stable"}.get(
+        row["limit"], axis_value(float(f"{row['limit']:.3g}"))
+    )
+    return [
+        axis_value(dt),
+        theory,
+        _between(row["low"], row["high"]),
+        f"{int(limits['agrees'].sum())} of {len(limits)}",
+    ]
+
+
+def _between(low: float, high: float) -> str:
+    if low == 0:
+        return f"below {axis_value(high)}"
+    return f"above {axis_value(low)}" if math.isinf(high) else f"{axis_value(low)} to {axis_value(high)}"
+
+
+def show(experiment: Experiment, rows: pd.DataFrame) -> None:
+    """Print the shares of the verdicts, and the boundaries of the oscillators without contact."""
+    maps = panels(placed(experiment, rows))
+    console = Console(highlight=False, markup=False, emoji=False)
+    if not console.is_terminal:
+        console.width = max(console.width, 120)
+    console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
+    counts = rows["status"].value_counts()
+    console.print(f"{counted(len(rows), 'cell')}: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
+    table = _table(["integrator", "scene"], ["cells", *(name for name in VERDICTS if name), "unstable"])
+    for kind in dict.fromkeys(panel.kind[:2] for panel in maps):
+        mine = [panel for panel in maps if panel.kind[:2] == kind]
+        cells = [str(sum(len(ran(panel.rows)) for panel in mine)), *map(_percent, shares(mine).values())]
+        table.add_row(*kind, *cells)
+    console.print(table)
+    boundaries = _table(["integrator", "oscillator"], ["dt", "theory", "measured", "dt that agree"])
+    for panel in maps:
+        if panel.contact == "none" and not panel.boundary.empty:
+            boundaries.add_row(panel.integrator, panel.title, *_limits(panel))
+    if boundaries.row_count:
+        console.print(
+            "\nStability limit as a stiffness: where the spectral radius leaves 1, and where states grow or diverge."
+        )
+        console.print(boundaries)
+    reasons = rows[rows["status"].isin(("unsupported", "unavailable", "error"))].groupby(["status", "reason"]).size()
+    for (status, reason), count in reasons.items():
+        console.print(f"{count} {status}: {reason}")
+
+
+def _table(left: Sequence[str], right: Sequence[str]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="underline")
+    for name in left:
+        table.add_column(name, overflow="fold")
+    for name in right:
+        table.add_column(name, justify="right")
+    return table
+
+
+# --------------------------------------------------------------------------------------------------- charts
+
+
+def heat_map(integrator: str, maps: Sequence[Panel], axes: Sequence[Axis] = ()) -> Figure:
+    """Draw verdicts of one integrator over dt and stiffness, one panel per problem, with the theoretical boundary."""
+    across = columns(len(maps), ACROSS)
+    down = math.ceil(len(maps) / across)
+    rows = pd.concat([panel.rows for panel in maps])
+    steps, levels = (np.sort(rows[name].dropna().unique()) for name in ("dt", "stiffness"))
+    width = WIDTH if across > 2 else 0.5 * WIDTH * across
+    figure = Figure(figsize=(width, 0.75 + down * (0.75 + 0.22 * max(len(levels), 4)) + 0.3), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(down, across, squeeze=False)
+    measured = {panel.measured for panel in maps}
+    common = len(measured) == 1
+    head = f"Is the gradient right? {plain(integrator)}" + "".join(f" on {text}" for text in measured if common)
+    figure.suptitle(head, fontsize=9, fontweight="bold")
+    for area, panel in zip(grid.flat, maps, strict=False):
+        _draw(area, panel, steps, levels, common)
+    for spare in grid.flat[len(maps) :]:
+        spare.remove()
+    named = {column: _axis_name(column, axes) for column in PLACES}
+    for i, area in enumerate(grid.flat[: len(maps)]):
+        if i % across:
+            area.set_yticklabels([])
+        else:
+            area.set_ylabel(named["stiffness"])
+        if i + across >= len(maps):
+            area.set_xlabel(named["dt"])
+        else:
+            area.set_xticklabels([])
+    present = [name for name in VERDICTS if name in set(rows["verdict"])]
+    legend: list[Any] = [_swatch(name, meaning(name, rows)) for name in present]
+    if (unstable(rows) & ~rows["verdict"].isin(LOST)).any():
+        legend.append(Patch(label="striped: state grows, slowly", facecolor="white", **STRIPES))
+    if any(area.lines for area in grid.flat[: len(maps)]):
+        legend.append(Line2D([], [], **BOUNDARY, label="theory: spectral radius 1"))
+    figure.legend(handles=legend, loc="outside lower center", ncols=min(3, len(legend)), columnspacing=1.2)
+    return figure
+
+
+STRIPES: dict[str, Any] = {"hatch": "////", "edgecolor": "#9a9a9a", "linewidth": 0.0}
+HALO = [patheffects.withStroke(linewidth=3, foreground="white")]
+BOUNDARY: dict[str, Any] = {"color": BLUE, "linewidth": 1.3, "linestyle": (0, (4, 1.5)), "path_effects": HALO}
+
+
+def _axis_name(column: str, axes: Sequence[Axis]) -> str:
+    """Return what a map is drawn over, with its unit; axes that step with it are left out if the label has no room."""
+    axis = next((axis for axis in axes if axis.column == column), Axis(column, (), COMMON[column].unit))
+    return axis_name(replace(axis, moves=()))
+
+
+def _swatch(name: str, text: str) -> Patch:
+    letter, colour, _ = VERDICTS[name]
+    label = text if letter in ("", "ok") else f"{letter}: {text}"
+    return Patch(facecolor=colour, edgecolor="#808080", linewidth=0.4, label=label)
+
+
+def _draw(axes: Axes, panel: Panel, steps: np.ndarray, levels: np.ndarray, common: bool) -> None:
+    """Draw the cells with their letters, and the boundary."""
+    x, y = _edges(steps), _edges(levels)
+    whole = panel.rows["stiffness"].isna().all()
+    heights = np.array([y[0], y[-1]]) if whole else y
+    names = list(VERDICTS)
+    codes = np.full((len(heights) - 1, len(steps)), names.index(""))
+    for row in panel.rows.to_dict("records"):
+        column = int(np.searchsorted(steps, row["dt"]))
+        line = 0 if whole else int(np.searchsorted(levels, row["stiffness"]))
+        codes[line, column] = names.index(row["verdict"] if row["verdict"] in VERDICTS else "")
+        colour = "white" if row["verdict"] in DARK else "black"
+        middle = math.sqrt(heights[line] * heights[line + 1])
+        letter, fill, _ = VERDICTS[names[codes[line, column]]]
+        halo = [patheffects.withStroke(linewidth=2.5, foreground=fill)]
+        axes.text(steps[column], middle, letter, color=colour, path_effects=halo, **LETTER)
+    colours = ListedColormap([colour for _, colour, _ in VERDICTS.values()])
+    axes.pcolormesh(
+        x, heights, codes, cmap=colours, vmin=-0.5, vmax=len(names) - 0.5, edgecolors="white", linewidth=0.4
+    )
+    for row in panel.rows[unstable(panel.rows) & ~panel.rows["verdict"].isin(LOST)].to_dict("records"):
+        i, j = int(np.searchsorted(steps, row["dt"])), int(np.searchsorted(levels, row["stiffness"]))
+        axes.add_patch(Rectangle((x[i], y[j]), x[i + 1] - x[i], y[j + 1] - y[j], fill=False, zorder=2, **STRIPES))
+    axes.set(xscale="log", yscale="log", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+    axes.xaxis.set_major_locator(FixedLocator(list(steps[:: -1 if len(steps) <= 4 else -2])))
+    axes.xaxis.set_major_formatter(lambda value, _: axis_value(float(f"{value:.3g}")))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_title("\n".join(_title(panel, whole, common)), pad=4)
+    _draw_boundary(axes, panel, x)
+
+
+LETTER: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6.5, "zorder": 5}
+
+
+def _title(panel: Panel, whole: bool, common: bool) -> list[str]:
+    """Write the problem, how it was measured (unless common to all panels), and the boundary where it is not a line."""
+    lines = list(map(plain, panel.title.split(", ")))
+    lines[1:1] = ["no contact"] if panel.contact == "none" else []
+    limits = set(panel.boundary["limit"])
+    theory = {"": limits - {0.0, math.inf} or not limits, "never stable": limits == {0.0}, "always stable": True}
+    note = next(text for text, holds in theory.items() if holds)
+    parts = ["theory: " + note if note else "", "has no stiffness" if whole else ""]
+    return [*lines, *filter(None, ["" if common else panel.measured, "; ".join(filter(None, parts))])]
+
+
+def _draw_boundary(axes: Axes, panel: Panel, x: np.ndarray) -> None:
+    """Draw the limit along dt, extended to the edges of the panel."""
+    limit = panel.boundary["limit"]
+    limit = limit[(limit > 0) & np.isfinite(limit)]
+    if len(limit) < 2:
+        return
+    dt, k = np.log(limit.index.to_numpy(dtype=float)), np.log(limit.to_numpy())
+    ends = np.log([x[0], x[-1]])
+    slopes = (k[1] - k[0]) / (dt[1] - dt[0]), (k[-1] - k[-2]) / (dt[-1] - dt[-2])
+    values = [k[0] + slopes[0] * (ends[0] - dt[0]), *k, k[-1] + slopes[1] * (ends[1] - dt[-1])]
+    axes.plot(np.exp([ends[0], *dt, ends[1]]), np.exp(values), **BOUNDARY)
+
+
+def _edges(values: np.ndarray) -> np.ndarray:
+    """Return the edges of cells around values on a log axis."""
+    if len(values) == 0:
+        return np.array([1.0, 10.0])
+    logs = np.log(values)
+    if len(logs) == 1:
+        return np.asarray(np.exp(logs[0] + np.array([-0.5, 0.5])))
+    inner = 0.5 * (logs[1:] + logs[:-1])
+    return np.asarray(np.exp([1.5 * logs[0] - 0.5 * logs[1], *inner, 1.5 * logs[-1] - 0.5 * logs[-2]]))

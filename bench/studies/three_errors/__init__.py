@@ -1,0 +1,49 @@
+"""Three errors of one gradient, measured separately, and the forward error beside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from bench.studies.three_errors.columns import COLUMNS
+from bench.sweep.cell import Cell
+from bench.sweep.columns import Columns
+from bench.sweep.experiment import Experiment
+from bench.sweep.session import Session
+from bench.sweep.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class ThreeErrors(Study):
+    """Measures program, model and estimator error of a gradient, and the forward error beside them."""
+
+    name = "three_errors"
+    columns: ClassVar[Columns] = COLUMNS
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Measure the forward error, the errors of program and model at w = 0, and the bias of the estimator."""
+        from bench.studies.three_errors.measure import measure
+
+        return measure(cell, session)
+
+    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+        """Write the tables and charts."""
+        from bench.studies.three_errors import report
+
+        return report.write(experiment, rows)
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
+        """Print the tables and the traps."""
+        from bench.studies.three_errors import report
+
+        report.show(experiment, rows)
+
+    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
+        """Return the finding, its table and the charts."""
+        from bench.studies.three_errors.page import content
+
+        return content(experiment, rows)

@@ -1,0 +1,122 @@
+"""Three errors of one gradient, measured separately, and the forward error beside them.
+
+Program error: the program's gradient against central differences of the same program. Model error: against the
+gradient of the physics. Estimator error: the bias of an estimator against grad J_sigma of the program. A gradient can
+have any one of them without the others, and a small forward error says nothing about any.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.measure import noise, statistics
+from bench.model import Problem, Program
+from bench.sweep.cell import Cell
+from bench.sweep.session import Session
+
+SUMMARY = (
+    "reference_norm", "reference_se", "bias", "bias_low", "bias_high", "bias_rel", "variance", "rmse_rel", "cosine",
+    "sign_agreement",
+)  # fmt: skip
+"""The statistics of an estimator that are kept."""
+STEPS = 10.0 ** -np.arange(1.0, 9.5, 0.5)
+"""Step sizes of the central differences, in the units of theta."""
+
+
+def measure(cell: Cell, session: Session) -> dict[str, Any]:
+    """Measure the forward error, the errors of program and model at w = 0, and the bias of the cell's estimator."""
+    problem = session.problem(cell)
+    check = difference_check(problem)
+    result = {"status": "ok", "reason": ""} | check.columns() | _against_physics(problem.program, check)
+    truth = session.references.of(cell)
+    result["reference_method"] = truth.method
+    if not np.isfinite(truth.batches).all():
+        return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}
+    w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, problem.program.n_noise)
+    estimates = np.asarray(cell.estimator.estimate(problem, problem.program.theta0, w), dtype=np.float64)
+    summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
+    result |= {name: summary[name] for name in SUMMARY} | {"reason": summary["note"]}
+    if not (np.isfinite(estimates).all() and np.isfinite(check.gradient).all()):
+        result["status"] = "nonfinite"
+    return result
+
+
+@dataclass(frozen=True)
+class DifferenceCheck:
+    """A program's cost and gradient at theta0 without noise, and the central difference closest to that gradient."""
+
+    cost: float
+    gradient: np.ndarray
+    """``(d,)``."""
+    difference: np.ndarray
+    """``(d,)``."""
+    step: float
+
+    def columns(self) -> dict[str, Any]:
+        """Return the program error and the numbers it is made of."""
+        norm, error = _norm(self.difference), _norm(self.gradient - self.difference)
+        return {
+            "cost": self.cost,
+            "gradient": self.gradient.tolist(),
+            "program_norm": _norm(self.gradient),
+            "program_error": error,
+            "program_error_rel": _ratio(error, norm),
+            "difference_step": self.step,
+        }
+
+
+def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceCheck:
+    """Compare the program's gradient with its best central difference over a sweep of step sizes, at w = 0.
+
+    Truncation and jumps spoil large steps, rounding small ones. All differences are one batch of 2 d len(steps) costs.
+    """
+    theta = problem.program.theta0
+    shifts = (np.eye(theta.size)[:, None, :] * steps[:, None]).reshape(-1, theta.size).T
+    points = theta[:, None] + np.concatenate([np.zeros((theta.size, 1)), shifts, -shifts], axis=1)
+    costs = problem.value(points, np.zeros((problem.program.n_noise, points.shape[1])))
+    ahead, behind = costs[1:].reshape(2, theta.size, len(steps))
+    differences = (ahead - behind) / (2 * steps)
+    gradient = problem.grad(theta, np.zeros((problem.program.n_noise, 1)))[:, 0]
+    errors = np.linalg.norm(differences - gradient[:, None], axis=0)
+    # argmin takes a NaN for the smallest number
+    best = int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
+    return DifferenceCheck(float(costs[0]), gradient, differences[:, best], float(steps[best]))
+
+
+def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]:
+    """Return forward and model error, where the scene knows its physics.
+
+    ``model_cosine`` is the cosine between the two gradients, ``model_signs`` the share of coordinates whose sign is
+    the physics'.
+    """
+    result: dict[str, Any] = {}
+    cost, physical = program.physical_cost(), program.physical_gradient()
+    if cost is not None:
+        error = abs(check.cost - cost)
+        result |= {"physical_cost": cost, "forward_error": error, "forward_error_rel": _ratio(error, abs(cost))}
+    if physical is not None:
+        norm, error = _norm(physical), _norm(check.gradient - physical)
+        told = physical != 0
+        result |= {
+            "physical_gradient": physical.tolist(),
+            "physical_norm": norm,
+            "model_error": error,
+            "model_error_rel": _ratio(error, norm),
+            "model_cosine": _ratio(float(check.gradient @ physical), norm * _norm(check.gradient)),
+            "model_signs": float((np.sign(check.gradient) == np.sign(physical))[told].mean())
+            if told.any()
+            else math.nan,
+        }
+    return result
+
+
+def _norm(vector: np.ndarray) -> float:
+    return float(np.linalg.norm(vector))
+
+
+def _ratio(value: float, norm: float) -> float:
+    return value / norm if norm > 0 else math.nan

@@ -1,0 +1,353 @@
+"""Writes the three errors of a gradient as one table, and as one chart with a column per error and a row per scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from bench.report.figures import save, styled
+from bench.report.page import WIDTH
+from bench.report.scales import log_axis
+from bench.report.style import GREY, MARKERS, SHADE, axis_name, colour, plain, symbol
+from bench.report.tables import plain_markdown
+from bench.report.text import axis_value, counted, number
+from bench.report.views import Arranged, along, arranged, merge_seeds, ran
+from bench.report.web.content import columns_of, grouped, problems, shown_as, telling
+from bench.sweep.axes import Axis, table
+from bench.sweep.experiment import Experiment
+from bench.sweep.files import write_all
+
+FLOOR, CEILING = 1e-14, 1e3
+"""Relative errors outside this range are drawn at the edge."""
+ERRORS = {
+    "forward_error_rel": "forward error\n(cost, to physics)",
+    "program_error_rel": "program error\n(to differences)",
+    "model_error_rel": "model error\n(to physics)",
+}
+"""The errors of the program itself, each drawn in a column."""
+EXACT = 1e-6
+"""Program error up to which a gradient counts as exact."""
+CONVERGED = 0.5
+"""Forward error at the smallest step over that at the largest, up to which a cost counts as converging."""
+AWAY: dict[str, Any] = {"marker": "x", "markersize": 6, "markeredgewidth": 1.6, "color": "#000000", "linestyle": "none"}
+HOLLOW: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 0.9}
+ORDER = (2, 0, 3, 4, 5, 6, 7, 1)
+"""Colours of the first contact laws, as places in the palette."""
+HEADERS = {
+    "contact": "contact law", "forward_error_rel": "forward", "program_error_rel": "program",
+    "model_error_rel": "model", "model_cosine": "cosine to physics", "model_signs": "right signs",
+}  # fmt: skip
+RESULTS = tuple(name for name in HEADERS if name != "contact")
+PROGRAM = ("scene", "contact", "integrator", "backend")
+"""What the errors belong to; a line of a table has one bias per estimator."""
+STEP = "dt"
+"""The column of the time step, along which a cost may converge."""
+NOTES = (
+    "Relative errors at theta, without noise except for the biases. forward: |cost - physics' cost|. program: gradient "
+    "against the best central difference of the same program. model: gradient against the physics'. right signs: share "
+    "of coordinates with the physics' sign. bias: of that estimator against grad J_sigma of the program, '< u' where it "
+    "cannot be distinguished from 0 (95%).",
+)
+
+
+def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+    """Write ``three_errors`` (.csv, .md) and its chart along the time step, or else the first swept axis."""
+    shown = arranged(experiment, rows)
+    parts = sections(shown)
+    texts = [f"## {part.heading}\n\n{plain_markdown(readable(shown, part), HEADERS)}" for part in parts]
+    title = f"# {experiment.name}: program, model and estimator error"
+    contents = {
+        "three_errors.csv": table(experiment, rows).to_csv(index=False, lineterminator="\n"),
+        "three_errors.md": "\n\n".join([title, *map(str, traps(shown)), *texts, *NOTES]) + "\n",
+    }
+    paths = write_all(experiment.directory, contents)
+    drawn = figure(shown)
+    if drawn is not None:
+        paths += save(drawn, experiment.directory / "three_errors", experiment.formats)
+    return paths
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """The rows of one table: those along an axis, with its values in a column ``x``, or those on no axis, ``x`` 0."""
+
+    axis: Axis | None
+    rows: pd.DataFrame
+
+    @property
+    def heading(self) -> str:
+        """The heading: ``Along dt [s], with horizon``."""
+        return "Not along a swept axis" if self.axis is None else f"Along {self.axis.title}"
+
+
+def sections(shown: Arranged) -> list[Section]:
+    """Return, per swept axis, the programs that move along it at one value of all others; then the other programs.
+
+    Axes that step together are one: the time step where it is among them, else the first.
+    """
+    parts: list[Section] = []
+    for axis in leading(shown):
+        part = ran(along(shown, axis))
+        for other in shown.axes:
+            if other not in (axis, *_with(shown, axis)) and other.column != "seed" and not part.empty:
+                part = part[_at_commonest(part, other, shown)]
+        if part.empty:
+            continue
+        moving = part.groupby(grouped(part, PROGRAM, [axis, *_with(shown, axis)]))["x"].transform("nunique") > 1
+        if moving.any():
+            parts.append(Section(axis, part[moving].sort_values("x", kind="stable")))
+    rest = ran(merge_seeds(shown.rows)).assign(x=0.0)
+    still = grouped(rest, PROGRAM, shown.axes)
+    listed = {key for part in parts for key in part.rows["key"]}
+    rest = rest[~still.isin(still[rest["key"].isin(listed)])]
+    return parts + ([] if rest.empty else [Section(None, rest)])
+
+
+def leading(shown: Arranged) -> list[Axis]:
+    """Return the axes that get a table: one of those that step together."""
+    axes: list[Axis] = []
+    for axis in sorted(shown.axes, key=lambda axis: axis.column != STEP):
+        if axis.column != "seed" and not any(axis.column in other.moves for other in axes):
+            axes.append(axis)
+    return [axis for axis in shown.axes if axis in axes]
+
+
+def _with(shown: Arranged, axis: Axis) -> list[Axis]:
+    return [other for other in shown.axes if other.column in axis.moves]
+
+
+def _at_commonest(rows: pd.DataFrame, axis: Axis, shown: Arranged) -> pd.Series:
+    """Return a mask of the rows whose value of an axis is the commonest for their scene and law, or that have none."""
+    laws = grouped(rows, ("scene", "contact"), shown.axes)
+    middle = rows.groupby(laws)[axis.column].transform(lambda v: v.mode().iloc[0] if v.notna().any() else np.nan)
+    return (rows[axis.column] == middle) | rows[axis.column].isna()
+
+
+# ------------------------------------------------------------------------------------------------------- tables
+
+
+def readable(shown: Arranged, part: Section) -> pd.DataFrame:
+    """Return a table of texts: a line per program and value of the axis, the errors, and a bias per estimator."""
+    rows, axis = part.rows, part.axis
+    without = [] if axis is None else [axis, *_with(shown, axis)]
+    programs = grouped(rows, PROGRAM, without)
+    names = telling(rows, programs, columns_of(shown, PROGRAM, without), ("scene", "contact"))
+    labels = rows["estimator"].where(
+        rows["estimator_params"] == "", rows["estimator"] + "[" + rows["estimator_params"] + "]"
+    )
+    laws = grouped(rows, ("scene", "contact"), without)
+    place = {law: i for i, law in enumerate(laws.unique())}
+    rows = rows.assign(program=programs, label=labels, place=laws.map(place))
+    lines = []
+    for _, own in rows.groupby(["place", "program", "x"], sort=False):
+        row = own.iloc[0]
+        line = {name: shown_as(row[name]) for name in names}
+        line |= {} if axis is None else {replace(axis, moves=()).title: axis_value(row["x"])}
+        line |= {name: number(row[name]) for name in RESULTS}
+        line |= {f"bias {name}": _bias(mine.iloc[0]) for name, mine in own.groupby("label", sort=False)}
+        lines.append((row["place"], line))
+    return pd.DataFrame([line for _, line in sorted(lines, key=lambda pair: pair[0])])
+
+
+def _bias(row: Any) -> str:
+    if row["status"] != "ok":
+        return str(row["status"])
+    if row["bias_low"] > 0:
+        return number(row["bias_rel"])
+    return f"< {number(row['bias_high'] / row['reference_norm'])}"
+
+
+def show(experiment: Experiment, rows: pd.DataFrame) -> None:
+    """Print the tables and the traps."""
+    from rich.console import Console
+    from rich.table import Table
+
+    shown = arranged(experiment, rows)
+    console = Console(highlight=False, markup=False, emoji=False)
+    if not console.is_terminal:
+        console.width = max(console.width, 140)
+    counts = ", ".join(f"{n} {status}" for status, n in rows["status"].value_counts().items())
+    console.print(f"\n{experiment.name}: {experiment.question}\n{counted(len(rows), 'cell')}: {counts}")
+    for part in sections(shown):
+        texts = readable(shown, part)
+        grid = Table(title=f"\n{part.heading}", title_justify="left", box=None, padding=(0, 2, 0, 0))
+        for name in texts:
+            grid.add_column(HEADERS.get(name, name), justify="left" if name in PROGRAM else "right")
+        for row in texts.fillna("").to_numpy():
+            grid.add_row(*map(str, row))
+        console.print(grid)
+    console.print(*map(str, traps(shown)), *NOTES, sep="\n")
+
+
+# -------------------------------------------------------------------------------------------------------- traps
+
+
+@dataclass(frozen=True)
+class Trap:
+    """A scene and law whose gradient passes every test but the physics': exact, of a converging cost, misdirected."""
+
+    name: str
+    """Name of the scene and the law, with whatever else distinguishes it."""
+    program: float
+    """Largest relative program error."""
+    forward: tuple[float, float]
+    """Relative forward error at the largest and the smallest value of the axis."""
+    cosine: tuple[float, float]
+    """Smallest and largest cosine to the physical gradient, both negative."""
+
+    def __str__(self) -> str:
+        """Write one sentence."""
+        return (
+            f"Trap: {self.name}: the gradient agrees with differences to {number(self.program)}, the "
+            f"cost's error falls from {number(self.forward[0])} to {number(self.forward[1])}, and the gradient's cosine "
+            f"to the physics is {number(self.cosine[0])} to {number(self.cosine[1])}, negative at every time step."
+        )
+
+
+def traps(shown: Arranged) -> list[Trap]:
+    """Return the programs that are traps along the time step."""
+    part = next((part for part in sections(shown) if part.axis is not None and part.axis.column == STEP), None)
+    if part is None:
+        return []
+    result = []
+    for name, rows in part.rows.groupby(programs_of(shown, part), sort=False):
+        own = rows.drop_duplicates("x").sort_values("x")
+        forward, cosine, program = own["forward_error_rel"], own["model_cosine"], own["program_error_rel"].max()
+        converges = forward.is_monotonic_increasing and forward.iloc[0] <= CONVERGED * forward.iloc[-1]
+        if (cosine < 0).all() and program <= EXACT and converges:
+            ends = (float(forward.iloc[-1]), float(forward.iloc[0]))
+            result.append(Trap(str(name), float(program), ends, (float(cosine.min()), float(cosine.max()))))
+    return result
+
+
+def programs_of(shown: Arranged, part: Section, parts: Sequence[str] = PROGRAM) -> pd.Series:
+    """Return, per row of a section, the name of its program, the same along the axis: ``bounce_once, penalty``."""
+    without = [] if part.axis is None else [part.axis, *_with(shown, part.axis)]
+    return problems(shown, parts, without, [name for name in ("scene", "contact") if name in parts], part.rows)
+
+
+# ------------------------------------------------------------------------------------------------------- charts
+
+
+def figure(shown: Arranged) -> Figure | None:
+    """Draw a row of panels per scene, a column per error and a line per law, along the time step or the first axis."""
+    parts = [part for part in sections(shown) if part.axis is not None]
+    if not parts:
+        return None
+    part = min(parts, key=lambda part: part.axis is not None and part.axis.column != STEP)
+    with styled():
+        return _figure(shown, part, {trap.name for trap in traps(shown)})
+
+
+def _figure(shown: Arranged, part: Section, trapped: Set[str]) -> Figure:
+    assert part.axis is not None
+    panels = programs_of(shown, part, ["scene"])
+    rows = part.rows.assign(
+        panel=panels,
+        law=_laws(shown, part, panels),
+        trap=programs_of(shown, part).isin(trapped if part.axis.column == STEP else ()),
+        label=problems(shown, ["estimator"], shown.axes, ["estimator"], part.rows),
+    )
+    scenes, laws, estimators = (list(dict.fromkeys(rows[name])) for name in ("panel", "law", "label"))
+    looks = {law: {"color": _colour(i), "marker": MARKERS[i % len(MARKERS)]} for i, law in enumerate(laws)}
+    drawn = Figure(figsize=(WIDTH, 1.45 * len(scenes) + 1.75), layout="constrained")
+    FigureCanvasAgg(drawn)
+    drawn.suptitle(_title(part.axis, bool(rows["trap"].any())), fontsize=9, fontweight="bold")
+    grid = drawn.subplots(len(scenes), len(ERRORS) + len(estimators), squeeze=False, sharey=True)
+    titles = [*ERRORS.values(), *(f"estimator error\n(bias of {plain(name)})" for name in estimators)]
+    for panel, title in zip(grid[0], titles, strict=True):
+        panel.set_title(title, pad=4)
+    for line, scene in zip(grid, scenes, strict=True):
+        own = rows[rows["panel"] == scene]
+        for panel in line:
+            _scale(panel, np.array(sorted(own["x"].unique())))
+        for law, program in own.groupby("law", sort=False):
+            _draw(line, program, estimators, looks[law] | (BOLD if program["trap"].any() else THIN))
+        if own["trap"].any():
+            for panel, (height, text) in zip(line, SAID, strict=False):
+                panel.text(0.5, height, text, transform=panel.transAxes, ha="center", va="center", fontweight="bold")
+        line[0].set_ylabel(plain(scene).replace("[", "\n[", 1))
+    for panel in grid[-1]:
+        panel.set_xlabel(_short_name(part.axis))
+    drawn.legend(handles=_legend(looks), loc="outside lower center", ncols=3, columnspacing=1.2)
+    return drawn
+
+
+def _laws(shown: Arranged, part: Section, panels: pd.Series) -> pd.Series:
+    """Name the law of each row by what distinguishes it from the others in its panel: one law has one look in all scenes."""
+    axes = ["contact", "integrator", "backend"]
+    return pd.concat(
+        [programs_of(shown, Section(part.axis, own), axes) for _, own in part.rows.groupby(panels, sort=False)]
+    ).reindex(part.rows.index)
+
+
+def _colour(place: int) -> str:
+    return colour(ORDER[place] if place < len(ORDER) else place)
+
+
+BOLD: dict[str, Any] = {"linewidth": 2.6, "markersize": 5.0, "zorder": 4}
+SAID = (
+    (0.3, "looks right:\nfalls with $\\Delta t$"),
+    (0.68, "looks right:\nexact"),
+    (0.42, "wrong direction\nat every $\\Delta t$"),
+)
+"""Texts in the panels of a scene with a trap, and their heights."""
+THIN: dict[str, Any] = {"linewidth": 0.9, "markersize": 3.0, "zorder": 3}
+
+
+def _title(axis: Axis, trapped: bool) -> str:
+    """Write what is drawn, and what to look at first."""
+    text = f"Three errors of a gradient along {axis_name(axis)}, all relative"
+    return text + ("\nBold is a trap: right cost, exact derivative, wrong direction" if trapped else "")
+
+
+def _short_name(axis: Axis) -> str:
+    """Write an axis by its symbol and unit, which fit under a small panel."""
+    return " ".join(filter(None, [symbol(axis.column) or plain(axis.short), f"[{axis.unit}]" if axis.unit else ""]))
+
+
+def _scale(panel: Axes, values: np.ndarray) -> None:
+    panel.set_yscale("log")
+    panel.set_ylim(FLOOR / 10, CEILING * 3)
+    panel.yaxis.set_major_locator(FixedLocator([1e-12, 1e-8, 1e-4, 1.0]))
+    panel.yaxis.set_minor_locator(NullLocator())
+    panel.axhspan(1.0, CEILING * 3, zorder=0, **SHADE)
+    log_axis(panel, "x", values[0] / 1.4, values[-1] * 1.4)
+    panel.xaxis.set_major_locator(FixedLocator(list(values)))
+    panel.xaxis.set_major_formatter(FuncFormatter(lambda x, _: number(x) if x in (values[0], values[-1]) else ""))
+
+
+def _draw(line: Sequence[Axes], rows: pd.DataFrame, estimators: Sequence[str], style: Mapping[str, Any]) -> None:
+    """Draw one law of a scene in each of its panels."""
+    program = rows.drop_duplicates("x")
+    for panel, name in zip(line, ERRORS, strict=False):
+        panel.plot(program["x"], program[name].clip(FLOOR, CEILING), **style)
+    away = program[program["model_cosine"] < 0]
+    line[2].plot(away["x"], away["model_error_rel"].clip(FLOOR, CEILING), zorder=5, **AWAY)
+    for panel, estimator in zip(line[len(ERRORS) :], estimators, strict=True):
+        own = rows[(rows["label"] == estimator) & (rows["status"] == "ok")]
+        limit = ~(own["bias_low"] > 0)
+        value = (own["bias"].where(~limit, own["bias_high"]) / own["reference_norm"]).clip(FLOOR, CEILING)
+        panel.plot(own["x"], value, **{**style, "marker": ""})
+        for mask, look in ((~limit, {}), (limit, HOLLOW)):
+            panel.plot(own["x"][mask], value[mask], **{**style, "linestyle": "none", **look})
+
+
+def _legend(looks: Mapping[str, Mapping[str, Any]]) -> list[Any]:
+    handles: list[Any] = [Line2D([], [], label=plain(law), **{**THIN, **look}) for law, look in looks.items()]
+    handles.append(Line2D([], [], label="gradient against the physics' direction", **AWAY))
+    hollow: dict[str, Any] = {"color": GREY, "marker": "o", "linestyle": "none", "markersize": 3.5, **HOLLOW}
+    handles.append(Line2D([], [], label="bias not resolved: 95% limit", **hollow))
+    handles.append(Patch(label="error exceeds what it is of", **SHADE))
+    return handles

@@ -1,0 +1,72 @@
+"""A physics engine's twin of a scene beside the scene's own program: one rollout, its cost and its gradient."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from bench.model import param
+from bench.sweep.cell import Cell
+from bench.sweep.columns import Column, Columns, Judged, numbers, text
+from bench.sweep.experiment import Experiment
+from bench.sweep.session import Session
+from bench.sweep.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Twins(Study):
+    """Measures how far a physics engine's twin is from the scene's own program, and what its gradient costs."""
+
+    name = "twins"
+    columns: ClassVar[Columns] = Columns.of(
+        Column("state_difference", "largest difference of states over time and coordinates"),
+        Column("state_difference_rel", "the same in units of the largest value of that coordinate",
+               judged=Judged("exact", "difference of states")),
+        Column("cost", "cost of the twin"),
+        Column("own_cost", "cost of the scene's own program"),
+        Column("cost_difference_rel", "difference of costs, relative"),
+        Column("gradient_norm", "norm of the twin's gradient"),
+        Column("own_gradient_norm", "norm of the own program's gradient"),
+        Column("gradient_difference_rel", "difference of gradients, relative", judged=Judged("exact", "difference of gradients")),
+        Column("gradient_cosine", "cosine between the gradients"),
+        Column("value_s", "costs of `samples` rollouts", "s"),
+        Column("gradient_s", "gradients of `samples` rollouts", "s"),
+        Column("trace_s", "part of compile_s: running the Python code once", "s"),
+        Column("lower_s", "part of compile_s: turning it into the compiler's input", "s"),
+        Column("compile_s", "compiling the gradient, in all", "s"),
+        text("own_backend", "backend of the scene's own program"),
+        numbers("gradient", "the twin's gradient, by coordinate of theta"),
+        numbers("own_gradient", "the own program's gradient, by coordinate of theta"),
+        numbers("path", "positions of the twin along the rollout", table=False),
+        numbers("own_path", "positions of the own program along the rollout", table=False),
+    )  # fmt: skip
+
+    timed_calls: int = param(5, "calls timed for costs and for gradients", positive=True)
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Measure the differences at w = 0, and the seconds of costs and gradients."""
+        from bench.studies.twins.measure import measure
+
+        return measure(cell, session, self.timed_calls)
+
+    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+        """Write the tables and charts."""
+        from bench.studies.twins import report
+
+        return report.write(experiment, rows)
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
+        """Print the table."""
+        from bench.studies.twins import report
+
+        report.show(experiment, rows)
+
+    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
+        """Return the finding, its table and the charts."""
+        from bench.studies.twins.page import content
+
+        return content(experiment, rows)

@@ -1,0 +1,78 @@
+"""A physics engine's twin of a scene beside the scene's own program: one rollout, its cost and its gradient.
+
+A difference here is the model error of the engine's program against the scene's, for the same masses, springs and step:
+neither is wrong about its own program. Seconds are those of a batch of ``samples`` rollouts.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bench.measure import noise, timing
+from bench.model import Problem, Unsupported, rollout
+from bench.sweep.cell import Cell
+from bench.sweep.referees import ranked_backends
+from bench.sweep.session import Session
+
+
+def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
+    """Measure the differences at w = 0, and the seconds of costs and gradients.
+
+    ``state_difference`` is the largest over time and coordinates, positions in their units and velocities in theirs;
+    ``_rel`` is in units of the largest value that coordinate takes.
+    """
+    scene = rollout(cell.program()).scene
+    if "physics" not in cell.backend.provides:
+        raise Unsupported(f"backend {cell.backend.name} has no twin to compare: its steps are the scene's own")
+    able = ranked_backends(cell)
+    if not able:
+        raise Unsupported(
+            f"scene {scene.name} exists only as an engine's model: it has no program of its own to compare with"
+        )
+    twin, own = session.problem(cell), session.problems.of(able[0], cell)
+    theta, still = twin.program.theta0, np.zeros((twin.program.n_noise, 1))
+    path, own_path = (problem.trajectory(theta, still).states[:, :, 0] for problem in (twin, own))
+    gradient, own_gradient = (problem.grad(theta, still)[:, 0] for problem in (twin, own))
+    cost, own_cost = (float(problem.value(theta, still)[0]) for problem in (twin, own))
+    off = np.abs(path - own_path).max(axis=0)
+    result = {
+        "status": "ok",
+        "reason": "",
+        "own_backend": able[0].name,
+        "state_difference": float(off.max()),
+        "state_difference_rel": float((off / np.maximum(np.abs(own_path).max(axis=0), 1e-300)).max()),
+        "cost": cost,
+        "own_cost": own_cost,
+        "cost_difference_rel": abs(cost - own_cost) / abs(own_cost),
+        "gradient": gradient.tolist(),
+        "own_gradient": own_gradient.tolist(),
+        "gradient_norm": float(np.linalg.norm(gradient)),
+        "own_gradient_norm": float(np.linalg.norm(own_gradient)),
+        "gradient_difference_rel": float(np.linalg.norm(gradient - own_gradient) / np.linalg.norm(own_gradient)),
+        "gradient_cosine": float(gradient @ own_gradient / (np.linalg.norm(gradient) * np.linalg.norm(own_gradient))),
+        "path": path[:, : scene.n_q].ravel().tolist(),
+        "own_path": own_path[:, : scene.n_q].ravel().tolist(),
+        **_seconds(cell, twin, timed_calls),
+    }
+    if not (np.isfinite(path).all() and np.isfinite(gradient).all()):
+        result |= {"status": "nonfinite", "reason": "the engine's rollout or its gradient is not finite"}
+    return result
+
+
+def _seconds(cell: Cell, problem: Problem, timed_calls: int) -> dict[str, float]:
+    """Return medians over calls with ``samples`` columns, and the time to compile the gradient."""
+    theta = problem.program.theta0
+    w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, problem.program.n_noise)[0].T
+    _, value = timing.timed(lambda _: problem.value(theta, w), timed_calls)
+    problem.reset_usage()
+    _, gradient = timing.timed(lambda _: problem.grad(theta, w), timed_calls)
+    usage = problem.usage
+    return {
+        "value_s": value.median_s,
+        "gradient_s": gradient.median_s,
+        "trace_s": usage.trace_s,
+        "lower_s": usage.lower_s,
+        "compile_s": usage.compile_s,
+    }

@@ -1,0 +1,233 @@
+"""What a stored row says about its cell: its plugins, and the swept axes as numbers, all from its own parameters."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from bench.errors import UserError
+from bench.model import Plugin, registry
+from bench.model.parameters import Parameter, build, parameters
+from bench.sweep.cell import labels
+from bench.sweep.experiment import Experiment
+from bench.sweep.grid import COUNTS, applies, points, swept
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pandas as pd
+
+NOT_PARTS = ("study", "theta", "reference")
+"""Entries of a row's parameters that are not a plugin on an axis."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One swept quantity: the column that holds it, what it means, and which names in the sweep it gathers.
+
+    Names that mean the same parameter of different plugins (``mass_spring.damping``, ``penalty.damping``) are one axis.
+    """
+
+    column: str
+    names: tuple[str, ...]
+    unit: str = ""
+    doc: str = ""
+    moves: tuple[str, ...] = ()
+    """Columns of other axes that step together with this one (a zip)."""
+
+    @property
+    def short(self) -> str:
+        """The parameter's own name: ``gamma`` of ``alpha_order.gamma``."""
+        return self.column.rpartition(".")[2]
+
+    @property
+    def title(self) -> str:
+        """The axis with its unit and what moves with it: ``dt [s], with horizon``."""
+        unit = f" [{self.unit}]" if self.unit else ""
+        return f"{self.column}{unit}" + (f", with {', '.join(self.moves)}" if self.moves else "")
+
+
+def parsed(rows: pd.DataFrame) -> list[Mapping[str, Any]]:
+    """Return the parameters of each row; empty where a row has none."""
+    cache: dict[str, Mapping[str, Any]] = {}
+    texts = rows["parameters"] if "parameters" in rows else [""] * len(rows)
+    return [
+        cache[text] if text in cache else cache.setdefault(text, json.loads(text) if text else {}) for text in texts
+    ]
+
+
+def value_of(name: str, given: Mapping[str, Any]) -> Any:
+    """Return the value that a row's parameters give to a name in a sweep; None if it applies to none of its plugins."""
+    for group, part in given.items():
+        if group not in NOT_PARTS and part is not None:
+            parameter = applies(name, registry.kind_of(group), part["name"], part)
+            if parameter is not None and parameter != "name":
+                return part[parameter]
+    return None
+
+
+def values_of(axis: Axis, rows: pd.DataFrame) -> np.ndarray:
+    """Return the numbers of an axis, NaN where it does not apply or is not a number."""
+    import numpy as np
+
+    if axis.column in COUNTS:
+        return rows[axis.column].to_numpy(float)
+    cache: dict[int, float] = {}
+
+    def number(given: Mapping[str, Any]) -> float:
+        if id(given) not in cache:
+            values = (value_of(name, given) for name in axis.names)
+            cache[id(given)] = next((_number(value) for value in values if value is not None), np.nan)
+        return cache[id(given)]
+
+    return np.array([number(given) for given in parsed(rows)], dtype=float)
+
+
+def shown_by(view: str, axis: Axis, rows: pd.DataFrame) -> np.ndarray:
+    """Return, per row, whether ``stiffness`` or ``smoothing`` is this very axis: a parameter of its contact law."""
+    import numpy as np
+
+    cache: dict[int, bool] = {}
+
+    def shown(given: Mapping[str, Any]) -> bool:
+        part = given.get("contact")
+        if part is None:
+            return False
+        entry = registry.entries()["contacts"].get(part["name"])
+        parameter = view if view != "smoothing" else getattr(entry and entry.plugin, "smoothing", "")
+        return bool(parameter) and any(
+            applies(name, "contacts", part["name"], part) == parameter for name in axis.names
+        )
+
+    return np.array(
+        [cache[id(g)] if id(g) in cache else cache.setdefault(id(g), shown(g)) for g in parsed(rows)], dtype=bool
+    )
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, str):
+        return float(value) if value in ("inf", "-inf") else float("nan")
+    return float("nan") if isinstance(value, bool) else float(value)
+
+
+def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
+    """Return the axes of a sweep whose values are numbers, in its order.
+
+    An axis takes the name of its parameter, unless that column means something else in some row, as when scene and
+    contact law both have a ``stiffness``: then the axis keeps its full name.
+    """
+    import numpy as np
+
+    names = swept(sweep)
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(name.rpartition(".")[2], []).append(name)
+    given = list({id(one): one for one in parsed(rows)}.values())
+    result = []
+    for short, members in groups.items():
+        clash = any(sum(value_of(name, one) is not None for name in members) > 1 for one in given)
+        for part in [[name] for name in members] if clash else [members]:
+            column = part[0] if clash else short
+            axis = Axis(column, tuple(part), *_meaning(part, given))
+            values = values_of(axis, rows)
+            own = np.isfinite(values)
+            if not own.any():
+                continue
+            if not clash and column in rows and column not in COUNTS:
+                shown = np.asarray(rows[column], dtype=float)
+                if not np.array_equal(shown[own], values[own]):
+                    axis = Axis(part[0] if "." in part[0] else f"swept.{short}", axis.names, axis.unit, axis.doc)
+            result.append(axis)
+    together = _together(sweep)
+    return [Axis(axis.column, axis.names, axis.unit, axis.doc, _moving(axis, result, together)) for axis in result]
+
+
+def _moving(axis: Axis, found: Sequence[Axis], together: Sequence[frozenset[str]]) -> tuple[str, ...]:
+    partners = {name for group in together for name in group if group & set(axis.names)} - set(axis.names)
+    return tuple(other.column for other in found if other is not axis and partners & set(other.names))
+
+
+def _together(sweep: Mapping[str, Any]) -> list[frozenset[str]]:
+    """Return the groups of names that step together in a ``zip``, wherever it stands in the sweep."""
+    groups = []
+    for name, value in sweep.items():
+        if name == "zip":
+            groups.append(frozenset(points({"zip": value})[0]))
+        elif name == "product":
+            groups += _together(value)
+        elif name == "union":
+            groups += [group for part in value for group in _together(part)]
+    return groups
+
+
+def _meaning(names: Iterable[str], given: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
+    """Return unit and meaning of a parameter, as its plugin declares them."""
+    meanings = {}
+    for name in names:
+        for one in given:
+            for group, part in one.items():
+                if group in NOT_PARTS or part is None:
+                    continue
+                declared = declared_parameters(registry.kind_of(group), part["name"])
+                if (parameter := applies(name, registry.kind_of(group), part["name"], declared)) is not None:
+                    meanings[declared[parameter].unit] = declared[parameter].doc
+    # a unit that differs between scenes cannot stand on a common axis
+    return next(iter(meanings.items())) if len(meanings) == 1 else ("", "")
+
+
+def declared_parameters(kind: str, name: str) -> Mapping[str, Parameter]:
+    """Return the parameters that a plugin declares; none where it is not installed here."""
+    entry = registry.entries().get(kind, {}).get(name)
+    return parameters(entry.plugin) if entry is not None and entry.plugin is not None else {}
+
+
+def with_axes(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
+    """Add to rows a numeric column for every swept axis that is not a column already."""
+    return rows.assign(**{a.column: values_of(a, rows) for a in axes(experiment.sweep, rows) if a.column not in rows})
+
+
+def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows as the CSV has them: the study's table, the swept axes, then the cell's whole identity."""
+    extra = [axis.column for axis in axes(experiment.sweep, rows) if axis.column not in rows]
+    wide = with_axes(experiment, rows)
+    return wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
+
+
+def revived(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
+    """Build the plugins described by a row's parameters, by axis; raises :class:`UserError` if one is not installed."""
+    parts: dict[str, Plugin | None] = {}
+    for axis, part in given.items():
+        if axis in NOT_PARTS:
+            continue
+        values = {} if part is None else {name: value for name, value in part.items() if name != "name"}
+        parts[axis] = None if part is None else build(registry.usable(registry.kind_of(axis), part["name"]), values)
+    return parts
+
+
+def relabelled(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
+    """Drop from rows' identity strings the parameters shown as columns of swept axes; unknown plugins keep theirs."""
+    cache: dict[int, dict[str, str]] = {}
+    lines = []
+    for given in parsed(rows):
+        if id(given) not in cache:
+            cache[id(given)] = _labels(given, [name for axis in axes for name in axis.names])
+        lines.append(cache[id(given)])
+    changed = {name for line in lines for name in line}
+    return rows.assign(
+        **{name: [line.get(name, old) for line, old in zip(lines, rows[name], strict=True)] for name in changed}
+    )
+
+
+def _labels(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, str]:
+    hidden: dict[str, set[str]] = {}
+    for group, part in given.items():
+        if group not in NOT_PARTS and part is not None:
+            taken = {applies(name, registry.kind_of(group), part["name"], part) for name in names}
+            hidden[group] = {parameter for parameter in taken if parameter is not None}
+    if not any(hidden.values()):
+        return {}
+    try:
+        return labels(revived(given), hidden)
+    except UserError:
+        return {}

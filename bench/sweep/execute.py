@@ -1,0 +1,64 @@
+"""Runs one experiment from plan to files, for both the command line and the Python face."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from bench.errors import StorageError
+from bench.measure import timing
+from bench.sweep import progress, runner
+from bench.sweep.experiment import Experiment
+from bench.sweep.plan import Planned, plan
+from bench.sweep.store import Store
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """A run that ended by itself: its experiment, its stored rows, and how long it took."""
+
+    experiment: Experiment
+    store: Store
+    planned: list[Planned]
+    seconds: float
+
+    @property
+    def keys(self) -> list[str]:
+        """The keys of its cells, in order."""
+        return [item.cell.key for item in self.planned]
+
+
+def store_of(experiment: Experiment) -> Store:
+    """Return the store of an experiment's rows."""
+    return Store(experiment.directory, experiment.columns)
+
+
+def execute(experiment: Experiment, quiet: bool = True) -> Finished:
+    """Run the missing cells of an experiment and fold their rows into ``rows.parquet``.
+
+    Raises :class:`runner.Stopped` after a failed cell where the experiment says so, and KeyboardInterrupt when
+    interrupted; every cell finished by then is stored.
+    """
+    started = time.time()
+    # asked now, before the run itself loads the machine
+    timing.load_at_start()
+    store = store_of(experiment)
+    planned = plan(experiment, store)
+    progress.print_versions(planned, experiment.execution.versions)
+    store.prepare()
+    with progress.of(experiment.name, planned, quiet) as shown:
+        try:
+            runner.run(experiment, planned, store, shown.finished, shown.working)
+        finally:
+            _compact(store, planned)
+    return Finished(experiment, store, planned, time.time() - started)
+
+
+def _compact(store: Store, planned: Sequence[Planned]) -> None:
+    """Fold small files; a full disk must not hide why a run ended, and rows can be read from small files as well."""
+    try:
+        store.compact([item.cell.key for item in planned])
+    except StorageError as error:
+        print(f"bench: {error}; every finished cell is stored nevertheless", file=sys.stderr)

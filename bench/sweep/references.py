@@ -1,0 +1,95 @@
+"""Reference gradients on disk: each is computed once, beside the experiments, and shared by all cells that need it."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from bench.measure import reference
+from bench.measure.reference import Reference
+from bench.sweep.cell import Cell
+from bench.sweep.experiment import Experiment
+from bench.sweep.files import make_directory, write_whole
+from bench.sweep.problems import Problems
+from bench.sweep.referees import ranked_backends, reference_backends, reference_key
+
+
+class References:
+    """The reference gradients of one run."""
+
+    def __init__(self, experiment: Experiment, problems: Problems) -> None:
+        self._problems = problems
+        self._directory = experiment.results_dir / "references"
+        self._budget = experiment.reference
+        self._known: dict[str, Reference] = {}
+
+    def stored(self, cell: Cell) -> bool:
+        """Return whether the reference of the cell's program is on disk."""
+        return self._path(cell).exists()
+
+    def of(self, cell: Cell) -> Reference:
+        """Return the reference of the cell's program, from the best backend that can run it."""
+        key = reference_key(cell)
+        if key not in self._known:
+            result = load(self._path(cell))
+            if result is None:
+                backend = next(reference_backends(cell))
+                problem = self._problems.of(backend, cell)
+                budget = self._budget.samples, self._budget.tolerance
+                result = reference.certify(problem, backend.provides, *budget, self._stood_for(cell))
+                save(result, self._path(cell))
+            self._known[key] = result
+        return self._known[key]
+
+    def _path(self, cell: Cell) -> Path:
+        return self._directory / f"{reference_key(cell)}.parquet"
+
+    def _stood_for(self, cell: Cell) -> np.ndarray | None:
+        """Return the gradient that the program's own, at w = 0, approximates: the physics', if the scene knows it.
+
+        For a backend with physics of its own and a scene that does not know the physics' gradient, it is that of the
+        scene's own program.
+        """
+        program = cell.program()
+        physical = program.physical_gradient()
+        if physical is None and "physics" in cell.backend.provides:
+            for backend in ranked_backends(cell):
+                if "grad" in backend.provides:
+                    still = np.zeros((program.n_noise, 1))
+                    return self._problems.of(backend, cell).grad(program.theta0, still)[:, 0]
+        return physical
+
+
+def save(reference: Reference, path: Path) -> None:
+    """Store a reference as Parquet."""
+    import pandas as pd
+
+    lines = [("batch", row) for row in reference.batches]
+    lines += [
+        (name, value) for name, value in (("plain", reference.plain), ("physical", reference.physical)) if value.size
+    ]
+    table = pd.DataFrame(
+        {"part": [name for name, _ in lines], "gradient": [list(row) for _, row in lines],
+         "method": reference.method, "error": reference.error}
+    )  # fmt: skip
+    buffer = io.BytesIO()
+    table.to_parquet(buffer, index=False)
+    make_directory(path.parent)
+    write_whole(path, buffer.getvalue())
+
+
+def load(path: Path) -> Reference | None:
+    """Load a stored reference; return None if there is none or it cannot be read."""
+    import pandas as pd
+
+    if not path.exists():
+        return None
+    try:
+        table = pd.read_parquet(path)
+        rows = {name: np.stack(list(part)) for name, part in table.groupby("part")["gradient"]}
+        vectors = {name: rows[name][0] for name in ("plain", "physical") if name in rows}
+        return Reference(rows["batch"], str(table["method"][0]), float(table["error"][0]), **vectors)
+    except Exception:
+        return None

@@ -1,0 +1,71 @@
+"""The adjoints of a rollout: how much its cost depends on each state it passes through."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.measure.contacts import split
+from bench.model import Array, Jacobians, LoopOps, Rollout, Unsupported
+
+
+def adjoints(program: Rollout, theta: np.ndarray, w: np.ndarray, path: Jacobians) -> tuple[np.ndarray, np.ndarray]:
+    """Return dL/dx_k along a rollout, ``(T + 1, n)``, and the gradient dL/dtheta that follows from it, ``(d,)``.
+
+    With stage costs c_k(x_k, u_k), control u_k = pi(theta, x_k), and the steps' A_k, B_k (``path`` without batch axis),
+    p_k = dc_k/du + B_k' l_{k+1} and l_k = A_k' l_{k+1} + dc_k/dx + (dpi/dx)' p_k, from l_T = dc_T/dx; then dL/dtheta =
+    (dx_0/dtheta)' l_0 + sum_k (dpi/dtheta)' p_k, and where theta names parameters also sum_k (dF/dtheta)' l_{k+1} and
+    the derivatives of the costs at fixed x and u. Costs and policy are differentiated by JAX, with the steps as batch
+    columns, whatever backend gave the steps. Source: Griewank and Walther 2008, ch. 3.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    if program.decision.names and program.needs_root:
+        raise Unsupported("theta names parameters of steps that solve an equation, which no trace differentiates yet")
+    ops = LoopOps(jnp)
+    column = jnp.asarray(theta)[:, None]
+    before, end = jnp.asarray(path.states[:-1].T), jnp.asarray(path.states[-1:].T)
+    count, size = before.shape[1], before.shape[0]
+    taken = jnp.asarray(path.controls.T)
+
+    def first(theta: Array) -> Array:
+        bound, theta, noise = program.resolved(ops, theta, w)
+        return jnp.concatenate(bound.start(ops, theta, noise)[1])
+
+    def controls(theta: Array, x: Array) -> Array:
+        bound, theta, noise = program.resolved(ops, theta, w)
+        theta, _, scanned = bound.start(ops, theta, noise)
+        slices = tuple(part[:, :, 0].T for part in scanned)
+        theta = jnp.broadcast_to(theta, (theta.shape[0], count))
+        return bound.control(ops, theta, split(bound.scene, x), slices)
+
+    def stage(theta: Array, x: Array, u: Array) -> Array:
+        scene = program.resolved(ops, theta, w)[0].scene
+        return jnp.sum(jnp.asarray(scene.stage_cost(jnp, *split(scene, x), u)))
+
+    def terminal(theta: Array, x: Array) -> Array:
+        scene = program.resolved(ops, theta, w)[0].scene
+        return jnp.sum(scene.terminal_cost(jnp, *split(scene, x)))
+
+    def along(e: Array) -> Array:
+        return jax.jvp(lambda x: controls(column, x), (before,), (jnp.broadcast_to(e[:, None], before.shape),))[1]
+
+    by_state, by_control = (np.asarray(part) for part in jax.grad(stage, (1, 2))(column, before, taken))
+    feedback = np.asarray(jax.vmap(along)(jnp.eye(size)))
+    adjoint = np.empty((count + 1, size))
+    adjoint[count] = np.asarray(jax.grad(terminal, 1)(column, end))[:, 0]
+    pulls = np.empty_like(path.controls)
+    for k in reversed(range(count)):
+        pulls[k] = by_control[:, k] + path.b[k].T @ adjoint[k + 1]
+        adjoint[k] = path.a[k].T @ adjoint[k + 1] + by_state[:, k] + feedback[:, :, k] @ pulls[k]
+    back = jax.vjp(lambda t: (first(t), controls(t, before)), column)[1]
+    gradient = np.asarray(back((jnp.asarray(adjoint[0])[:, None], jnp.asarray(pulls.T)))[0])[:, 0]
+    if not program.decision.names:
+        return adjoint, gradient
+
+    def at_fixed_states(theta: Array) -> Array:
+        bound = program.resolved(ops, theta, w)[0]
+        after = jnp.concatenate(bound.step(ops, split(bound.scene, before), taken))
+        return jnp.sum(jnp.asarray(adjoint[1:].T) * after) + stage(theta, before, taken) + terminal(theta, end)
+
+    return adjoint, gradient + np.asarray(jax.grad(at_fixed_states)(column))[:, 0]

@@ -1,0 +1,82 @@
+"""Contacts of a rollout, state by state: gaps, forces, which contacts act, and where that changes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.measure.contacts import acting, split
+from bench.model import ContactScene, ForceLaw, FrictionScene, Jacobians, Rollout, compose
+from bench.trace import equations
+from bench.trace.equations import Newton, solved_again, stepped
+
+REAL = ("gap", "penetration", "force", "force_peak", "sticking", "slipping")
+
+
+def contact_columns(program: Rollout, path: Jacobians) -> dict[str, np.ndarray]:
+    """Return the columns on contact and on the equations of the steps, ``(T + 1,)`` each."""
+    scene, law = program.scene, program.contact
+    count = len(path.states)
+    columns = dict.fromkeys((*REAL, *equations.COLUMNS), np.full(count, np.nan))
+    columns |= {"contacts": np.zeros(count, dtype=int), "switch": np.zeros(count, dtype=int)}
+    after = None
+    if program.needs_root:
+        after, solver = solved_again(program, path)
+        columns |= solver
+    if law is None or not isinstance(scene, ContactScene):
+        return columns
+    state = split(scene, path.states.T)
+    gap = scene.gap(np, state.q)
+    touching, force = _touching(program, scene, path, after)
+    mode = touching.astype(int)
+    if isinstance(scene, FrictionScene) and scene.friction > 0:
+        mode = np.where(touching & (np.abs(scene.slip(np, *state)) > scene.slip_speed), 2, mode)
+        columns |= {"sticking": (mode == 1).sum(axis=0), "slipping": (mode == 2).sum(axis=0)}
+    total = force.sum(axis=0)
+    return columns | {
+        "contacts": touching.sum(axis=0),
+        "switch": np.append(0, (mode[:, 1:] != mode[:, :-1]).any(axis=0).astype(int)),
+        "gap": gap.min(axis=0),
+        "penetration": np.maximum(0.0, -gap).max(axis=0),
+        "force": total,
+        "force_peak": np.fmax.accumulate(total),
+    }
+
+
+def _touching(
+    program: Rollout, scene: ContactScene, path: Jacobians, after: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which contacts act at each state, and their normal forces [N], both ``(n_contacts, T + 1)``.
+
+    A state has the contacts of the step from it, see :func:`bench.measure.contacts.acting`. Under a force law the force
+    is the law's at the state; under an impulse law it is the impulse of the step over dt, the contacts are the measured
+    ones, and the last state keeps those of the step that led to it.
+    """
+    law, states, controls = program.contact, path.states[..., None], path.controls[..., None]
+    if isinstance(law, ForceLaw):
+        state = split(scene, path.states.T)
+        gap = scene.gap(np, state.q)
+        touching = acting(program, states, controls)[..., 0].T
+        force = law.force(np, gap, scene.gap_rate(np, *state)) + 0.0
+        return np.append(touching, gap[:, -1:] < 0, axis=1), force
+    force = _impulse_forces(program, scene, path, after)
+    touching = acting(program, states, controls, force.T[..., None])[..., 0].T
+    nothing = np.full((len(force), 1), np.nan)
+    return np.append(touching, touching[:, -1:], axis=1), np.append(force, nothing, axis=1)
+
+
+def _impulse_forces(program: Rollout, scene: ContactScene, path: Jacobians, after: np.ndarray | None) -> np.ndarray:
+    """Return normal forces ``(n_contacts, T)`` [N] whose impulses make up the difference to a step without the law.
+
+    They solve M^-1 J^T lambda dt = v_{k+1} - v_free by least squares, exactly for contacts whose normals are
+    independent.
+    """
+    q = split(scene, path.states[:-1].T).q
+    if after is None:
+        after = stepped(program, path, Newton())
+    without_contact = compose(scene, None, program.integrator)
+    assert isinstance(without_contact, Rollout)
+    jump = split(scene, after - stepped(without_contact, path, Newton())).v
+    units = np.eye(scene.n_contacts)[:, :, None] + np.zeros((1, 1, q.shape[1]))
+    response = np.stack([scene.contact_acceleration(np, q, unit) for unit in units])
+    inverse = np.linalg.pinv(np.nan_to_num(response.transpose(2, 1, 0)))
+    return np.asarray((inverse @ jump.T[:, :, None])[:, :, 0].T / scene.dt)

@@ -1,0 +1,64 @@
+"""Finds spikes of a gradient measure, and tests whether they are near contact switches more often than by chance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+MEASURES = {"jacobian_norm": "|dF/dx|", "adjoint_norm": "|dL/dx|"}
+"""Columns whose spikes are compared with the contact switches, and how they are printed."""
+SPIKE = 3.0
+"""Factor by which a norm must change over one step for a spike; a first stage cost may double an adjoint harmlessly."""
+TENTH = 0.1
+"""Share of the steps (those of the largest changes) that can be spikes."""
+LEVEL = 0.05
+"""p-value up to which spikes are said to line up with switches."""
+
+
+class Alignment(NamedTuple):
+    """How many spikes are within one step of a contact switch, compared with chance."""
+
+    spikes: int
+    near: int
+    chance: float
+    """Share of the steps that are within one step of a switch."""
+    p_value: float
+    """Chance that as many spikes or more, at random on different steps, are near a switch: a permutation test."""
+
+
+def changes(values: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return |log ratio| of neighbouring values, ``(T,)`` for ``(T + 1,)``; 0 where one is zero or not finite."""
+    with np.errstate(all="ignore"):
+        steps = np.abs(np.diff(np.log(np.asarray(values, dtype=np.float64))))
+    return np.where(np.isfinite(steps), steps, 0.0)
+
+
+def spikes(values: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return the steps that are spikes, boolean ``(T,)``: changes above :data:`SPIKE` and among the largest tenth.
+
+    Of neighbouring such steps only the largest counts: a rise over several steps is one spike.
+    """
+    steps = changes(values)
+    largest = np.sort(steps)[-max(1, int(TENTH * len(steps)))]
+    high = (steps > np.log(SPIKE)) & (steps >= largest)
+    result = np.zeros(len(steps), dtype=bool)
+    for run in np.split(np.arange(len(steps)), np.flatnonzero(np.diff(high.astype(int))) + 1):
+        if high[run[0]]:
+            result[run[np.argmax(steps[run])]] = True
+    return result
+
+
+def align(values: Sequence[float] | np.ndarray, switch: Sequence[int] | np.ndarray) -> Alignment:
+    """Compare spikes of ``values (T + 1,)`` with ``switch (T + 1,)``, 1 where contacts differ from the state before."""
+    from scipy.stats import hypergeom
+
+    spiked = spikes(values)
+    switched = np.asarray(switch[1:], dtype=bool)
+    near = switched.copy()
+    near[1:] |= switched[:-1]
+    near[:-1] |= switched[1:]
+    hits, steps, covered, drawn = (int(n) for n in ((spiked & near).sum(), len(near), near.sum(), spiked.sum()))
+    p_value = float(hypergeom.sf(hits - 1, steps, covered, drawn))
+    return Alignment(drawn, hits, covered / steps, p_value)

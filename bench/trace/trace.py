@@ -1,0 +1,165 @@
+"""The gradient health of one rollout: contact, step Jacobians and adjoints, step by step.
+
+Exploding gradients come from somewhere. A :class:`Trace` shows where: it has a row for every state of a rollout, and
+says whether the steps over which |dF/dx| or |dL/dx| changes most are those at which a contact is made or lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.errors import UserError
+from bench.measure import noise
+from bench.measure.contacts import split
+from bench.model import EngineScene, Jacobians, LoopOps, MechanicalScene, Problem, Program, Unsupported, rollout
+from bench.model.identity import label
+from bench.sweep.cell import Cell
+from bench.sweep.experiment import Experiment
+from bench.sweep.grid import cells
+from bench.sweep.referees import linearising
+from bench.sweep.session import Session
+from bench.trace import sentences
+from bench.trace.adjoints import adjoints
+from bench.trace.contacts import contact_columns
+from bench.trace.states import per_state
+
+COLUMNS = (
+    "step", "time", "contacts", "switch", "gap", "penetration", "force", "force_peak", "sticking", "slipping",
+    "solver_residual", "solver_iterations", "solver_mismatch", "jacobian_norm", "adjoint_norm", "cost_stage",
+    "cost_terminal",
+)  # fmt: skip
+"""Columns of every trace; finer costs (``cost_NAME``), states (``q1``, ``v1``) and controls (``u1``) follow."""
+AXES = ("scene", "contact", "integrator", "backend")
+"""The axes of a cell that decide its rollout; a trace needs no estimator."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """One rollout, step by step."""
+
+    scene: str
+    title: str
+    """Scene, contact law, integrator, backend and noise."""
+    table: pd.DataFrame
+    """A row per state, ``horizon + 1`` in all; NaN where a quantity does not exist, as |dF/dx| at the last state."""
+    gradient_error: float
+    """|gradient from the adjoints - the program's own gradient|, relative to the latter (absolute where that is 0)."""
+
+    def report(self) -> list[str]:
+        """Describe the trace in sentences."""
+        return sentences.report(self.table, self.gradient_error)
+
+
+def run(experiment: Experiment, seeded: bool) -> list[Trace]:
+    """Make one trace for each scene of the experiment.
+
+    The noise is w = 0, or with ``seeded`` the first sample of the first repeat that estimators get from that seed.
+    Raises :class:`UserError` where there is no rollout or no step Jacobian to trace.
+    """
+    session = Session(experiment)
+    return [_of_cell(session, cell, seeded) for cell in _chosen(experiment)]
+
+
+def _chosen(experiment: Experiment) -> list[Cell]:
+    """Return one cell for each scene, whatever its estimator."""
+    unique: dict[str, dict[Any, Cell]] = {}
+    for cell in cells(experiment):
+        rollouts = unique.setdefault(cell.scene.name, {})
+        rollouts.setdefault((*(cell.parts.get(axis) for axis in AXES), cell.seed), cell)
+    for name, rollouts in unique.items():
+        if len(rollouts) > 1:
+            raise UserError(
+                f"a trace follows one rollout, and there are {len(rollouts)} problems of scene {name}: choose one "
+                "contact law, integrator, backend and seed, and sweep nothing"
+            )
+    return [cell for rollouts in unique.values() for cell in rollouts.values()]
+
+
+def _of_cell(session: Session, cell: Cell, seeded: bool) -> Trace:
+    scene = cell.scene
+    if not isinstance(scene, MechanicalScene):
+        raise UserError(f"scene {scene.name} is a plain function: it has no steps to trace")
+    if isinstance(scene, EngineScene):
+        raise UserError(f"scene {scene.name} runs only in physics engines, whose contacts cannot be shown")
+    try:
+        program = cell.program()
+    except Unsupported as error:
+        raise UserError(f"{scene.name} cannot be traced: {error}") from None
+    refusal = cell.with_part("estimator", None).refusal()
+    if refusal is not None:
+        raise _cannot(cell, program, refusal[1])
+    w = np.zeros((program.n_noise, 1))
+    if seeded:
+        # "cells" is the stream of estimators: the trace shows a sample that they see
+        w = noise.draw(cell.seed, scene.name, 1, 1, program.n_noise, "cells")[0].T
+    try:
+        table, gradient_error = trace(session.problem(cell), w)
+    except Unsupported as reason:
+        raise _cannot(cell, program, str(reason)) from None
+    parts = [label(cell.parts[axis]) for axis in AXES if cell.parts[axis] is not None]
+    drawn = f"noise of seed {cell.seed}" if seeded else "w = 0"
+    return Trace(scene.name, ", ".join([*parts, drawn]), table, gradient_error)
+
+
+def _cannot(cell: Cell, program: Program, reason: str) -> UserError:
+    """Return why a cell cannot be traced, and the backends that can trace its program."""
+    able = sorted(name for name in linearising(program) if name != cell.backend.name)
+    hint = f"; use backends=[{'] or backends=['.join(able)}]" if able else ""
+    return UserError(f"{cell.scene.name} on backend {cell.backend.name} cannot be traced: {reason}{hint}")
+
+
+def trace(problem: Problem, w: np.ndarray) -> tuple[pd.DataFrame, float]:
+    """Return the table of the rollout at ``theta0`` with noise ``w (n_w, 1)``, and the error of the adjoints' gradient.
+
+    Raises :class:`Unsupported` for plain functions, and for backends without step Jacobians.
+    """
+    program = rollout(problem.program)
+    theta = program.theta0
+    path = Jacobians(*(part[..., 0] for part in problem.jacobians(theta, w)))
+    bound, *_ = program.resolved(LoopOps(), theta[:, None], w)
+    scene = bound.scene
+    with np.errstate(all="ignore"):
+        adjoint, gradient = adjoints(program, theta, w, path)
+        columns = {**contact_columns(bound, path), **_costs(scene, path)}
+        columns["jacobian_norm"] = per_state(_norms(path.a))
+        columns["adjoint_norm"] = np.linalg.norm(adjoint, axis=1)
+    columns["step"] = np.arange(scene.horizon + 1)
+    columns["time"] = columns["step"] * scene.dt
+    extra = [name for name in columns if name not in COLUMNS]
+    states = {f"q{i + 1}": path.states[:, i] for i in range(scene.n_q)}
+    states |= {f"v{i + 1}": path.states[:, scene.n_q + i] for i in range(path.states.shape[1] - scene.n_q)}
+    controls = {f"u{i + 1}": per_state(path.controls[:, i]) for i in range(scene.n_u)}
+    table = pd.DataFrame({name: columns[name] for name in [*COLUMNS, *extra]} | states | controls)
+    return table, _gradient_error(gradient, problem.grad(theta, w)[:, 0])
+
+
+def _gradient_error(gradient: np.ndarray, own: np.ndarray) -> float:
+    scale = float(np.linalg.norm(own))
+    return float(np.linalg.norm(gradient - own)) / (scale or 1.0)
+
+
+def _norms(matrices: np.ndarray) -> np.ndarray:
+    """Return spectral norms of ``(T, n, n)``; inf where an entry is not finite, which LAPACK would refuse."""
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    norms = np.full(len(matrices), np.inf)
+    norms[finite] = np.linalg.norm(matrices[finite], 2, axis=(1, 2))
+    return norms
+
+
+def _costs(scene: MechanicalScene, path: Jacobians) -> dict[str, np.ndarray]:
+    """Return costs by name, ``(T + 1,)``: stage costs and terms at the states before the steps, terminal cost last."""
+    states, u = path.states.T, path.controls.T
+    before = split(scene, states[:, :-1])
+
+    def staged(value: Any) -> np.ndarray:
+        return per_state(np.broadcast_to(value, u.shape[1]))
+
+    terms = {"stage": staged(scene.stage_cost(np, *before, u))}
+    terms["terminal"] = np.full(states.shape[1], np.nan)
+    terms["terminal"][-1] = scene.terminal_cost(np, *split(scene, states[:, -1:]))[0]
+    terms |= {name: staged(value) for name, value in scene.cost_terms(np, *before, u).items()}
+    return {f"cost_{name}": values for name, values in terms.items()}

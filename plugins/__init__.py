@@ -1,1 +1,0 @@
-"""The built-in plugins: one class per file, found by being there."""

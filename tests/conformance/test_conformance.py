@@ -1,0 +1,752 @@
+"""Every registered plugin passes the conformance kit, and the kit catches the faults planted here."""
+
+import contextlib
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from bench.plugins.backends.numpy import Numpy, NumpyProblem
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.contacts.softplus import Softplus
+from bench.plugins.integrators.explicit_euler import ExplicitEuler
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.cubic import Cubic
+from bench.plugins.scenes.double_integrator import DoubleIntegrator
+from bench.plugins.scenes.heaviside import Heaviside
+from bench.plugins.scenes.pushing import Pushing
+from bench.plugins.scenes.quadratic import Quadratic
+
+from bench.conformance import Skipped, check, main, parametrize
+from bench.conformance.kit import variants
+from bench.errors import UserError
+from bench.model import (
+    Array,
+    Backend,
+    ContactScene,
+    EngineScene,
+    Estimator,
+    ForceLaw,
+    FunctionScene,
+    ImpulseLaw,
+    MechanicalScene,
+    Plugin,
+    Problem,
+    Program,
+    SampleMean,
+    Scene,
+    columns,
+    compose,
+    param,
+    per_repeat,
+    registry,
+)
+
+ENTRIES = [entry for table in registry.entries().values() for entry in table.values()]
+PLUGINS = [entry.plugin for entry in ENTRIES if entry.plugin is not None]
+
+
+def _is_long(plugin: type[Plugin]) -> bool:
+    """Whether its checks take a minute or many: backends that compile each program for seconds, or run it eagerly."""
+    return bool({"physics", "root"} & set(getattr(plugin, "provides", ()))) or plugin.requires == ("torch",)
+
+
+@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry.kind}-{entry.name}")
+def test_registered_plugin_loads(entry):
+    assert entry.plugin is not None, entry.reason
+
+
+@parametrize([plugin for plugin in PLUGINS if not _is_long(plugin)])
+def test_registered_plugin_conforms(plugin, check):
+    check(plugin)
+
+
+@pytest.mark.slow
+@parametrize([plugin for plugin in PLUGINS if _is_long(plugin)])
+def test_registered_engine_or_solver_conforms(plugin, check):
+    check(plugin)
+
+
+# ------------------------------------------------------------------------------------------- planted: estimators
+
+
+@dataclass(frozen=True)
+class WrongSign(SampleMean):
+    """First-order, with the wrong sign."""
+
+    name = "wrong_sign"
+    needs = frozenset({"grad"})
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return -problem.grad(theta, w)
+
+
+@dataclass(frozen=True)
+class SigmaForSigmaSquared(SampleMean):
+    """Zeroth-order, f sigma w / sigma^2 with a sigma for the sigma^2."""
+
+    name = "sigma_for_sigma_squared"
+    across_jumps = True
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        cost = problem.value(theta, w) - problem.value(theta, 0 * w[:, :1])
+        return cost * problem.sigma * w / problem.sigma
+
+
+@dataclass(frozen=True)
+class SecondHalfIsTheFirst(SampleMean):
+    """First-order, using the first half of the noise twice."""
+
+    name = "second_half_is_the_first"
+    needs = frozenset({"grad"})
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return problem.grad(theta, w)
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        half = noise[:, : noise.shape[1] // 2]
+        return super().estimate(problem, theta, np.concatenate([half, half], axis=1))
+
+
+@dataclass(frozen=True)
+class RepeatsAreTheFirst(SecondHalfIsTheFirst):
+    """First-order, with the noise of repeat 0 in every repeat."""
+
+    name = "repeats_are_the_first"
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        return SampleMean.estimate(self, problem, theta, np.broadcast_to(noise[:1], noise.shape))
+
+
+@dataclass(frozen=True)
+class SixteenSamples(SecondHalfIsTheFirst):
+    """First-order, from the first 16 samples whatever their number."""
+
+    name = "sixteen_samples"
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        return SampleMean.estimate(self, problem, theta, noise[:, :16])
+
+
+@dataclass(frozen=True)
+class OwnSampleInBaseline(Estimator):
+    """Zeroth-order, with a batch mean as baseline that counts the sample itself."""
+
+    name = "own_sample_in_baseline"
+    needs = frozenset({"value", "score"})
+    across_jumps = True
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        w = columns(noise)
+        f, score = per_repeat(problem.value(theta, w), noise), per_repeat(problem.score(theta, w), noise)
+        return ((f - f.mean(axis=1, keepdims=True))[..., None] * score).mean(axis=1)
+
+
+@dataclass(frozen=True)
+class OpenLoopScore(SampleMean):
+    """Zeroth-order, with the score of an open-loop control under feedback too."""
+
+    name = "open_loop_score"
+    needs = frozenset({"value", "score"})
+    across_jumps = True
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        cost = problem.value(theta, w) - problem.value(theta, 0 * w[:, :1])
+        return cost * (0 * problem.score(theta, w) + w[: problem.dim] / problem.sigma)
+
+
+@dataclass(frozen=True)
+class OwnNoise(SampleMean):
+    """First-order, at noise of its own."""
+
+    name = "own_noise"
+    needs = frozenset({"grad"})
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return problem.grad(theta, np.random.default_rng().standard_normal(w.shape))
+
+
+@dataclass(frozen=True)
+class UndeclaredValue(SampleMean):
+    """First-order, and it looks at costs without saying so."""
+
+    name = "undeclared_value"
+    needs = frozenset({"grad"})
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return problem.grad(theta, w) + 0 * problem.value(theta, w)
+
+
+@dataclass(frozen=True)
+class UnusedScore(SecondHalfIsTheFirst):
+    """First-order, and it asks for scores it never uses."""
+
+    name = "unused_score"
+    needs = frozenset({"grad", "score"})
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        return SampleMean.estimate(self, problem, theta, noise)
+
+
+@dataclass(frozen=True)
+class ClaimsJumps(UnusedScore):
+    """First-order, and it claims to be right across jumps."""
+
+    name = "claims_jumps"
+    needs = frozenset({"grad"})
+    across_jumps = True
+
+
+@dataclass(frozen=True)
+class DeniesJumps(SampleMean):
+    """Zeroth-order, and it denies being right across jumps."""
+
+    name = "denies_jumps"
+    needs = frozenset({"value", "score"})
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return problem.value(theta, w) * problem.score(theta, w)
+
+
+@dataclass(frozen=True)
+class LastingBias(UnusedScore):
+    """First-order, two and a half times as large however many samples there are."""
+
+    name = "lasting_bias"
+    needs = frozenset({"grad"})
+    unbiased = False
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return 2.5 * problem.grad(theta, w)
+
+
+@dataclass(frozen=True)
+class RefusesEverything(UnusedScore):
+    """First-order, for programs that do not exist."""
+
+    name = "refuses_everything"
+
+    def refuses(self, program: Program) -> str | None:
+        return "not this one"
+
+
+# --------------------------------------------------------------------------------------------- planted: backends
+
+
+@dataclass(frozen=True)
+class Faulty(Numpy):
+    """The NumPy backend with a faulty problem."""
+
+    faulty: ClassVar[type[NumpyProblem]]
+
+    def compile(self, program: Program) -> Problem:
+        return self.faulty(program, self.dtype, 1e-6 if self.dtype == "float64" else 5e-3)
+
+
+class OtherLawProblem(NumpyProblem):
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        program = self.program
+        if isinstance(program.contact, Penalty):
+            program = compose(program.scene, Softplus(stiffness=program.contact.stiffness), program.integrator)
+        return NumpyProblem(program, self._dtype.name, self._step)._grad(theta, w)
+
+
+@dataclass(frozen=True)
+class GradientOfAnotherLaw(Faulty):
+    """Costs of the penalty law, gradients of the softplus law."""
+
+    name = "gradient_of_another_law"
+    faulty = OtherLawProblem
+
+
+class SofterProblem(NumpyProblem):
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        program = self.program
+        if isinstance(program.contact, Penalty):
+            law = Penalty(stiffness=program.contact.stiffness / 2, damping=program.contact.damping)
+            program = compose(program.scene, law, program.integrator)
+        return NumpyProblem(program, self._dtype.name, self._step)._grad(theta, w)
+
+
+@dataclass(frozen=True)
+class HalfStiffnessGradient(Faulty):
+    """Gradients of a contact half as stiff."""
+
+    name = "half_stiffness_gradient"
+    faulty = SofterProblem
+
+
+class ForgetfulProblem(NumpyProblem):
+    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(w.sum(axis=0) / self.sigma, (self.dim, w.shape[1]))
+
+
+@dataclass(frozen=True)
+class WrongScore(Faulty):
+    """Scores that leave out the states a policy acted on."""
+
+    name = "wrong_score"
+    faulty = ForgetfulProblem
+
+
+class LeakyProblem(NumpyProblem):
+    def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        cost = super()._value(theta, w)
+        return cost + 1e-3 * cost.mean()
+
+
+@dataclass(frozen=True)
+class LeakyColumns(Faulty):
+    """Costs that mix a little of the batch into every column."""
+
+    name = "leaky_columns"
+    faulty = LeakyProblem
+
+
+@dataclass(frozen=True)
+class ClaimsRoot(Numpy):
+    """Claims to solve equations."""
+
+    name = "claims_root"
+    provides = Backend.provides | {"root"}
+
+
+@dataclass(frozen=True)
+class DoubleAnyway(Numpy):
+    """Float64 whatever the dtype."""
+
+    name = "double_anyway"
+
+    def compile(self, program: Program) -> Problem:
+        return NumpyProblem(program, "float64", 1e-6)
+
+
+# ----------------------------------------------------------------------------------------------- planted: scenes
+
+
+@dataclass(frozen=True)
+class WrongClosedForm(Quadratic):
+    """A bowl whose stated gradient is 5% too long."""
+
+    name = "wrong_closed_form"
+
+    def closed_form_gradient(self, contact: Any, integrator: Any) -> np.ndarray:
+        return 1.05 * super().closed_form_gradient(contact, integrator)
+
+
+@dataclass(frozen=True)
+class ClaimsContinuity(Heaviside):
+    """A step that claims to be continuous."""
+
+    name = "claims_continuity"
+    continuous = True
+
+
+@dataclass(frozen=True)
+class ClaimsAJump(Cubic):
+    """A cubic that claims to jump."""
+
+    name = "claims_a_jump"
+    continuous = False
+
+
+@dataclass(frozen=True)
+class ClaimsControls(DoubleIntegrator):
+    """A theta that is twice the controls, and a claim to be the controls."""
+
+    name = "claims_controls"
+
+    def planned_controls(self, xp: Any, theta: Array) -> Array:
+        return 2.0 * super().planned_controls(xp, theta)
+
+
+@dataclass(frozen=True)
+class MixedColumns(FunctionScene):
+    """A cost that depends on the whole batch."""
+
+    name = "mixed_columns"
+
+    def theta0(self) -> np.ndarray:
+        return np.ones(2)
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        return xp.sum(x * x, axis=0) - xp.mean(x)
+
+
+@dataclass(frozen=True)
+class NumpyOnly(MixedColumns):
+    """A cost that only NumPy can evaluate."""
+
+    name = "numpy_only"
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        return np.square(np.array(x)).sum(axis=0)
+
+
+@dataclass(frozen=True)
+class PullsTogether(Pushing):
+    """Bodies that a contact force pulls together."""
+
+    name = "pulls_together"
+
+    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+        return -super().contact_acceleration(xp, q, force)
+
+
+@dataclass(frozen=True)
+class WrongGapRate(Pushing):
+    """A gap rate that forgets one of the bodies."""
+
+    name = "wrong_gap_rate"
+
+    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+        return v[1:2]
+
+
+@dataclass(frozen=True)
+class NoContacts(Pushing):
+    """Bodies that touch, and no number of contacts."""
+
+    name = "no_contacts"
+    n_contacts: ClassVar[int] = 0
+
+
+@dataclass(frozen=True)
+class WrongStateSize(DoubleIntegrator):
+    """Two coordinates declared, and one given."""
+
+    name = "wrong_state_size"
+    n_q: ClassVar[int] = 2
+
+
+# -------------------------------------------------------------------------------- planted: contacts and integrators
+
+
+@dataclass(frozen=True)
+class Attracts(ForceLaw):
+    """A spring that pulls bodies into each other."""
+
+    name = "attracts"
+
+    def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
+        return xp.where(gap < 0, 1e3 * gap, 0.0 * gap)
+
+
+@dataclass(frozen=True)
+class SmoothsNothing(Penalty):
+    """A penalty pushing from afar, with a smoothing parameter that changes nothing."""
+
+    name = "smooths_nothing"
+    smoothing: ClassVar[str] = "beta"
+
+    beta: float = param(100.0, "unused", positive=True)
+
+    def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
+        return super().force(xp, gap, gap_rate) + 0.1
+
+
+@dataclass(frozen=True)
+class SecretJump(Penalty):
+    """A damper that sets in at once, and a claim to be continuous."""
+
+    name = "secret_jump"
+    continuous = True  # type: ignore[assignment]
+
+    damping: float = param(1.0, "force per penetration rate", "N s/m", low=0.0)
+
+
+@dataclass(frozen=True)
+class OneSided(ImpulseLaw):
+    """Pushes only the first body."""
+
+    name = "one_sided"
+    continuous = False
+
+    def impulse(self, ops: Any, contact: Any, before: Any, free: Any, dt: Any) -> Any:
+        rate = contact.gap_rate(before.q, before.v)
+        hit = (contact.gap(before.q + dt * before.v) < 0) & (rate < 0)
+        change = contact.acceleration(before.q, ops.xp.where(hit, -rate, 0.0 * rate))
+        change = ops.xp.concat([change[:1], 0.0 * change[1:]], axis=0)
+        return type(free)(0.0 * change, change)
+
+
+@dataclass(frozen=True)
+class WrongOrder(SemiImplicitEuler):
+    """A first-order integrator that claims second order."""
+
+    name = "wrong_order"
+    order = 2
+
+
+@dataclass(frozen=True)
+class DropsImpulses(ExplicitEuler):
+    """Claims to take impulses, and drops them."""
+
+    name = "drops_impulses"
+    takes_impulses = True
+
+
+# ---------------------------------------------------------------------------------------------- planted: any plugin
+
+
+class NotADataclass(Cubic):
+    """A plugin without its own decorator."""
+
+    name = "not_a_dataclass"
+
+
+@dataclass(frozen=True)
+class Undocumented(Cubic):
+    name = "undocumented"
+
+
+@dataclass(frozen=True)
+class BadName(Cubic):
+    """A name that a command line would trip over."""
+
+    name = "Bad name"
+
+
+@dataclass(frozen=True)
+class BareField(Cubic):
+    """A parameter without a meaning."""
+
+    name = "bare_field"
+
+    width: float = 1.0
+
+
+@dataclass(frozen=True)
+class Unfinished(Scene):
+    """A scene without a single method."""
+
+    name = "unfinished"
+
+
+@dataclass(frozen=True)
+class NothingApplies(Plugin):
+    """A scene by its kind, of a class that no check of scenes knows."""
+
+    kind: ClassVar[str] = "scenes"
+    name = "nothing_applies"
+
+
+@dataclass(frozen=True)
+class RefusedDefault(Cubic):
+    """A default outside its own bounds."""
+
+    name = "refused_default"
+
+    width: float = param(-1.0, "width", positive=True)
+
+
+def _local() -> type[Cubic]:
+    @dataclass(frozen=True)
+    class Unpicklable(Cubic):
+        """A class that no other process can find."""
+
+        name = "unpicklable"
+
+    return Unpicklable
+
+
+PLANTED = {
+    WrongSign: {"bias_is_as_declared"},
+    SigmaForSigmaSquared: {"bias_is_as_declared", "bias_across_jumps_is_as_declared"},
+    SecondHalfIsTheFirst: {"uses_every_sample"},
+    RepeatsAreTheFirst: {"repeats_are_independent"},
+    SixteenSamples: {"variance_falls_as_one_over_n"},
+    OwnSampleInBaseline: {"bias_is_as_declared"},
+    OpenLoopScore: {"bias_under_action_feedback"},
+    OwnNoise: {"shape_and_repeatability"},
+    UndeclaredValue: {"needs_are_truthful"},
+    UnusedScore: {"needs_are_truthful"},
+    ClaimsJumps: {"bias_across_jumps_is_as_declared"},
+    DeniesJumps: {"bias_across_jumps_is_as_declared"},
+    LastingBias: {"bias_is_as_declared"},
+    RefusesEverything: {"something_was_checked"},
+    GradientOfAnotherLaw: {"gradient_is_that_of_value"},
+    HalfStiffnessGradient: {"gradient_is_that_of_value"},
+    WrongScore: {"score_is_that_of_actions"},
+    LeakyColumns: {"columns_are_independent", "value_agrees"},
+    ClaimsRoot: {"root_is_differentiated_implicitly"},
+    DoubleAnyway: {"single_precision_is_finite"},
+    WrongClosedForm: {"closed_form_is_right"},
+    ClaimsContinuity: {"continuity_is_as_declared"},
+    ClaimsAJump: {"continuity_is_as_declared"},
+    ClaimsControls: {"noise_is_where_declared", "closed_form_is_right"},
+    MixedColumns: {"costs_are_finite"},
+    NumpyOnly: {"backends_agree"},
+    PullsTogether: {"contact_geometry_is_consistent"},
+    WrongGapRate: {"contact_geometry_is_consistent"},
+    NoContacts: {"contact_geometry_is_consistent"},
+    WrongStateSize: {"state_has_declared_size"},
+    Attracts: {"pushes_in_contact", "force_grows_with_penetration"},
+    SmoothsNothing: {"does_not_push_from_afar"},
+    SecretJump: {"continuity_in_rollouts_is_as_declared"},
+    OneSided: {"impulse_keeps_momentum"},
+    WrongOrder: {"error_falls_with_declared_order"},
+    DropsImpulses: {"takes_impulses_is_truthful"},
+    NotADataclass: {"is_frozen_dataclass"},
+    Undocumented: {"has_docstring"},
+    BadName: {"has_good_name"},
+    BareField: {"declares_parameters"},
+    RefusedDefault: {"declares_parameters"},
+    Unfinished: {"builds"},
+    NothingApplies: {"something_was_checked"},
+    _local(): {"survives_spawned_process"},
+}
+
+
+@pytest.mark.parametrize("plugin", PLANTED, ids=lambda plugin: plugin.name)
+def test_planted_fault_is_caught(plugin):
+    failed = {result.check: result.detail for result in check(plugin, PLANTED[plugin]) if result.outcome == "fail"}
+    assert PLANTED[plugin] <= failed.keys(), failed
+
+
+def test_line_per_check_and_exit_status(capsys):
+    assert main(["linear", "explicit_euler"]) == 0
+    *lines, empty, summary = capsys.readouterr().out.splitlines()
+    assert {line.split()[0] for line in lines} <= {"pass", "skip"}
+    assert {line.split()[1] for line in lines} == {"linear", "explicit_euler"}
+    assert not empty
+    assert summary.startswith(f"2 plugins, {len(lines)} checks: ")
+    assert " 0 failed" in summary
+
+
+def test_unavailable_plugin_is_skipped_unless_named(capsys, monkeypatch):
+    entry = registry.Entry("scenes", "far_away", None, "not installed: some-dist; pip install some-dist")
+    monkeypatch.setattr(registry, "entries", lambda: {"scenes": {"far_away": entry}})
+    assert main([]) == 0
+    assert main(["far_away"]) == 1
+    unnamed, named = (line for line in capsys.readouterr().out.splitlines() if "far_away" in line)
+    assert unnamed.startswith("skip")
+    assert named.startswith("fail")
+    assert "pip install some-dist" in unnamed
+    assert "pip install some-dist" in named
+
+
+# ------------------------------------------------------------------------------------------------ abstract plugins
+
+
+def test_scene_without_methods_cannot_be_built():
+    with pytest.raises(TypeError, match=r"abstract.*theta0"):
+        Unfinished()
+    with pytest.raises(TypeError, match=r"abstract.*acceleration.*initial_state.*terminal_cost.*theta0"):
+        type("Unfinished", (MechanicalScene,), {})()
+    with pytest.raises(TypeError, match=r"abstract.*contact_acceleration.*gap.*gap_rate"):
+        type("Unfinished", (ContactScene,), {})()
+
+
+def test_fault_of_an_unfinished_plugin_names_its_methods():
+    (fault,) = [result.detail for result in check(Unfinished) if result.check == "builds"]
+    assert "theta0" in fault
+
+
+def test_registry_says_which_methods_are_missing(tmp_path):
+    """Found in a folder, an abstract plugin is listed with the reason why it cannot be used."""
+    (tmp_path / "half_done.py").write_text(
+        "from dataclasses import dataclass\n"
+        "from bench.model import FunctionScene\n\n\n"
+        "@dataclass(frozen=True)\n"
+        "class HalfDone(FunctionScene):\n"
+        '    """A cost without a theta."""\n\n'
+        '    name = "half_done"\n\n'
+        "    def cost(self, xp, x):\n"
+        "        return x[0]\n"
+    )
+    with folder_of_plugins(tmp_path):
+        entry = registry.find("scenes", "half_done")
+        assert not entry.available
+        assert entry.reason == "HalfDone does not define theta0"
+        with pytest.raises(UserError, match=r"scene 'half_done' cannot be used: HalfDone does not define theta0"):
+            registry.make("scenes", "half_done")
+
+
+@contextlib.contextmanager
+def folder_of_plugins(path):
+    """The registry with the plugins of a folder, and without them again."""
+    before = list(registry._folders)
+    registry.add_folder(path)
+    try:
+        yield
+    finally:
+        registry._folders[:] = before
+        registry.entries.cache_clear()
+
+
+@pytest.mark.parametrize("base", [MechanicalScene, DoubleIntegrator])
+def test_contacts_without_contact_scene_are_refused_with_the_fix(base):
+    with pytest.raises(TypeError, match=r"Touching has n_contacts=1: derive it from ContactScene and give its gap"):
+        type("Touching", (base,), {"n_contacts": 1})
+    for role in (ContactScene, EngineScene):
+        assert type("Touching", (role,), {"n_contacts": 1}).n_contacts == 1
+
+
+# ---------------------------------------------------------------------------------------------- as pytest items
+
+
+def items(*arguments, **options):
+    """The (plugin, check) pairs that the decorator makes, by id, with their marks."""
+    mark = parametrize(*arguments, **options).mark
+    assert mark.args[0] == ("plugin", "check")
+    return {item.id: item for item in mark.args[1]}
+
+
+def test_every_check_of_every_variant_is_an_item():
+    made = items([Penalty])
+    assert {item.split("-")[0] for item in made} == set(variants(Penalty))
+    results = {f"{result.plugin}-{result.check}" for result in check(Penalty)}
+    assert results | {"penalty-something_was_checked"} == set(made)
+
+
+def test_item_fails_where_the_check_does():
+    plugin, run = items([ClaimsAJump])["claims_a_jump-continuity_is_as_declared"].values
+    with pytest.raises(Exception, match="no jump"):
+        run(plugin)
+
+
+def test_item_skips_with_the_reason_of_the_kit():
+    plugin, run = items([ExplicitEuler, Penalty])["penalty-smoothing_converges"].values
+    with pytest.raises(pytest.skip.Exception, match="has no smoothing"):
+        run(plugin)
+    with pytest.raises(Skipped):
+        run.args[0](plugin)
+
+
+@parametrize([ClaimsAJump], expected_failures={"continuity_is_as_declared": "planted"})
+def test_expected_failures_are_xfailed(plugin, check):
+    check(plugin)
+
+
+def test_expected_failures_are_strict_and_say_why():
+    made = items([Cubic, Quadratic], expected_failures={"cubic-backends_agree": "see #12", "has_docstring": "late"})
+    marks = {title: [(m.name, m.kwargs) for m in item.marks] for title, item in made.items() if item.marks}
+    late = [("xfail", {"reason": "late", "strict": True})]
+    assert marks == {
+        "cubic-backends_agree": [("xfail", {"reason": "see #12", "strict": True})],
+        "cubic-has_docstring": late,
+        "quadratic-has_docstring": late,
+    }
+
+
+def test_expected_failure_of_no_check_gets_the_nearest_name():
+    with pytest.raises(UserError, match="did you mean 'has_docstring'"):
+        parametrize([Cubic], expected_failures={"has_docstrings": "none"})
+
+
+def test_plugin_that_lacks_a_module_is_skipped():
+    absent = dataclass(frozen=True)(type("Absent", (Cubic,), {"name": "absent", "requires": ("no_such_module",)}))
+    for item in items([absent]).values():
+        assert [(m.name, m.kwargs) for m in item.marks] == [("skip", {"reason": "not installed: no_such_module"})]
+
+
+def test_item_that_nothing_applies_fails():
+    plugin, run = items([NothingApplies])["nothing_applies-something_was_checked"].values
+    with pytest.raises(Exception, match="every check of its kind was skipped"):
+        run(plugin)
+
+
+def test_plugin_of_another_kind_needs_no_checks_of_its_own():
+    study = next(plugin for plugin in PLUGINS if plugin.kind == "studies")
+    assert {result.outcome for result in check(study)} == {"pass"}

@@ -1,0 +1,256 @@
+"""Rows as a run makes them, without running anything: from real cells, or made up of columns."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.model import registry
+from bench.model.identity import parse_identity
+from bench.model.parameters import parameters
+from bench.studies.bias_variance import BiasVariance
+from bench.studies.bias_variance.columns import COLUMNS
+from bench.sweep import config
+from bench.sweep.cell import Cell
+from bench.sweep.columns import IDENTITY
+from bench.sweep.experiment import Experiment
+from bench.sweep.grid import cells
+from bench.sweep.runner import blank
+
+NAMES = ("alpha_order", "finite_difference", "fobg", "inverse_variance", "randomized_smoothing", "reinforce")
+STIFFNESS = (1e1, 1e2, 1e3, 3e3, 1e4, 1e5, 1e6)
+BACKENDS = ("jax", "torch", "numpy", "implicit")
+SPEED = {"jax": 2e-4, "torch": 8e-3, "numpy": 3e-3, "implicit": 6e-4}
+VIEWS = {"scene": ("horizon", "dt", "sigma", "noise"), "contact": ("stiffness",), "backend": ("dtype",)}
+"""The columns that show a parameter of the plugin on an axis."""
+WHO = (*IDENTITY, "experiment", "dim", "key", "study", "parameters")
+"""The columns that a failed cell has as well."""
+
+
+# ------------------------------------------------------------------------------------------------ made-up results
+
+
+def results(stiffness: float, sigma: float, samples: int, repeats: int, seed: int, estimator: str, backend: str, contact: str) -> dict[str, Any]:  # fmt: skip
+    """Results of one cell: first-order estimates turn biased and wild where contact is stiff, others do not."""
+    k, n = stiffness, samples
+    stiff = max(k, 1.0) / 3e3 if math.isfinite(k) else 0.1
+    first = estimator in ("fobg", "alpha_order", "inverse_variance")
+    share = {"alpha_order": 0.3, "inverse_variance": 0.1}.get(estimator, 1.0)
+    bias = share * stiff / (1 + stiff) if first and contact == "penalty" else 0.0
+    variance = (0.05 + share * stiff**2 * sigma if first else 6.0 / (1 + 10 * sigma)) * 10 / n
+    generator = np.random.default_rng(zlib.crc32(repr((k, sigma, estimator, n, seed)).encode()))
+    se = math.sqrt(variance / repeats)
+    bias = max(0.0, bias + 0.3 * se * generator.standard_normal())
+    low, high = max(0.0, bias - 2 * se), bias + 2 * se
+    if low == 0:
+        bias = 0.0
+    norm = 4.0
+    time = SPEED.get(backend, 1e-3) * (n / 100) ** 0.9 * (1.0 if first else 0.4)
+    return {
+        "status": "ok", "device": "cpu",
+        "reference_norm": norm, "grad_norm": norm * (1 + bias), "reference_method": "quadrature",
+        "reference_se": 0.0, "bias": norm * bias, "bias_low": norm * low, "bias_high": norm * high, "bias_rel": bias,
+        "variance": norm**2 * variance, "variance_low": norm**2 * variance * 0.6, "variance_high": norm**2 * variance * 1.8,
+        "variance_per_sample": norm**2 * variance * n, "rmse": norm * math.hypot(bias, math.sqrt(variance)),
+        "rmse_rel": math.hypot(bias, math.sqrt(variance)), "cosine": 1 / math.sqrt(1 + bias**2 + variance),
+        "sign_agreement": 0.9, "finite_fraction": 1.0, "time_s": time, "time_iqr_s": 0.15 * time, "compile_s": 0.3,
+        "rollouts": n, "gradients": n if first else 0, "peak_memory_mb": 300.0, "versions": "numpy=2.4",
+    }  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------------------ from real cells
+
+
+def loaded(*words: str) -> tuple[Experiment, list[Cell]]:
+    """An experiment and its cells."""
+    made = config.load(list(words))
+    return made, cells(made)
+
+
+def rows_of(made: Experiment, of: Sequence[Cell]) -> pd.DataFrame:
+    """Rows of real cells with made-up results; a cell that would be refused is refused."""
+    rows = []
+    for cell in of:
+        row = blank(made, cell)
+        refused = cell.refusal()
+        if refused is not None:
+            rows.append(row | dict(zip(("status", "reason"), refused, strict=True)))
+            continue
+        given = {name: row[name] for name in ("stiffness", "sigma", "samples", "repeats", "seed", "estimator")}
+        rows.append(
+            row | results(**given, backend=cell.backend.name, contact=cell.contact.name if cell.contact else "")
+        )
+    return made.columns.typed(pd.DataFrame(rows))
+
+
+# ------------------------------------------------------------------------------------------- made up of columns
+
+
+def row(**values: Any) -> dict[str, Any]:
+    """A row with these columns and, in ``parameters``, what they say; plugins need not exist."""
+    given = {
+        "scene": "pushing", "contact": "penalty", "integrator": "semi_implicit_euler", "backend": "jax",
+        "estimator": "fobg", "noise": "action", "horizon": 20, "dt": 0.01, "stiffness": 1e3, "sigma": 0.1,
+        "samples": 100, "repeats": 32, "dim": 20, "seed": 0, "dtype": "float64",
+    } | values  # fmt: skip
+    numbers = {name: given[name] for name in ("stiffness", "sigma", "samples", "repeats", "seed")}
+    made = results(**numbers, estimator=given["estimator"], backend=given["backend"], contact=given["contact"])
+    named = {"experiment": "made_up", "study": "bias_variance"}
+    result: dict[str, Any] = COLUMNS.blank() | made | named | given
+    result["parameters"] = json.dumps(described_by(result), allow_nan=False)
+    result["key"] = f"{zlib.crc32(repr(sorted(given.items())).encode()):08x}"
+    return result
+
+
+def failed(status: str, reason: str, **values: Any) -> dict[str, Any]:
+    """A row without results."""
+    made, empty = row(**values), COLUMNS.blank()
+    return {name: made[name] if name in WHO else empty[name] for name in made} | {"status": status, "reason": reason}
+
+
+def described_by(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters that a cell with these identity columns would have."""
+    parts: dict[str, Any] = {"study": {"name": "bias_variance", "timed_calls": 5}}
+    for axis in BiasVariance.axes:
+        name, own = _parsed(axis, given)
+        entry = registry.entries()[registry.kind_of(axis)].get(name)
+        known = parameters(entry.plugin) if entry is not None and entry.plugin is not None else {}
+        part = {n: parameter.default for n, parameter in known.items()}
+        part |= {view: given[view] for view in VIEWS.get(axis, ()) if not known or view in known}
+        if axis == "contact" and (smoothing := getattr(entry and entry.plugin, "smoothing", "")):
+            part[smoothing] = given["smoothing"]
+        parts[axis] = (
+            None if name == "none" else {"name": name} | {n: _plain(value) for n, value in (part | own).items()}
+        )
+    return parts | {"theta": None, "reference": {"samples": 262144, "tolerance": 0.005}}
+
+
+def _parsed(axis: str, given: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Name and parameters of an identity string; a made-up one is a name, whatever brackets it has."""
+    params = given["estimator_params"] if axis == "estimator" else ""
+    try:
+        name, own = parse_identity(f"{given[axis]}[{params}]" if params else given[axis])
+    except Exception:
+        return given[axis], {}
+    return (name, own) if name in registry.entries()[registry.kind_of(axis)] else (given[axis], {})
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Rows as they are loaded."""
+    return COLUMNS.typed(pd.DataFrame(rows))
+
+
+def stiffness_rows(
+    stiffness: Sequence[float] = STIFFNESS,
+    sigmas: Sequence[float] = (0.1, 0.3),
+    estimators: Sequence[str] = NAMES,
+    backends: Sequence[str] = BACKENDS,
+) -> pd.DataFrame:
+    """4 backends x 6 estimators x 2 contact laws x 7 stiffnesses x 2 sigmas."""
+    rows = []
+    for sigma, k, contact, backend, estimator in itertools.product(
+        sigmas, stiffness, ("penalty", "complementarity"), backends, estimators
+    ):
+        cell = {"sigma": sigma, "stiffness": k, "contact": contact, "backend": backend, "estimator": estimator}
+        cell["smoothing"] = 1e-6 if contact == "complementarity" else math.nan
+        if contact == "complementarity" and backend != "implicit":
+            rows.append(
+                failed("unsupported", f"{contact} solves an equation each step, backend {backend} has none", **cell)
+            )
+        elif k == 1e6 and estimator in ("fobg", "inverse_variance") and contact == "penalty":
+            rows.append(failed("nonfinite", "3 of 32 estimates are not finite, first repeat 4 of seed 0", **cell))
+        else:
+            rows.append(row(**cell))
+            if backend == "numpy":
+                rows[-1]["rmse"] *= 1 + 1e-5
+    return table(rows)
+
+
+def small_rows(**given: Any) -> pd.DataFrame:
+    """Two stiffnesses at one sigma."""
+    return stiffness_rows(**{"stiffness": (1e2, 1e4), "sigmas": (0.1,), **given})
+
+
+def experiment(
+    directory: Path = Path("unused"),
+    sweep: Mapping[str, Any] | None = None,
+    marks: Mapping[str, Mapping[str, float]] | None = None,
+    name: str = "made_up",
+    formats: tuple[str, ...] = ("png",),
+) -> Experiment:
+    """An experiment to show made-up rows of: a sweep and nothing that could be run."""
+    return Experiment(
+        name=name,
+        study=BiasVariance(),
+        columns=COLUMNS,
+        choices={},
+        sweep={"sigma": [0.1, 0.3], "stiffness": list(STIFFNESS)} if sweep is None else sweep,
+        results_dir=directory,
+        question="As contact stiffens, which gradient stays right?",
+        marks={"stiffness": {"step size limit": 6400}} if marks is None else marks,
+        formats=formats,
+    )
+
+
+SPRINGY = '''
+"""A scene for a test."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from bench.model import ContactScene, State, param
+
+
+@dataclass(frozen=True)
+class Springy(ContactScene):
+    """A point on a spring above the ground."""
+
+    name = "springy"
+    n_q: ClassVar[int] = 1
+    n_contacts: ClassVar[int] = 1
+
+    horizon: int = param(5, "number of time steps", "steps", positive=True)
+    stiffness: float = param(2.0, "of the spring", "N/m", positive=True)
+
+    def theta0(self):
+        """Above the ground."""
+        return np.array([0.1])
+
+    def initial_state(self, xp, theta):
+        """Falling."""
+        return State(theta[0:1], 0.0 * theta[0:1] - 1.0)
+
+    def acceleration(self, xp, q, v, u):
+        """The spring's."""
+        return -self.stiffness * q
+
+    def gap(self, xp, q):
+        """Height."""
+        return q
+
+    def gap_rate(self, xp, q, v):
+        """Velocity."""
+        return v
+
+    def contact_acceleration(self, xp, q, force):
+        """Upwards."""
+        return force
+
+    def terminal_cost(self, xp, q, v):
+        """Height squared."""
+        return q[0] ** 2
+'''

@@ -1,0 +1,325 @@
+"""Gradient checks: each planted fault gets its name, right gradients get none, and the command says so."""
+
+import json
+import shlex
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bench.cli import main
+from bench.measure import noise
+from bench.measure.gradcheck import EPS, FAULTS, VERDICTS, Sample, diagnose
+from bench.model import Problem, compose, registry
+from bench.studies.gradient_check import GradientCheck, measure, report
+from bench.sweep.columns import IDENTITY
+
+FLOAT64, FLOAT32 = (float(np.finfo(dtype).eps) for dtype in (np.float64, np.float32))
+
+
+def plugin(kind, name, **values):
+    return registry.make(kind, name, values)
+
+
+SEARCH = measure.Search(*(getattr(GradientCheck(), name) for name in ("directions", "drawn", "reach", "aside")))
+"""Where the study looks by default."""
+
+
+def compiled(scene, contact=None, backend="jax", dtype="float64"):
+    program = compose(scene, contact, plugin("integrators", "semi_implicit_euler"))
+    return plugin("backends", backend, dtype=dtype).compile(program)
+
+
+class Planted(Problem):
+    """A problem whose costs and gradients pass through functions."""
+
+    def __init__(self, problem, value=lambda f, theta: f, grad=lambda g, theta: g):
+        super().__init__(problem.program)
+        self._inner, self._on_value, self._on_grad = problem, value, grad
+
+    def _value(self, theta, w):
+        return self._on_value(self._inner.value(theta, w), theta)
+
+    def _grad(self, theta, w):
+        return self._on_grad(self._inner.grad(theta, w), theta)
+
+    def _score(self, theta, w):
+        raise NotImplementedError
+
+
+def verdicts(problem, unit=FLOAT64):
+    """The verdicts of a problem's checks by point."""
+    scene = problem.program.scene
+    drawn = noise.draw(0, scene.name, 1, 1, problem.program.n_noise, "test")[0, 0]
+    directions = noise.draw(0, scene.name, 1, SEARCH.drawn, problem.dim, "test directions")[0]
+    places, found = measure.examine(problem, problem.program.theta0, drawn, directions, unit, SEARCH)
+    told = {}
+    for place, (sample, _) in zip(places, found, strict=True):
+        told.setdefault(place.point, []).append(diagnose(sample))
+    return {point: set(names) for point, names in told.items()}
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return compiled(plugin("scenes", "pendulum", horizon=10))
+
+
+@pytest.fixture(scope="module")
+def bounce():
+    """A ball that meets the ground in the 10 steps, between two of them."""
+    scene = plugin("scenes", "bounce_once", horizon=10, height=0.1 + 5.3 * 2.0 / 480.0)
+    return compiled(scene, plugin("contacts", "penalty", stiffness=1e4))
+
+
+# ------------------------------------------------------------------------------------------------ planted faults
+
+
+def test_right_gradient_is_smooth(pendulum):
+    assert verdicts(pendulum) == {"start": {"smooth"}}
+
+
+@pytest.mark.parametrize("factor", [1.0001, 0.5, -1.0])
+def test_wrong_adjoint(pendulum, factor):
+    assert verdicts(Planted(pendulum, grad=lambda g, _: factor * g)) == {"start": {"wrong_adjoint"}}
+
+
+def test_gradient_that_is_no_number_is_a_wrong_adjoint(pendulum):
+    assert verdicts(Planted(pendulum, grad=lambda g, _: np.nan * g)) == {"start": {"wrong_adjoint"}}
+
+
+def test_wrong_adjoint_beside_a_contact_switch_and_on_it(bounce):
+    told = verdicts(Planted(bounce, grad=lambda g, _: -g))
+    assert set(told) == {"start", "before", "at", "after"}
+    assert all(names == {"wrong_adjoint"} for names in told.values())
+
+
+def test_stopped_gradient_is_disconnected(pendulum):
+    assert verdicts(Planted(pendulum, grad=lambda g, _: 0.0 * g)) == {"start": {"disconnected"}}
+
+
+def test_noisy_value_is_nondeterministic(pendulum):
+    generator = np.random.default_rng(0)
+    noisy = Planted(pendulum, value=lambda f, _: f + 1e-12 * generator.standard_normal(f.shape))
+    assert verdicts(noisy) == {"start": {"nondeterministic"}}
+
+
+def test_float32_is_rounding(pendulum):
+    single = compiled(pendulum.program.scene, dtype="float32")
+    assert verdicts(single, FLOAT32) == {"start": {"rounding"}}
+
+
+def test_wrong_adjoint_is_seen_in_float32(pendulum):
+    single = compiled(pendulum.program.scene, dtype="float32")
+    assert verdicts(Planted(single, grad=lambda g, _: 2.0 * g), FLOAT32) == {"start": {"wrong_adjoint"}}
+
+
+def test_loose_solver_is_rounding(pendulum):
+    """A cost that is the right one up to a rough 1e-7, as of a solver that stops early."""
+    loose = Planted(pendulum, value=lambda f, theta: f + 1e-7 * np.sin(1e12 * theta.sum(axis=0)))
+    assert verdicts(loose) == {"start": {"rounding"}}
+
+
+def test_cost_that_bends_within_the_largest_step_is_nonlinear(pendulum):
+    def value(f, theta):
+        return f + np.sin(300.0 * theta).sum(axis=0)
+
+    def grad(g, theta):
+        return g + 300.0 * np.cos(300.0 * theta)
+
+    assert verdicts(Planted(pendulum, value, grad)) == {"start": {"nonlinear"}}
+
+
+def test_constant_cost_is_zero():
+    assert verdicts(compiled(plugin("scenes", "constant"))) == {"start": {"zero"}}
+
+
+def test_switch_of_a_penalty_contact_is_a_kink_between_two_crossings(bounce):
+    told = verdicts(bounce)
+    assert told["before"] == told["after"] == {"mode_crossing"}
+    assert told["at"] == {"kink"}
+    assert not told["start"] & set(FAULTS)
+
+
+@pytest.fixture(scope="module")
+def exploding():
+    """Bodies pushed together with a spring so stiff that each step in contact multiplies the state."""
+    return compiled(plugin("scenes", "pushing", horizon=50), plugin("contacts", "penalty", stiffness=1e4))
+
+
+def test_switch_in_an_exploding_rollout_is_no_fault(exploding):
+    """Its one-sided slopes settle at the smallest steps only, and the gradient is one of them."""
+    told = verdicts(exploding)
+    assert told["at"] <= {"kink", "unsettled"}
+    assert "kink" in told["at"]
+    assert not set.union(*told.values()) & set(FAULTS)
+
+
+@pytest.mark.parametrize(("factor", "name"), [(-1.0, "wrong_adjoint"), (0.5, "wrong_adjoint"), (0.0, "disconnected")])
+def test_faults_are_seen_at_the_switch_of_an_exploding_rollout(exploding, factor, name):
+    told = verdicts(Planted(exploding, grad=lambda g, _: factor * g))
+    assert told["at"] == {name}
+
+
+def test_rollout_that_explodes_beyond_differences_tells_nothing():
+    """Over 100 steps the gradient is 3e18 and no step is small enough to see it: not a fault, and not trusted either."""
+    problem = compiled(plugin("scenes", "pushing", horizon=100), plugin("contacts", "penalty", stiffness=1e4))
+    assert verdicts(problem)["at"] == {"unsettled"}
+
+
+def test_switch_of_a_damped_contact_is_a_jump():
+    law = plugin("contacts", "penalty", stiffness=50.0, damping=1.0, damping_mode="linear")
+    told = verdicts(compiled(plugin("scenes", "wall_penalty_1d", horizon=10, start=0.05), law))
+    assert told["at"] == {"jump"}
+
+
+def test_sources_initial_state_of_the_bounce_is_a_kink():
+    """0.9 m at 2/480 m a step are 216 whole steps; off that state the gradient is smooth."""
+    law = plugin("contacts", "penalty", stiffness=1e4)
+    on, off = (
+        compiled(plugin("scenes", "bounce_once", horizon=230, height=height), law, "numpy")
+        for height in (1.0, 1.0 + 1.0 / 960.0)
+    )
+    step = EPS
+    theta, direction = on.program.theta0, np.array([1.0, 0.0, 0.0])
+    told = []
+    for problem in (on, off):
+        theta = problem.program.theta0
+        at = theta[:, None] + np.concatenate([-step, [0.0], step]) * direction[:, None]
+        costs = problem.value(at, np.zeros_like(at))
+        sample = Sample(
+            step, costs[: step.size], costs[step.size], costs[step.size + 1 :],
+            float(direction @ problem.grad(theta, np.zeros((3, 1)))[:, 0]), np.zeros(step.size, bool), scale=2.24,
+        )  # fmt: skip
+        told.append(diagnose(sample))
+    assert told[0] == "kink"
+    assert told[1] not in ("kink", *FAULTS)
+
+
+def test_kink_with_a_derivative_outside_its_slopes_is_a_wrong_adjoint():
+    step = np.ones(1) * EPS
+    inside, outside = (
+        Sample(step, 1.0 + step, 1.0, 1.0 + 2.0 * step, derivative, np.ones(step.size, bool), slope=abs(derivative))
+        for derivative in (2.0, 2.1)
+    )
+    assert diagnose(inside) == "kink"
+    assert diagnose(outside) == "wrong_adjoint"
+
+
+def test_differences_that_never_settle_tell_nothing():
+    generator = np.random.default_rng(1)
+    costs = generator.standard_normal((2, EPS.size))
+    sample = Sample(EPS, costs[0], 0.0, costs[1], 1.0, np.zeros(EPS.size, bool))
+    assert diagnose(sample) == "unsettled"
+
+
+def test_cost_that_is_no_number():
+    bad = np.full(EPS.size, np.nan)
+    assert diagnose(Sample(EPS, bad, 0.0, bad, 1.0, np.zeros(EPS.size, bool))) == "nonfinite"
+
+
+# ------------------------------------------------------------------------------------------------- contact modes
+
+
+def test_switch_is_found_to_the_last_digit():
+    edge = measure.switch(lambda at: ["left" if a < -0.7 else "right" for a in at], 2.0)
+    assert edge is not None
+    assert edge[1] < -0.7 <= edge[0]
+    assert edge[0] - edge[1] <= 4.0 * np.spacing(2.0)
+    assert measure.switch(lambda at: ["same"] * at.size, 2.0) is None
+
+
+def test_signature_names_the_steps():
+    contacts = np.zeros((2, 60), bool)
+    assert measure.signature(contacts) == "-;-"
+    contacts[0, 3:6] = contacts[1, 9] = True
+    assert measure.signature(contacts) == "3-5;9"
+    contacts[0, ::2] = True
+    assert len(measure.signature(contacts)) == 24
+    assert measure.signature(contacts) != measure.signature(contacts[::-1])
+
+
+@pytest.mark.parametrize("law", ["penalty", "impulse", "complementarity"])
+def test_every_kind_of_law_shows_when_it_acts(law):
+    """A ball 5.3 steps above the ground, at 1 step's worth a step, is first pushed in step 5 or the one after."""
+    scene = plugin("scenes", "bounce_once", horizon=10, height=0.1 + 5.3 * 2.0 / 480.0)
+    problem = compiled(scene, plugin("contacts", law), "implicit")
+    modes = measure.contact_modes(problem)
+    (name,) = modes(problem.program.theta0[:, None], np.zeros((3, 1)))
+    first = {"penalty": "6-9", "impulse": "5"}
+    assert name == first[law] if law in first else name.startswith("5")
+
+
+# -------------------------------------------------------------------------------------------------- the command
+
+TINY = ["contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[1,5]"]
+
+
+def test_command_writes_files_and_exits_with_0(tmp_path, capsys):
+    words = ["gradcheck", "bounce_once", "pendulum", *TINY, "formats=[png,svg]", f"results_dir={tmp_path}"]
+    assert main(words) == 0
+    directory = tmp_path / "gradcheck"
+    for name in ("gradient_check.csv", "gradient_check.md", "gradient_check.png", "gradient_check.svg"):
+        assert (directory / name).stat().st_size > 0
+    table = pd.read_csv(directory / "gradient_check.csv")
+    assert {*IDENTITY, "point", "direction", "eps", "derivative_program", "derivative_differences"} <= set(
+        table.columns
+    )
+    assert set(table["point"]) == {"start", "before", "at", "after"}
+    assert set(table["verdict"]) <= set(VERDICTS)
+    assert (table["status"] == "ok").all()
+    assert set(table["horizon"]) == {1, 5}
+    a, b = table["derivative_program"], table["derivative_differences"]
+    expected = (a - b).abs() / np.maximum(1.0, np.maximum(a.abs(), b.abs()))
+    np.testing.assert_allclose(table["relative_error"], expected, rtol=1e-6, atol=1e-16)  # digits lost in CSV's a - b
+    capsys.readouterr()
+    (directory / "gradient_check.csv").unlink()
+    assert main(["report", "experiment=gradient_check", "name=gradcheck", *TINY, f"results_dir={tmp_path}"]) == 0
+    pd.testing.assert_frame_equal(pd.read_csv(directory / "gradient_check.csv"), table)
+    assert json.loads((directory / "run.json").read_text())["study"] == "gradient_check"
+
+
+def test_scene_without_steps_is_checked(tmp_path):
+    assert main(["gradcheck", "quadratic", "backends=[numpy]", f"results_dir={tmp_path}"]) == 0
+    table = pd.read_csv(tmp_path / "gradcheck" / "gradient_check.csv")
+    assert set(table["verdict"]) == {"smooth"}
+
+
+def test_fault_is_exit_status_1_and_its_line_repeats_it(tmp_path, monkeypatch, capsys):
+    from bench.plugins.backends.numpy import NumpyProblem
+
+    right = NumpyProblem._grad
+    monkeypatch.setattr(NumpyProblem, "_grad", lambda self, theta, w: -right(self, theta, w))
+    words = ["gradcheck", "pushing[mass=0.2]", "contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[2]"]
+    assert main([*words, "scene.pushing.sigma=0.05", "seed=3", "workers=0", f"results_dir={tmp_path / 'a'}"]) == 1
+    printed = capsys.readouterr().out
+    assert "wrong_adjoint (start" in printed
+    lines = (tmp_path / "a" / "gradcheck" / "gradient_check.md").read_text().splitlines()
+    (line,) = [text.strip() for text in lines if "python -m bench gradcheck" in text]
+    again = shlex.split(line)[3:]
+    assert main([*again, "workers=0", f"results_dir={tmp_path / 'b'}"]) == 1
+    first, second = (pd.read_csv(tmp_path / run / "gradcheck" / "gradient_check.csv") for run in "ab")
+    pd.testing.assert_frame_equal(first, second)
+
+
+def test_unsupported_cells_are_rows(tmp_path):
+    words = ["gradcheck", "pushing", "contacts=[complementarity]", "backends=[numpy]", "sweep.horizon=[2]"]
+    assert main([*words, f"results_dir={tmp_path}"]) == 0
+    table = pd.read_csv(tmp_path / "gradcheck" / "gradient_check.csv")
+    assert list(table["status"]) == ["unsupported"]
+    assert "root finder" in table["reason"][0]
+    assert "Not checked" in (tmp_path / "gradcheck" / "gradient_check.md").read_text()
+
+
+def test_worst_check_decides_the_line_of_a_point():
+    rows = pd.DataFrame([GradientCheck.columns.blank() | {
+        "point": ["start", "start"], "check_verdict": ["smooth", "wrong_adjoint"], "check_error": [1e-9, 0.5],
+        "check_eps": [1e-5, 1e-6], "key": "k",
+    }])  # fmt: skip
+    (line,) = report.by_point(rows).to_dict("records")
+    assert (line["verdict"], line["error"]) == ("wrong_adjoint", 0.5)
+
+
+def test_unknown_scene_is_bad_input(tmp_path, capsys):
+    assert main(["gradcheck", "pushng", f"results_dir={tmp_path / 'out'}"]) == 2
+    assert "'pushing'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

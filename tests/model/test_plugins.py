@@ -1,0 +1,191 @@
+"""Plugins are found by being there, and neither a broken nor an absent one disturbs the rest."""
+
+import subprocess
+import sys
+
+import pandas as pd
+import pytest
+from trees import Tree
+
+ESTIMATOR = '''
+"""A plugin for a test."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from bench import Problem, SampleMean, param
+
+
+@dataclass(frozen=True)
+class Dropped(SampleMean):
+    """Approximates grad J_sigma with the first-order mean times a factor."""
+
+    name = "{name}"
+    requires: ClassVar[tuple[str, ...]] = ({requires})
+    needs = frozenset({{"grad"}})
+
+    factor: float = param(1.0, "what the mean is multiplied by")
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Gradients times the factor."""
+        return self.factor * problem.grad(theta, w)
+'''
+
+FAILING_SCENE = '''
+"""A plugin for a test."""
+
+from dataclasses import dataclass
+
+from bench import FunctionScene
+
+
+@dataclass(frozen=True)
+class Failing(FunctionScene):
+    """A scene that fails when it is used."""
+
+    name = "failing"
+
+    def theta0(self):
+        """Nothing."""
+        raise ValueError("no theta today")
+
+    def cost(self, xp, x):
+        """The first component."""
+        return x[0]
+'''
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory) -> Tree:
+    made = Tree(tmp_path_factory.mktemp("plugins"))
+    made.add("plugins/estimators/half_step.py", ESTIMATOR.format(name="half_step", requires=""))
+    made.add("plugins/estimators/broken.py", "import no_such_module_at_all\n")
+    made.add("plugins/scenes/unfinished.py", "from bench import Scene\n\nclass Unfinished(Scene:\n")
+    made.add("plugins/scenes/failing.py", FAILING_SCENE)
+    absent = ESTIMATOR.format(name="absent", requires='"no_such_module=some-dist",')
+    made.add("plugins/estimators/absent.py", absent)
+    made.install(
+        "third_party",
+        ESTIMATOR.format(name="third_name", requires=""),
+        "[bench.plugins]\nthird_name = third_party:Dropped\ngone = third_party:NotThere\n",
+    )
+    return made
+
+
+@pytest.fixture(scope="module")
+def listing(tree) -> str:
+    done = tree.run("list")
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def rows(tree) -> pd.DataFrame:
+    """A run of a dropped, a third-party and an unavailable plugin beside a built-in one."""
+    done = tree.run(
+        "scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg,half_step,third_name,absent]",
+        "estimator.half_step.factor=0.5", "samples=8", "repeats=4", "name=mine", "results_dir=out",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return pd.read_parquet(tree.root / "out" / "mine" / "rows.parquet").set_index("estimator")
+
+
+def entry_of(listing: str, name: str) -> str:
+    """The lines about one plugin in the output of ``list``."""
+    lines = listing.splitlines()
+    start = next(i for i, line in enumerate(lines) if line.startswith(f"  {name} "))
+    length = next((n for n, line in enumerate(lines[start + 1 :]) if not line.startswith("   ")), len(lines))
+    return "\n".join(lines[start : start + 1 + length])
+
+
+@pytest.mark.parametrize("name", ["half_step", "third_name"])
+def test_added_plugin_is_listed_with_its_parameters(listing, name):
+    described = entry_of(listing, name)
+    assert "first-order mean times a factor" in described
+    assert "needs grad" in described
+    assert "factor=1" in described
+    assert "UNAVAILABLE" not in described
+
+
+def test_added_plugins_run_and_take_parameters_from_the_command_line(rows):
+    assert rows.loc[["fobg", "half_step", "third_name"], "status"].tolist() == ["ok"] * 3
+    assert rows.loc["half_step", "estimator_params"] == "factor=0.5"
+    assert rows.loc["half_step", "grad_norm"] == pytest.approx(rows.loc["fobg", "grad_norm"] / 2)
+    assert rows.loc["third_name", "grad_norm"] == rows.loc["fobg", "grad_norm"]
+
+
+def test_parameter_is_checked(tree):
+    done = tree.run("plan", "estimators=[half_step]", "estimator.half_step.facter=0.5")
+    assert done.returncode == 2
+    assert "did you mean 'factor'" in done.stderr
+
+
+def test_failing_plugin_fails_the_kit_for_itself_alone(tree):
+    done = tree.run("check", "failing", "linear")
+    assert done.returncode == 1
+    failed = [line for line in done.stdout.splitlines() if line.startswith("fail")]
+    assert {line.split()[1] for line in failed} == {"failing"}
+    assert all("no theta today" in line for line in failed)
+
+
+def test_added_plugins_conform_and_survive_a_spawned_process(tree):
+    done = tree.run("check", "half_step", "third_name")
+    assert done.returncode == 0, done.stdout + done.stderr
+    passed = [line.split()[1:3] for line in done.stdout.splitlines() if line.startswith("pass")]
+    assert ["half_step", "survives_spawned_process"] in passed
+    assert ["third_name", "survives_spawned_process"] in passed
+
+
+def test_added_plugin_crosses_a_worker_pool(tree):
+    script = (
+        "from concurrent.futures import ProcessPoolExecutor\n"
+        "from multiprocessing import get_context\n"
+        "from bench.plugins.estimators.half_step import Dropped\n"
+        "if __name__ == '__main__':\n"
+        "    with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:\n"
+        "        print(pool.submit(repr, Dropped(factor=3.0)).result())\n"
+    )
+    tree.add("crosses.py", script)
+    done = subprocess.run([sys.executable, "crosses.py"], cwd=tree.root, capture_output=True, text=True)
+    assert done.stdout.strip() == "Dropped(factor=3.0)", done.stderr
+
+
+def test_only_the_named_third_party_plugin_is_listed(tree):
+    done = tree.run("list", "third_name")
+    assert done.returncode == 0
+    assert [line.split()[0] for line in done.stdout.splitlines() if line[:3].strip()] == ["estimators", "third_name"]
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("broken", "No module named 'no_such_module_at_all'"),
+        ("unfinished", "SyntaxError"),
+        ("gone", "NotThere"),
+        ("absent", "pip install some-dist"),
+    ],
+)
+def test_unusable_plugin_is_listed_with_its_reason(listing, name, reason):
+    described = entry_of(listing, name)
+    assert "UNAVAILABLE" in described
+    assert reason in described
+
+
+def test_plugin_that_fails_to_import_is_refused_by_name_only(tree, rows):
+    done = tree.run("plan", "scenes=[quadratic]", "backends=[numpy]", "estimators=[broken]")
+    assert done.returncode == 2
+    assert "no_such_module_at_all" in done.stderr
+    assert (rows["status"] != "error").all()
+
+
+def test_cells_of_an_unavailable_plugin_become_rows(rows):
+    assert rows.loc["absent", "status"] == "unavailable"
+    assert "pip install some-dist" in rows.loc["absent", "reason"]
+
+
+def test_kit_names_the_reason_of_an_unavailable_plugin(tree):
+    done = tree.run("check", "absent")
+    assert done.returncode == 1
+    assert "pip install some-dist" in done.stdout

@@ -1,0 +1,329 @@
+"""Scenes of several contact modes against published numbers, exact motions and the central path."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from bench.plugins.backends.implicit import Implicit
+from bench.plugins.backends.jax import Jax
+from bench.plugins.backends.numpy import NumpyOps
+from bench.plugins.backends.torch import Torch
+from bench.plugins.contacts.complementarity import Complementarity
+from bench.plugins.contacts.impulse import Impulse
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.contacts.softplus import Softplus
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.friction_block import FrictionBlock
+from bench.plugins.scenes.ground_wall import GroundWall
+from bench.plugins.scenes.hopper import Hopper
+from scipy import integrate
+
+from bench.conformance.subjects import SAME
+from bench.model import ContactScene, Dynamics, State, compose, param
+
+
+def program(scene, law, **values):
+    """The scene under a law that takes the scene's contact values, then ``values``."""
+    fields = {f.name for f in dataclasses.fields(law)}
+    given = {k: v for k, v in scene.contact_values.items() if k in fields}
+    return compose(scene, law(**{**given, **values}), SemiImplicitEuler())
+
+
+def quiet(made, columns=1):
+    return np.zeros((made.n_noise, columns))
+
+
+def trajectory(made):
+    """Positions and velocities ``(horizon + 1, n)`` and controls ``(horizon + 1, n_u)`` without noise."""
+    theta = made.theta0[:, None]
+    steps = list(made.steps(NumpyOps(), theta, quiet(made)))
+    return tuple(
+        np.stack(part)[:, :, 0] for part in ([s.q for s, _ in steps], [s.v for s, _ in steps], [u for _, u in steps])
+    )
+
+
+def rises(flags):
+    """How often a sequence of flags turns true."""
+    return int((np.diff(flags.astype(int)) == 1).sum())
+
+
+# ------------------------------------------------------------------------------------------------ ground_wall
+
+THROWS = {
+    "time_of_impact": (Impulse, {}, (-3.16627, -0.31108), (10.184146, -4.160555)),
+    "no_time_of_impact": (Impulse, {"time_of_impact": False}, (1.55584, -0.15521), (-2.493337, -4.298402)),
+    "penalty": (Penalty, {}, (-4.97277, -0.39844), (10.638576, -4.282096)),
+}
+"""Law, its values, gradient at the initial velocity, velocity after 1,000 steps of gradient descent at rate 0.01."""
+
+
+@pytest.mark.parametrize(("law", "values", "expected", "_"), THROWS.values(), ids=THROWS)
+def test_ground_wall_initial_gradients(law, values, expected, _):
+    made = program(GroundWall(), law, **values)
+    found = Jax().compile(made).grad(made.theta0, quiet(made))[:, 0]
+    assert found == pytest.approx(expected, rel=1e-4)  # five digits are given
+
+
+@pytest.mark.parametrize(("law", "values", "_", "end"), THROWS.values(), ids=THROWS)
+def test_ground_wall_gradient_descent(law, values, _, end):
+    made = program(GroundWall(), law, **values)
+    problem, theta, w = Jax().compile(made), made.theta0, quiet(made)
+    for _step in range(1000):
+        theta = theta - 0.01 * problem.grad(theta, w)[:, 0]
+    assert theta == pytest.approx(end, rel=1e-3)
+
+
+def rigid_end(q, v, acceleration, wall, e, end, steps=300):
+    """Position at time ``end`` of a point above ``wall``: parabolas over small steps, impacts found by bisection."""
+    h = end / steps
+    for _ in range(steps):
+        rest = h
+        if q + v * h + 0.5 * acceleration * h * h < wall:
+            early, late = 0.0, h
+            for _ in range(60):
+                time = 0.5 * (early + late)
+                above = q + v * time + 0.5 * acceleration * time * time > wall
+                early, late = (time, late) if above else (early, time)
+            q, v, rest = wall, -e * (v + acceleration * late), h - late
+        q, v = q + v * rest + 0.5 * acceleration * rest * rest, v + acceleration * rest
+    return q
+
+
+def rigid_cost(scene, theta):
+    """f of the rigid motion; x is mirrored, so that the wall is below."""
+    end, e = scene.horizon * scene.dt, scene.restitution
+    x = -rigid_end(-scene.start_x, -theta[0], 0.0, scene.radius - scene.wall, e, end)
+    y = rigid_end(scene.start_y, theta[1], -scene.gravity, scene.radius, e, end)
+    return (x - scene.target_x) ** 2 + (y - scene.target_y) ** 2
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [GroundWall(), GroundWall(horizon=960), GroundWall(velocity_x=-1.0, gravity=3.0, restitution=0.6, horizon=700)],
+    ids=["source", "many_bounces", "no_wall"],
+)
+def test_ground_wall_physical_gradient(scene):
+    """Against differences of a motion integrated in another way, and the checked number."""
+    theta, eps = scene.theta0(), 1e-5
+    difference = [
+        (rigid_cost(scene, theta + eps * e) - rigid_cost(scene, theta - eps * e)) / (2 * eps) for e in np.eye(2)
+    ]
+    # a smooth function between events: eps^2 of truncation, 1e-15 / eps of rounding
+    assert scene.physical_gradient() == pytest.approx(difference, rel=1e-6, abs=1e-8)
+    assert scene.physical_cost() == pytest.approx(rigid_cost(scene, theta))
+    if scene == GroundWall():
+        assert scene.physical_gradient() == pytest.approx([-3.16627, -0.21223], rel=1e-4)
+
+
+def test_ground_wall_has_no_physical_gradient_at_rest():
+    assert GroundWall(restitution=0.0).physical_gradient() is None
+    resting = GroundWall(restitution=0.1, horizon=2000)
+    assert resting.physical_gradient() is None
+    assert resting.physical_cost() is None
+
+
+# ------------------------------------------------------------------------------------------------------ hopper
+
+
+def test_hopper_hops():
+    """Stance and flight alternate, several times, and the apexes agree between contact laws."""
+    apexes = {}
+    for law, values in ((Penalty, {}), (Complementarity, {"kappa": 1e-6})):
+        made = program(Hopper(), law, **values)
+        problem = Implicit().compile(made)
+        q = problem.jacobians(made.theta0, quiet(made)).states[:, :2, 0]
+        assert np.all(np.isfinite(q))
+        high = q[:, 1] > 0.02  # more than a rebound within a stance
+        assert rises(~high) >= 3
+        assert rises(high) >= 3
+        assert q[:, 1].min() > -0.02
+        body = q[:, 0]
+        tops = np.flatnonzero((body[1:-1] > body[:-2]) & (body[1:-1] >= body[2:])) + 1
+        apexes[law.name] = body[tops][:3]
+    # the contact's spring stores M g / k = 1 mm at rest and up to 7 mm under impact
+    assert apexes["penalty"] == pytest.approx(apexes["complementarity"], abs=0.02)
+
+
+def test_hopper_conserves_energy_in_flight():
+    """Without damper and policy, the semi-implicit step keeps the energy of a flight to O(dt)."""
+    drift = []
+    for dt in (2e-3, 1e-3):
+        scene = Hopper(leg_damping=0.0, dt=dt, horizon=round(0.16 / dt))  # lands after 0.175 s
+        made = compose(scene, None, SemiImplicitEuler())
+        state = State(np.array([[0.7], [0.12]]), np.array([[0.3], [-0.2]]))
+        masses = np.array([[scene.body_mass], [scene.foot_mass]])
+        energy = []
+        for _ in range(scene.horizon):
+            spring = 0.5 * scene.leg_stiffness * (scene.leg - state.q[0] + state.q[1]) ** 2
+            energy.append((masses * (0.5 * state.v**2 + scene.gravity * state.q)).sum() + spring[0])
+            state = made.step(NumpyOps(), state, np.zeros((1, 1)))
+        drift.append(np.ptp(energy))
+    assert drift[0] / drift[1] == pytest.approx(2.0, rel=0.1)
+
+
+@pytest.mark.parametrize(("law", "values"), [(Penalty, {}), (Softplus, {"beta": 1e3})], ids=["penalty", "softplus"])
+def test_hopper_gradients_agree(law, values):
+    made = program(Hopper(), law, **values)
+    theta, w = made.theta0, np.random.default_rng(0).standard_normal((made.n_noise, 3))
+    jax, torch = Jax().compile(made), Torch().compile(made)
+    exact = jax.grad(theta, w)
+    assert np.all(np.isfinite(exact))
+    scale = np.abs(exact).max()
+    assert np.abs(torch.grad(theta, w) - exact).max() < 1e-8 * scale
+    eps = 1e-7
+    for i, e in enumerate(eps * np.eye(2)):
+        difference = (jax.value(theta + e, w) - jax.value(theta - e, w)) / (2 * eps)
+        assert np.abs(difference - exact[i]).max() < 1e-5 * scale
+
+
+def test_hopper_target_is_what_the_policy_regulates():
+    """A higher target gives higher hops."""
+    tops = [trajectory(program(Hopper(target=target), Penalty))[0][300:, 0].max() for target in (0.65, 0.7, 0.75)]
+    assert tops == sorted(tops)
+    assert tops[-1] - tops[0] > 0.03
+
+
+# ---------------------------------------------------------------------------------------------- friction_block
+
+
+def test_friction_block_sticks_and_slips():
+    scene = FrictionBlock()
+    q, v, _ = trajectory(program(scene, Penalty))
+    sticks = np.abs(v[:, 0]) < scene.slip_speed
+    slips = v[:, 0] > 20 * scene.slip_speed
+    assert 1 + rises(sticks) >= 2
+    assert rises(slips) >= 2
+    assert 0.1 < sticks.mean() < 0.9
+    assert q[:, 1] == pytest.approx(-scene.depth, abs=1e-12)  # it starts in equilibrium
+
+
+def test_friction_stays_in_the_cone():
+    """|f_t| <= mu lambda, against the motion, along a rollout whose normal force varies."""
+    scene = FrictionBlock(depth=1.5e-4)
+    made = program(scene, Penalty)
+    dynamics = Dynamics(NumpyOps(), scene, made.contact)
+    q, v, u = (part.T for part in trajectory(made))  # time as batch
+    normal = made.contact.force(np, scene.gap(np, q), scene.gap_rate(np, q, v))[0]
+    tangential = scene.mass * (dynamics.acceleration(q, v, u) - scene.acceleration(np, q, v, u))[0]
+    weight = scene.mass * scene.gravity
+    assert normal.max() - normal.min() > 0.9 * weight
+    assert np.all(np.abs(tangential) <= scene.friction * normal + 1e-12 * weight)
+    assert np.all(tangential * v[0] <= 0.0)
+    sliding = np.abs(v[0]) > 5 * scene.slip_speed
+    assert np.abs(tangential[sliding]) == pytest.approx(scene.friction * normal[sliding], rel=1e-3)  # 1 - tanh 5 = 9e-5
+
+
+@pytest.mark.parametrize("slip_speed", [1e-3, 1e-4])
+def test_slip_sets_in_at_the_coulomb_bound(slip_speed):
+    """Pulled evenly, the block holds until the spring pulls with mu m g, then moves at V (1 - cos(sqrt(k/m) t)).
+
+    Reaching v = 3 slip_speed on that motion, V k t^2 / 2m, takes an excess k V t = sqrt(6 slip_speed V k m) of force.
+    """
+    scene = FrictionBlock(
+        jerk=0.0, pull=0.2, slip_speed=slip_speed, dt=0.1 * slip_speed, horizon=round(2.5 / slip_speed)
+    )
+    q, v, u = trajectory(program(scene, Penalty))
+    force = scene.spring * (u[:, 0] - q[:, 0])
+    onset = np.flatnonzero(v[:, 0] > 3 * slip_speed)[0]  # tanh 3 = 0.995
+    bound = scene.friction * scene.mass * scene.gravity
+    excess = math.sqrt(6 * slip_speed * scene.pull * scene.spring * scene.mass)
+    assert force[onset] == pytest.approx(bound, abs=excess)
+    assert excess < (0.05 if slip_speed < 1e-3 else 0.15) * bound
+    rate = math.sqrt(scene.spring / scene.mass)
+    time = scene.dt * np.arange(len(q)) - bound / (scene.spring * scene.pull)
+    sliding = (time > 0) & (time < 1.5 * math.pi / rate)
+    assert sliding.sum() > 100
+    exact = scene.pull * (1 - np.cos(rate * time[sliding]))
+    assert np.abs(v[sliding, 0] - exact).max() < 5 * slip_speed + 0.02 * scene.pull
+
+
+@pytest.mark.parametrize(("law", "values"), [(Penalty, {}), (Softplus, {})], ids=["penalty", "softplus"])
+def test_friction_block_gradients_agree(law, values):
+    made = program(FrictionBlock(), law, **values)
+    theta, w = made.theta0, np.random.default_rng(0).standard_normal((2, 3))
+    jax, torch = Jax().compile(made), Torch().compile(made)
+    exact = jax.grad(theta, w)
+    scale = np.abs(exact).max()
+    assert np.abs(torch.grad(theta, w) - exact).max() < SAME * scale
+    eps = 1e-6
+    for i, e in enumerate(eps * np.eye(2)):
+        difference = (jax.value(theta + e, w) - jax.value(theta - e, w)) / (2 * eps)
+        assert np.abs(difference - exact[i]).max() < 1e-6 * scale
+
+
+def test_friction_makes_the_difference():
+    """Without friction the block follows the spring as a free oscillator."""
+    scene = FrictionBlock(friction=0.0)
+    q, _, _ = trajectory(program(scene, Penalty))
+    free, _, _ = trajectory(compose(scene, None, SemiImplicitEuler()))
+    assert q[:, 0] == pytest.approx(free[:, 0], abs=1e-12)
+    rubbing, _, _ = trajectory(program(FrictionBlock(), Penalty))
+    assert np.abs(q[:, 0] - rubbing[:, 0]).max() > 0.01
+
+
+# ------------------------------------------------------------------------------------------------ central path
+
+
+@dataclass(frozen=True)
+class OneStep(ContactScene):
+    """A mass of 1 kg that would be at height theta after one step, over ground; f = its height after it."""
+
+    name = "one_step"
+    n_q: ClassVar[int] = 1
+    n_contacts: ClassVar[int] = 1
+    horizon: int = param(1)
+    dt: float = param(1.0)
+
+    def theta0(self):
+        return np.array([0.5])
+
+    def initial_state(self, xp, theta):
+        return State(theta, 0.0 * theta)
+
+    def acceleration(self, xp, q, v, u):
+        return 0.0 * v
+
+    def gap(self, xp, q):
+        return q
+
+    def gap_rate(self, xp, q, v):
+        return v
+
+    def contact_acceleration(self, xp, q, force):
+        return force
+
+    def terminal_cost(self, xp, q, v):
+        return q[0]
+
+
+A = np.array([-3.0, -1.0, -0.3, -1e-3, 0.0, 1e-3, 0.3, 1.0, 3.0])
+
+
+@pytest.mark.parametrize("kappa", [1.0, 1e-2, 1e-4, 1e-6])
+@pytest.mark.parametrize("step", [1.0, 0.5], ids=["rigid", "soft"])
+def test_central_path(kappa, step):
+    """y = (a + sqrt(a^2 + 4 kappa)) / 2 and dy/da, where a newton opens the gap by dt^2 and the rest to 1 m is softness."""
+    softness = 1.0 - step**2
+    law = Complementarity(kappa=kappa, stiffness=1.0 / softness if softness else math.inf)
+    problem = Implicit().compile(compose(OneStep(dt=step), law, SemiImplicitEuler()))
+    w = np.zeros((1, len(A)))
+    height, slope = problem.value(A[None], w), problem.grad(A[None], w)[0]
+    remaining, remaining_slope = (softness * part / step**2 for part in (height - A, slope - 1.0))
+    root = np.sqrt(A**2 + 4 * kappa)
+    assert height + remaining == pytest.approx(
+        (A + root) / 2, abs=1e-9
+    )  # solved to 1e-12, through a condition of 1/kappa
+    assert slope + remaining_slope == pytest.approx((1 + A / root) / 2, abs=1e-9)
+
+
+@pytest.mark.parametrize("kappa", [1.0, 1e-2])
+def test_central_path_smooths_like_noise(kappa):
+    """dy/da is P(w > -a) for noise of density 2 kappa / (w^2 + 4 kappa)^(3/2)."""
+    problem = Implicit().compile(compose(OneStep(), Complementarity(kappa=kappa), SemiImplicitEuler()))
+    slope = problem.grad(A[None], np.zeros((1, len(A))))[0]
+    for a, found in zip(A, slope, strict=True):
+        chance, _ = integrate.quad(lambda w: 2 * kappa / (w * w + 4 * kappa) ** 1.5, -a, math.inf, epsabs=1e-11)
+        assert found == pytest.approx(chance, abs=1e-9)

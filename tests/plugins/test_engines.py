@@ -1,0 +1,268 @@
+"""Physics engines: their twins are the scenes' programs, their gradients are right, and what they cannot do is refused."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from bench.plugins.backends import compiling
+from bench.plugins.backends.jax import Jax
+from bench.plugins.backends.mjx import Mjx
+from bench.plugins.backends.mujoco import Mujoco
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.contacts.complementarity import Complementarity
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.estimators.fobg import Fobg
+from bench.plugins.integrators.rk4 import Rk4
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.bounce_once import BounceOnce
+from bench.plugins.scenes.bouncing_ball import BouncingBall
+from bench.plugins.scenes.cartpole import Cartpole
+from bench.plugins.scenes.double_pendulum import DoublePendulum
+from bench.plugins.scenes.hopper import Hopper
+from bench.plugins.scenes.pendulum import Pendulum
+from bench.plugins.scenes.pushing import Pushing
+from bench.plugins.scenes.tossed_box import TossedBox
+from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
+
+from bench.cli import main
+from bench.conformance.subjects import distance, law_for, samples
+from bench.model import EngineScene, EngineTwin, compose, registry
+from bench.studies.bias_variance import BiasVariance
+from bench.sweep.cell import Cell
+from bench.sweep.experiment import Budget
+from bench.sweep.referees import reference_key
+
+ROOT = Path(__file__).resolve().parents[2]
+for _name in ("mujoco", "mjx"):
+    _entry = registry.find("backends", _name)
+    if not _entry.available:
+        pytest.skip(f"backend {_name} is {_entry.reason}", allow_module_level=True)
+
+SPRING = (-1.56802, -1.22481, -1.22481 / 480)
+"""Gradient of one bounce on an undamped spring of 1e4 N/m under semi-implicit Euler, made once by hand-written code.
+
+A force in the first step is a first velocity dt / m higher: -0.002552 to the digits that were kept.
+"""
+ENGINES = [Mujoco(), pytest.param(Mjx(), marks=pytest.mark.slow)]
+EXACT = 1e-6
+"""Relative difference of gradients allowed where integrator and forces are the same."""
+
+
+def program(scene, **law):
+    made = law_for(scene, Penalty, {"damping_mode": "clipped", **law}) if scene.n_contacts else None
+    return compose(scene, made, SemiImplicitEuler())
+
+
+def cell(scene, law, backend):
+    parts = {"scene": scene, "contact": law, "integrator": SemiImplicitEuler(), "backend": backend, "estimator": Fobg()}
+    return Cell(parts, 8, 2, 0, BiasVariance(), budget=Budget(4096, 0.01))
+
+
+def gradients(backend, of, count=3):
+    theta, w = samples(of, count)
+    return backend.compile(of).grad(theta, w)
+
+
+# ---------------------------------------------------------------------------------------------------- numbers
+
+
+@pytest.mark.parametrize(
+    "engine", [*ENGINES, Mujoco(gradient="rollouts"), Mujoco(differences="forward"), Jax()], ids=repr
+)
+def test_gradient_of_one_bounce_is_that_of_the_spring(engine):
+    scene = BounceOnce()
+    found = engine.compile(program(scene, stiffness=1e4)).grad(scene.theta0(), np.zeros((3, 1)))[:, 0]
+    np.testing.assert_allclose(found, SPRING, rtol=1e-4)
+
+
+TWINS = {
+    Pendulum(damping=0.05, horizon=20): EXACT,
+    Cartpole(horizon=20): EXACT,
+    Cartpole(horizon=20, noise="parameter"): EXACT,
+    BounceOnce(): EXACT,
+    Pushing(): 1e-3,
+    Hopper(horizon=100): 1e-3,
+    WallPenalty1d(start=0.5): 1e-2,
+}
+
+
+@pytest.mark.parametrize(("scene", "allowed"), TWINS.items(), ids=lambda value: getattr(value, "name", ""))
+def test_gradients_of_twins_are_those_of_the_scene(scene, allowed):
+    of = program(scene)
+    assert distance(gradients(Mujoco(), of), gradients(Jax(), of)) < allowed
+
+
+@pytest.mark.parametrize("scene", [Cartpole(horizon=20), Hopper(horizon=50)], ids=lambda s: s.name)
+def test_scores_under_feedback_are_those_of_the_scene(scene):
+    of = program(scene)
+    theta, w = samples(of)
+    assert distance(Mujoco().compile(of).score(theta, w), Jax().compile(of).score(theta, w)) < 1e-3
+
+
+@pytest.mark.parametrize("changed", [{"mass": 0.5}, {"gravity": 3.0}, {"dt": 0.001}, {"height": 0.4}], ids=str)
+def test_twin_takes_its_numbers_from_the_scene(changed):
+    of = program(BouncingBall(horizon=300, **changed), stiffness=2e3, damping=3.0)
+    theta, w = samples(of)
+    engine, own = (backend.compile(of).value(theta, w) for backend in (Mujoco(), Numpy()))
+    assert distance(engine, own) < 1e-2
+
+
+def test_chained_jacobians_agree_with_differences_of_whole_rollouts():
+    scene = TossedBox(horizon=150)
+    of = program(scene)
+    still = np.zeros((3, 1))
+    chain, rollouts = (
+        Mujoco(gradient=kind, impedance=0.9).compile(of).grad(scene.theta0(), still) for kind in ("chain", "rollouts")
+    )
+    assert distance(chain, rollouts) < 1e-5
+
+
+def test_impedance_near_one_is_another_contact_than_the_spring():
+    of = program(BouncingBall(), stiffness=1e4)
+    theta, w = samples(of)
+    off = distance(Mujoco(impedance=0.9).compile(of).value(theta, w), Numpy().compile(of).value(theta, w))
+    assert off > BouncingBall.twin_difference
+
+
+@pytest.mark.parametrize("engine", ENGINES, ids=repr)
+def test_rollout_that_diverges_is_nan_and_not_frozen(engine, tmp_path, monkeypatch):
+    """MuJoCo resets a state beyond 1e10, or repeats the last one, and writes a log: finite costs that mean nothing."""
+    monkeypatch.chdir(tmp_path)
+    of = program(Pendulum(damping=1e3, horizon=20))
+    theta, w = samples(of)
+    value = engine.compile(of).value(theta, w)
+    own = Jax().compile(of).value(theta, w)
+    assert (~np.isfinite(value) | (np.abs(value - own) < 1e-2 * np.abs(own))).all()
+    assert (np.abs(own) > 1e20).all()
+    assert not list(tmp_path.iterdir())
+
+
+def test_lean_changes_no_number():
+    of = program(Pushing())
+    theta, w = samples(of)
+    lean, full = (Mujoco(lean=flag).compile(of).value(theta, w) for flag in (True, False))
+    np.testing.assert_array_equal(lean, full)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_stiffness_and_mass_compile_nothing_anew(mode):
+    compiled = []
+    for stiffness, mass, dt in ((1e3, 0.1, 0.005), (1e4, 0.1, 0.005), (1e5, 0.3, 0.004)):
+        of = program(Pushing(horizon=4, mass=mass, dt=dt), stiffness=stiffness)
+        known = len(compiling._known)
+        found = gradients(Mjx(mode=mode), of)
+        compiled.append(len(compiling._known) - known)
+        assert distance(found, gradients(Jax(), of)) < 1e-2
+    assert compiled == [1, 0, 0]
+
+
+# --------------------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("engine", "of", "reason"),
+    [
+        (Mujoco(), compose(Pushing(), Complementarity(), SemiImplicitEuler()), "stands for penalty, not complementarity"),
+        (Mujoco(), compose(Pendulum(), None, Rk4()), "not rk4"),
+        (Mujoco(), compose(DoublePendulum(), None, SemiImplicitEuler()), "no MJCF twin"),
+        (Mujoco(), compose(WallPenalty1d(), law_for(WallPenalty1d(), Penalty), SemiImplicitEuler()), "never pull"),
+        (Mujoco(dtype="float32"), program(Pushing()), "double precision"),
+        (Mjx(mode="reverse", iterations=2), program(Pushing()), "no reverse mode"),
+        (Mjx(cone="elliptic"), program(TossedBox()), "NaN"),
+        (Mjx(integrator="rk4"), program(Pendulum()), "not semi_implicit_euler"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)  # fmt: skip
+def test_what_an_engine_cannot_do_is_refused(engine, of, reason):
+    assert reason in engine.refuses(of)
+
+
+def test_allowed_settings_are_not_refused():
+    for engine in (Mjx(), Mjx(iterations=5), Mjx(mode="reverse"), Mjx(cone="elliptic"), Mujoco(cone="elliptic")):
+        assert engine.refuses(program(Pushing())) is None
+    assert Mjx(integrator="rk4").refuses(compose(Pendulum(), None, Rk4())) is None
+
+
+def test_scene_for_engines_is_refused_elsewhere():
+    scene = TossedBox()
+    made = cell(scene, law_for(scene, Penalty), Jax())
+    assert made.refusal() == ("unsupported", "tossed_box runs only in physics engines, and backend jax is not one")
+    assert made.with_part("backend", Mujoco()).refusal() is None
+
+
+def test_reference_of_an_engine_is_its_own():
+    law = Penalty()
+    own, engine, other = (cell(Pushing(), law, backend) for backend in (Jax(), Mujoco(), Mujoco(impedance=0.9)))
+    assert reference_key(own) == reference_key(own.with_part("backend", Numpy()))
+    assert len({reference_key(one) for one in (own, engine, other)}) == 3
+
+
+def test_every_twin_is_listed_with_its_difference():
+    for entry in registry.entries()["scenes"].values():
+        scene = entry.plugin()
+        if isinstance(scene, EngineTwin):
+            assert 0 < scene.twin_difference <= 1e-3 or isinstance(scene, EngineScene)
+            assert Mujoco().refuses(program(scene)) is None
+
+
+# --------------------------------------------------------------------------------------------------- commands
+
+
+@pytest.mark.slow
+def test_engine_runs_through_the_command_line(tmp_path):
+    words = ["scenes=[double_integrator]", "backends=[jax,mujoco]", "estimators=[fobg]", "samples=8", "repeats=4"]
+    words += ["scene.double_integrator.horizon=5", "reference.samples=256", "name=mine", f"results_dir={tmp_path}"]
+    assert main(words) == 0
+    rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet").set_index("backend")
+    assert (rows["status"] == "ok").all()
+    assert rows.loc["jax", "reference_method"] == "closed_form"
+    assert rows.loc["mujoco", "reference_method"].startswith("sampling")
+    assert rows.loc["mujoco", "model_error"] < 1e-8
+    assert "mujoco=" in rows.loc["mujoco", "versions"]
+
+
+@pytest.mark.slow
+def test_twins_study_measures_writes_and_draws(tmp_path):
+    words = ["+experiment=twins", "scenes=[pendulum,bounce_once,tossed_box]", "backends=[jax,mujoco]", "samples=2"]
+    assert main([*words, f"results_dir={tmp_path}"]) == 0
+    written = {path.name for path in (tmp_path / "twins").iterdir()}
+    assert {"twins.csv", "twins.md", "twins.png"} <= written
+    assert "Trajectories differ by" in (tmp_path / "twins" / "report.html").read_text()
+    rows = pd.read_parquet(tmp_path / "twins" / "rows.parquet").set_index(["scene", "backend"])
+    assert (rows.xs("jax", level="backend")["status"] == "unsupported").all()
+    assert rows.loc[("tossed_box", "mujoco"), "status"] == "unsupported"
+    for name in ("pendulum", "bounce_once"):
+        row = rows.loc[(name, "mujoco")]
+        assert row["status"] == "ok"
+        assert row["state_difference"] < 1e-9
+        assert row["gradient_difference_rel"] < 1e-6
+        assert row["gradient_s"] > 0
+
+
+def test_scene_for_engines_cannot_be_traced(capsys):
+    assert main(["trace", "tossed_box", "backends=[mujoco]"]) == 2
+    assert "runs only in physics engines" in capsys.readouterr().err
+
+
+def test_study_is_found():
+    assert registry.find("studies", "twins").available
+
+
+def test_without_the_library_everything_else_is_listed_and_runs(tmp_path):
+    words = ["scenes=[double_integrator]", "backends=[numpy,mujoco,mjx]", "estimators=[fobg]", "samples=4", "repeats=2",
+             "name=mine", f"results_dir={tmp_path}"]  # fmt: skip
+    hidden = "import sys; sys.modules['mujoco'] = None; from bench.cli import main; sys.exit(main(sys.argv[1:]))"
+    listed, ran = (
+        subprocess.run([sys.executable, "-c", hidden, *command], cwd=ROOT, capture_output=True, text=True)
+        for command in (["list", "mujoco", "mjx", "tossed_box"], words)
+    )
+    assert listed.returncode == 0, listed.stderr
+    assert "pip install mujoco mujoco-mjx" in listed.stdout
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet").set_index("backend")
+    assert rows["status"].to_dict() == {"numpy": "ok", "mujoco": "unavailable", "mjx": "unavailable"}
+    assert "pip install mujoco" in rows.loc["mjx", "reason"]

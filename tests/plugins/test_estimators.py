@@ -1,0 +1,165 @@
+"""Estimators against closed-form biases and variances, and where two of them really differ."""
+
+import math
+
+import numpy as np
+import pytest
+from bench.plugins.backends.jax import Jax
+from bench.plugins.backends.torch import Torch
+from bench.plugins.estimators.alpha_order import AlphaOrder
+from bench.plugins.estimators.finite_difference import FiniteDifference
+from bench.plugins.estimators.fobg import Fobg
+from bench.plugins.estimators.inverse_variance import InverseVariance
+from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
+from bench.plugins.estimators.reinforce import Reinforce
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.cartpole import Cartpole
+from bench.plugins.scenes.heaviside import Heaviside
+from bench.plugins.scenes.soft_heaviside import SoftHeaviside
+from scipy import stats
+
+from bench.measure import noise
+from bench.measure.reference import certify
+from bench.measure.statistics import summarise
+from bench.model import compose
+
+SIGMA, SAMPLES, REPEATS = 0.1, 200, 400
+
+
+# Exact derivatives throughout: the differences of the numpy backend see a jump when a sample falls within a step of it.
+
+
+def measured(scene, estimator, backend=None, integrator=None, samples=SAMPLES, repeats=REPEATS):
+    backend = backend or Torch()
+    problem = backend.compile(compose(scene, None, integrator))
+    truth = certify(problem, backend.provides, 1 << 17, 0.005)
+    w = noise.draw(0, scene.name, repeats, samples, problem.program.n_noise, "cells")
+    return summarise(estimator.estimate(problem, problem.program.theta0, w), truth.known(), samples)
+
+
+def moments(terms):
+    """Mean and variance of ``terms(w)``, w standard normal, by a fine midpoint rule between -9 and 9."""
+    w = np.linspace(-9, 9, 2_000_001)
+    w = (w[1:] + w[:-1]) / 2
+    weight = stats.norm.pdf(w) * (w[1] - w[0])
+    values = terms(w)
+    mean = float(values @ weight)
+    return mean, float((values - mean) ** 2 @ weight)
+
+
+def step(x):
+    return (x >= 0).astype(float)
+
+
+def ramp(nu):
+    return lambda x: np.clip(2 * x / nu, -1, 1)
+
+
+def expected(f, slope, theta, h=0.02):
+    """Per-sample mean and variance of every estimator that is a mean, by name."""
+    s = SIGMA
+    return {
+        Fobg(): moments(lambda w: slope(theta + s * w)),
+        Reinforce(baseline="none"): moments(lambda w: f(theta + s * w) * w / s),
+        Reinforce(): moments(lambda w: (f(theta + s * w) - f(np.array(theta))) * w / s),
+        RandomizedSmoothing(): moments(lambda w: (f(theta + s * w) - f(theta - s * w)) * w / (2 * s)),
+        RandomizedSmoothing(variant="forward"): moments(lambda w: (f(theta + s * w) - f(np.array(theta))) * w / s),
+        FiniteDifference(step=h): moments(lambda w: (f(theta + s * w + h) - f(theta + s * w - h)) / (2 * h)),
+    }
+
+
+CASES = [
+    pytest.param(scene, estimator, mean, variance, id=f"{scene.name} {estimator}")
+    for scene, table in (
+        (Heaviside(sigma=SIGMA), expected(step, np.zeros_like, 0.0)),
+        (Heaviside(sigma=SIGMA, theta=0.1), expected(step, np.zeros_like, 0.1)),
+        (SoftHeaviside(sigma=SIGMA, nu=0.1), expected(ramp(0.1), lambda x: (abs(x) < 0.05) * 20.0, 0.0)),
+        (SoftHeaviside(sigma=SIGMA, nu=0.01), expected(ramp(0.01), lambda x: (abs(x) < 0.005) * 200.0, 0.0)),
+    )
+    for estimator, (mean, variance) in table.items()
+]
+
+
+@pytest.mark.parametrize(("scene", "estimator", "mean", "variance"), CASES)
+def test_bias_and_variance_are_the_closed_form_ones(scene, estimator, mean, variance):
+    summary = measured(scene, estimator)
+    truth = scene.closed_form_gradient(None, None)[0]
+    bias = abs(mean - truth)
+    slack = 1e-4 * abs(truth)  # of the quadrature above, whose nodes straddle the jumps
+    assert summary.bias_low - slack <= bias <= summary.bias_high + slack
+    ratio = summary.variance_per_sample / variance if variance > 1e-9 else 1.0
+    inside = summary.variance_low <= variance / SAMPLES <= summary.variance_high
+    assert inside or abs(ratio - 1) < 0.03
+    if variance < 1e-9:
+        assert summary.variance == 0.0
+
+
+@pytest.mark.parametrize(
+    ("theta", "baseline", "variance"), [(0.0, "center", 34.085), (0.1, "center", 34.208), (0.1, "none", 54.08)]
+)
+def test_heaviside_zeroth_order_variances(theta, baseline, variance):
+    summary = measured(Heaviside(theta=theta), Reinforce(baseline=baseline))
+    assert summary.variance_low <= variance / SAMPLES <= summary.variance_high
+
+
+def test_leave_one_out_has_no_bias_and_less_variance_than_no_baseline():
+    alone, plain = (measured(Heaviside(theta=0.1), Reinforce(baseline=b)) for b in ("leave_one_out", "none"))
+    assert alone.indistinguishable
+    assert alone.variance_high < plain.variance_low
+
+
+@pytest.mark.parametrize("estimator", [InverseVariance(), AlphaOrder(gamma=1e6)], ids=str)
+def test_mixtures_that_trust_low_variance_are_wholly_wrong_at_a_jump(estimator):
+    summary = measured(Heaviside(), estimator)
+    assert summary.bias == pytest.approx(3.98942, rel=1e-5)
+    assert summary.variance == 0.0
+
+
+def test_alpha_order_keeps_within_its_accuracy_where_the_mixture_fails():
+    summary = measured(Heaviside(), AlphaOrder(gamma=3.0), samples=800)
+    assert summary.bias_high < 3.0
+    assert measured(
+        Heaviside(), AlphaOrder(gamma=0.1)
+    ).indistinguishable  # its test cannot be met, which leaves zeroth order
+
+
+def test_mixtures_gain_where_both_orders_are_right():
+    scene = SoftHeaviside(nu=0.2)
+    mixed = measured(scene, InverseVariance())
+    for half in (Fobg(), Reinforce()):
+        assert mixed.variance < measured(scene, half, samples=SAMPLES // 2).variance
+    assert mixed.bias_rel < 0.02
+
+
+def test_confidence_radius_uses_the_failure_probability():
+    """eps = sqrt(2 V ln((d+1)/delta)/N) + 2 L ln((d+1)/delta)/(3 N): at its edge the weight drops to 0."""
+    scene, n = SoftHeaviside(nu=0.2), 400
+    problem = Torch().compile(compose(scene))
+    w = noise.draw(3, scene.name, 1, n, 1, "cells")
+    zeroth = Reinforce().estimate(problem, scene.theta0(), w[:, n // 2 :])
+    terms = np.array([Reinforce().estimate(problem, scene.theta0(), w[:, i : i + 1])[0, 0] for i in range(n // 2, n)])
+    log_term = math.log(2 / 0.05)
+    eps = math.sqrt(2 * terms.var(ddof=1) * log_term / (n // 2)) + 2 * abs(terms).max() / (3 * (n // 2)) * log_term
+    below, above = (AlphaOrder(gamma=eps * factor).estimate(problem, scene.theta0(), w) for factor in (0.999, 1.001))
+    assert below == pytest.approx(zeroth, rel=1e-12)
+    assert above[0, 0] != below[0, 0]
+    assert abs(above - below).max() <= 0.0011 * eps
+
+
+@pytest.mark.parametrize("model", ["action", "parameter"])
+def test_smoothing_gains_is_not_smoothing_actions(model):
+    """Under action noise REINFORCE aims at grad J_sigma and smoothing of the gains at something else; under parameter noise not."""
+    scene = Cartpole(sigma=1.0, noise=model)
+    score, smoothing = (
+        measured(scene, e, Jax(), SemiImplicitEuler(), samples=256, repeats=64)
+        for e in (Reinforce(), RandomizedSmoothing())
+    )
+    assert score.indistinguishable
+    assert smoothing.indistinguishable == (model == "parameter")
+    if model == "action":
+        assert smoothing.bias_low / smoothing.reference_norm > 0.05
+        far = measured(Cartpole(sigma=3.0), Reinforce(), Jax(), SemiImplicitEuler(), samples=256, repeats=64)
+        near = measured(
+            Cartpole(sigma=3.0), RandomizedSmoothing(radius=0.1), Jax(), SemiImplicitEuler(), samples=256, repeats=64
+        )
+        assert far.variance_low > near.variance_high

@@ -1,0 +1,408 @@
+"""Integrators and the smooth scenes that tell them apart: stability, order, energy, impacts, chaos."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from bench.plugins.backends.implicit import Implicit
+from bench.plugins.backends.jax import Jax
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.backends.torch import Torch
+from bench.plugins.contacts.complementarity import Complementarity
+from bench.plugins.contacts.impulse import Impulse
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.integrators.event_driven import EventDriven
+from bench.plugins.integrators.explicit_euler import ExplicitEuler
+from bench.plugins.integrators.implicit_euler import ImplicitEuler
+from bench.plugins.integrators.implicit_midpoint import ImplicitMidpoint
+from bench.plugins.integrators.midpoint import Midpoint
+from bench.plugins.integrators.rk4 import Rk4
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.integrators.stormer_verlet import StormerVerlet
+from bench.plugins.scenes.bounce_once import BounceOnce
+from bench.plugins.scenes.bouncing_ball import BouncingBall
+from bench.plugins.scenes.double_pendulum import DoublePendulum
+from bench.plugins.scenes.mass_spring import MassSpring
+from bench.plugins.scenes.pushing import Pushing
+from bench.plugins.scenes.stiff_decay import StiffDecay
+
+from bench.conformance import check
+from bench.conformance.subjects import SAME, NewtonOps
+from bench.model import compose
+
+EXPLICIT = [ExplicitEuler(), SemiImplicitEuler(), Midpoint(), Rk4(), StormerVerlet(), EventDriven()]
+IMPLICIT = [ImplicitEuler(), ImplicitMidpoint()]
+
+
+def named(plugin):
+    return plugin.name
+
+
+def compiled(scene, integrator, law=None, backend=None):
+    """On the given backend, or on a fast one that can run it."""
+    backend = backend or (Implicit() if integrator.needs_root else Numpy())
+    return backend.compile(compose(scene, law, integrator))
+
+
+def quiet(problem):
+    return np.zeros((problem.program.n_noise, 1))
+
+
+def normal(problem, count, seed=0):
+    return np.random.default_rng(seed).standard_normal((problem.program.n_noise, count))
+
+
+def gradient(problem):
+    """At theta0, without noise, ``(d,)``."""
+    return problem.grad(problem.program.theta0, quiet(problem))[:, 0]
+
+
+def states(scene, integrator):
+    """q and v at theta0 before each step and after the last, ``(horizon + 1, n, 1)`` each."""
+    program = compose(scene, None, integrator)
+    visited = [
+        state for state, _ in program.steps(NewtonOps(), scene.theta0()[:, None], np.zeros((program.n_noise, 1)))
+    ]
+    return tuple(np.stack([np.asarray(part) for part in parts]) for parts in zip(*visited, strict=True))
+
+
+# ------------------------------------------------------------------------------------- planted faults, and sources
+
+
+@dataclass(frozen=True)
+class WrongStabilityFunction(Rk4):
+    """A fourth-order step that states the factor of a second-order one."""
+
+    name = "wrong_stability_function"
+
+    def amplification(self, z):
+        return 1 + z + z * z / 2
+
+
+@dataclass(frozen=True)
+class ForgetsTheFactor(SemiImplicitEuler):
+    """States a matrix without the velocity factor."""
+
+    name = "forgets_the_factor"
+
+    def transition(self, dt, stiffness, damping, factor):
+        return super().transition(dt, stiffness, damping, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("plugin", "fault"),
+    [
+        (WrongStabilityFunction, "amplification_is_that_of_the_step"),
+        (ForgetsTheFactor, "transition_is_that_of_the_step"),
+    ],
+)
+def test_planted_fault_is_caught(plugin, fault):
+    assert {result.check for result in check(plugin) if result.outcome == "fail"} == {fault}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", EXPLICIT, ids=named)
+@pytest.mark.parametrize(
+    "scene", [StiffDecay(), MassSpring(velocity_factor=0.9), DoublePendulum(horizon=50)], ids=named
+)
+def test_backends_agree(scene, integrator):
+    numpy, jax, torch = (compiled(scene, integrator, backend=backend) for backend in (Numpy(), Jax(), Torch()))
+    theta, w = scene.theta0(), normal(numpy, 3)
+    costs, gradients = jax.value(theta, w), jax.grad(theta, w)
+    for other in (numpy, torch):
+        assert other.value(theta, w) == pytest.approx(costs, rel=SAME)
+    assert np.abs(torch.grad(theta, w) - gradients).max() <= SAME * np.abs(gradients).max()
+
+
+# -------------------------------------------------------------------------------------------------- stiff_decay
+
+
+@pytest.mark.parametrize(
+    ("integrator", "factor"),
+    [
+        (ExplicitEuler(), -1.5),
+        (SemiImplicitEuler(), -1.5),
+        (Midpoint(), 1 - 2.5 + 2.5**2 / 2),
+        (StormerVerlet(), 1 - 2.5 + 2.5**2 / 2),
+        (Rk4(), 1 - 2.5 + 2.5**2 / 2 - 2.5**3 / 6 + 2.5**4 / 24),
+        (ImplicitEuler(), 1 / 3.5),
+        (ImplicitMidpoint(), -1 / 9),
+    ],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_stiff_decay(integrator, factor):
+    """State and derivative are factor^20: (-1.5)^20 = 3325 for explicit, (1 / 3.5)^20 = 1.3e-11 for implicit Euler."""
+    scene = StiffDecay()
+    problem = compiled(scene, integrator, backend=Implicit() if integrator.needs_root else Jax())
+    expected = factor**20
+    # where each step's equation is solved to an absolute 1e-12, the end is known to that
+    allowed = pytest.approx(expected, rel=1e-9, abs=1e-12 if integrator.needs_root else 0.0)
+    assert problem.value(scene.theta0(), quiet(problem))[0] == allowed
+    assert gradient(problem) == pytest.approx([expected], rel=1e-9)
+    assert scene.closed_form_gradient(None, integrator) == pytest.approx([expected], rel=1e-12)
+    assert scene.physical_gradient() == pytest.approx([math.exp(-50)], rel=1e-12)
+
+
+# -------------------------------------------------------------------------------------------------- mass_spring
+
+
+def radius(scene, integrator):
+    """Spectral radius of one step."""
+    step = integrator.transition(scene.dt, 2 * scene.stiffness / scene.mass, 0.0, scene.velocity_factor)
+    return np.abs(np.linalg.eigvals(step)).max()
+
+
+def at_limit(share, factor, horizon=2000):
+    """A scene with dt^2 2 k / m that share of 2 (1 + d)."""
+    scene = MassSpring(velocity_factor=factor, horizon=horizon)
+    return dataclasses.replace(scene, stiffness=share * (1 + factor) * scene.mass / scene.dt**2)
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.6, 1.0])
+def test_semi_implicit_stability_limit(factor):
+    """dt^2 2 k / m = 2 (1 + d) parts bounded from growing, by the spectral radius and in rollouts."""
+    integrator = SemiImplicitEuler()
+    inside, outside = at_limit(0.99, factor), at_limit(1.01, factor)
+    assert radius(inside, integrator) <= 1 + 1e-12
+    assert radius(outside, integrator) > 1 + 1e-3
+    calm, wild = (np.abs(states(scene, integrator)[0][:, 0, 0]).max() / scene.stretch for scene in (inside, outside))
+    # near the limit the modes are far from orthogonal, 1 / sqrt(1 - share) at worst
+    assert calm <= 1 / math.sqrt(1 - 0.99)
+    assert wild > 1e3
+
+
+@pytest.mark.parametrize(
+    ("integrator", "limit"), [(StormerVerlet(), 2.0), (EventDriven(), 2.0), (Rk4(), 2 * math.sqrt(2))], ids=str
+)
+def test_explicit_stability_limit(integrator, limit):
+    """On an undamped oscillator, w dt at most 2 for Stormer-Verlet and 2 sqrt(2) for RK4."""
+    scene = MassSpring(horizon=2000)
+    frequency = limit / scene.dt
+    for share, stable in ((0.99, True), (1.01, False)):
+        moved = dataclasses.replace(scene, stiffness=(share * frequency) ** 2 * scene.mass / 2)
+        assert (radius(moved, integrator) <= 1 + 1e-12) == stable
+        grown = np.abs(states(moved, integrator)[0][:, 0, 0]).max() / moved.stretch
+        assert (grown < 100) == stable
+
+
+@pytest.mark.parametrize("stiffness", [1.0, 1e3, 1e6, 1e12])
+def test_who_is_stable_at_any_stiffness(stiffness):
+    scene = MassSpring(stiffness=stiffness)
+    assert radius(scene, ImplicitEuler()) < 1
+    assert radius(scene, ImplicitMidpoint()) == pytest.approx(1.0, abs=1e-9)
+    assert radius(scene, ExplicitEuler()) > 1
+    assert radius(scene, Midpoint()) > 1
+
+
+def test_stiff_implicit_rollouts_stay_bounded():
+    """At dt^2 2 k / m = 2e4, 5,000 times beyond the explicit limit."""
+    scene = MassSpring(stiffness=1e8, horizon=20)
+    for integrator in IMPLICIT:
+        problem = compiled(scene, integrator)
+        assert problem.value(scene.theta0(), quiet(problem))[0] <= scene.stretch**2 * (1 + 1e-6)
+        assert gradient(problem) == pytest.approx(scene.closed_form_gradient(None, integrator), rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize("damping", [0.0, 1.0, 10.0, 15.0], ids=["undamped", "damped", "critical", "overdamped"])
+@pytest.mark.parametrize("integrator", EXPLICIT, ids=named)
+def test_mass_spring_gradient(integrator, damping):
+    """The closed form of the program, and that of the physics up to the integrator's order."""
+    scene = MassSpring(damping=damping)
+    problem = compiled(scene, integrator, backend=Torch())
+    assert gradient(problem) == pytest.approx(scene.closed_form_gradient(None, integrator), rel=1e-9)
+    errors = []
+    for halvings in (3, 4):
+        fine = dataclasses.replace(scene, dt=scene.dt / 2**halvings, horizon=scene.horizon * 2**halvings)
+        closed = fine.closed_form_gradient(None, integrator)
+        errors.append(np.linalg.norm(closed - scene.physical_gradient()))
+    assert math.log2(errors[0] / errors[1]) == pytest.approx(integrator.order, abs=0.2)
+
+
+def energy_error(integrator, **values):
+    """Largest relative error of the energy in the first and in the second half of the rollout."""
+    scene = MassSpring(**values)
+    q, v = states(scene, integrator)
+    energy = np.array([scene.energy(*state)[0] for state in zip(q, v, strict=True)])
+    error = np.abs(energy / energy[0] - 1)
+    half = len(error) // 2
+    return error[:half].max(), error[half:].max()
+
+
+@pytest.mark.parametrize("integrator", [SemiImplicitEuler(), StormerVerlet(), EventDriven()], ids=named)
+def test_symplectic_energy_is_bounded(integrator):
+    """Over 300 periods the error is that of the first ones, of order (w dt)^order: w dt = 0.1."""
+    early, late = energy_error(integrator, horizon=20_000)
+    assert early < 1.1 * 0.1**integrator.order
+    assert late == pytest.approx(early, rel=0.01)
+
+
+def test_implicit_midpoint_keeps_energy():
+    assert max(energy_error(ImplicitMidpoint(), horizon=50)) < 1e-9  # 50 solves, each to 1e-12
+
+
+@pytest.mark.parametrize(
+    ("integrator", "rate"),
+    [(ExplicitEuler(), 0.1**2), (Midpoint(), 0.1**4 / 4), (Rk4(), -(0.1**6) / 72), (ImplicitEuler(), -(0.1**2))],
+    ids=lambda value: getattr(value, "name", None),
+)
+def test_energy_drift(integrator, rate):
+    """Others gain or lose energy by a leading term a step, at w dt = 0.1."""
+    scene = MassSpring(horizon=200)
+    q, v = states(scene, integrator)
+    growth = math.log(scene.energy(q[-1], v[-1])[0] / scene.energy(q[0], v[0])[0]) / scene.horizon
+    assert growth == pytest.approx(rate, rel=0.02)  # the next term is (w dt)^2 = 1% smaller
+
+
+# ---------------------------------------------------------------------------------------------- double_pendulum
+
+
+def test_double_pendulum_keeps_energy():
+    """To 1e-3 of the kinetic energy over 10 s of RK4, and 8 times better (16 by its order) at half the step."""
+    errors = []
+    for halvings in (0, 1):
+        scene = DoublePendulum(horizon=1000 * 2**halvings, dt=0.01 / 2**halvings)
+        q, v = states(scene, Rk4())
+        energy = np.array([scene.energy(np, *state)[0] for state in zip(q, v, strict=True)])
+        errors.append(np.abs(energy - energy[0]).max() / (scene.mass * (scene.length * 5.0) ** 2))
+    assert errors[0] < 1e-3
+    assert errors[1] < errors[0] / 8
+
+
+def test_double_pendulum_acceleration_is_that_of_its_energy():
+    """d(energy)/dt = 0 from every state; hanging still is an equilibrium."""
+    scene = DoublePendulum()
+    q, v = np.random.default_rng(0).normal(size=(2, 2, 50))
+    a, eps = scene.acceleration(np, q, v, np.zeros((0, 50))), 1e-5
+    rate = (scene.energy(np, q + eps * v, v + eps * a) - scene.energy(np, q - eps * v, v - eps * a)) / (2 * eps)
+    assert (
+        np.abs(rate).max() < 1e-7
+    )  # differences of step 1e-5: rounding 1e-11, truncation 1e-10 times third derivatives
+    still = scene.acceleration(np, np.array([[0.0], [0.0]]), np.zeros((2, 1)), np.zeros((0, 1)))
+    assert np.abs(still).max() == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seconds", "median"), [(1.0, 8.0), (2.5, 26.0), (5.0, 580.0), pytest.param(10.0, 3.1e5, marks=pytest.mark.slow)]
+)
+def test_double_pendulum_gradients_explode(seconds, median):
+    """Median norm of 400 sample gradients with RK4, which varies by 20% between seeds; costs stay within [0, 2]."""
+    scene = DoublePendulum(horizon=round(seconds / 0.01))
+    problem = compiled(scene, Rk4(), backend=Jax())
+    w = normal(problem, 400, seed=7)
+    norms = np.linalg.norm(problem.grad(scene.theta0(), w), axis=0)
+    assert median / 1.5 < np.median(norms) < 1.5 * median
+    if seconds == 10.0:
+        costs = problem.value(scene.theta0(), w)
+        assert costs.min() >= 0
+        assert costs.max() <= 2
+
+
+# ------------------------------------------------------------------------------------------------- event_driven
+
+BOUNCES = [
+    BouncingBall(),
+    BouncingBall(horizon=50, dt=0.02),
+    BouncingBall(horizon=7, dt=1 / 7),
+    BouncingBall(horizon=300, dt=0.01, velocity=1.0),
+    BouncingBall(horizon=120, dt=0.01, restitution=0.7),
+    BouncingBall(horizon=120, dt=0.01, restitution=0.7, mass=3.0, velocity=-2.0),
+]
+
+
+@pytest.mark.parametrize("scene", BOUNCES, ids=lambda s: f"{s.horizon}x{s.dt:.3g}-e{s.restitution:g}-v{s.velocity:g}")
+@pytest.mark.parametrize("law", [Impulse(), Impulse(time_of_impact=False)], ids=["time_of_impact", "without"])
+def test_event_driven_gradient_is_the_physical_one(scene, law):
+    """Constant acceleration leaves no discretisation error, at any dt; the same for JAX and torch."""
+    for backend in (Jax(), Torch()):
+        problem = compiled(scene, EventDriven(), law, backend)
+        assert gradient(problem) == pytest.approx(scene.physical_gradient(), rel=1e-9)
+
+
+def test_boundary_steps_have_another_gradient():
+    """What event_driven is for: semi-implicit Euler with the same law is wrong by more than the gradient at every dt."""
+    for horizon in (100, 400, 1600):
+        scene = BouncingBall(horizon=horizon, dt=1 / horizon)
+        exact = scene.physical_gradient()
+        wrong = gradient(compiled(scene, SemiImplicitEuler(), Impulse(), Torch()))
+        right = gradient(compiled(scene, EventDriven(), Impulse(), Torch()))
+        assert np.linalg.norm(wrong - exact) > np.linalg.norm(exact)
+        assert np.linalg.norm(right - exact) < 1e-9 * np.linalg.norm(exact)
+
+
+def test_event_driven_gradients_across_noise():
+    """Each of 1,000 samples, among which impacts fall everywhere within a step."""
+    scene = BouncingBall(horizon=100, dt=0.01)
+    problem = compiled(scene, EventDriven(), Impulse(), Torch())
+    w = normal(problem, 1000)
+    starts = scene.theta0()[:, None] + scene.sigma * w
+    exact = [dataclasses.replace(scene, height=h, velocity=v).physical_gradient() for h, v in starts.T]
+    assert problem.grad(scene.theta0(), w) == pytest.approx(np.transpose(exact), rel=1e-8, abs=1e-10)
+
+
+@pytest.mark.parametrize("height", [1.0, 1.0 + 1 / 480], ids=["on_a_boundary", "within_a_step"])
+def test_event_driven_bounce_without_gravity(height):
+    """Where the impact meets a step boundary too, which is a kink for force laws. The force of the first step acts at its middle."""
+    scene = BounceOnce(height=height)
+    found = gradient(compiled(scene, EventDriven(), Impulse(), Torch()))
+    end = scene.horizon * scene.dt
+    assert found == pytest.approx([-1.0, -end, -(end - scene.dt / 2) * scene.dt], rel=1e-9)
+    assert scene.physical_gradient() == pytest.approx(found, rel=scene.dt)
+
+
+def test_event_driven_without_impacts_is_stormer_verlet():
+    for scene, law in (
+        (DoublePendulum(horizon=20), None),
+        (BouncingBall(horizon=100, dt=0.01), Penalty(stiffness=1e4)),
+    ):
+        event, plain = (compiled(scene, integrator, law) for integrator in (EventDriven(), StormerVerlet()))
+        w = normal(event, 4)
+        assert np.array_equal(event.value(scene.theta0(), w), plain.value(scene.theta0(), w))
+
+
+def test_event_driven_comes_to_rest():
+    """After infinitely many bounces, by 1.36 s, it lies on the ground but for a sinking of less than dt^2 g / 2 a step."""
+    scene = BouncingBall(horizon=1200, restitution=0.5)
+    assert scene.physical_gradient() is None
+    problem = compiled(scene, EventDriven(), Impulse(), Torch())
+    end = scene.target - math.sqrt(problem.value(scene.theta0(), quiet(problem))[0])
+    assert -scene.horizon * scene.gravity * scene.dt**2 / 2 < end <= 0
+    assert np.abs(gradient(problem)).max() < 0.01
+
+
+# ---------------------------------------------------------------------------------------------------- implicit
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "law", "integrator"),
+    [
+        (DoublePendulum(horizon=50), None, ImplicitEuler()),
+        (DoublePendulum(horizon=50), None, ImplicitMidpoint()),
+        (Pushing(), Penalty(stiffness=1e7), ImplicitEuler()),
+        (BouncingBall(horizon=200, dt=0.005), Penalty(stiffness=1e4), ImplicitMidpoint()),
+        (BouncingBall(horizon=48, dt=0.01), Complementarity(), ImplicitEuler()),
+    ],
+    ids=lambda value: getattr(value, "name", "none"),
+)
+def test_implicit_gradient_is_that_of_its_program(scene, law, integrator):
+    problem = compiled(scene, integrator, law)
+    theta, w = scene.theta0(), 0.5 * normal(problem, 4)
+    exact, step = problem.grad(theta, w), 1e-6 * np.eye(theta.size)[0]
+    difference = (problem.value(theta + step, w) - problem.value(theta - step, w)) / 2e-6
+    # 1e-9: rounding of the costs over the step
+    assert np.abs(exact[0] - difference).max() <= 1e-5 * np.abs(exact).max() + 1e-9
+
+
+def test_stiff_penalty_is_stable_under_implicit_euler():
+    """k = 1e7 in the pushing scene, dt^2 2 k / m = 5,000: the explicit step's gradient is off by orders, the implicit one bounded."""
+    scene = Pushing()
+    norms = []
+    for integrator, backend in ((SemiImplicitEuler(), Torch()), (ImplicitEuler(), Implicit())):
+        problem = compiled(scene, integrator, Penalty(stiffness=1e7), backend)
+        norms.append(np.linalg.norm(problem.grad(scene.theta0(), 0.5 * normal(problem, 4)), axis=0).max())
+    explicit, implicit = norms
+    assert implicit < 100
+    assert explicit > 10 * implicit

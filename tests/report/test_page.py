@@ -1,0 +1,395 @@
+"""The page of an experiment: what it says, that it stays literal, and what it does in a browser without a network."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shlex
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import pandas as pd
+import pytest
+from browser import CHROMIUM, chromium
+from helpers import experiment, row, small_rows, table
+
+from bench import cli, gallery
+from bench.model import registry
+from bench.report import reproduce, web
+from bench.report.web import document
+from bench.studies.bias_variance.columns import COLUMNS
+from bench.sweep import config, grid
+from bench.sweep.columns import Columns
+from bench.sweep.store import Store
+from bench.sweep.study import Study
+
+HOSTILE = (
+    "<script>window.hacked=1</script>",
+    '<img src=x onerror="window.hacked=1">',
+    "</script><b>bold</b>",
+    "{{data}} & $x$",
+)
+"""Names that would do something if they were taken for HTML, or for a part of the page's template."""
+
+
+def page(rows, study=None, **given):
+    """The page of made-up rows."""
+    made = experiment(**given)
+    if study is not None:
+        made = replace(made, study=study, columns=study.columns)
+    return document.assemble(made, web.content(made, rows), [["a=1"]] * len(rows), {})
+
+
+def data_of(text):
+    return json.loads(re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1])
+
+
+def column(data, name, of="rows"):
+    found = data["tables"][of][name]
+    return [found["values"][i] for i in found["index"]] if isinstance(found, dict) else found
+
+
+def finding(text):
+    found = re.search(r'id="finding">(.*?)</p>', text, re.DOTALL)[1]
+    return html.unescape(re.sub(r"<[^>]+>", "; ", found))
+
+
+# ------------------------------------------------------------------------------------------------------- contents
+
+
+def test_finding_names_the_estimators_and_their_errors_where_each_is_to_be_used():
+    given = {"scene": "one", "estimator": "good", "rmse_rel": 0.1}
+    rows = [row(**given | {"stiffness": k}) for k in (10.0, 100.0, 1000.0)]
+    rows += [row(**given | {"stiffness": k, "estimator": "other", "rmse_rel": 0.5}) for k in (10.0, 100.0)]
+    rows += [row(**given | {"stiffness": 1000.0, "estimator": "other", "rmse_rel": 0.04})]
+    text = page(table(rows), sweep={"stiffness": [10.0, 100.0, 1000.0]}, marks={})
+    assert "Use good: lowest relative RMSE in 2 of 3 settings (0.10)" in finding(text)
+    assert "one, penalty, stiffness at 1000: use other (0.040, where good has 0.10)" in finding(text)
+
+
+def test_finding_says_when_nothing_beats_zero_and_when_nothing_ran():
+    rows = table([row(stiffness=k, rmse_rel=3.0) for k in (10.0, 100.0)])
+    assert "Nothing beats answering zero" in finding(page(rows))
+    rows["status"], rows["reason"] = "error", "it broke"
+    assert "No cell gave a result" in finding(page(rows))
+
+
+def test_finding_tells_of_backends_that_refused_every_cell():
+    rows = table([row(stiffness=k) for k in (10.0, 100.0)])
+    refused = rows.assign(backend="stubborn", status="unsupported", reason="cannot", key=rows["key"] + "s")
+    assert "stubborn refuses: cannot" in finding(page(pd.concat([rows, refused], ignore_index=True)))
+    refused.loc[0, "status"] = "ok"
+    assert "stubborn" not in finding(page(pd.concat([rows, refused], ignore_index=True)))
+
+
+def test_every_row_is_in_the_page_with_its_status_and_reason():
+    rows = small_rows()
+    found = data_of(page(rows))
+    for name in ("scene", "estimator", "status", "reason", "backend"):
+        assert column(found, name) == list(rows[name])
+    assert np.allclose(column(found, "stiffness"), rows["stiffness"])
+
+
+def test_numbers_keep_six_digits_and_missing_ones_are_null():
+    assert document.column(pd.Series([1.23456789, np.nan, np.inf, 3.0, 1e-30])) == [1.23457, None, None, 3, 1e-30]
+
+
+def test_a_bias_that_cannot_be_told_from_0_is_drawn_as_its_upper_limit():
+    rows = table([row(stiffness=k, bias=0.0, bias_low=0.0, bias_high=0.8, reference_norm=4.0) for k in (1.0, 2.0)])
+    found = data_of(page(rows))
+    assert column(found, "bias_limit") == [1, 1]
+    assert column(found, "bias_shown") == pytest.approx([0.2, 0.2])
+
+
+def test_page_holds_plotly_once_asks_for_nothing_and_stays_small():
+    text = page(small_rows())
+    assert len(text) < 6e6
+    assert text.count('id="plotly"') == 1
+    assert not re.search(r'(src|href)="(?!#)', text.partition('id="data"')[0])
+    assert "default-src 'none'" in text
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_names_with_html_in_them_are_text(name):
+    rows = small_rows(estimators=("fobg",))
+    rows = pd.concat(
+        [rows, rows.assign(scene=name, estimator=name, reason=name, key=rows["key"] + "h")], ignore_index=True
+    )
+    text = page(rows, name=name).replace(document.plotly(), "")
+    assert text.count("<script") == 3
+    assert text.count("</script") == 3
+    assert "<img" not in text
+    assert name in column(data_of(text), "scene")
+
+
+@pytest.mark.parametrize("name", config.experiments())
+def test_command_of_a_cell_makes_that_cell(name):
+    made = config.load([f"experiment={name}"])
+    every = grid.cells(made)
+    for cell in every[:: max(1, len(every) // 2)]:
+        told = shlex.split(" ".join([reproduce.HEAD, *map(shlex.quote, reproduce.words(cell))]))
+        assert told[:3] == ["python", "-m", "bench"]
+        again = config.load(told[3:])
+        assert [other.key for other in grid.cells(again)] == [cell.key]
+        if cell.budget is not None:
+            assert again.reference == made.reference
+
+
+RUN = (
+    "name=mine", "scenes=[pushing]", "scene.pushing.horizon=5", "contacts=[penalty,complementarity]", "backends=[numpy]",
+    "estimators=[reinforce,randomized_smoothing]", "sweep.stiffness=[1e2,1e3]", "samples=8", "repeats=4",
+    "reference.samples=4096",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory):
+    """A small run through the command line: the directory of its results."""
+    directory = tmp_path_factory.mktemp("results")
+    assert cli.main([*RUN, f"results_dir={directory}"]) == 0
+    return directory
+
+
+def stored(directory, name):
+    return Store(directory / name, COLUMNS).load().set_index("key")
+
+
+def test_command_in_the_page_gives_the_same_numbers_of_that_cell_alone(ran, tmp_path):
+    found = data_of((ran / "mine" / "report.html").read_text())
+    place = column(found, "status").index("ok")
+    words = [c["values"][c["index"][place]] for c in found["command"]["words"]]
+    told = shlex.split(" ".join([found["command"]["head"], *filter(None, words)]))
+    assert cli.main([*told[3:], f"results_dir={tmp_path}"]) == 0
+    alone = stored(tmp_path, "one_cell")
+    assert len(alone) == 1
+    before = stored(ran, "mine").loc[alone.index[0]]
+    for name in ("bias", "variance", "rmse"):
+        assert alone[name].iloc[0] == before[name]
+
+
+def test_report_writes_the_page_again_with_machine_and_versions(ran):
+    path = ran / "mine" / "report.html"
+    path.unlink()
+    assert cli.main(["report", *RUN, f"results_dir={ran}"]) == 0
+    text = path.read_text()
+    assert "numpy" in text.partition("Configuration")[0].partition('id="made"')[2]
+
+
+def test_gallery_has_the_finding_and_keeps_what_it_cannot_make_anew(ran, tmp_path, monkeypatch):
+    loaded = {"experiment=absent": ["name=absent"], "experiment=mine": RUN}
+    monkeypatch.setattr(config, "experiments", lambda: ["absent", "mine"])
+    monkeypatch.setattr(config, "load", lambda words, load=config.load: load([*loaded[words[0]], words[1]]))
+    readme = tmp_path / "README.md"
+    readme.write_text(f"before {gallery.MARKS[0]}\n\n### `absent`\n\nkept\n{gallery.MARKS[1]} after")
+    gallery.main(readme, ran)
+    text = readme.read_text()
+    assert text.startswith("before ")
+    assert text.endswith(" after")
+    assert "### `absent`\n\nkept\n" in text
+    assert "lowest relative RMSE in" in text
+    assert "bias_variance_stiffness.png" in text
+    gallery.main(readme, ran)
+    assert readme.read_text() == text
+
+
+# -------------------------------------------------------------------------------------------------------- browser
+
+MARKS = "document.querySelectorAll('.scatterlayer .trace .point').length"
+SETTLED = "settled()"
+WIDE = (1200, 3000)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """Opens a page given as text, and asserts that the last one neither complained nor asked for anything."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium to open pages in: apt-get install chromium")
+    with chromium(tmp_path_factory.mktemp("profile")) as found:
+        found.size(*WIDE)
+        yield found
+
+
+@pytest.fixture(scope="module")
+def opened(browser, tmp_path_factory):
+    """The page of a few rows, opened once."""
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    path.write_text(page(small_rows()))
+    browser.open(path)
+    return browser
+
+
+@pytest.fixture
+def shown(opened):
+    """That page with nothing filtered, sorted or selected; it never complains and never asks for anything."""
+    opened.size(*WIDE)
+    opened.do("document.getElementById('clear').click(); state.sort = null; applyTheme('auto'); select(-1)")
+    opened.do(SETTLED)
+    yield opened
+    assert opened.said == []
+    assert opened.requests == []
+
+
+def test_unsteady_times_are_marked(browser, tmp_path):
+    rows = table([row(stiffness=k, time_s=0.01, time_iqr_s=spread) for k, spread in ((1.0, 1e-4), (2.0, 5e-3))])
+    path = tmp_path / "report.html"
+    path.write_text(page(rows))
+    browser.open(path)
+    assert browser.do("[0, 1].map((i) => shownAs(page.columns.find((c) => c.name === 'time_s'), i))") == [
+        "10 ms",
+        "10 ms !",
+    ]
+
+
+def test_charts_are_drawn_and_a_filter_takes_points_away(shown):
+    rows = small_rows()
+    before = shown.do(MARKS)
+    assert before >= 2 * int((rows["status"] == "ok").sum())
+    shown.do(
+        """(() => {
+        const box = document.querySelector('#filters details[data-column="estimator"] input[data-value="fobg"]');
+        box.checked = false;
+        box.dispatchEvent(new Event('change'));
+        return settled();
+        })()"""
+    )
+    left = rows[rows["estimator"] != "fobg"]
+    assert 2 * int((left["status"] == "ok").sum()) <= shown.do(MARKS) < before
+    assert f"{len(left)} of {len(rows)} cells" in shown.do("document.getElementById('shown').textContent")
+    shown.do("document.getElementById('clear').click(); settled()")
+    assert shown.do(MARKS) == before
+
+
+def test_number_of_points_in_the_first_chart_is_that_of_the_good_cells(shown):
+    drawn = shown.do(
+        "[...charts[0].panels.querySelectorAll('.plot')].flatMap((plot) => plot.data).filter((one) => one.text)"
+        ".reduce((count, one) => count + one.x.length, 0)"
+    )
+    assert drawn == int((small_rows()["status"] == "ok").sum())
+
+
+def test_time_axis_takes_compilation_and_rollouts(shown):
+    values = "charts[0].panels.querySelector('.plot').data.filter((one) => one.text).flatMap((one) => one.x)"
+    times = shown.do(values)
+    select = "charts[0].options.querySelector('select')"
+    for place in (1, 2):
+        shown.do(f"{select}.value = {place}; {select}.dispatchEvent(new Event('change'))")
+        assert min(shown.do(values)) > max(times)
+    shown.do(f"{select}.value = 0; {select}.dispatchEvent(new Event('change'))")
+
+
+def test_table_sorts_both_ways_and_has_missing_values_last(shown):
+    place = shown.do("page.columns.findIndex((c) => c.name === 'rmse_rel')")
+    button = f"document.querySelectorAll('#table thead button')[{place}]"
+    shown.do("state.limit = 1e6")
+    for order in ("ascending", "descending"):
+        shown.do(f"{button}.click()")
+        assert shown.do(f"{button}.closest('th').ariaSort") == order
+        read = shown.do(
+            f"[...document.querySelectorAll('#table tbody tr')].map((line) => line.cells[{place}].textContent)"
+        )
+        numbers = [float(text) for text in read if text != "-"]
+        assert len(read) == len(small_rows())
+        assert len(numbers) == int((small_rows()["status"] == "ok").sum())
+        assert numbers == sorted(numbers, reverse=order == "descending")
+        assert set(read[len(numbers) :]) <= {"-"}
+
+
+def test_a_row_and_a_point_select_the_cell_and_show_its_command(shown):
+    shown.do("document.querySelector('#table tbody tr').focus()")
+    shown.press("ArrowDown")
+    shown.press("Enter")
+    assert shown.do("state.selected") == shown.do("Number(document.querySelectorAll('#table tbody tr')[1].dataset.row)")
+    assert shown.do("document.getElementById('command').textContent") == "python -m bench name=one_cell a=1"
+    assert "null" not in shown.do("document.getElementById('cell').innerText")
+    shown.do("document.querySelector('#cell button').click(); settled()")
+    assert shown.do("document.getElementById('cell').hidden")
+    x, y = shown.do(
+        """(() => {
+        const box = document.querySelector('.scatterlayer .point').getBoundingClientRect();
+        return [box.x + box.width / 2, box.y + box.height / 2];
+        })()"""
+    )
+    shown.click(x, y)
+    shown.wait("state.selected >= 0 && !document.getElementById('cell').hidden", 10)
+
+
+def test_keyboard_reaches_theme_filters_headings_and_rows(shown):
+    shown.do("document.activeElement.blur(); window.getSelection().collapse(document.body, 0)")
+    active = "document.activeElement"
+    reached = set()
+    for _ in range(60):
+        shown.press("Tab")
+        reached.add(shown.do(f"{active}.closest('#theme, #filters, #find, .options, thead, tbody, a')?.tagName"))
+        assert shown.do(f"{active}.matches(':focus-visible')")
+        assert float(shown.do(f"getComputedStyle({active}).outlineWidth").removesuffix("px")) >= 2
+    assert {"A", "BUTTON", "DIV", "INPUT", "THEAD", "TBODY"} <= reached
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_colours_follow_the_system_and_the_button(shown, dark):
+    ground = "getComputedStyle(document.body).backgroundColor"
+    light_ground, dark_ground = "rgb(255, 255, 255)", "rgb(20, 23, 26)"
+    shown.size(*WIDE, dark)
+    assert shown.do(ground) == (dark_ground if dark else light_ground)
+    shown.do("document.getElementById('theme').click()")
+    assert shown.do(ground) == dark_ground
+    shown.do("document.getElementById('theme').click()")
+    assert shown.do(ground) == light_ground
+
+
+def test_an_estimator_has_one_colour_in_every_chart(shown):
+    found = shown.do(
+        "[...document.querySelectorAll('.plot')].flatMap((plot) => plot.data).filter((one) => one.text)"
+        ".map((one) => [reader('rows', 'estimator')(one.customdata[0]), one.marker.color])"
+    )
+    assert {name for name, _ in found} == set(small_rows()["estimator"])
+    assert len({tuple(pair) for pair in found}) == len({name for name, _ in found})
+
+
+def test_a_phone_needs_no_sideways_scrolling(shown):
+    shown.size(390, 844)
+    shown.do(SETTLED)
+    assert shown.do("document.documentElement.scrollWidth") <= 390
+
+
+def test_hostile_names_are_shown_as_they_are_and_do_nothing(browser, tmp_path):
+    rows = small_rows(estimators=("fobg", "reinforce"), backends=("jax",))
+    hostile = [rows.assign(scene=name, estimator=name, reason=name, key=rows["key"] + name) for name in HOSTILE]
+    path = tmp_path / "report.html"
+    path.write_text(page(pd.concat([rows, *hostile], ignore_index=True), name=HOSTILE[0]))
+    browser.open(path)
+    browser.do("select(rowCount - 1)")
+    assert browser.do("window.hacked === undefined")
+    texts = browser.do("document.body.innerText")
+    assert all(name in texts for name in HOSTILE)
+    assert browser.do("document.querySelectorAll('img, .panels b, td b').length") == 0
+    assert browser.said == browser.requests == []
+
+
+@dataclass(frozen=True)
+class Unknown(Study):
+    """A study without a page of its own."""
+
+    name = "unknown"
+    columns: ClassVar[Columns] = COLUMNS
+
+    def measure(self, cell, session):
+        """Nothing."""
+        return {"status": "ok"}
+
+    def write(self, experiment, rows):
+        """Nothing."""
+        return []
+
+
+STUDIES = {name: entry.plugin for name, entry in registry.entries()["studies"].items() if name != "bias_variance"}
+
+
+@pytest.mark.parametrize("study", [*STUDIES.values(), Unknown], ids=[*STUDIES, "unknown"])
+def test_page_of_every_other_study_says_why_nothing_ran(study):
+    blank = study.columns.blank() | {"experiment": "made_up", "scene": "pushing", "estimator": "fobg", "seed": 0.0}
+    rows = [blank | {"key": status, "status": status, "reason": "no reason"} for status in ("unsupported", "error")]
+    found = data_of(page(study.columns.typed(pd.DataFrame(rows)), study=study()))
+    assert column(found, "reason") == ["no reason", "no reason"]

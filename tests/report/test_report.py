@@ -1,0 +1,582 @@
+"""Tables and charts from rows, held to what they promise and to what goes wrong in them."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pandas as pd
+import pytest
+from helpers import (
+    BACKENDS,
+    NAMES,
+    SPRINGY,
+    STIFFNESS,
+    experiment,
+    failed,
+    loaded,
+    row,
+    rows_of,
+    small_rows,
+    stiffness_rows,
+    table,
+)
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from bench.cli import main
+from bench.report import views
+from bench.report.figures import save, styled
+from bench.report.plotted import plotted
+from bench.report.style import PALETTE, Look, axis_name, colour
+from bench.report.tables import number_format
+from bench.report.text import number
+from bench.studies.bias_variance import charts, findings, tables, terminal
+from bench.studies.bias_variance.columns import TABLE
+from bench.sweep.store import Store
+
+
+@pytest.fixture
+def made(tmp_path):
+    """An experiment whose files can be written."""
+    found = experiment(tmp_path)
+    found.directory.mkdir()
+    return found
+
+
+# ---------------------------------------------------------------------------------------------------------- tables
+
+
+def test_csv_has_the_promised_columns_in_order_and_every_digit(made):
+    rows = stiffness_rows()
+    tables.write(made, rows)
+    with open(made.directory / "bias_variance.csv", newline="") as file:
+        assert next(csv.reader(file)) == [*TABLE, "study", "parameters"]
+    back = pd.read_csv(made.directory / "bias_variance.csv")
+    assert len(back) == len(rows)
+    for name in ("bias", "variance", "time_s"):
+        np.testing.assert_array_equal(back[name], rows[name])
+    assert set(back["samples"].astype(str)) == {"100"}
+
+
+def test_every_promised_file_is_written(made):
+    names = {path.name for path in tables.write(made, stiffness_rows())}
+    assert names == {"bias_variance.csv", "bias_variance.md", "bias_variance.tex", "speed_accuracy.csv"}
+    assert {path.name for path in made.directory.iterdir()} == names
+
+
+def test_pareto_is_what_brute_force_finds(made):
+    generator = np.random.default_rng(0)
+    rows = small_rows()
+    rows["time_s"] = generator.integers(1, 6, len(rows)) / 1e3
+    rows["rmse_rel"] = generator.integers(1, 6, len(rows)) / 10
+    tables.write(made, rows)
+    found = pd.read_csv(made.directory / "speed_accuracy.csv")
+    assert found["pareto"].sum() > 4
+    same = ["scene", "contact", "integrator", "horizon", "dt", "stiffness", "sigma", "smoothing", "noise"]
+    found["smoothing"] = found["smoothing"].fillna(-1.0)
+    lines = found.to_dict("records")
+    for line in lines:
+        rivals = [r for r in lines if r["status"] == "ok" and all(r[c] == line[c] for c in same)]
+        beaten = any(r["time_s"] < line["time_s"] and r["rmse_rel"] < line["rmse_rel"] for r in rivals)
+        assert line["pareto"] == (line["status"] == "ok" and not beaten)
+
+
+def test_bias_within_its_noise_is_told_apart(made):
+    rows = table([row(bias_low=0.0, bias_high=0.124, bias=0.05), row(seed=1, bias=0.5, bias_low=0.4, bias_high=0.6)])
+    tables.write(made, rows)
+    for name in ("bias_variance.md", "bias_variance.tex"):
+        text = (made.directory / name).read_text().replace("$<$", "<").replace("{[}", "[").replace("{]}", "]")
+        assert "0 (< 0.124)" in text
+        assert "0.500 [0.400, 0.600]" in text
+        assert "not distinguishable from 0" in text
+
+
+def test_failed_cells_are_rows_with_their_reason(made):
+    rows = stiffness_rows()
+    tables.write(made, rows)
+    text = (made.directory / "bias_variance.md").read_text()
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert len(lines) == 2 + len(rows)
+    assert sum("| nonfinite (" in line for line in lines) == (rows["status"] == "nonfinite").sum() > 0
+    assert "3 of 32 estimates are not finite, first repeat 4 of seed 0" in text
+    assert (made.directory / "bias_variance.tex").read_text().count(r"\\") == 1 + len(rows)
+
+
+EVIL = "<script>alert(1)</script>|[x](http://y)*a*_b_`c`$d$\\input{e}%f&g#h~i^j\nnext \x1b[31mline"
+
+
+def test_text_is_escaped_in_every_format(made):
+    rows = table([row(scene=EVIL), row(scene="tame"), failed("error", EVIL, scene="other")])
+    tables.write(made, rows)
+    markdown = (made.directory / "bias_variance.md").read_text()
+    assert "<script>" not in markdown
+    assert "](http" not in markdown
+    body = [line for line in markdown.splitlines() if line.startswith("|")]
+    assert len(body) == 5
+    assert len({len(re.findall(r"(?<!\\)\|", line)) for line in body}) == 1
+    latex = (made.directory / "bias_variance.tex").read_text()
+    plain = re.sub(r"\\[a-zA-Z]+(\{\})?|\\[&%$#_{}]|\$[<>|]\$", "", "\n".join(latex.splitlines()[4:]))
+    plain = plain.replace(r"\\", "")
+    assert not set(plain) & set("$#_%~^<>|")
+    assert r"\input" not in latex
+    assert pd.read_csv(made.directory / "bias_variance.csv")["scene"][0] == EVIL
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0213, "0.021"), (0.996, "1.0"), (350.0, "350"), (1234.0, "1200"), (123456.0, "1.2e5"), (2e-7, "2.0e-7"),
+     (0.0, "0"), (math.nan, "-"), (math.inf, "inf")],
+)  # fmt: skip
+def test_numbers_are_short(value, text):
+    assert number(value) == text
+
+
+# -------------------------------------------------------------------------------------------------------- terminal
+
+
+@pytest.mark.parametrize("rows", [stiffness_rows(), small_rows(backends=("jax",))])
+def test_terminal_output_fits_and_says_what_matters(rows, capsys, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    terminal.show(experiment(), rows)
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 100
+    assert text.isascii()
+    assert "As contact stiffens, which gradient stays right?" in text
+    assert f"{len(rows)} cells: " in text
+    for status, count in rows["status"].value_counts().items():
+        assert f"{count} {status}" in text
+    assert "lowest error" in text
+
+
+def families(rows, column, **given):
+    """The problems of rows along the axis of that column."""
+    shown = views.arranged(experiment(**given), rows)
+    return views.families(shown, views.along(shown, named(shown, column)))
+
+
+def named(shown, column):
+    return next(axis for axis in shown.axes if axis.column == column)
+
+
+def test_backends_that_agree_are_one_line():
+    rows = stiffness_rows(sigmas=(0.1,), estimators=("fobg",), backends=("jax", "torch", "numpy"))
+
+    def merged():
+        family = families(rows, "stiffness")[0]
+        return [dict(line.backends) for line in views.lines(family.rows)]
+
+    assert merged() == [{"jax": True, "torch": True, "numpy": False}]
+    rows.loc[rows["backend"] == "torch", "rmse"] *= 1.5
+    assert merged() == [{"jax": True, "numpy": False}, {"torch": True}]
+
+
+def test_terminal_takes_names_literally(capsys):
+    rows = table([row(estimator_params="baseline=[bold]x", scene="[red]s[/red]", samples=n) for n in (16, 64)])
+    terminal.show(experiment(sweep={"samples": [16, 64]}), rows)
+    text = capsys.readouterr().out
+    assert "fobg[baseline=[bold]x]" in text
+    assert "[red]s[/red]" in text
+
+
+# ---------------------------------------------------------------------------------------------------------- charts
+
+
+def drawn(rows, swept, sweep=None):
+    """The charts of rows that were swept along these axes, or by a sweep."""
+    if sweep is None:
+        sweep = {name: sorted(map(float, rows[name].unique())) for name in swept}
+    with styled():
+        return charts.figures(experiment(sweep=sweep), rows)
+
+
+def curves(panel):
+    """Colour of each labelled line of a panel."""
+    found = {}
+    for line in panel.lines:
+        if not line.get_label().startswith("_"):
+            found.setdefault(line.get_label(), set()).add(line.get_color())
+    for container in panel.containers:
+        if not container.get_label().startswith("_"):
+            found.setdefault(container.get_label(), set()).add(container.lines[0].get_color())
+    found.pop("Pareto front", None)
+    return found
+
+
+def test_charts_are_written_as_pictures_and_data(tmp_path):
+    made = experiment(tmp_path, formats=("png", "svg", "pdf"))
+    made.directory.mkdir()
+    paths = charts.write(made, small_rows(sigmas=(0.1, 0.3)))
+    stems = {"bias_variance_sigma", "bias_variance_stiffness", "speed_accuracy"}
+    assert {path.name for path in paths} == {
+        f"{stem}.{suffix}" for stem in stems for suffix in ("png", "svg", "pdf", "plotted.csv")
+    }
+    for path in paths:
+        content = path.read_bytes()
+        starts = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF", ".csv": b"panel,"}
+        assert content.startswith(starts[path.suffix])
+        assert len(content) > 10_000
+
+
+def test_one_line_per_estimator_and_one_colour_everywhere():
+    figures = drawn(stiffness_rows(), ["sigma", "stiffness"])
+    panels = figures["bias_variance_stiffness"].axes
+    assert len(panels) == 2 * 4
+    colours = {}
+    for figure in figures.values():
+        for panel in figure.axes:
+            assert set(curves(panel)) == set(NAMES)
+            for name, found in curves(panel).items():
+                colours.setdefault(name, set()).update(found)
+    assert all(len(found) == 1 for found in colours.values())
+    assert len(set.union(*colours.values())) == len(NAMES)
+
+
+def test_colours_do_not_depend_on_which_estimators_ran():
+    few, all_of_them = (
+        drawn(small_rows(estimators=names), ["stiffness"])["bias_variance_stiffness"]
+        for names in (("reinforce", "fobg"), NAMES)
+    )
+    assert curves(few.axes[0]) == {name: curves(all_of_them.axes[0])[name] for name in ("reinforce", "fobg")}
+
+
+def test_backends_that_differ_get_a_line_of_their_own():
+    rows = small_rows()
+    rows.loc[(rows["backend"] == "torch") & (rows["estimator"] == "fobg"), ["rmse", "variance"]] *= 2
+    panel = drawn(rows, ["stiffness"])["bias_variance_stiffness"].axes[0]
+    lines = [line for line in panel.lines if line.get_label() == "fobg"]
+    assert len(lines) == 2
+    assert lines[0].get_linestyle() != lines[1].get_linestyle()
+
+
+def test_failed_cells_are_crosses():
+    rows = stiffness_rows(sigmas=(0.1,))
+    panels = drawn(rows, ["stiffness"])["bias_variance_stiffness"].axes
+    crosses = [[line for line in panel.lines if line.get_marker() == "x"] for panel in panels]
+    assert [len(found) for found in crosses] == [2, 0, 2, 0]  # fobg and inverse_variance, bias and variance
+
+
+def test_marks_are_drawn():
+    panels = drawn(small_rows(), ["stiffness"])["bias_variance_stiffness"].axes
+    assert all(any(list(line.get_xdata()) == [6400, 6400] for line in panel.lines) for panel in panels)
+
+
+def test_nothing_swept_gives_an_overview():
+    rows = table([row(estimator=e, backend=b) for e in NAMES for b in BACKENDS])
+    figures = drawn(rows, ["sigma"], sweep={"sigma": [0.1]})
+    assert set(figures) == {"overview", "speed_accuracy"}
+    assert set(curves(figures["overview"].axes[0])) == set(NAMES)
+
+
+def test_a_parameter_in_an_identity_string_is_an_axis():
+    """The default value is left out of identity strings, and so is the one value that no string has."""
+    sweep = {"gamma": [0.1, 1.0, 10.0]}
+    rows = table([row(estimator="alpha_order", estimator_params=p) for p in ("", "gamma=0.1", "delta=0.3,gamma=10")])
+    rows = pd.concat([rows, table([row()])], ignore_index=True)
+    shown = views.arranged(experiment(sweep=sweep), rows)
+    found = views.along(shown, named(shown, "gamma"))
+    assert list(found["x"]) == [1.0, 0.1, 10.0]
+    assert list(found["estimator_params"]) == ["", "", "delta=0.3"]
+    assert "bias_variance_gamma" in drawn(rows, ["gamma"], sweep=sweep)
+
+
+def test_the_parameter_behind_smoothing_is_an_axis():
+    sweep = {"union": [{"beta": [1.0, 10.0]}, {"kappa": [1e-6, 1e-4]}]}
+    rows = [row(contact="softplus", smoothing=b) for b in (1.0, 10.0)]
+    rows += [row(contact="complementarity", smoothing=k) for k in (1e-6, 1e-4)] + [row()]
+    figures = drawn(table(rows), ["beta", "kappa"], sweep=sweep)
+    assert set(figures) == {"bias_variance_beta", "bias_variance_kappa"}
+    assert len(figures["bias_variance_beta"].axes) == 2
+
+
+def test_zipped_axes_do_not_split_problems():
+    sweep = {"zip": {"stiffness": [1e2, 1e4], "dt": [0.01, 0.001]}}
+    rows = table([row(stiffness=k, dt=h) for k, h in ((1e2, 0.01), (1e4, 0.001))])
+    assert len(families(rows, "stiffness", sweep=sweep)) == 1
+    assert set(drawn(rows, ["stiffness", "dt"], sweep=sweep)) == {"bias_variance_stiffness", "bias_variance_dt"}
+
+
+def test_seeds_become_medians_and_lost_ones_stay_visible():
+    rows = [row(stiffness=k, seed=s, bias_rel=0.1 * s) for k in (1e2, 1e4) for s in range(5)]
+    rows[-1] = failed("nonfinite", "1 of 32 estimates are not finite", stiffness=1e4, seed=4)
+    merged = views.merge_seeds(table(rows))
+    assert list(merged["bias_rel"]) == pytest.approx([0.2, 0.15])
+    assert list(merged["lost"]) == [0, 1]
+    panel = drawn(table(rows), ["stiffness"])["bias_variance_stiffness"].axes[0]
+    assert [list(line.get_xdata()) for line in panel.lines if line.get_marker() == "x"] == [[pytest.approx(1e4)]]
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [failed("error", "it broke", stiffness=k) for k in (1e2, 1e4)],
+        [failed("unsupported", "it cannot", stiffness=k) for k in (1e2, 1e4)],
+        [row(stiffness=k, reference_norm=0.0, bias_rel=math.nan, rmse_rel=math.nan) for k in (1e2, 1e4)],
+        [row(stiffness=k, bias=0.0, bias_low=0.0, bias_high=0.0, variance=0.0, variance_low=0.0) for k in (1e2, 1e4)],
+        [row(stiffness=k, bias=math.inf, bias_high=math.inf, variance=math.inf, rmse=math.inf) for k in (1e2, 1e4)],
+        [row(stiffness=k, bias_low=math.nan, bias_high=math.nan, variance_high=math.inf) for k in (1e2, 1e4)],
+        [row(stiffness=k, time_s=0.0, rmse_rel=0.0, backend=b) for k in (1e2, 1e4) for b in ("jax", "torch")],
+        [row(stiffness=k, scene="$s_1", estimator="_x$") for k in (0.0, -1.0)],
+        [row()],
+    ],
+    ids=["error", "unsupported", "no_gradient", "exact", "infinite", "no_interval", "no_time", "odd_names", "single"],
+)
+def test_odd_rows_break_nothing(rows, made, capsys):
+    tables.write(made, table(rows))
+    charts.write(made, table(rows))
+    terminal.show(made, table(rows))
+    assert capsys.readouterr().out
+
+
+# ----------------------------------------------------------------------------------------------------------- paper
+
+
+def figure_of_known_data():
+    """Two panels: a line, points with intervals, an upper limit, a cross at the panel's edge."""
+    with styled():
+        made = Figure()
+        upper, lower = made.subplots(2, 1)
+        upper.set(title="up", ylabel="error")
+        upper.plot([1, 2, 3], [10.0, 20.0, math.nan], label="a", color="#0072B2")
+        upper.errorbar([1], [10.0], yerr=[[4.0], [5.0]], color="#0072B2", marker="o", linestyle="none")
+        upper.plot([2], [20.0], marker="o", markerfacecolor="white", color="#0072B2", linestyle="none")
+        upper.plot([9], [0.5], marker="x", transform=upper.get_xaxis_transform(), color="#0072B2")
+        lower.errorbar([5.0], [6.0], xerr=[[1.0], [1.0]], label="b", color="#D55E00", marker="s")
+        return made
+
+
+def test_plotted_data_is_that_of_the_figure():
+    found = plotted(figure_of_known_data())
+    assert list(found["title"]) == ["up", "up", "up"]
+    assert list(found["series"]) == ["a", "a", "b"]
+    assert list(found["mark"]) == ["point", "limit", "point"]
+    assert found[["x", "y"]].to_numpy().tolist() == [[1, 10], [2, 20], [5, 6]]
+    assert found[["y_low", "y_high"]].iloc[0].tolist() == [6.0, 15.0]
+    assert found[["x_low", "x_high"]].iloc[2].tolist() == [4.0, 6.0]
+
+
+def test_every_bias_and_interval_of_the_rows_is_in_the_plotted_data(tmp_path):
+    rows = stiffness_rows(sigmas=(0.1,), backends=("jax",), estimators=("fobg", "reinforce"))
+    made = experiment(tmp_path, sweep={"stiffness": list(STIFFNESS)})
+    made.directory.mkdir()
+    charts.write(made, rows)
+    found = pd.read_csv(tmp_path / "made_up" / "bias_variance_stiffness.plotted.csv")
+    for _, cell in rows[rows["bias_low"] > 0].iterrows():
+        ends = cell[["bias", "bias_low", "bias_high"]] / cell["reference_norm"]
+        near = np.isclose(found[["y", "y_low", "y_high"]], ends.to_numpy(dtype=float), rtol=1e-6).all(axis=1)
+        assert (found["series"][near] == cell["estimator"]).any()
+
+
+def test_equal_figures_are_equal_files_with_their_fonts_inside(tmp_path):
+    for name in ("first", "second"):
+        with styled():
+            paths = save(figure_of_known_data(), tmp_path / name, ("png", "svg", "pdf"))
+        assert [path.name.partition(".")[2] for path in paths] == ["png", "svg", "pdf", "plotted.csv"]
+    for path in paths:
+        assert path.read_bytes() == (tmp_path / f"first.{path.name.partition('.')[2]}").read_bytes()
+    pdf = (tmp_path / "first.pdf").read_bytes()
+    assert b"/FontFile2" in pdf
+    assert b"CreationDate" not in pdf
+    assert b"<text" not in (tmp_path / "first.svg").read_bytes()
+
+
+def test_best_is_told_only_where_its_interval_is_apart_from_every_other_estimator():
+    def rows(other):
+        made = [row(estimator=name, backend=backend) for name in ("fobg", "reinforce") for backend in ("jax", "torch")]
+        known = table(made)
+        known[["bias_low", "bias_high"]] = 0.0
+        ends = {"fobg": (1.0, 2.0), "reinforce": other}
+        for end, place in (("low", 0), ("high", 1)):
+            known[f"variance_{end}"] = [ends[name][place] for name in known["estimator"]]
+        return known.assign(rmse=[1.2 if name == "fobg" else 2.0 for name in known["estimator"]])
+
+    assert tables.best(rows((2.5, 4.0))).tolist() == [True, True, False, False]
+    assert not tables.best(rows((1.9, 4.0))).any()
+    assert not tables.best(rows((2.5, 4.0)).assign(variance_low=math.nan)).any()
+    assert tables.latex(tables.readable(experiment(), rows((2.5, 4.0)))).count(r"\bfseries") == 2
+    assert r"\bfseries" not in tables.latex(tables.readable(experiment(), rows((1.9, 4.0))))
+
+
+@pytest.mark.parametrize(
+    ("texts", "form"),
+    [(["0.10", "12", "-"], "2.2"), (["1.2e5", "-3"], "-1.1e1"), (["2.0e-7"], "1.1e-1"), (["0 (< 0.1)", "-"], "1.0")],
+)
+def test_column_format_holds_every_number(texts, form):
+    assert number_format(texts) == form
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex: apt-get install texlive-science")
+@pytest.mark.parametrize("count", [30, 60])
+def test_table_compiles_in_latex(count, made):
+    rows = table(
+        [row(scene=EVIL), failed("error", EVIL, scene="other"), *(row(stiffness=float(k + 1)) for k in range(count))]
+    )
+    rows.loc[2, ["bias", "bias_low"]] = 0.0
+    tables.write(made, rows)
+    packages = re.search(r"usepackage\{(.*)\}", (made.directory / "bias_variance.tex").read_text())[1]
+    text = rf"\documentclass{{article}}\usepackage{{{packages}}}\begin{{document}}\input{{bias_variance.tex}}\end{{document}}"
+    (made.directory / "paper.tex").write_text(text)
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+    done = subprocess.run(command, cwd=made.directory, capture_output=True, text=True, errors="replace", timeout=120)
+    assert done.returncode == 0, done.stdout[-2000:]
+
+
+# ------------------------------------------------------------------------------------------------------ swept axes
+
+FEW = ("estimators=[fobg]", "backends=[numpy]")
+
+
+def test_no_cell_is_lost_where_a_swept_value_is_the_default_of_one_scene(capsys, made):
+    """Damping 1 is what wall_penalty_1d asks of its law, and 0 what bouncing_ball leaves it: no identity string shows either."""
+    swept, cells = loaded(*FEW, "scenes=[wall_penalty_1d,bouncing_ball]", "sweep.damping=[0,1,10]")
+    rows = rows_of(swept, cells)
+    shown = views.arranged(swept, rows)
+    along = views.along(shown, named(shown, "damping"))
+    assert sorted(along["x"]) == [0.0, 0.0, 1.0, 1.0, 10.0, 10.0]
+    assert [sorted(family.rows["x"]) for family in views.families(shown, along)] == [[0.0, 1.0, 10.0]] * 2
+    found = findings.problems(shown)
+    assert [(axis.column, len(family.rows)) for axis, family in found] == [("damping", 3)] * 2
+    terminal.show(swept, rows)
+    digest = capsys.readouterr().out
+    assert len(re.findall(r"^ *(?:0|1|10)  fobg ", digest, re.MULTILINE)) == 6
+    with styled():
+        figure = charts.figures(swept, rows)["bias_variance_damping"]
+    assert set(plotted(figure)["x"]) == {0.0, 1.0, 10.0}
+
+
+def test_a_law_parameter_that_happens_to_equal_another_keeps_its_problem():
+    """Stiffness 10 stays stiffness 10 where damping is 10 as well."""
+    swept, cells = loaded(*FEW, "scenes=[pushing]", "sweep.stiffness=[10,100]", "sweep.damping=[1,10]")
+    rows = rows_of(swept, cells)
+    shown = views.arranged(swept, rows)
+    for column in ("stiffness", "damping"):
+        found = views.families(shown, views.along(shown, named(shown, column)))
+        assert [len(family.rows) for family in found] == [2, 2]
+    table = tables.readable(swept, rows)
+    assert table.headers[:2] == ["stiffness", "damping"]
+    assert [cells[:2] for cells in table.body] == [["10", "1"], ["10", "10"], ["100", "1"], ["100", "10"]]
+
+
+def test_cells_that_differ_in_a_scene_parameter_named_like_one_of_the_law_are_all_reported(tmp_path, capsys):
+    (tmp_path / "springy.py").write_text(SPRINGY)
+    words = [
+        *FEW, f"plugins={tmp_path}", "scenes=[springy]", "sweep.springy.stiffness=[1,2,3]", "name=own", "timing=false",
+        f"results_dir={tmp_path / 'out'}",
+    ]  # fmt: skip
+    swept, cells = loaded(*words)
+    store = Store(swept.directory, swept.columns)
+    store.prepare()
+    store.append(*rows_of(swept, cells).to_dict("records"))
+    assert main(["report", *words]) == 0
+    assert "3 cells: 3 ok" in capsys.readouterr().out
+    found = pd.read_csv(swept.directory / "bias_variance.csv")
+    assert list(found["springy.stiffness"]) == [1.0, 2.0, 3.0]
+    assert list(found["stiffness"]) == [1000.0] * 3
+    assert set(pd.read_csv(swept.directory / "bias_variance_springy_stiffness.plotted.csv")["x"]) == {1.0, 2.0, 3.0}
+
+
+def test_rows_of_a_version_that_stored_no_parameters_are_told_apart_and_make_way_for_new_ones():
+    new = table([row(stiffness=k) for k in (1.0, 2.0, 3.0)])
+    old = new.assign(parameters="", study="", key="old" + new["key"], bias=7.0)
+    assert len(views.latest(old)) == 3
+    found = views.latest(pd.concat([old, new[:2]], ignore_index=True))
+    assert list(found["stiffness"]) == [3.0, 1.0, 2.0]
+    assert list(found["bias"] == 7.0) == [True, False, False]
+    assert len(views.merge_seeds(pd.concat([old, old.assign(seed=1.0)], ignore_index=True))) == 3
+
+
+def test_a_swept_scene_parameter_is_a_number_in_every_table_and_title_at_its_default_too(tmp_path):
+    words = [*FEW, "scenes=[pushing]", "sweep.mass=[0.1,0.2]", "sweep.stiffness=[100,1000]", f"results_dir={tmp_path}"]
+    swept, cells = loaded(*words)
+    swept.directory.mkdir()
+    rows = rows_of(swept, cells)
+    assert sorted(set(rows["scene"])) == ["pushing", "pushing[mass=0.2]"]
+    tables.write(swept, rows)
+    back = pd.read_csv(swept.directory / "bias_variance.csv")
+    assert sorted(back["mass"]) == [0.1, 0.1, 0.2, 0.2]
+    found = tables.readable(swept, rows)
+    assert "scene" not in found.headers
+    place = found.headers.index("mass")
+    assert found.numeric[place]
+    assert sorted(line[place] for line in found.body) == ["0.1", "0.1", "0.2", "0.2"]
+    assert "| stiffness | mass | " in (swept.directory / "bias_variance.md").read_text()
+    shown = views.arranged(swept, rows)
+    titles = [family.title() for family in views.families(shown, views.along(shown, named(shown, "stiffness")))]
+    assert titles == ["mass=0.1", "mass=0.2"]
+    with styled():
+        panels = charts.figures(swept, rows)["bias_variance_stiffness"].axes
+    assert [panel.get_title() for panel in panels if panel.get_title()] == ["mass = 0.1", "mass = 0.2"]
+
+
+def test_the_axis_of_zipped_parameters_names_all_of_them():
+    sweep = {"zip": {"stiffness": [1e2, 1e4], "dt": [0.01, 0.001]}}
+    rows = table([row(stiffness=k, dt=h) for k, h in ((1e2, 0.01), (1e4, 0.001))])
+    figures = drawn(rows, (), sweep=sweep)
+    for name, other in (("stiffness", "dt"), ("dt", "stiffness")):
+        labels = [panel.get_xlabel() for panel in figures[f"bias_variance_{name}"].axes]
+        assert any(other in label for label in labels)
+    shown = views.arranged(experiment(sweep=sweep), rows)
+    assert axis_name(named(shown, "stiffness")) == "stiffness $k$ [N/m], dt with it"
+    assert [axis.title for axis in shown.axes] == ["stiffness [N/m], with dt", "dt [s], with stiffness"]
+
+
+@pytest.mark.parametrize("values", [STIFFNESS, (1000.0, 1500.0, 2000.0)], ids=["logarithmic", "linear"])
+def test_plotted_data_have_the_swept_values_and_points_stand_beside_each_other(tmp_path, values):
+    made = experiment(tmp_path, sweep={"stiffness": list(values)})
+    made.directory.mkdir()
+    rows = stiffness_rows(stiffness=values, sigmas=(0.1,), backends=("jax",))
+    rows = rows[rows["status"] != "unsupported"]
+    charts.write(made, rows)
+    found = pd.read_csv(made.directory / "bias_variance_stiffness.plotted.csv")
+    good = rows[rows["status"] == "ok"]
+    for estimator, part in good.groupby("estimator"):
+        mine = found[(found["series"] == estimator) & found["y_label"].str.startswith("variance")]
+        assert sorted(mine["x"]) == sorted(part["stiffness"])
+    with styled():
+        panel = charts.figures(made, rows)["bias_variance_stiffness"].axes[0]
+    places = {
+        round(line.get_transform().transform((values[1], 1.0))[0], 3)
+        for line in panel.lines if not line.get_label().startswith("_")
+    }  # fmt: skip
+    assert len(places) == len(NAMES)
+    centre = panel.transData.transform((values[1], 1.0))[0]
+    assert sum(place - centre for place in places) == pytest.approx(0.0, abs=0.1)
+
+
+# --------------------------------------------------------------------------------------------------------- colours
+
+
+def lab(text):
+    """A colour in CIELAB, where distances are those that are seen."""
+    rgb = np.array(to_rgb(text))
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]] @ linear / [0.9505, 1.0, 1.089]
+    x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+def test_forty_estimators_have_forty_colours_each_told_from_the_one_it_comes_from():
+    found = [colour(place) for place in range(40)]
+    assert len(set(found)) == 40
+    assert found[: len(PALETTE)] == list(PALETTE)
+    for place in range(len(PALETTE), 40):
+        assert np.linalg.norm(lab(found[place]) - lab(PALETTE[place % len(PALETTE)])) > 10
+    assert min(np.linalg.norm(lab(a) - lab(b)) for a, b in itertools.combinations(found, 2)) > 5
+
+
+def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
+    def look(*estimators):
+        rows = table([row(estimator=name, stiffness=k) for name in estimators for k in (1e2, 1e4)])
+        styles = Look(rows, NAMES)
+        return {line.label: styles.marked(line) for line in views.lines(rows.assign(x=rows["stiffness"], lost=0.0))}
+
+    every = look(*NAMES)
+    assert len({(style["color"], style["marker"]) for style in every.values()}) == len(NAMES)
+    for name in NAMES:
+        assert look(name) == {name: every[name]}
+    assert look("of_my_own", *NAMES) == every | look("of_my_own")

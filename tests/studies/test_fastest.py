@@ -1,0 +1,105 @@
+"""The fastest method for an error: costs at a known law of bias and variance."""
+
+import json
+import math
+
+import pandas as pd
+import pytest
+from helpers import described_by
+
+from bench.report.views import Line
+from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED
+from bench.studies.bias_variance.fastest import reach, table
+from bench.sweep import config
+
+SAMPLES = (16, 64, 256)
+VARIANCE = 4.0
+"""Of one sample, relative: an RMSE of 0.1 takes 400 samples and one of 0.5 takes 16."""
+
+
+def rows(bias=0.0, resolved=None, **values):
+    """Rows of a method with that law, 1 ms a sample, for a gradient of norm 2."""
+    resolved = bias > 0 if resolved is None else resolved
+    found = [
+        {
+            "scene": "s", "contact": "none", "integrator": "i", "noise": "action", "backend": "b", "dtype": "float64",
+            "estimator": "e", "estimator_params": "", "horizon": 10.0, "dt": 0.1, "stiffness": math.nan, "sigma": 0.1,
+            "smoothing": math.nan, "repeats": 8, "seed": 0, "status": "ok", "lost": 0.0, "samples": float(n),
+            "reference_norm": 2.0, "bias": 2 * bias, "bias_low": 1.9 * bias if resolved else 0.0, "bias_high": 2.1 * bias,
+            "variance": 4 * VARIANCE / n, "rmse": 2 * math.sqrt(bias**2 + VARIANCE / n),
+            "rmse_rel": math.sqrt(bias**2 + VARIANCE / n), "time_s": 1e-3 * n, "time_iqr_s": 0.0, "compile_s": 2.0,
+            "rollouts": float(n), "gradients": float(n),
+        } | values
+        for n in SAMPLES
+    ]  # fmt: skip
+    return pd.DataFrame(
+        [one | {"study": "bias_variance", "parameters": json.dumps(described_by(one))} for one in found]
+    )
+
+
+def line(**values):
+    found = rows(**values)
+    return Line("e", "", {"b": True}, found.set_index("samples"), {"b": 1.0}, frozenset(), 0)
+
+
+@pytest.mark.parametrize(
+    ("target", "how", "samples"),
+    [
+        (0.5, "at once", 16),
+        (math.sqrt(4 / 100), "measured", 100),
+        (0.1, "extrapolated", 400),
+        (0.01, "extrapolated", 40_000),
+    ],
+)
+def test_unbiased_methods_follow_the_law(target, how, samples):
+    found = reach(line(), target, TIME)
+    assert found.how == how
+    assert found.samples == pytest.approx(samples)
+    assert found.cost == pytest.approx(1e-3 * samples)
+    assert reach(line(), target, ROLLOUTS).cost == pytest.approx(2 * samples)
+    assert TIME_COMPILED.of(rows()).iloc[0] == pytest.approx(2.016)
+
+
+def test_a_bias_below_the_error_takes_more_samples():
+    found = reach(line(bias=0.06), 0.1, TIME)
+    assert found.how == "extrapolated"
+    assert found.samples == pytest.approx(VARIANCE / (0.1**2 - 0.06**2))
+
+
+def test_a_bias_above_the_error_never_gets_there():
+    assert reach(line(bias=0.2), 0.1, TIME).how == "never"
+
+
+def test_a_bias_that_may_exceed_the_error_is_not_extrapolated():
+    assert reach(line(bias=0.1, resolved=False), 0.1, TIME).how == "unknown"
+    assert reach(line(bias=0.01, resolved=False), 0.1, TIME).how == "extrapolated"
+
+
+def test_failed_rows_tell_nothing():
+    assert reach(line(status="nonfinite"), 0.1, TIME).how == "unknown"
+
+
+def test_table_names_the_fastest_and_by_how_much(tmp_path):
+    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
+    slow = rows(estimator="slow").assign(time_s=lambda r: 3 * r["time_s"])
+    found = table(given, pd.concat([rows(), slow, rows(bias=0.3, estimator="biased")], ignore_index=True))
+    first = found[(found["by"] == "time") & (found["relative error"] == "10%")].iloc[0]
+    assert (first["fastest"], first["next"], first["factor"]) == ("e on b", "slow on b", "3.0")
+    assert first["never"] == "biased on b"
+    assert first["how"] == "extrapolated"
+    assert len(found) == 4
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_rollouts_are_those_of_the_cheapest_backend(tmp_path, order):
+    """A backend that fails, as one that differences across a jump, takes nothing from the estimator."""
+    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
+    parts = [rows(), rows(backend="other", status="nonfinite")]
+    found = table(given, pd.concat([parts[i] for i in order], ignore_index=True))
+    line = found[(found["by"] == "rollouts") & (found["relative error"] == "10%")].iloc[0]
+    assert (line["fastest"], line["cost"], line["how"]) == ("e", "800", "extrapolated")
+
+
+def test_nothing_is_told_where_samples_are_not_swept(tmp_path):
+    given = config.load([f"results_dir={tmp_path}"])
+    assert table(given, rows()[:1]).empty

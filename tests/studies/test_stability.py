@@ -1,0 +1,271 @@
+"""The stability map: verdicts, boundaries against theory, and the files made from them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bench.model import MechanicalScene, State, compose, registry
+from bench.model.parameters import build
+from bench.studies.stability import Stability, report
+from bench.studies.stability import measure as stability
+from bench.sweep import config, runner
+from bench.sweep.cell import Cell
+from bench.sweep.grid import cells
+from bench.sweep.plan import plan
+from bench.sweep.session import Session
+from bench.sweep.store import Store
+
+STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
+HORIZON, DT = 40, 0.05
+
+
+def experiment(tmp_path, *words):
+    return config.load(
+        ["study=stability", "name=map", f"results_dir={tmp_path}", "estimators=[fobg]", "backends=[implicit]", *words]
+    )
+
+
+def swept(tmp_path, integrator, *words):
+    """Rows of mass_spring over STIFFNESS at one dt, which compiles once."""
+    given = experiment(
+        tmp_path, "scenes=[mass_spring]", f"integrators=[{integrator}]", f"sweep.stiffness={list(STIFFNESS)}",
+        f"scene.mass_spring.horizon={HORIZON}", f"scene.mass_spring.dt={DT}", *words,
+    )  # fmt: skip
+    store = Store(given.directory, given.columns)
+    runner.run(given, plan(given, store), store, lambda cell, row: None)
+    return given, store.load().sort_values("stiffness").reset_index(drop=True)
+
+
+@dataclass(frozen=True)
+class Drop(MechanicalScene):
+    """A mass thrown at unit speed; f = q_N. It has no physical gradient."""
+
+    name = "drop"
+    n_q = 1
+    slope: float = 1.0
+
+    def theta0(self):
+        return np.array([0.5, 1.0])
+
+    def initial_state(self, xp, theta):
+        return State(theta[0:1], theta[1:2])
+
+    def acceleration(self, xp, q, v, u):
+        return -0.1 * v
+
+    def terminal_cost(self, xp, q, v):
+        return self.slope * q[0]
+
+
+def cell(tmp_path, *words):
+    return cells(experiment(tmp_path, *words))[0]
+
+
+LIMITS = stability.Limits(**{name: getattr(Stability(), name) for name in stability.Limits.__annotations__})
+
+
+def measured(found: Cell, given):
+    return Stability().measure(found, Session(given))
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.5])
+def test_semi_implicit_euler_diverges_within_a_cell_of_its_limit(tmp_path, factor):
+    """h^2 2 k / m = 2 (1 + d) for two masses m on a spring k with velocity factor d."""
+    given, rows = swept(tmp_path, "semi_implicit_euler", f"scene.mass_spring.velocity_factor={factor}")
+    limit = (1 + factor) / DT**2
+    assert np.allclose(rows["stiffness_limit"], limit, rtol=1e-6)
+    lost = rows["verdict"].isin(["diverged", "nonfinite"]).to_numpy()
+    first = int(np.argmax(lost))
+    assert lost[first:].all()
+    assert 0 < first < len(STIFFNESS) - 1
+    assert STIFFNESS[first - 2] < limit < STIFFNESS[first + 1]
+    (panel,) = report.panels(report.placed(given, rows))
+    assert panel.boundary["agrees"].all()
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "implicit_midpoint"])
+def test_implicit_steps_never_diverge(tmp_path, integrator):
+    _, rows = swept(tmp_path, integrator, "scene.mass_spring.mass=0.001")
+    assert np.isinf(rows["stiffness_limit"]).all()
+    assert (rows["spectral_radius"] <= stability.NEUTRAL).all()
+    assert (rows["status"] == "ok").all()
+    assert (rows["first_bad_step"].isna()).all()
+
+
+@pytest.mark.parametrize("damping", [0.0, 3.0])
+@pytest.mark.parametrize("integrator", sorted(registry.entries()["integrators"]))
+def test_measured_boundary_is_within_a_cell_of_the_theoretical_one(tmp_path, integrator, damping):
+    """For every integrator, those too that grow too slowly to diverge within the rollout."""
+    given, rows = swept(tmp_path, integrator, f"scene.mass_spring.damping={damping}")
+    (panel,) = report.panels(report.placed(given, rows))
+    assert panel.boundary["agrees"].all()
+    assert rows["growth_factor"].to_numpy() == pytest.approx(rows["spectral_radius"].to_numpy(), rel=1e-6)
+
+
+@pytest.mark.parametrize(("integrator", "per_step"), [("explicit_euler", 2), ("midpoint", 4)])
+def test_slow_growth_is_measured(tmp_path, integrator, per_step):
+    """Explicit Euler grows by (w dt)^2 / 2 a step and midpoint by (w dt)^4 / 8, here over less than half a period."""
+    words = ["scene.mass_spring.stiffness=0.5", "scene.mass_spring.dt=0.02", "scene.mass_spring.horizon=100"]
+    found = cell(tmp_path, "scenes=[mass_spring]", f"integrators=[{integrator}]", *words)
+    row = measured(found, experiment(tmp_path))
+    assert row["verdict"] == "ok"
+    expected = {2: 0.02**2 / 2, 4: 0.02**4 / 8}[per_step]
+    assert row["growth_factor"] - 1 == pytest.approx(expected, rel=1e-3)  # the next term is (w dt)^2 smaller
+
+
+def test_growth_of_ten_percent_is_divergence():
+    """A state that doubles in 20 steps stays within 10 times its scale, and is bad where it has grown by a tenth."""
+    growth = 2 ** (1 / 20)
+    states = 0.1 * growth ** np.arange(21)[:, None]
+    step, verdict, reason = stability.first_bad_step(states, np.ones(1), growth, LIMITS)
+    assert (step, verdict) == (math.ceil(20 * math.log2(1.1)), "diverged")
+    assert "10%" in reason
+    assert stability.first_bad_step(states, np.ones(1), 1.0, LIMITS) is None
+    assert stability.first_bad_step(states, np.ones(1), math.nan, LIMITS) is None
+
+
+@pytest.mark.parametrize("backend", ["jax", "torch", "numpy"])
+def test_backends_without_step_jacobians_are_classified_alike(tmp_path, backend):
+    words = [f"backends=[{backend}]", "contacts=[penalty]", "integrators=[semi_implicit_euler]"]
+    sweep = ["scenes=[mass_spring,bouncing_ball]", "sweep.stiffness=[1e2,1e4]", "scene.mass_spring.damping=1"]
+    scenes = [
+        f"scene.{name}.{value}" for name in ("mass_spring", "bouncing_ball") for value in ("horizon=20", "dt=0.05")
+    ]
+    given = experiment(tmp_path, *words, *sweep, *scenes)
+    session = Session(given)
+    rows = [runner.outcome(found, session, Stability()) for found in cells(given)]
+    assert [row["verdict"] for row in rows] == ["inaccurate", "wrong_sign", "diverged", "diverged"]
+    assert all(row["reason"] for row in rows[2:])
+    assert rows[0]["growth_factor"] == pytest.approx(rows[0]["spectral_radius"], abs=1e-9)
+
+
+@pytest.mark.parametrize("backend", ["jax", "torch", "numpy"])
+@pytest.mark.parametrize("scene", ["pushing", "cartpole", "bouncing_ball"])
+def test_trajectories_are_the_same_on_every_backend(backend, scene):
+    made = build(registry.find("scenes", scene).plugin, {"horizon": 6})
+    law = build(registry.find("contacts", "penalty").plugin, {}) if made.n_contacts else None
+    program = compose(made, law, build(registry.find("integrators", "rk4").plugin, {}))
+    problem, jax = (build(registry.find("backends", n).plugin, {}).compile(program) for n in (backend, "jax"))
+    w = np.random.default_rng(0).standard_normal((program.n_noise, 3))
+    found, known = problem.trajectory(made.theta0(), w), jax.jacobians(made.theta0(), w)
+    assert found.states == pytest.approx(known.states, rel=1e-12, abs=1e-14)  # sums in another order
+    assert found.controls == pytest.approx(known.controls, rel=1e-12, abs=1e-14)
+
+
+def test_first_bad_step_and_its_state_are_in_the_row(tmp_path):
+    _, rows = swept(tmp_path, "semi_implicit_euler")
+    row = rows[rows["verdict"] == "diverged"].iloc[0]
+    assert row["status"] == "diverged"
+    assert f"step {int(row['first_bad_step'])} of {HORIZON}" in row["reason"]
+    k, theta = row["stiffness"], np.array([0.1, 0.0])
+    step = np.array([[1 - 2 * k * DT**2, DT], [-2 * k * DT, 1.0]])
+    states = np.array([np.linalg.matrix_power(step, n) @ theta for n in range(HORIZON + 1)])
+    scale = np.array([0.1, math.sqrt(2 * k * 0.1 * 0.1)])
+    far = int(np.argmax((np.abs(states) > LIMITS.diverged * scale).any(axis=1)))
+    grown = math.ceil(math.log(LIMITS.grown) / math.log(np.abs(np.linalg.eigvals(step)).max()))
+    expected = min(far, grown)
+    assert row["first_bad_step"] == expected
+    # The powers above and the rollout round differently, by an ulp a step, amplified as the states are.
+    assert np.allclose(row["state_at_first_bad_step"], states[expected], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("gradient", "verdict"),
+    [
+        ([1.0, 2.0], "ok"),
+        ([1.05, 2.1], "ok"),
+        ([1.3, 2.0], "inaccurate"),
+        ([-1.0, -2.0], "wrong_sign"),
+        ([0.0, 2.0], "zero"),
+        ([0.0, 0.0], "zero"),
+    ],
+)
+def test_verdicts(gradient, verdict):
+    assert stability.compare(np.array(gradient), np.array([1.0, 2.0]), LIMITS.inaccurate)["verdict"] == verdict
+
+
+def test_a_truth_of_zero_is_no_disconnection():
+    assert stability.compare(np.zeros(2), np.zeros(2), LIMITS.inaccurate)["verdict"] == "ok"
+    assert stability.compare(np.array([1.0, 0.0]), np.array([1.0, 0.0]), LIMITS.inaccurate)["verdict"] == "ok"
+
+
+def test_impulse_without_time_of_impact_has_the_wrong_sign(tmp_path):
+    """The trap of bounce_once, here on the ball under gravity, where only resolved impacts are right."""
+    verdicts = {}
+    for integrator in ("semi_implicit_euler", "event_driven"):
+        found = cell(
+            tmp_path, "scenes=[bouncing_ball]", "contacts=[impulse]", f"integrators=[{integrator}]", "backends=[jax]"
+        )
+        verdicts[integrator] = measured(found, experiment(tmp_path))
+    assert verdicts["semi_implicit_euler"]["verdict"] == "wrong_sign"
+    assert verdicts["semi_implicit_euler"]["truth"] == "physical"
+    assert verdicts["event_driven"]["verdict"] == "ok"
+
+
+def test_truth_is_refined_where_there_is_no_physical_gradient(tmp_path):
+    """q_N = q_0 + v_0 (1 - e^(-T/10)) 10, whose Euler error is about dt T / 20 of the second component."""
+    given = cell(tmp_path, "scenes=[mass_spring]", "integrators=[semi_implicit_euler]", "backends=[jax]")
+    row = measured(given.with_part("scene", Drop(horizon=10, dt=0.1)), experiment(tmp_path))
+    assert row["truth"] == "refined"
+    assert row["verdict"] == "ok"
+    truth = math.hypot(1.0, 10 * (1 - math.exp(-0.1)))
+    assert row["truth_norm"] == pytest.approx(truth, rel=1 / LIMITS.fine_steps)
+    assert row["truth_error"] < 1 / LIMITS.fine_steps
+
+
+def test_scenes_without_time_steps_are_unsupported(tmp_path):
+    given = experiment(tmp_path, "scenes=[quadratic]", "backends=[jax]")
+    row = runner.outcome(cells(given)[0], Session(given), Stability())
+    assert row["status"] == "unsupported"
+    assert "no time steps" in row["reason"]
+
+
+def test_contact_springs_are_oscillators_while_they_last(tmp_path):
+    given = cell(
+        tmp_path, "scenes=[bouncing_ball]", "contacts=[penalty]", "integrators=[semi_implicit_euler]",
+        "scene.bouncing_ball.mass=2", "contact.penalty.damping=4", "contact.penalty.stiffness=100",
+    )  # fmt: skip
+    assert stability.oscillator(given) == (50.0, 2.0, 1.0)
+
+
+def test_limits_hold_what_is_known():
+    def limit(name):
+        entry = registry.find("integrators", name)
+        return stability.stiffness_limit(build(entry.plugin, {}), 0.5, 0.0, 1.0) * 0.25
+
+    assert limit("semi_implicit_euler") == pytest.approx(4.0, rel=1e-6)
+    assert limit("stormer_verlet") == pytest.approx(4.0, rel=1e-6)
+    assert limit("rk4") == pytest.approx(8.0, rel=1e-6)  # |R(iz)| = 1 at z = 2 sqrt 2
+    assert limit("explicit_euler") == limit("midpoint") == 0.0
+    assert limit("implicit_euler") == limit("implicit_midpoint") == math.inf
+
+
+def test_files_and_the_printed_table(tmp_path, capsys):
+    given, rows = swept(tmp_path, "semi_implicit_euler")
+    coarse = rows.assign(dt=2 * DT, horizon=HORIZON / 2, stiffness_limit=rows["stiffness_limit"] / 4)
+    coarse["parameters"] = coarse["parameters"].str.replace(f'"dt":{DT}', f'"dt":{2 * DT}')
+    both = pd.concat([rows, coarse], ignore_index=True)
+    given = replace(given, sweep={**given.sweep, "dt": [DT, 2 * DT]})
+    capsys.readouterr()
+    paths = Stability().write(given, both)
+    assert capsys.readouterr().out == ""
+    names = {path.name for path in paths}
+    assert names == {
+        "stability_map.csv", "stability_map.md", "stability_map_semi_implicit_euler.png",
+        "stability_map_semi_implicit_euler.plotted.csv",
+    }  # fmt: skip
+    Stability().show(given, both)
+    printed = capsys.readouterr().out
+    assert "semi_implicit_euler" in printed
+    assert "1 of 2" in printed  # the verdicts at twice the dt are copies, and its limit is a quarter
+    (panel,) = report.panels(report.placed(given, both))
+    (axes,) = report.heat_map("semi_implicit_euler", [panel]).axes
+    (line,) = axes.get_lines()
+    drawn = dict(zip(np.round(line.get_xdata(), 9), line.get_ydata(), strict=True))
+    assert drawn[DT] == pytest.approx(2 / DT**2, rel=1e-6)
+    assert {text.get_text() for text in axes.texts} >= {"D"}

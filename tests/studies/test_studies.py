@@ -1,0 +1,477 @@
+"""What studies show of rows: nothing is folded that has parameters of its own, and every row says how to make it again."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import bench.report
+from bench.measure.gradcheck import EPS
+from bench.model import registry
+from bench.report import reproduce, web
+from bench.report.views import along, arranged, families
+from bench.report.web.content import Content, grouped, looks, problems
+from bench.report.web.document import data
+from bench.studies.gradient_check import report as gradient_check
+from bench.studies.growth import report as growth
+from bench.studies.stability import page as stability_page
+from bench.studies.stability import report as stability
+from bench.studies.three_errors import page as three_errors_page
+from bench.studies.three_errors import report as three_errors
+from bench.studies.twins import report as twins
+from bench.sweep import config
+from bench.sweep.axes import axes, table
+from bench.sweep.files import make_directory
+from bench.sweep.grid import cells
+from bench.sweep.study import study_of
+
+SPRUNG = '''
+from dataclasses import dataclass
+
+from bench.model import param
+from bench.plugins.scenes.bouncing_ball import BouncingBall
+
+
+@dataclass(frozen=True)
+class Sprung(BouncingBall):
+    """A ball with a spring of its own beside the contact's."""
+
+    name = "sprung"
+    stiffness: float = param(1.0, "stiffness of a spring of its own", "N/m", low=0.0)
+'''
+COUNTED = '''
+from dataclasses import dataclass
+from typing import ClassVar
+
+from bench.sweep.columns import Column, Columns, Judged, text
+from bench.sweep.study import Study
+
+
+@dataclass(frozen=True)
+class Counted(Study):
+    """A study without a page of its own."""
+
+    name = "counted"
+    columns: ClassVar[Columns] = Columns.of(
+        Column("weight", "how heavy it is", "kg"),
+        text("outcome", "how it ended", judged=Judged("verdict", "outcome", order=("bad", "good"))),
+    )
+
+    def measure(self, cell, session):
+        return {"status": "ok", "weight": 1.0, "outcome": "good"}
+
+    def write(self, experiment, rows):
+        return []
+'''
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory):
+    """A folder with a scene that has a stiffness of its own and a study without a page."""
+    folder = tmp_path_factory.mktemp("own plugins")
+    for kind, name, code in (("scenes", "sprung", SPRUNG), ("studies", "counted", COUNTED)):
+        (folder / kind).mkdir()
+        (folder / kind / f"{name}.py").write_text(code)
+    return folder
+
+
+def made(*words):
+    """An experiment, and a row without results for each of its cells."""
+    given = config.load([*words])
+    lines = [
+        given.columns.blank() | cell.columns() | {"experiment": given.name, "status": "ok"} for cell in cells(given)
+    ]
+    return given, given.columns.typed(pd.DataFrame(lines))
+
+
+def table_of(markdown):
+    """The lines of the first table in Markdown, by heading."""
+    lines = [line.strip("|").split(" | ") for line in markdown.splitlines() if line.startswith("|")]
+    heads, _, *body = [[cell.strip() for cell in line] for line in lines]
+    return pd.DataFrame(body, columns=heads)
+
+
+# -------------------------------------------------------------------------------------------------- gradient_check
+
+
+def checked(*words):
+    given, rows = made("study=gradient_check", "backends=[jax,torch]", "estimators=[fobg]", *words)
+    eps = EPS[:2]
+    values = {
+        "point": ["start"], "sample": [0], "direction": [0], "derivative_program": [1.0], "check_verdict": ["smooth"],
+        "check_error": [1e-9], "check_eps": [1e-4], "eps": list(eps), "derivative_differences": [1.0, 1.0],
+        "relative_error": [1e-9, 1e-8], "mode_minus": ["", ""], "mode_plus": ["", ""],
+    }  # fmt: skip
+    return given, rows.assign(verdict="smooth", **{name: [value] * len(rows) for name, value in values.items()})
+
+
+def test_two_integrators_are_two_lines_of_the_gradient_check():
+    given, rows = checked("scenes=[pendulum]", "integrators=[semi_implicit_euler,rk4]", "sweep.horizon=[1,10]")
+    found = table_of(gradient_check.markdown(arranged(given, rows)))
+    assert list(found["integrator"]) == ["semi_implicit_euler", "rk4"] * 2
+    assert list(found["horizon"]) == ["1", "1", "10", "10"]
+    assert set(found["backends"]) == {"jax, torch"}
+
+
+def test_a_swept_parameter_keeps_lines_of_the_gradient_check_apart():
+    given, rows = checked("scenes=[mass_spring]", "sweep.mass_spring.damping=[0,1,10]", "sweep.horizon=[2]")
+    shown = arranged(given, rows)
+    found = table_of(gradient_check.markdown(shown))
+    assert list(found["damping"]) == ["0", "1", "10"]
+    assert set(found["scene"]) == {"mass_spring"}
+    titles = [panel.get_title() for panel in gradient_check.figure(shown).axes]
+    assert titles == ["mass_spring\ndamping=0", "mass_spring\ndamping=1", "mass_spring\ndamping=10"]
+    assert web.content(given, rows).tables["checks"]["problem"].nunique() == 6
+
+
+def test_the_gradient_check_says_how_far_from_a_switch_it_looked():
+    given, rows = checked("scenes=[pendulum]", "study=gradient_check[aside=0.002]")
+    assert "are 2e-3 from a switch" in gradient_check.markdown(arranged(given, rows))
+    given, rows = checked("scenes=[pendulum]")
+    assert "are 1e-4 from a switch" in gradient_check.markdown(arranged(given, rows))
+
+
+def test_the_long_table_keeps_its_columns_and_adds_swept_ones(tmp_path):
+    given, rows = checked(
+        "scenes=[mass_spring]", "sweep.mass_spring.damping=[0,1]", f"results_dir={tmp_path}", "formats=[]"
+    )
+    make_directory(given.directory)
+    study_of(given).write(given, rows)
+    found = pd.read_csv(given.directory / "gradient_check.csv")
+    assert list(found)[-4:] == ["verdict", "key", "damping", "study"]
+    assert len(found) == 2 * len(rows)
+    assert set(found["damping"]) == {0.0, 1.0}
+
+
+# ---------------------------------------------------------------------------------------------------- three_errors
+
+
+def erring(*words):
+    given, rows = made("study=three_errors", "backends=[jax]", "estimators=[fobg,reinforce]", *words)
+    numbers = {name: 0.5 for name in ("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine")}
+    return given, rows.assign(**numbers, bias=0.1, bias_rel=0.1, bias_low=0.05, bias_high=0.2, reference_norm=1.0)
+
+
+def lines_of(given, rows):
+    shown = arranged(given, rows)
+    return {part.heading: three_errors.readable(shown, part) for part in three_errors.sections(shown)}
+
+
+def test_three_errors_of_two_integrators_are_twice_as_many_lines():
+    words = ["scenes=[bounce_once]", "contacts=[impulse,penalty]", "integrators=[semi_implicit_euler,event_driven]"]
+    given, rows = erring(*words, "sweep.dt=[0.1,0.05,0.02]")
+    ((heading, found),) = lines_of(given, rows).items()
+    assert heading == "Along dt [s]"
+    assert len(found) == 2 * 2 * 3
+    assert found.groupby(["contact", "integrator"], sort=False).ngroups == 4
+    shown = arranged(given, rows)
+    assert three_errors.figure(shown).axes[0].get_legend() is None
+    labels = {text.get_text() for text in three_errors.figure(shown).legends[0].get_texts()}
+    assert {"impulse, semi_implicit_euler", "impulse, event_driven", "penalty, event_driven"} <= labels
+
+
+def test_three_errors_without_a_swept_axis_have_a_table(tmp_path):
+    given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,penalty]", f"results_dir={tmp_path}")
+    found = lines_of(given, rows)
+    assert list(found) == ["Not along a swept axis"]
+    assert list(found["Not along a swept axis"]["contact"]) == ["impulse", "penalty"]
+    make_directory(given.directory)
+    study_of(given).write(given, rows)
+    assert "| bounce_once | penalty | 0.50 |" in (given.directory / "three_errors.md").read_text()
+
+
+def test_a_law_that_no_axis_moves_is_in_a_table_of_its_own():
+    given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,softplus]", "sweep.beta=[100,1000]")
+    found = lines_of(given, rows)
+    assert set(found["Along beta [1/m]"]["contact"]) == {"softplus"}
+    assert set(found["Not along a swept axis"]["contact"]) == {"impulse"}
+
+
+def test_along_one_axis_the_others_have_one_value():
+    """As in the standard experiment: the time step, stepping with the horizon, and parameters of the laws."""
+    words = [
+        "scenes=[bounce_once]",
+        "contacts=[penalty,softplus]",
+        "scene.bounce_once.dt=0.05",
+        "scene.bounce_once.horizon=20",
+    ]
+    sweep = "sweep.union=[{zip:{horizon:[10,20,40],dt:[0.1,0.05,0.025]}},{penalty.stiffness:[50,1000,10000]},{beta:[100,1000]}]"
+    given, rows = erring(*words, sweep)
+    found = lines_of(given, rows)
+    assert list(found) == ["Along dt [s], with horizon", "Along stiffness [N/m]", "Along beta [1/m]"]
+    steps = found["Along dt [s], with horizon"]
+    assert [list(part["dt [s]"]) for _, part in steps.groupby("contact")] == [["0.025", "0.05", "0.1"]] * 2
+    assert set(found["Along stiffness [N/m]"]["contact"]) == {"penalty"}
+    assert list(found["Along stiffness [N/m]"]["stiffness [N/m]"]) == ["50", "1000", "1e4"]
+
+
+def test_the_page_of_three_errors_draws_along_every_swept_parameter():
+    given, rows = erring("scenes=[bounce_once]", "contacts=[softplus]", "sweep.beta=[100,1000]", "sweep.dt=[0.1,0.05]")
+    chart = web.content(given, rows).charts[0]
+    assert [axis.label for axis in chart.x] == ["beta [1/m]", "dt [s]"]
+
+
+# ------------------------------------------------------------------------------------------------------- stability
+
+
+def mapped(*words):
+    given, rows = made("study=stability", "backends=[jax]", "estimators=[fobg]", *words)
+    return given, rows.assign(verdict="ok", truth="physical", growth_factor=1.0)
+
+
+def test_maps_are_apart_by_parameters_and_their_titles_say_defaults():
+    given, rows = mapped(
+        "scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]",
+        "sweep.mass_spring.damping=[0,1,10]",
+    )  # fmt: skip
+    panels = stability.panels(stability.placed(given, rows))
+    assert [panel.title for panel in panels] == [f"mass_spring, damping={d}" for d in (0, 1, 10)]
+    assert [len(panel.rows) for panel in panels] == [4, 4, 4]
+    assert panels[0].kind == ("semi_implicit_euler", "mass_spring", "none")
+    assert list(table_of(stability.markdown(stability.placed(given, rows), panels))["damping"]) == ["0", "1", "10"]
+
+
+def test_maps_of_scenes_that_no_label_tells_apart_are_apart():
+    """sigma has a column of its own, and so is in no identity string."""
+    given, rows = mapped("scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']", "sweep.stiffness=[10,100]")
+    assert rows["scene"].nunique() == 1
+    panels = stability.panels(stability.placed(given, rows))
+    assert [panel.title for panel in panels] == ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]
+
+
+def test_a_stiffness_that_equals_another_swept_number_stays_on_its_map():
+    given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[10,100]")
+    for panel in stability.panels(stability.placed(given, rows)):
+        assert list(panel.rows["stiffness"]) == [10.0, 100.0]
+
+
+def test_limits_in_texts_are_those_of_the_rows():
+    given, rows = mapped("study=stability[inaccurate=0.25]", "scenes=[mass_spring]", "sweep.stiffness=[10,100]")
+    shown = stability.placed(given, rows)
+    panels = stability.panels(shown)
+    assert "off by more than 25%" in stability.markdown(shown, panels)
+    legend = stability.heat_map("semi_implicit_euler", panels).legends[0]
+    assert legend.get_texts()[0].get_text() == "within 25% of the truth"
+    content = web.content(given, rows)
+    assert "within 25% of the truth" in content.charts[0].text
+    assert content.looks["inaccurate"]["meaning"] == "inaccurate: off by more than 25%"
+
+
+def test_a_share_is_not_named_after_a_parameter_that_varies_in_it():
+    given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[0,1]")
+    (line,) = stability_page.shares(stability.placed(given, rows)).to_dict("records")
+    assert (line["scene"], line["step"]) == ("mass_spring", "semi_implicit_euler")
+
+
+# ---------------------------------------------------------------------------------------------- growth and twins
+
+
+def test_growth_keeps_noises_apart_and_joins_what_steps_with_the_horizon():
+    words = ["study=growth", "scenes=[double_integrator]", "estimators=[fobg]", "sweep.sigma=[0.1,0.2]"]
+    given, rows = made(*words, "sweep.zip.horizon=[10,20]", "sweep.zip.dt=[0.1,0.05]")
+    rows = rows.assign(gradient_median=1.0, time_horizon=rows["horizon"] * rows["dt"])
+    names = growth.problem_of(arranged(given, rows))
+    assert dict(names.value_counts()) == {"double_integrator, sigma=0.1": 2, "double_integrator, sigma=0.2": 2}
+    assert list(growth.readable(arranged(given, rows))["sigma"]) == ["0.1", "0.1", "0.2", "0.2"]
+
+
+def test_twins_of_a_swept_scene_are_panels_of_their_own():
+    given, rows = made(
+        "study=twins", "scenes=[pendulum]", "backends=[mujoco,mjx]", "estimators=[fobg]", "sweep.horizon=[2,3]"
+    )
+    paths = [list(np.zeros(int(h) + 1)) for h in rows["horizon"]]
+    rows = rows.assign(state_difference=1e-3, path=paths, own_path=paths)
+    figure = twins.figure(arranged(given, rows))
+    titles = [panel.get_title().splitlines()[0] for panel in figure.axes]
+    assert titles == ["pendulum, horizon=2", "pendulum, horizon=3"]
+    assert list(twins.readable(arranged(given, rows))["horizon"]) == ["2", "2", "3", "3"]
+    table_ = table(given, rows)
+    assert "own_path" not in table_
+    assert list(table_)[-2:] == ["study", "parameters"]
+
+
+# ------------------------------------------------------------------------------------------------------ swept axes
+
+
+def test_a_parameter_that_two_scenes_lend_to_their_law_keeps_every_row():
+    given, rows = made("scenes=[wall_penalty_1d,bouncing_ball]", "estimators=[fobg]", "sweep.damping=[0,1,10]")
+    shown = arranged(given, rows)
+    assert len(shown.rows) == len(rows) == 6
+    (axis,) = shown.axes
+    found = along(shown, axis)
+    assert len(found) == 6
+    assert [len(family.rows) for family in families(shown, found)] == [3, 3]
+    assert list(shown.rows["damping"]) == [0.0, 0.0, 1.0, 1.0, 10.0, 10.0]
+
+
+def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
+    words = [f"plugins=['{own}']", "scenes=[sprung]", "contacts=[penalty]", "estimators=[fobg]"]
+    given, rows = made(*words, "sweep.sprung.stiffness=[1,10,100]")
+    assert grouped(rows, ["scene"]).nunique() == 3
+    shown = arranged(given, rows)
+    (axis,) = shown.axes
+    assert sorted(shown.rows[axis.column]) == [1.0, 10.0, 100.0]
+    assert axis.unit == "N/m"
+    assert rows["stiffness"].nunique() == 1  # that of the law
+    given, rows = mapped(*words, "sweep.sprung.stiffness=[1,10,100]", "sweep.penalty.stiffness=[1,10]")
+    panels = stability.panels(stability.placed(given, rows))
+    assert [list(panel.rows["stiffness"]) for panel in panels] == [[1.0, 10.0]] * 3
+    assert len({panel.title for panel in panels}) == 3
+
+
+def test_a_swept_scene_parameter_is_a_numeric_column_and_its_default_is_named():
+    given, rows = made("scenes=[pushing]", "estimators=[fobg]", "sweep.pushing.mass=[0.1,0.2]", "sweep.horizon=[2,3]")
+    shown = arranged(given, rows)
+    assert pd.api.types.is_numeric_dtype(shown.rows["mass"])
+    assert set(shown.rows["scene"]) == {"pushing"}
+    default = registry.find("scenes", "pushing").plugin().mass
+    names = problems(shown, ["scene"], [axis for axis in shown.axes if axis.column == "horizon"])
+    assert set(names) == {"pushing, mass=0.1", "pushing, mass=0.2"}
+    assert default in (0.1, 0.2), "the default is one of the swept values, and left out of identity strings"
+    assert list(table(given, rows))[-3:] == ["mass", "study", "parameters"]
+
+
+def test_zipped_axes_name_each_other():
+    given, rows = made("scenes=[pushing]", "estimators=[fobg]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[2,4]")
+    found = {axis.column: axis for axis in axes(given.sweep, rows)}
+    assert found["dt"].moves == ("horizon",)
+    assert found["horizon"].moves == ("dt",)
+    assert found["dt"].title == "dt [s], with horizon"
+
+
+# ----------------------------------------------------------------------------------------------------------- pages
+
+
+def test_colours_of_series_do_not_repeat():
+    found = looks([f"series {i}" for i in range(24)])
+    assert len({look["colour"][0] for look in found.values()}) == 24
+
+
+def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own):
+    words = [f"plugins=['{own}']", "study=counted", "scenes=[mass_spring]", "estimators=[fobg]", "sweep.mass=[1,2,3]"]
+    given, rows = made(*words)
+    rows = rows.assign(weight=[1.0, 2.0, 30.0], outcome=["good", "bad", "good"])
+    content = web.content(given, rows)
+    assert content.finding == "3 of 3 cells gave a result."
+    assert [axis.label for axis in content.charts[0].y] == ["weight [kg]"]
+    assert content.charts[0].x[0].column == "mass"
+    assert data(content, [[]] * 3)["filters"] == ["mass", "outcome"]
+    assert data(content, [[]] * 3)["tables"]["rows"]["mass"] == [1, 2, 3]
+
+
+def test_verdicts_and_what_was_swept_can_be_filtered_by():
+    given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[0,1]")
+    rows.loc[0, "verdict"] = "inaccurate"
+    assert data(web.content(given, rows), [[]] * len(rows))["filters"] == ["stiffness", "damping", "verdict"]
+
+
+def test_reports_name_no_plugin():
+    """Neither study nor plugin: what a report has to know of one it asks it."""
+    every = (entry for found in registry.entries().values() for entry in found.values() if entry.plugin)
+    names = {entry.name for entry in every if entry.plugin.__module__.startswith("bench.")}
+    here = Path(bench.report.__file__).parent
+    for path in here.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                assert node.value not in names, f"{path.name}, line {node.lineno}"
+
+
+def test_findings_count_in_plain_english():
+    given, rows = erring("scenes=[bounce_once]", "contacts=[penalty]", "estimators=[fobg]")
+    text = three_errors_page.finding(rows.assign(program_error_rel=1e-9))
+    assert text.startswith("1 of 1 gradient that matches differences of its program misses")
+    given, rows = checked("scenes=[pendulum]", "backends=[jax]")
+    assert web.content(given, rows).finding.startswith("None of 1 checked point shows a wrong gradient")
+    here = Path(bench.report.__file__).parent
+    for path in [*here.glob("web/*.py"), *here.parent.glob("studies/[gst]*/*.py")]:
+        texts = (n.value for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Constant))
+        assert not any(re.search(r"\btold\b", text) for text in texts if isinstance(text, str)), path
+
+
+# ---------------------------------------------------------------------------------------------------------- again
+
+
+def again(given, rows, command):
+    """The keys of the cells that a command line runs."""
+    words = shlex.split(" ".join([reproduce.HEAD, *command]))
+    assert words[:3] == ["python", "-m", "bench"]
+    return [cell.key for cell in cells(config.load(words[3:]))]
+
+
+@pytest.mark.parametrize("name", config.experiments())
+def test_every_standard_experiment_says_how_each_of_its_rows_is_made_again(name):
+    given, rows = made(f"experiment={name}")
+    commands = reproduce.commands(given, rows)
+    assert all(commands)
+    assert len(set(map(tuple, commands))) == len(rows)
+    for place in np.linspace(0, len(rows) - 1, 6).astype(int):
+        assert again(given, rows, commands[place]) == [rows["key"][place]]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["scenes=[pushing]", "timing=false", "sweep.stiffness=[10,1e6]"],
+        ["study=stability[inaccurate=0.25,fine_steps=64]", "scenes=[mass_spring]", "timing=true"],
+        ["scenes=[mass_spring]", "theta=[mass,stiffness]", "theta0=[0.5,20]", "sweep.sigma=[0.01,0.02]"],
+        ["scenes=[pushing]", "theta=[mass]", "reference.samples=512", "reference.tolerance=0.1", "sweep.seed=[0,7]"],
+        ["scenes=[wall_penalty_1d,bouncing_ball]", "contacts=[penalty]", "sweep.damping=[0,1]", "sweep.samples=[8,16]"],
+        ["scenes=[wall_penalty_1d]", "contacts=[penalty]", "sweep.stiffness=[50,1e4]"],
+        ["scenes=[quadratic]", "backends=['numpy','jax[dtype=float32]']"],
+    ],
+)
+def test_whatever_decides_a_cell_is_in_its_command(words):
+    given, rows = made(*words)
+    for command, key in zip(reproduce.commands(given, rows), rows["key"], strict=True):
+        assert again(given, rows, command) == [key]
+
+
+def test_the_command_of_a_cell_names_the_folders_of_its_plugins(own):
+    given, rows = made(f"plugins=['{own}']", "scenes=['sprung[stiffness=3]']", "study=counted")
+    (command,) = reproduce.commands(given, rows[:1])
+    assert any(str(own) in word for word in command)
+    assert again(given, rows, command) == [rows["key"][0]]
+
+
+def test_a_row_knows_whether_it_was_timed_whatever_is_configured_now():
+    given, rows = made("scenes=[pushing]", "timing=false")
+    now, _ = made("scenes=[pushing]")
+    command = reproduce.commands(now, rows)[0]
+    assert "timing=false" in command
+    assert again(given, rows, command) == [rows["key"][0]]
+
+
+def test_a_row_of_a_plugin_that_is_not_installed_has_no_command():
+    given, rows = made("scenes=[pushing]")
+    rows["parameters"] = rows["parameters"].str.replace('"name":"pushing"', '"name":"gone"')
+    assert reproduce.commands(given, rows) == [[]] * len(rows)
+    assert isinstance(web.content(given, rows), Content)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["scenes=['bouncing_ball[dt=0.02]']", "contacts=['penalty[stiffness=500]']", "sweep.horizon=[7]", "seed=3"],
+        ["scenes=[pushing]", "study=gradient_check[reach=3]", "theta=[mass]", "sweep.horizon=[5]"],
+        ["scenes=[pendulum]", "sweep.horizon=[1]"],
+    ],
+)
+def test_the_command_of_a_gradient_check_repeats_its_cell(words):
+    given = config.load(["experiment=gradient_check", "backends=[jax]", "integrators=[rk4]", *words])
+    cell = cells(given)[0]
+    head, verb, scene, *rest = shlex.split(reproduce.check_of(cell).removeprefix("python -m "))
+    assert (head, verb) == ("bench", "gradcheck")
+    assert "=" not in scene.partition("[")[0]
+    found = cells(config.load(["experiment=gradient_check", f"scenes=[{scene}]", *rest]))
+    assert [other.key for other in found] == [cell.key]
+
+
+def test_the_command_of_a_gradient_check_without_time_steps_has_no_horizon():
+    (cell,) = cells(config.load(["study=gradient_check", "scenes=[quadratic]", "estimators=[fobg]"]))
+    assert reproduce.check_of(cell) == "python -m bench gradcheck quadratic 'backends=[jax]' seed=0"

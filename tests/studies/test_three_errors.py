@@ -1,0 +1,144 @@
+"""Program, model and estimator error kept apart: the impulse without time of impact, which only the model error betrays."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+from bench.plugins.backends.jax import Jax
+from bench.plugins.contacts.impulse import Impulse
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.bounce_once import BounceOnce
+from bench.plugins.scenes.bouncing_ball import BouncingBall
+from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
+
+from bench.cli import main
+from bench.model import compose
+from bench.report.views import arranged
+from bench.studies.three_errors.columns import COLUMNS
+from bench.studies.three_errors.measure import difference_check
+from bench.studies.three_errors.report import traps
+from bench.sweep import config
+from bench.sweep.grid import cells
+from bench.sweep.store import Store
+
+TRAP = Impulse(time_of_impact=False)
+
+
+def check(scene, law):
+    return difference_check(Jax().compile(compose(scene, law, SemiImplicitEuler())))
+
+
+def test_the_trap_is_exact_for_its_program_and_wrong_for_the_physics_at_every_step_size():
+    horizons = (64, 256, 1024)
+    forward = []
+    for horizon in horizons:
+        scene = BounceOnce(horizon=horizon, dt=1.0 / horizon)
+        found, physical = check(scene, TRAP), scene.physical_gradient()
+        assert np.linalg.norm(found.gradient - found.difference) < 1e-9  # rounding over the best step size
+        assert found.gradient[0] == pytest.approx(1.0, abs=1e-12)  # rounding; the physics says -1
+        assert physical[0] == -1.0
+        cosine = found.gradient @ physical / np.linalg.norm(found.gradient) / np.linalg.norm(physical)
+        assert -0.64 < cosine < -0.61  # df/dvy0 is -0.1 plus O(dt), so that of all of theta is (-1 + 0.1) / sqrt(2.02)
+        forward.append(abs(found.cost - scene.physical_cost()))
+    assert forward[0] > 2 * forward[1] > 4 * forward[2]
+    assert all(error <= 4.0 / n for error, n in zip(forward, horizons, strict=True))  # one step at 2 m/s, reversed
+
+
+def test_in_one_dimension_the_cosine_is_minus_one():
+    for horizon in (32, 128, 512):
+        scene = WallPenalty1d(start=0.15, horizon=horizon, dt=2.0 / horizon)
+        assert check(scene, TRAP).gradient == pytest.approx([1.0])
+        assert scene.physical_gradient()[0] < 0
+
+
+def test_time_of_impact_mends_bounce_once():
+    scene = BounceOnce(horizon=128, dt=1 / 128)
+    found = check(scene, Impulse())
+    assert found.gradient == pytest.approx(scene.physical_gradient(), rel=1e-9)
+    assert found.cost == pytest.approx(scene.physical_cost(), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("scene", "fields"),
+    [
+        (BounceOnce(), ("height", "velocity")),
+        (BouncingBall(restitution=0.8), ("height", "velocity")),
+        (WallPenalty1d(start=0.6), ("start",)),
+        (WallPenalty1d(start=0.2), ("start",)),
+        (WallPenalty1d(start=1.8), ("start",)),
+    ],
+)
+def test_physical_cost_has_the_physical_gradient(scene, fields):
+    eps = 1e-6
+    for i, name in enumerate(fields):
+        ahead, behind = (
+            dataclasses.replace(scene, **{name: getattr(scene, name) + e}).physical_cost() for e in (eps, -eps)
+        )
+        assert (ahead - behind) / (2 * eps) == pytest.approx(scene.physical_gradient()[i], rel=1e-6, abs=1e-8)
+
+
+def test_a_wrong_derivative_is_seen():
+    class Wrong:
+        def __init__(self, problem):
+            self.program, self.value = problem.program, problem.value
+            self.grad = lambda theta, w: -problem.grad(theta, w)
+
+    problem = Jax().compile(compose(BouncingBall(horizon=50), Impulse(), SemiImplicitEuler()))
+    found = difference_check(Wrong(problem))
+    assert np.linalg.norm(found.gradient - found.difference) == pytest.approx(2 * np.linalg.norm(found.gradient))
+
+
+def test_from_the_command_line(tmp_path, capsys):
+    words = [
+        "study=three_errors", "name=small", "scenes=[bounce_once]", "contacts=[impulse,impulse[time_of_impact=false]]",
+        "backends=[jax]", "estimators=[fobg,reinforce]", "sweep.zip.horizon=[64,256]", "sweep.zip.dt=[0.015625,0.00390625]",
+        "samples=64", "repeats=16", "reference.samples=4096", f"results_dir={tmp_path}",
+    ]  # fmt: skip
+    assert main(words) == 0
+    for name in ("csv", "md", "png"):
+        assert (tmp_path / "small" / f"three_errors.{name}").stat().st_size > 0
+    printed = capsys.readouterr().out
+    assert "right signs" in printed
+    assert printed.count("Trap: ") == 1
+    assert "Trap: bounce_once, impulse[time_of_impact=false]" in printed
+    rows = Store(tmp_path / "small", COLUMNS).load()
+    trap = rows[rows["contact"].str.contains("false")]
+    assert (trap["program_error_rel"] < 1e-9).all()
+    assert (trap["model_error_rel"] > 1.5).all()
+    assert (trap[trap["estimator"] == "fobg"]["bias_low"] > 0).all()
+    assert (rows[rows["contact"] == "impulse"]["model_error_rel"] < 1e-9).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "trapped"),
+    [
+        ({}, True),
+        ({"program_error_rel": [1e-12, 1e-3]}, False),
+        ({"model_cosine": [-0.5, 0.1]}, False),
+        ({"forward_error_rel": [0.4, 0.3]}, False),
+    ],
+)
+def test_a_trap_is_exact_convergent_and_turned_away_at_every_step(tmp_path, change, trapped):
+    words = [
+        "study=three_errors",
+        "scenes=[bounce_once]",
+        "contacts=[impulse]",
+        "backends=[jax]",
+        "sweep.dt=[0.1,0.05]",
+    ]
+    given = config.load([*words, "estimators=[fobg]", f"results_dir={tmp_path}"])
+    rows = pd.DataFrame([cell.columns() for cell in cells(given)]).assign(status="ok", reason="")
+    values = {"program_error_rel": [1e-12, 1e-13], "model_cosine": [-0.5, -0.4], "forward_error_rel": [0.4, 0.1]}
+    assert len(traps(arranged(given, rows.assign(**(values | change))))) == trapped
+
+
+LAWS = [("impulse", True), ("impulse", False), ("penalty", True), ("softplus", True), ("complementarity", True)]
+
+
+def test_the_standard_experiment_covers_four_scenes_and_all_laws():
+    found = cells(config.load(["+experiment=three_errors"]))
+    scenes = {"bounce_once", "wall_penalty_1d", "ground_wall", "bouncing_ball"}
+    assert {cell.scene.name for cell in found} == scenes
+    laws = {(cell.scene.name, cell.contact.name, getattr(cell.contact, "time_of_impact", True)) for cell in found}
+    assert laws == {(scene, *law) for scene in scenes for law in LAWS}

@@ -1,0 +1,188 @@
+"""The package works wherever it is installed and wherever a command is run."""
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+TINY = [
+    "scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny", "--quiet",
+]  # fmt: skip
+HIDDEN = ("jax", "jaxlib", "torch", "optimistix", "lineax", "equinox", "mujoco")
+"""Libraries of the extras, which the core does without."""
+BLOCK = f"""
+from importlib.machinery import PathFinder
+found = PathFinder.find_spec
+def absent(name, path=None, target=None):
+    return None if name.partition(".")[0] in {HIDDEN!r} else found(name, path, target)
+PathFinder.find_spec = staticmethod(absent)
+"""
+"""What hides them from a process, as if they were not installed."""
+
+
+def bench(*words: str, cwd: Path, path: str = "") -> subprocess.CompletedProcess[str]:
+    """``python -m bench`` in a directory, from a given place or from this checkout."""
+    environment = {**os.environ, "PYTHONPATH": path}
+    return subprocess.run(
+        [sys.executable, "-m", "bench", *words], cwd=cwd, env=environment, capture_output=True, text=True
+    )
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory) -> Path:
+    """The wheel's content, as installing it lays it out."""
+    pytest.importorskip("hatchling")
+    where = tmp_path_factory.mktemp("wheel")
+    source = where / "source"
+    source.mkdir()
+    for name in ("bench", "plugins", "conf"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        if (ROOT / name).exists():
+            shutil.copy(ROOT / name, source / name)
+    script = "from hatchling.build import build_wheel; print(build_wheel('.'))"
+    made = subprocess.run([sys.executable, "-c", script], cwd=source, capture_output=True, text=True)
+    assert made.returncode == 0, made.stderr
+    site = where / "site"
+    with zipfile.ZipFile(source / made.stdout.strip().splitlines()[-1]) as wheel:
+        wheel.extractall(site)
+    # in the place of this checkout, which the tests' own environment names
+    (site / "sitecustomize.py").write_text(BLOCK)
+    return site
+
+
+def test_wheel_runs_in_an_empty_directory_with_numpy_only(installed, tmp_path):
+    done = bench(*TINY, cwd=tmp_path, path=str(installed))
+    assert done.returncode == 0, done.stderr
+    assert len(pd.read_csv(tmp_path / "results" / "tiny" / "bias_variance.csv")) == 2
+    listed = bench("list", "backends", cwd=tmp_path, path=str(installed)).stdout
+    assert "pip install jax" in listed
+    assert "numpy                 Gradients" in listed
+    for words in (["plan", "+experiment=quick"], ["report", *TINY[:-1]], ["--version"], ["check", "fobg"]):
+        done = bench(*words, cwd=tmp_path, path=str(installed))
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_wheel_holds_the_plugins_and_the_experiments(installed):
+    assert (installed / "bench" / "plugins" / "scenes" / "pushing.py").exists()
+    assert (installed / "bench" / "conf" / "experiment" / "quick.yaml").exists()
+    assert not (installed / "plugins").exists()
+
+
+@pytest.mark.parametrize("hidden", ["plugins", "conf"])
+def test_a_directory_with_packages_of_the_same_names(hidden, tmp_path):
+    (tmp_path / hidden).mkdir()
+    (tmp_path / hidden / "__init__.py").write_text("raise RuntimeError('the wrong one')\n")
+    done = bench(*TINY, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+OWN_ESTIMATOR = """
+from dataclasses import dataclass
+import numpy as np
+from bench import Problem, SampleMean, param
+
+@dataclass(frozen=True)
+class Half(SampleMean):
+    \"\"\"Approximates grad J_sigma with a share of the first-order mean.\"\"\"
+
+    name = "share"
+    needs = frozenset({"grad"})
+    unbiased = False
+    share: float = param(0.5, "what the mean is multiplied by")
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        \"\"\"Gradients times the share.\"\"\"
+        return self.share * problem.grad(theta, w)
+"""
+OWN_STUDY = """
+from dataclasses import dataclass
+from typing import ClassVar
+import numpy as np
+from bench.sweep.columns import Column, Columns, Judged
+from bench.sweep.files import write_all
+from bench.sweep.study import Study
+
+@dataclass(frozen=True)
+class CostAt(Study):
+    \"\"\"Measures the cost at theta without noise.\"\"\"
+
+    name = "cost_at"
+    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend")
+    columns: ClassVar[Columns] = Columns.of(Column("cost_at_theta", "f at theta", judged=Judged("exact", "cost")))
+
+    def measure(self, cell, session):
+        problem = session.problem(cell)
+        w = np.zeros((problem.program.n_noise, 1))
+        return {"status": "ok", "cost_at_theta": float(problem.value(problem.program.theta0, w)[0])}
+
+    def write(self, experiment, rows):
+        return write_all(experiment.directory, {"costs.csv": rows[["scene", "cost_at_theta"]].to_csv(index=False)})
+"""
+EXPERIMENT = """
+# @package _global_
+name: mine
+scenes: [quadratic]
+backends: [numpy]
+estimators: [share]
+sweep: {share: [0.5, 1.0]}
+samples: 8
+repeats: 4
+"""
+
+
+def test_own_plugins_and_experiments_from_folders(tmp_path):
+    (tmp_path / "own" / "estimators").mkdir(parents=True)
+    (tmp_path / "own" / "estimators" / "share.py").write_text(OWN_ESTIMATOR)
+    (tmp_path / "settings" / "experiment").mkdir(parents=True)
+    (tmp_path / "settings" / "experiment" / "mine.yaml").write_text(EXPERIMENT)
+    words = ["+experiment=mine", "plugins=own", "--config-dir", "settings", "--quiet"]
+    done = bench(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    table = pd.read_csv(tmp_path / "results" / "mine" / "bias_variance.csv")
+    assert sorted(table["share"]) == [0.5, 1.0]
+    assert (table["status"] == "ok").all()
+    assert bench("report", *words[:-1], cwd=tmp_path).returncode == 0
+
+
+def test_a_study_of_ones_own_from_a_folder_and_from_an_entry_point(tmp_path):
+    words = [
+        "study=cost_at",
+        "scenes=[quadratic,pushing]",
+        "backends=[numpy]",
+        "sweep.sigma=[0.1,0.2]",
+        "name=costs",
+        "--quiet",
+    ]
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "cost_at.py").write_text(OWN_STUDY)
+    done = bench(*words, "plugins=own", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    first = pd.read_csv(tmp_path / "results" / "costs" / "costs.csv")
+    assert len(first) == 4
+    assert (tmp_path / "results" / "costs" / "report.html").stat().st_size > 0
+
+    site = tmp_path / "site"
+    information = site / "third_party-1.0.dist-info"
+    information.mkdir(parents=True)
+    (site / "third_party.py").write_text(OWN_STUDY)
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: third-party\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text("[bench.plugins]\ncost_at = third_party:CostAt\n")
+    done = bench(*words, "results_dir=again", cwd=tmp_path, path=str(site))
+    assert done.returncode == 0, done.stderr
+    pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "again" / "costs" / "costs.csv"), first)
+    done = bench("compare", "results/costs", "again/costs", cwd=tmp_path, path=str(site))
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_the_kit_checks_a_plugin_from_a_folder(tmp_path):
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "share.py").write_text(OWN_ESTIMATOR)
+    assert bench("check", "share", "plugins=own", cwd=tmp_path).returncode == 0

@@ -1,0 +1,137 @@
+"""Imports go one way, type-checking imports too: no circle, no arrow upwards, and plugins see only the contracts."""
+
+import ast
+from collections.abc import Iterator
+from importlib.util import resolve_name
+from pathlib import Path
+
+import pytest
+
+from bench import model
+
+ROOT = Path(__file__).resolve().parents[1]
+BENCH = ROOT / "bench"
+LAYERS = [
+    ["errors"],
+    ["model"],
+    ["measure", "conformance", "plugins"],
+    ["sweep"],
+    ["report"],
+    ["studies", "trace"],
+    ["compare", "gallery", "benchself"],
+    ["face"],
+    ["__init__"],
+    ["cli"],
+    ["__main__"],
+]
+"""The rooms of ``bench``, each importing only from those above it in this list."""
+FILES = sorted(BENCH.rglob("*.py"))
+PLUGINS = sorted((ROOT / "plugins").rglob("*.py"))
+
+
+def module_of(path: Path) -> str:
+    """``bench.report.tables`` of its file, ``bench.report`` of the ``__init__.py``."""
+    base = "bench.plugins" if (ROOT / "plugins") in path.parents else ""
+    parts = path.relative_to(ROOT / "plugins" if base else ROOT).with_suffix("").parts
+    return ".".join(filter(None, [base, *(part for part in parts if part != "__init__")]))
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Every module and name that a file imports, at its top, later, or for types only, as ``bench.sweep.cell.Cell``."""
+    own = module_of(path)
+    parent = own if path.name == "__init__.py" else own.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = resolve_name("." * node.level + (node.module or ""), parent)
+            yield from (f"{base}.{alias.name}" for alias in node.names)
+
+
+def room(name: str) -> str:
+    """``report`` of ``bench.report.tables``; ``__init__`` of a name that ``bench`` itself offers."""
+    part = name.split(".")[1] if "." in name else "__init__"
+    return part if any(part in layer for layer in LAYERS) else "__init__"
+
+
+HEIGHT = {name: index for index, layer in enumerate(LAYERS) for name in layer}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_go_down(path):
+    own = room(module_of(path)) if path.parent != BENCH else path.stem
+    assert own in HEIGHT, f"say in LAYERS where bench/{own} belongs"
+    for name in imported(path):
+        assert name.partition(".")[0] != "plugins", f"bench knows no plugin by name, and imports {name}"
+        if name.partition(".")[0] == "bench":
+            there = room(name)
+            if there == "plugins":
+                assert own == "plugins", f"bench knows no plugin by name, and imports {name}"
+            assert there == own or HEIGHT[there] < HEIGHT[own], f"{own} imports {name}, which stands beside or above it"
+
+
+def graph() -> dict[str, set[str]]:
+    """Modules, and those of the package that each imports."""
+    modules = {module_of(path): path for path in FILES}
+    found: dict[str, set[str]] = {}
+    for name, path in modules.items():
+        taken = {inner if inner in modules else inner.rpartition(".")[0] for inner in imported(path)}
+        found[name] = {other for other in taken if other in modules and other not in (name, "bench")}
+    return found
+
+
+def test_no_two_modules_import_each_other_in_a_circle():
+    arrows, done, path = graph(), set(), []
+
+    def visit(name: str) -> None:
+        assert name not in path, f"a circle: {' -> '.join([*path[path.index(name) :], name])}"
+        if name in done:
+            return
+        path.append(name)
+        for other in sorted(arrows[name]):
+            # a package's __init__ that only gathers its own modules is no arrow back
+            if not name.startswith(f"{other}."):
+                visit(other)
+        path.pop()
+        done.add(name)
+
+    for name in sorted(arrows):
+        visit(name)
+
+
+def test_only_the_command_line_stands_on_the_command_line():
+    importers = {module_of(path) for path in FILES for name in imported(path) if name.startswith("bench.cli")}
+    assert importers == {"bench.__main__"}
+
+
+@pytest.mark.parametrize("path", PLUGINS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_plugins_import_only_public_names(path):
+    for name in imported(path):
+        if name.startswith("bench.plugins"):
+            family = path.parent.name == "backends" or path.parent == ROOT / "plugins"
+            assert family or name.split(".")[2] == path.parent.name, f"{path.name} imports {name} of another kind"
+        elif name.partition(".")[0] == "bench":
+            assert name.rpartition(".")[0] == "bench.model", f"a plugin imports bench.model, not {name}"
+            assert name.rpartition(".")[2] in model.__all__, f"{name} is not in bench.model.__all__"
+
+
+def test_the_core_names_no_plugin():
+    """Store, sweep, report kit, compare and gallery know plugins and studies only through the registry."""
+    from bench.model import registry
+
+    names = {
+        n
+        for kind, table in registry.entries().items()
+        for n in table
+        if kind not in ("backends", "studies") and "_" in n
+    }
+    studies = {f'"{name}"' for name in registry.entries()["studies"]}
+    for folder in ("sweep", "report", "compare"):
+        for path in (BENCH / folder).rglob("*.py"):
+            strings = [
+                node.value
+                for node in ast.walk(ast.parse(path.read_text()))
+                if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " not in node.value
+            ]
+            assert not names & set(strings), f"{path} names {names & set(strings)}"
+            assert not {s.strip('"') for s in studies} & set(strings), f"{path} names a study"

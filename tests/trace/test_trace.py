@@ -1,0 +1,371 @@
+"""The trace of one rollout: adjoints, contacts, solver, the verdict on spikes, and the command."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+import pytest
+from bench.plugins.backends.implicit import Implicit
+from bench.plugins.backends.jax import Jax
+from bench.plugins.contacts.complementarity import Complementarity
+from bench.plugins.contacts.impulse import Impulse
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.contacts.softplus import Softplus
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.bounce_once import BounceOnce
+from bench.plugins.scenes.cartpole import Cartpole
+from bench.plugins.scenes.double_integrator import DoubleIntegrator
+from bench.plugins.scenes.pendulum import Pendulum
+from bench.plugins.scenes.pushing import Pushing
+
+from bench.cli import main
+from bench.measure import noise
+from bench.measure.contacts import acting, split
+from bench.model import Decision, FrictionScene, Jacobians, LoopOps, Unsupported, compose
+from bench.sweep import config
+from bench.trace.adjoints import adjoints
+from bench.trace.chart import chart
+from bench.trace.equations import Newton
+from bench.trace.sentences import verdict
+from bench.trace.spikes import align, changes, spikes
+from bench.trace.trace import COLUMNS, Trace, run, trace
+
+
+def compiled(scene, contact=None, backend=None):
+    return (backend or Jax()).compile(compose(scene, contact, SemiImplicitEuler()))
+
+
+def drawn(problem, seed=3):
+    return np.random.default_rng(seed).standard_normal((problem.program.n_noise, 1))
+
+
+# ------------------------------------------------------------------------------------------------------ adjoints
+
+PROBLEMS = {
+    "double_integrator": (DoubleIntegrator(), None),
+    "pendulum": (Pendulum(), None),
+    "cartpole": (Cartpole(), None),
+    "cartpole, parameter noise": (Cartpole(noise="parameter"), None),
+    "pushing": (Pushing(), Penalty(stiffness=1e3)),
+    "pushing, softplus": (Pushing(), Softplus(stiffness=1e3)),
+    "pushing, impulse": (Pushing(), Impulse()),
+    "bounce_once": (BounceOnce(), Penalty(stiffness=1e4)),
+    "bounce_once, impulse": (BounceOnce(), Impulse()),
+}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_adjoints_give_the_programs_gradient(name):
+    problem = compiled(*PROBLEMS[name])
+    w = drawn(problem)
+    _, error = trace(problem, w)
+    # Both are exact derivatives of one program in float64, by another order of operations.
+    assert error < 1e-9
+
+
+def test_adjoints_give_the_programs_gradient_through_solved_steps():
+    problem = compiled(Pushing(), Complementarity(stiffness=1e3), Implicit())
+    assert trace(problem, drawn(problem))[1] < 1e-9
+
+
+def test_adjoint_of_every_state_is_the_slope_of_the_cost_to_go():
+    problem = compiled(Cartpole())
+    w = drawn(problem)
+    program, scene = problem.program, problem.program.scene
+    path = Jacobians(*(part[..., 0] for part in problem.jacobians(scene.theta0(), w)))
+    adjoint, _ = adjoints(program, scene.theta0(), w, path)
+    ops = LoopOps()
+    theta, _, scanned = program.start(ops, scene.theta0()[:, None], w)
+
+    def cost_to_go(k, x):
+        state, cost = split(scene, x[:, None]), 0.0
+        for t in range(k, scene.horizon):
+            u = program.control(ops, theta, state, tuple(part[t] for part in scanned))
+            cost = cost + scene.stage_cost(np, *state, u)
+            state = program.step(ops, state, u)
+        return float((cost + scene.terminal_cost(np, *state))[0])
+
+    step = 1e-5
+    for k in (0, 17, scene.horizon):
+        shifts = step * np.eye(4)
+        slope = [(cost_to_go(k, path.states[k] + s) - cost_to_go(k, path.states[k] - s)) / (2 * step) for s in shifts]
+        # Central differences of a cost of about 1: truncation and rounding both near 1e-10.
+        np.testing.assert_allclose(adjoint[k], slope, rtol=1e-7, atol=1e-8)
+
+
+def test_adjoints_give_the_gradient_with_respect_to_named_parameters():
+    names = ("mass", "penalty.stiffness", "dt")
+    program = compose(Pushing(sigma=1e-3), Penalty(stiffness=1e3), SemiImplicitEuler(), Decision(names))
+    problem = Jax().compile(program)
+    w = drawn(problem)
+    table, error = trace(problem, w)
+    assert error < 1e-9
+    assert table["time"].iloc[1] == pytest.approx(program.theta0[2] + 1e-3 * w[2, 0], rel=1e-14)
+
+
+def test_named_parameters_of_solved_steps_are_refused():
+    program = compose(Pushing(), Complementarity(stiffness=1e3), SemiImplicitEuler(), Decision(("mass",)))
+    problem = Implicit().compile(program)
+    with pytest.raises(Unsupported, match="theta names parameters of steps that solve an equation"):
+        trace(problem, drawn(problem))
+
+
+# ------------------------------------------------------------------------------------------------------- contacts
+
+
+def test_a_contact_mode_is_predicted_or_measured():
+    """Bodies that overlap and already part: the law does not act, and what was measured still calls it a contact."""
+    program = compose(BounceOnce(horizon=1, dt=0.1), Impulse(), SemiImplicitEuler())
+    controls = np.zeros((1, 0, 3))
+    # heights of a ball of radius 0.1 and velocities: parting overlap, free flight, approach within the step
+    before, after = [[0.05, 1.0, 0.15], [1.0, -1.0, -1.0]], [[0.15, 0.9, 0.15], [1.0, -1.0, 1.0]]
+    states = np.array([before, after])
+    forces = np.array([[[0.0, 0.0, 20.0]]])
+    assert acting(program, states, controls).tolist() == [[[False, False, True]]]
+    assert acting(program, states, controls, forces).tolist() == [[[True, False, True]]]
+    soft = compose(program.scene, Penalty(), program.integrator)
+    assert acting(soft, states, controls).tolist() == [[[True, False, False]]]
+
+
+def test_contacts_under_a_penalty_by_hand():
+    """Four states of a very soft bounce, worked out on paper."""
+    scene = BounceOnce(horizon=3, dt=0.5, height=0.6, velocity=-2.0)
+    table, _ = trace(compiled(scene, Penalty(stiffness=4.0)), np.zeros((3, 1)))
+    # gap 0.5; then v = -2, gap -0.5; force 2, v = -2 + 0.5 * 2 = -1, gap -1; force 4, v = 1, gap -0.5, force 2.
+    np.testing.assert_allclose(table["gap"], [0.5, -0.5, -1.0, -0.5], rtol=1e-14)
+    np.testing.assert_allclose(table["penetration"], [0.0, 0.5, 1.0, 0.5], rtol=1e-14)
+    np.testing.assert_allclose(table["force"], [0.0, 2.0, 4.0, 2.0], rtol=1e-14)
+    np.testing.assert_allclose(table["force_peak"], [0.0, 2.0, 4.0, 4.0], rtol=1e-14)
+    assert list(table["contacts"]) == [0, 1, 1, 1]
+    assert list(table["switch"]) == [0, 1, 0, 0]
+    free, touching = [[1.0, 0.5], [0.0, 1.0]], [[1.0 - 4.0 * 0.25, 0.5], [-2.0, 1.0]]
+    norms = [np.linalg.norm(matrix, 2) for matrix in (free, touching, touching)]
+    np.testing.assert_allclose(table["jacobian_norm"], [*norms, np.nan], rtol=1e-13)
+    assert table["sticking"].isna().all()
+    assert table["solver_residual"].isna().all()
+
+
+def test_the_impulse_of_a_bounce_is_read_from_the_velocity_jump():
+    scene = BounceOnce()
+    table, _ = trace(compiled(scene, Impulse()), np.zeros((3, 1)))
+    hit = np.flatnonzero(table["contacts"])
+    assert len(hit) == 1
+    # m (1 + e) v / dt with m = 1 kg, e = 1, v = 2 m/s, dt = 1/480 s
+    assert table["force"][hit[0]] == pytest.approx(4 * 480, rel=1e-12)
+    assert table["force"].drop(hit[0]).dropna().abs().max() == 0
+    assert list(np.flatnonzero(table["switch"])) == [hit[0], hit[0] + 1]
+
+
+def test_complementarity_forces_and_solver():
+    scene = Pushing(push=1.0)
+    law = Complementarity(kappa=1e-8)
+    table, _ = trace(compiled(scene, law, Implicit()), np.zeros((30, 1)))
+    steps = table.iloc[:-1]
+    # On the central path force times gap at the end of the step is kappa.
+    np.testing.assert_allclose(steps["force"].to_numpy() * table["gap"].to_numpy()[1:], law.kappa, rtol=1e-6)
+    # Bodies pushed together by 1 N at a velocity factor: the second needs half of it once both move alike.
+    assert steps["force"].iloc[-1] == pytest.approx(0.5, rel=1e-3)
+    assert list(table["contacts"]) == [1] * 31
+    assert steps["solver_residual"].max() < 1e-12
+    assert steps["solver_mismatch"].max() < 1e-12
+    assert (steps["solver_iterations"] >= 1).all()
+
+
+def test_newton_counts_the_iterations_of_each_column():
+    solver = Newton()
+    root = solver.root(lambda z, a: z * z - a, np.array([[1.0, 2.0]]), np.array([[4.0, 4.0]]))
+    np.testing.assert_allclose(np.asarray(root), [[2.0, 2.0]], rtol=1e-12)
+    # From 1: 2.5, 2.05, 2.0006, 2.00000009, then 2 to 2e-15 and a last step within tolerance; from 2: one, of 0.
+    assert list(solver.iterations[0]) == [6, 1]
+    assert solver.residuals[0].max() < 1e-12
+
+
+@dataclass(frozen=True)
+class Dragged(BounceOnce, FrictionScene):
+    """A bouncing body with a tangential velocity that friction cannot change."""
+
+    friction: float = 0.5
+    slip_speed: float = 0.1
+
+    def slip(self, xp, q, v):
+        """Fast at first, then at rest."""
+        return xp.where(q < 0.05, 0.0 * q, 0.0 * q + 1.0)
+
+    def friction_acceleration(self, xp, q, force):
+        """None."""
+        return 0.0 * force
+
+
+def test_stick_and_slip():
+    scene = Dragged(horizon=3, dt=0.5, height=0.65, velocity=-1.0)
+    table, _ = trace(compiled(scene, Penalty(stiffness=0.1)), np.zeros((3, 1)))
+    # gaps 0.55, 0.05, -0.45 and about -0.94; slip ends at height 0.05
+    assert list(table["contacts"]) == [0, 0, 1, 1]
+    assert list(table["sticking"]) == [0, 0, 1, 1]
+    assert list(table["slipping"]) == [0, 0, 0, 0]
+    scene = Dragged(horizon=3, dt=0.5, height=0.08, velocity=-0.1)
+    table, _ = trace(compiled(scene, Penalty(stiffness=0.1)), np.zeros((3, 1)))
+    assert list(table["slipping"]) == [1, 0, 0, 0]
+    assert list(table["sticking"]) == [0, 1, 1, 1]
+    assert list(table["switch"]) == [0, 1, 0, 0]
+
+
+@dataclass(frozen=True)
+class Itemised(Pushing):
+    """Pushing with its stage cost in two parts."""
+
+    def cost_terms(self, xp, q, v, u):
+        """Distance and effort."""
+        return {"distance": self.terminal_cost(xp, q, v), "effort": u[0] * u[0]}
+
+
+def test_costs_add_up_to_the_programs_cost():
+    problem = compiled(Itemised(), Penalty(stiffness=1e3))
+    w = drawn(problem)
+    table, _ = trace(problem, w)
+    total = table["cost_stage"].sum() + table["cost_terminal"].sum()
+    assert total == pytest.approx(problem.value(problem.program.scene.theta0(), w)[0], rel=1e-13)
+    np.testing.assert_allclose(table["cost_distance"] + table["cost_effort"], table["cost_stage"], rtol=1e-13)
+
+
+# ---------------------------------------------------------------------------------------------- spikes and switches
+
+
+def planted(spike_at=(), switch_at=(), steps=100):
+    """A table of quiet norms that rise tenfold at some states and stay there, with contact made or lost at others."""
+    norm = np.ones(steps + 1)
+    for k in spike_at:
+        norm[k:] *= 10.0
+    switch = np.zeros(steps + 1, dtype=int)
+    switch[list(switch_at)] = 1
+    contacts = np.cumsum(switch) % 2
+    force = contacts.astype(float)
+    return pd.DataFrame(
+        {"jacobian_norm": 1.0, "adjoint_norm": norm, "switch": switch, "contacts": contacts, "force": force}
+    )
+
+
+def test_spikes_at_switches_line_up():
+    table = planted(spike_at=(30, 61), switch_at=(30, 60))
+    found = align(table["adjoint_norm"], table["switch"])
+    assert (found.spikes, found.near, found.chance) == (2, 2, 0.06)
+    # two of two draws from the 6 near steps out of 100
+    assert found.p_value == pytest.approx(6 * 5 / (100 * 99))
+    said = verdict(table)
+    assert "no spike" in said[0]
+    assert said[1].endswith("Spikes line up with contact switches.")
+
+
+def test_spikes_away_from_switches_do_not():
+    table = planted(spike_at=(10, 80), switch_at=(30, 60))
+    found = align(table["adjoint_norm"], table["switch"])
+    assert (found.spikes, found.near, found.p_value) == (2, 0, 1.0)
+    assert verdict(table)[1].endswith("No spike lines up with a contact switch.")
+
+
+def test_one_spike_among_many_switches_is_left_open():
+    said = verdict(planted(spike_at=(30,), switch_at=range(10, 90, 5)))
+    assert said[1].endswith("chance could explain that.")
+
+
+def test_no_contact_and_no_switch_are_said():
+    (said,) = verdict(planted(spike_at=(30,)))
+    assert said.startswith("No contact in this rollout")
+    table = planted(spike_at=(30,))
+    table["contacts"] = 1
+    (said,) = verdict(table)
+    assert said.startswith("Contact never switches")
+    table = planted().assign(force=2.0)
+    assert "forces of up to 2 N act from a distance" in verdict(table)[0]
+
+
+def test_by_chance_the_p_value_is_honest():
+    """Spikes and switches drawn apart from each other: p <= 0.05 in at most 5% of the cases, within 3 standard errors."""
+    random = np.random.default_rng(0)
+    cases, low = 1000, 0
+    for _ in range(cases):
+        spiked = random.choice(np.arange(1, 100), 6, replace=False)
+        switched = random.choice(np.arange(1, 100), 8, replace=False)
+        table = planted(spiked, switched)
+        low += align(table["adjoint_norm"], table["switch"]).p_value <= 0.05
+    assert low / cases <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / cases)
+
+
+def test_changes_and_spikes():
+    np.testing.assert_allclose(changes([1.0, 2.0, 1.0, 0.0, np.inf, np.nan]), [np.log(2), np.log(2), 0, 0, 0])
+    rising = [1.0] * 10 + [5.0, 50.0, 200.0] + [200.0] * 40
+    assert list(np.flatnonzero(spikes(rising))) == [10]
+    assert not spikes(np.exp(0.5 * np.arange(50))).any()
+
+
+# --------------------------------------------------------------------------------------------------------- command
+
+
+def test_command_writes_table_and_chart(tmp_path, capsys):
+    words = [
+        "trace", "pushing", "double_integrator", "contacts=[penalty]", "contact.penalty.stiffness=1e4",
+        "scene.pushing.horizon=60", "seed=1", f"results_dir={tmp_path}",
+    ]  # fmt: skip
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "Spikes line up with contact switches." in printed
+    assert "no contacts in this scene" in printed
+    for scene, steps in (("pushing", 60), ("double_integrator", 20)):
+        directory = tmp_path / "trace" / scene
+        assert sorted(path.name for path in directory.iterdir()) == [
+            "trace.csv", "trace.plotted.csv", "trace.png",
+        ]  # fmt: skip
+        table = pd.read_csv(directory / "trace.csv")
+        assert tuple(table.columns[: len(COLUMNS)]) == COLUMNS
+        assert len(table) == steps + 1
+    assert list(table.columns[len(COLUMNS) :]) == ["q1", "v1", "u1"]
+
+
+def test_the_seed_draws_the_first_sample_of_the_runs(tmp_path):
+    traced = run(config.load(["scenes=[pushing]", "seed=4"]), seeded=True)[0].table
+    w = noise.shared(4, "pushing", 3, 8, 30)[0, 0]
+    np.testing.assert_allclose(traced["u1"].dropna(), 0.1 + 0.3 * w, rtol=1e-14)
+    still = run(config.load(["scenes=[pushing]"]), seeded=False)[0].table
+    np.testing.assert_allclose(still["u1"].dropna(), 0.1, rtol=1e-14)
+
+
+def test_a_diverging_rollout_is_drawn_and_told():
+    problem = compiled(Pushing(horizon=150, velocity_factor=1e3), Penalty(stiffness=1e3))
+    table, error = trace(problem, drawn(problem))
+    found = Trace("pushing", "pushing", table, error)
+    assert not np.isfinite(table["q1"]).all()
+    assert all(isinstance(sentence, str) for sentence in found.report())
+    assert len(chart(found).axes) == 5
+
+
+BAD = [
+    (["pushng"], ["pushng", "'pushing'"]),
+    (["heaviside"], ["heaviside", "no steps"]),
+    ([], ["name a scene"]),
+    (["pushing", "backends=[numpy]"], ["numpy", "no step Jacobians", "backends=[jax]"]),
+    (["pushing", "contacts=[complementarity]"], ["jax has no root finder", "backends=[implicit]"]),
+    (["pushing", "contacts=[penalty,softplus]"], ["2 problems", "one contact law"]),
+    (["pushing", "contacts=[impulse]", "integrators=[explicit_euler]"], ["explicit_euler has no place"]),
+    (["pushing", "scene.pushing.mas=2"], ["mas", "'mass'"]),
+]
+
+
+@pytest.mark.parametrize(("words", "said"), BAD, ids=[" ".join(words) for words, _ in BAD])
+def test_bad_input(words, said, tmp_path, capsys):
+    assert main(["trace", *words, *([f"results_dir={tmp_path / 'out'}"] if words else [])]) == 2
+    answer = capsys.readouterr()
+    assert answer.out == ""
+    assert answer.err.startswith("bench: ")
+    assert len(answer.err.strip().splitlines()) == 1
+    for part in said:
+        assert part in answer.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_files_are_written_before_anything_is_printed(tmp_path, capsys):
+    (tmp_path / "trace").mkdir()
+    (tmp_path / "trace" / "pushing").write_text("in the way")
+    assert main(["trace", "pushing", "scene.pushing.horizon=5", f"results_dir={tmp_path}"]) == 2
+    answer = capsys.readouterr()
+    assert answer.out == ""
+    assert "cannot be written" in answer.err
