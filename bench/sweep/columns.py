@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -163,8 +163,3 @@ class Columns:
             elif column.kind == "number":
                 table[column.name] = pd.to_numeric(table[column.name], errors="coerce").astype("float64")
         return table
-
-
-def texts_of(columns: Iterable[Columns]) -> set[str]:
-    """Return the names of columns that hold strings in any of some studies."""
-    return {name for some in columns for name in some.named("text")}
