@@ -195,7 +195,7 @@ def estimate(
 
     method: Estimator = _made("estimators", estimator)
     program = problem.program
-    if reason := method.refuses(program):
+    if reason := method.lacks(program, problem.provides, "this backend"):
         raise Unsupported(reason)
     w = noise.shared(seed, program.scene.name, repeats, samples, program.n_noise)
     values = np.asarray(method.estimate(problem, program.theta0, w), dtype=np.float64)

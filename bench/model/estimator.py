@@ -27,6 +27,10 @@ class Estimator(Plugin):
     across_jumps: ClassVar[bool] = False
     """Whether it is also unbiased when the cost jumps in theta."""
 
+    adds_explicit: ClassVar[bool] = False
+    """Whether it adds :meth:`Problem.explicit` to cost times score; if not, it is refused where theta sets the initial
+    state and noise is on the actions, since cost times score alone is then biased."""
+
     @abstractmethod
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return R independent estimates ``(R, d)`` at ``theta (d,)`` from standard normal ``noise (R, N, n_w)``.
@@ -37,6 +41,19 @@ class Estimator(Plugin):
     def refuses(self, program: Program) -> str | None:
         """Return why this estimator cannot be used on the program, or None."""
         return None
+
+    def lacks(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
+        """Return why it cannot be used on a program run by a backend that ``provides`` certain capabilities, or None."""
+        missing = self.needs - provides
+        if missing:
+            return f"{self.name} needs {', '.join(sorted(missing))}, which {backend} lacks"
+        if "score" in self.needs and program.explicit:
+            start = f"theta sets the initial state of {program.scene.name} while noise is on the actions, so "
+            if not self.adds_explicit:
+                return f"{start}cost times score lacks a term, which {self.name} does not add"
+            if "explicit" not in provides:
+                return f"{start}{self.name} needs explicit, which {backend} lacks"
+        return self.refuses(program)
 
 
 @dataclass(frozen=True)
@@ -68,7 +85,7 @@ def per_repeat(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
 def halves(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return first-order terms of the first half of the samples, zeroth-order terms of the rest, each ``(R, N/2, d)``.
 
-    The zeroth-order terms are (f - f at w = 0) times the score. Raises ValueError below 4 samples.
+    The zeroth-order terms are (f - f at w = 0) times the score, plus the explicit derivative. Raises ValueError below 4 samples.
     """
     half = noise.shape[1] // 2
     if half < 2:
@@ -77,4 +94,4 @@ def halves(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.n
     first = per_repeat(problem.grad(theta, columns(a)), a)
     w = columns(b)
     cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))
-    return first, per_repeat(cost * problem.score(theta, w), b)
+    return first, per_repeat(cost * problem.score(theta, w) + problem.explicit(theta, w), b)

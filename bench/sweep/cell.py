@@ -194,9 +194,6 @@ class Cell:
         if reason := backend.lacks(program):
             return "unsupported", reason
         if isinstance(estimator, Estimator):
-            lacking = estimator.needs - backend.provides
-            if lacking:
-                return "unsupported", f"{estimator.name} needs {', '.join(sorted(lacking))}, which {backend.name} lacks"
-            if reason := estimator.refuses(program):
+            if reason := estimator.lacks(program, backend.provides, backend.name):
                 return "unsupported", reason
         return None

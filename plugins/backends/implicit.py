@@ -22,7 +22,7 @@ class Implicit(Jax):
 
     name = "implicit"
     requires: ClassVar[tuple[str, ...]] = ("jax", "optimistix", "lineax")
-    provides = Backend.provides | {"root"}
+    provides = Jax.provides | {"root"}
     reference_rank: ClassVar[int | None] = 1
 
     def ops(self) -> Ops:

@@ -19,6 +19,7 @@ class AlphaOrder(Estimator):
 
     name = "alpha_order"
     needs = frozenset({"value", "grad", "score"})
+    adds_explicit = True
     unbiased = False
 
     gamma: float = param(1.0, "accuracy asked of the zeroth-order mean, in units of the gradient", positive=True)

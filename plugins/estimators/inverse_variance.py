@@ -18,6 +18,7 @@ class InverseVariance(Estimator):
 
     name = "inverse_variance"
     needs = frozenset({"value", "grad", "score"})
+    adds_explicit = True
     unbiased = False
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
