@@ -6,8 +6,9 @@ import pytest
 
 from bench.model import registry
 
-
-QUICK = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true"
+QUICK = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true"
+)
 """Tests compile hundreds of programs and run each for milliseconds: without optimisation and fused loops XLA compiles in a
 quarter of the time, to the same numbers but for rounding. Processes that a test starts inherit the setting."""
 
