@@ -176,7 +176,11 @@ def score_gives_the_gradient(scene: Scene) -> str:
     centre = problem.value(theta, np.zeros((program.n_noise, 1)))
     # w and -w together: their mean has the same expectation, and less spread
     terms = sum(
-        ((problem.value(theta, s) - centre) * problem.score(theta, s) + problem.explicit(theta, s) - problem.grad(theta, s))
+        (
+            (problem.value(theta, s) - centre) * problem.score(theta, s)
+            + problem.explicit(theta, s)
+            - problem.grad(theta, s)
+        )
         / 2
         for s in (w, -w)
     )

@@ -16,6 +16,7 @@ from bench.model.program import Program
 
 NO_EXPLICIT = "{} cannot move the initial state by theta under given actions, which the score needs here"
 
+
 class Trajectory(NamedTuple):
     """The states x = (q, v) and the controls of rollouts."""
 

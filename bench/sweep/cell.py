@@ -193,7 +193,6 @@ class Cell:
         backend, estimator = self.backend, self.parts.get("estimator")
         if reason := backend.lacks(program):
             return "unsupported", reason
-        if isinstance(estimator, Estimator):
-            if reason := estimator.lacks(program, backend.provides, backend.name):
-                return "unsupported", reason
+        if isinstance(estimator, Estimator) and (reason := estimator.lacks(program, backend.provides, backend.name)):
+            return "unsupported", reason
         return None

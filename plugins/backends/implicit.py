@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bench.model import Array, Backend, Ops
+from bench.model import Array, Ops
 
 from .jax import Jax, JaxOps
 
