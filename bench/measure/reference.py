@@ -117,8 +117,9 @@ def _computed(
     if quadrature is None:
         return sampled
     # a gradient near zero has no relative accuracy; what counts there is which method leaves less
-    beaten = np.isfinite(sampled.batches).all() and sampled.known().standard_error < quadrature.error
-    return sampled if beaten else quadrature
+    if not np.isfinite(sampled.batches).all():
+        return quadrature
+    return sampled if 0.0 < sampled.known().standard_error < quadrature.error else quadrature
 
 
 def _unlisted_jumps(program: Program) -> bool:
@@ -233,13 +234,15 @@ def _batches(
         enough = se <= tolerance * np.linalg.norm(batches.mean(axis=0)) and count * BATCHES >= LEAST_SAMPLES
         if spent or enough:
             unseen = _unseen(problem, terms, batches.mean(axis=0), directions, count * BATCHES, columns)
-            if spent or math.hypot(se, unseen) <= tolerance * np.linalg.norm(batches.mean(axis=0)):
+            if spent or math.hypot(se, np.nan_to_num(unseen)) <= tolerance * np.linalg.norm(batches.mean(axis=0)):
                 break
         size = count
     if not np.isfinite(batches).all():
         return Reference(batches[:1] * math.nan, "sampling[failed: rollouts are not finite]", math.nan)
     note = ""
-    if heavy_tails(batches - batches.mean(axis=0)):
+    if math.isnan(unseen):
+        note, unseen = "rollouts in the far tails of the noise are not finite, so the reference may not exist", 0.0
+    elif heavy_tails(batches - batches.mean(axis=0)):
         note = "the reference's batches have heavy tails, so that its standard error is uncertain"
     elif not np.ptp(pilot) and not pilot.any():
         note = (
@@ -290,7 +293,7 @@ def _unseen(
     w = w + along * (np.tile(depth, directions.shape[1]) - (along * w).sum(axis=0))
     found = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
     if not np.isfinite(found).all():
-        return math.inf
+        return math.nan
     return share * float(np.linalg.norm(found.mean(axis=2) - mean[:, None], axis=0).max())
 
 
