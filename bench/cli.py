@@ -344,7 +344,7 @@ VERBS = {
     ),
     "list": Verb(
         _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
-        "KIND is scenes, contacts, integrators, backends, estimators or studies.\n",
+        "KIND is scenes, contacts, integrators, backends, estimators, optimizers or studies.\n",
     ),
     "check": Verb(
         _check, "check [NAME ...] [plugins=DIR]", "the conformance kit on some plugins, or all",

@@ -27,6 +27,9 @@ class Estimator(Plugin):
     across_jumps: ClassVar[bool] = False
     """Whether it is also unbiased when the cost jumps in theta."""
 
+    gives_gradient: ClassVar[bool] = True
+    """Whether its estimates are of a gradient, so that an optimizer can descend along them."""
+
     @abstractmethod
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return R independent estimates ``(R, d)`` at ``theta (d,)`` from standard normal ``noise (R, N, n_w)``.
