@@ -159,6 +159,24 @@ def shape_and_repeatability(estimator: Estimator) -> str:
 
 
 @verifies(Estimator)
+def reports_are_as_declared(estimator: Estimator) -> str:
+    """Verify that ``explained`` gives the estimates, and finite ``(R,)`` or ``(R, d)`` arrays of the declared names."""
+    oracle = lively_oracle(estimator)
+    noise = draw_noise(oracle, 6, 8)
+    values, decided = estimator.explained(oracle.problem, oracle.problem.program.theta0, noise)
+    same = np.array_equal(values, estimates(estimator, oracle, noise))
+    require(same, "explained and estimate give different estimates")
+    require(
+        tuple(decided) == estimator.reports, f"reports {', '.join(decided)}, declares {', '.join(estimator.reports)}"
+    )
+    for name, array in decided.items():
+        shapes = [(6,), (6, oracle.problem.dim)]
+        require(np.shape(array) in shapes, f"{name} has shape {np.shape(array)}, not one of {shapes}")
+        require(np.isfinite(array).all(), f"{name} is not finite")
+    return ", ".join(decided) or "nothing"
+
+
+@verifies(Estimator)
 def repeats_are_independent(estimator: Estimator) -> str:
     """Verify that estimate r depends on ``noise[r]`` and on no other."""
     oracle = lively_oracle(estimator)

@@ -13,7 +13,16 @@ from bench.errors import Unsupported
 from bench.model.backend import Backend
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
-from bench.model.estimator import Estimator, SampleMean, columns, halves, per_repeat
+from bench.model.estimator import (
+    Auxiliaries,
+    Estimator,
+    SampleMean,
+    columns,
+    first_order,
+    halves,
+    per_repeat,
+    zeroth_order,
+)
 from bench.model.integrator import Integrator
 from bench.model.known import KnownOptimum, KnownValue
 from bench.model.ops import Array, LoopOps, Ops, State
@@ -37,6 +46,7 @@ from bench.model.scene import (
 __all__ = [
     "Answer",
     "Array",
+    "Auxiliaries",
     "Backend",
     "Compilations",
     "Contact",
@@ -77,8 +87,10 @@ __all__ = [
     "Usage",
     "columns",
     "compose",
+    "first_order",
     "halves",
     "param",
     "per_repeat",
     "rollout",
+    "zeroth_order",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,6 +12,9 @@ import numpy as np
 from bench.model.parameters import Plugin
 from bench.model.problem import Problem
 from bench.model.program import Program
+
+Auxiliaries = Mapping[str, np.ndarray]
+"""What decided estimates, by name."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,8 @@ class Estimator(Plugin):
     """Whether the expectation is the target for continuous costs."""
     across_jumps: ClassVar[bool] = False
     """Whether it is also unbiased when the cost jumps in theta."""
+    reports: ClassVar[tuple[str, ...]] = ()
+    """Names of the auxiliaries that :meth:`explained` gives beside the estimates, a weight for example."""
 
     gives_gradient: ClassVar[bool] = True
     """Whether its estimates are of a gradient, so that an optimizer can descend along them."""
@@ -36,6 +42,13 @@ class Estimator(Plugin):
 
         All randomness comes from ``noise``: estimate r depends on ``noise[r]`` and on nothing else random.
         """
+
+    def explained(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Auxiliaries]:
+        """Return the estimates, and by name what decided them: one array ``(R,)`` or ``(R, d)`` for each of ``reports``.
+
+        An estimator that reports something defines this method, and :meth:`estimate` as its first part.
+        """
+        return self.estimate(problem, theta, noise), {}
 
     def refuses(self, program: Program) -> str | None:
         """Return why this estimator cannot be used on the program, or None."""
@@ -76,8 +89,16 @@ def halves(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.n
     half = noise.shape[1] // 2
     if half < 2:
         raise ValueError(f"needs at least 4 samples, got {noise.shape[1]}")
-    a, b = noise[:, :half], noise[:, half:]
-    first = per_repeat(problem.grad(theta, columns(a)), a)
-    w = columns(b)
+    return first_order(problem, theta, noise[:, :half]), zeroth_order(problem, theta, noise[:, half:])
+
+
+def first_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return the gradient of each sample, ``(R, N, d)``."""
+    return per_repeat(problem.grad(theta, columns(noise)), noise)
+
+
+def zeroth_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return (f - f at w = 0) times the score of each sample, ``(R, N, d)``."""
+    w = columns(noise)
     cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))
-    return first, per_repeat(cost * problem.score(theta, w), b)
+    return per_repeat(cost * problem.score(theta, w), noise)
