@@ -136,3 +136,18 @@ def spearman_interval(points: Sequence[np.ndarray], seed: int = 0, draws: int = 
         return spearman(both[:, 0], both[:, 1])
 
     return bootstrap(points, rho, seed, draws)
+
+
+def spearman_chance(points: Sequence[np.ndarray], seed: int = 0, draws: int = DRAWS) -> float:
+    """Return the chance of a rho at least as far from 0 if the order within each stratum of points ``(n, 2)`` were random.
+
+    Few points give a narrow bootstrap interval when they happen to be in order; this chance then stays large.
+    """
+    rng = np.random.default_rng(seed)
+    whole = np.concatenate(points)
+    seen = abs(spearman(whole[:, 0], whole[:, 1]))
+    if math.isnan(seen):
+        return 1.0
+    y = np.stack([np.concatenate([rng.permutation(part[:, 1]) for part in points]) for _ in range(draws)])
+    far = sum(abs(spearman(whole[:, 0], one)) >= seen - 1e-12 for one in y)
+    return (1 + far) / (1 + draws)

@@ -13,6 +13,8 @@ STEP = 1e-5
 """Step of the differences of gradients that make the Hessian, in units of theta: error about 1e-10 of it."""
 ENOUGH = 1e-8
 """A gradient below this share of the first one is 0: differences of costs no longer show it."""
+FAR = 1e6
+"""A theta this many times its start has run away: the cost has no lower bound that can be found."""
 ROUNDING = 1e-13
 """Relative difference of two costs that is rounding."""
 
@@ -33,7 +35,8 @@ def solve(problem: Problem, theta: np.ndarray | None = None, steps: int = 40) ->
     """Minimise the cost at w = 0 from ``theta (d,)``, by default the problem's own: L-BFGS, then damped Newton steps.
 
     The Hessian comes from central differences of gradients, 2 d of them per step. The damping grows tenfold while a
-    step does not lower the cost and falls tenfold after one that does (Nocedal, Wright 2006, ch. 10 to 11).
+    step does not lower the cost and falls tenfold after one that does (Nocedal, Wright 2006, ch. 10 to 11). A cost
+    without lower bound is -inf.
     """
     theta = np.array(problem.program.theta0 if theta is None else theta, dtype=np.float64)
     still = np.zeros((problem.program.n_noise, 1))
@@ -65,6 +68,8 @@ def solve(problem: Problem, theta: np.ndarray | None = None, steps: int = 40) ->
         values, vectors = _curvatures(problem, theta)
     norm = float(np.linalg.norm(gradient))
     lowest = float(values.min())
+    if np.abs(theta).max() > FAR * (1.0 + np.abs(problem.program.theta0).max()):
+        return Solved(-np.inf, theta, norm, lowest, False)
     certified = norm <= ENOUGH * first and lowest >= -1e-8 * float(np.abs(values).max())
     return Solved(cost, theta, norm, lowest, certified)
 

@@ -159,7 +159,9 @@ def test_clipping_each_step_keeps_the_sign_only():
 
 
 def test_decay_of_the_rate():
-    assert path(GradientDescent(rate=1.0, decay=1.0), np.ones((4, 1))) == pytest.approx([1 - (1 + 1 / 2 + 1 / 3 + 1 / 4)])
+    assert path(GradientDescent(rate=1.0, decay=1.0), np.ones((4, 1))) == pytest.approx(
+        [1 - (1 + 1 / 2 + 1 / 3 + 1 / 4)]
+    )
 
 
 @pytest.mark.parametrize(("dim", "population"), [(2, 6), (5, 8), (10, 10), (100, 17)])

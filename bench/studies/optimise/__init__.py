@@ -58,9 +58,13 @@ class Optimise(Study):
     gradient_cost: float = param(4.0, "rollouts that a gradient counts as in the budget", positive=True)
     iterations: int | None = param(None, "most iterations; null: as the budget allows", positive=True)
     target: float | None = param(None, "cost at which a search has arrived; null: it goes on")
-    patience: int | None = param(None, "iterations without a better cost after which a search ends; null: any", positive=True)
+    patience: int | None = param(
+        None, "iterations without a better cost after which a search ends; null: any", positive=True
+    )
     limit: float = param(1e3, "a search has diverged at a cost above this many times |J0| + 1", positive=True)
-    scored: str = param("plain", "objective on which paths are scored: f at w = 0, or its mean", choices=("plain", "smoothed"))
+    scored: str = param(
+        "plain", "objective on which paths are scored: f at w = 0, or its mean", choices=("plain", "smoothed")
+    )
     evaluations: int = param(256, "rollouts of a smoothed objective", positive=True)
     sigma_decay: float = param(0.0, "the noise at iteration i has sigma / i^sigma_decay", low=0.0)
     quality: str = param("start", "where the gradient's quality is measured", choices=("none", "start", "path"))
