@@ -286,7 +286,8 @@ class _Checker:
         repeatable = np.ones(count, bool)
         if twice:
             # in another order, so that no column depends on its neighbours
-            repeatable = (self._same(values, self.cost(at[:, ::-1])[::-1].reshape(count, -1))).all(axis=1)
+            same = self._same(values, self.cost(at[:, ::-1])[::-1].reshape(count, -1))
+            repeatable = np.asarray(same.all(axis=1))
         crossing = None
         if self._modes is not None:
             names_ = np.array(self._modes(at), dtype=object).reshape(count, -1)

@@ -220,8 +220,8 @@ def _believed(sample: Sample, index: int, uncertainty: float, tolerance: float) 
     """
     differences = sample.differences
     near = np.asarray(np.abs(differences - differences[index]) <= ALIKE * abs(differences[index]))
-    lasting = _windows(near, BRIEFLY).all(axis=1)
-    settled = lasting[max(0, index - BRIEFLY + 1) : index + 1].any()
+    lasting = np.asarray(_windows(near, BRIEFLY).all(axis=1))
+    settled = bool(lasting[max(0, index - BRIEFLY + 1) : index + 1].any())
     if settled and uncertainty <= ALIKE * abs(differences[index]):
         return True
     plain = (sample.noise or 0.0) / sample.step[index] <= sample.rounding(sample.unit)[index]
