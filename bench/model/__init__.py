@@ -13,7 +13,16 @@ from bench.errors import Unsupported
 from bench.model.backend import Backend
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
-from bench.model.estimator import Estimator, SampleMean, columns, halves, per_repeat
+from bench.model.estimator import (
+    Auxiliaries,
+    Estimator,
+    SampleMean,
+    columns,
+    first_order,
+    halves,
+    per_repeat,
+    zeroth_order,
+)
 from bench.model.integrator import Integrator
 from bench.model.ops import Array, LoopOps, Ops, State
 from bench.model.parameters import Plugin, param
@@ -33,6 +42,7 @@ from bench.model.scene import (
 
 __all__ = [
     "Array",
+    "Auxiliaries",
     "Backend",
     "Compilations",
     "Contact",
@@ -67,8 +77,10 @@ __all__ = [
     "Usage",
     "columns",
     "compose",
+    "first_order",
     "halves",
     "param",
     "per_repeat",
     "rollout",
+    "zeroth_order",
 ]

@@ -45,4 +45,6 @@ COLUMNS = Columns.ordered(
     text("shapes", "hashes of the programs asked for", table=False, measured=True),
     numbers("mean_estimate", "mean estimate, signed, by coordinate of theta", table=False),
     numbers("reference_gradient", "reference gradient, signed, by coordinate of theta", table=False),
+    text("auxiliaries", "what the estimator reports of itself, such as a weight: JSON of mean, quantiles and share of exact zeros",
+         table=False),
 )  # fmt: skip
