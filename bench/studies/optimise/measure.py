@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -24,20 +24,8 @@ LARGEST = 1000
 """Longest theta whose optimum is looked for by Newton's method."""
 
 
-class Settings(Protocol):
-    """The parameters of the study; see there."""
-
-    budget: int
-    gradient_cost: float
-    iterations: int | None
-    target: float | None
-    patience: int | None
-    limit: float
-    scored: str
-    evaluations: int
-    sigma_decay: float
-    quality: str
-    quality_samples: int
+Settings = Any
+"""The study, whose parameters say how to search; it imports this module, so its type has no name here."""
 
 
 class Quieter(Problem):
@@ -210,12 +198,11 @@ def walk(search: Search, state: dict[str, Any], settings: Settings) -> tuple[Pat
     iteration = 0
     while True:
         cost = search.objective(state["theta"])
-        for line, value in zip(
-            (path.iteration, path.cost, path.rollouts, path.gradients, path.seconds),
-            (iteration, cost, problem.usage.rollouts, problem.usage.gradients, spent_s),
-            strict=True,
-        ):
-            line.append(value)
+        path.iteration.append(iteration)
+        path.cost.append(cost)
+        path.rollouts.append(problem.usage.rollouts)
+        path.gradients.append(problem.usage.gradients)
+        path.seconds.append(spent_s)
         thetas.append(np.array(state["theta"]))
         waited = 0 if cost < best - 1e-12 * abs(best) or not np.isfinite(best) else waited + 1
         best = min(best, cost)
