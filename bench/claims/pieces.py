@@ -128,3 +128,31 @@ def descend(
         theta = theta - rate * step(theta, i)
         path.append(theta.copy())
     return theta, np.array(path)
+
+
+def stochastic_descent(
+    problem: Problem,
+    zeroth: bool,
+    start: float,
+    rate: float,
+    iterations: int,
+    seed: int,
+    runs: int = 20,
+    samples: int = 50,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Descend on one variable, ``runs`` times beside each other; returns the ends ``(runs,)`` and the paths.
+
+    A step takes the mean of ``samples`` gradients or, with ``zeroth``, of (f - f at w = 0) w / sigma.
+    """
+    noise = np.random.default_rng(seed).standard_normal((iterations, 1, runs * samples))
+
+    def step(theta: np.ndarray, i: int) -> np.ndarray:
+        every, w = np.repeat(theta, samples)[None], noise[i]
+        if zeroth:
+            base = problem.value(theta[None], np.zeros((1, runs)))
+            values = (problem.value(every, w) - np.repeat(base, samples)) * w[0] / problem.sigma
+        else:
+            values = problem.grad(every, w)[0]
+        return values.reshape(runs, samples).mean(axis=1)
+
+    return descend(step, np.full(runs, start), rate, iterations)

@@ -30,6 +30,7 @@ class Result:
     name: str
     verdict: str
     seconds: float
+    """Processor seconds, which do not depend on what else the machine does."""
     figures: tuple[Figure, ...] = ()
     remark: str = ""
     """The reservation, or why nothing could be measured."""
@@ -47,18 +48,18 @@ class Result:
 def measured(claim: type[Claim]) -> Result:
     """Measure a claim now; an error in its code is a result of its own."""
     pieces.used.clear()
-    started = time.perf_counter()
+    started = time.process_time()
     try:
         outcome = claim().measure()
     except Unsupported as reason:
-        return Result(claim.name, UNDECIDED, time.perf_counter() - started, remark=str(reason))
+        return Result(claim.name, UNDECIDED, time.process_time() - started, remark=str(reason))
     except Exception as error:
-        return Result(claim.name, FAILED, time.perf_counter() - started, remark=f"{type(error).__name__}: {error}")
+        return Result(claim.name, FAILED, time.process_time() - started, remark=f"{type(error).__name__}: {error}")
     used = tuple(sorted(pieces.used))
     return Result(
         claim.name,
         verdict(outcome.figures, outcome.reservation),
-        time.perf_counter() - started,
+        time.process_time() - started,
         tuple(outcome.figures),
         outcome.reservation,
         outcome.series,

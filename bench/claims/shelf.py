@@ -46,6 +46,8 @@ def claims() -> dict[str, type[Claim]]:
 def _of(thing: object) -> list[type[Claim]]:
     """Return the claims of a module, or the claim itself."""
     if inspect.isclass(thing):
+        if not issubclass(thing, Claim):
+            raise UserError(f"entry point of group {ENTRY_POINT_GROUP} names {thing.__qualname__}, which is no Claim")
         return [thing]
     own = (value for value in vars(thing).values() if inspect.isclass(value) and issubclass(value, Claim))
     name = getattr(thing, "__name__", "")

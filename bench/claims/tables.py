@@ -121,7 +121,9 @@ def markdown(found: Found) -> str:
                 parts.append("\n".join(lines) + "\n")
             if result.remark:
                 parts.append(f"*{escape_markdown(result.remark)}*\n")
-            parts.append(f"Learned: {claim.learned} `python -m bench claims {claim.name}`, {duration(result.seconds)}.\n")
+            parts.append(
+                f"Learned: {claim.learned} `python -m bench claims {claim.name}`, {duration(result.seconds)}.\n"
+            )
     return "\n".join(parts)
 
 
@@ -178,7 +180,13 @@ def page(found: Found, charts: dict[str, Path]) -> str:
 
 
 def _row(figure: Figure) -> str:
-    cells = [figure.what, figure.published, measured_text(figure), "yes" if figure.agrees else "no", resolution_text(figure)]
+    cells = [
+        figure.what,
+        figure.published,
+        measured_text(figure),
+        "yes" if figure.agrees else "no",
+        resolution_text(figure),
+    ]
     kinds = ("", "n", "n", "", "n")
     line = "".join(f'<td class="{kind}">{escape(cell)}</td>' for kind, cell in zip(kinds, cells, strict=True))
     return f'<tr class="{"" if figure.agrees else "bad"}">{line}</tr>'

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.pieces import centre, descend, estimator, expectation, problem
+from bench.claims.pieces import centre, estimator, expectation, problem, stochastic_descent
 from bench.model import Array, FunctionScene, Problem, param
 
 if TYPE_CHECKING:
@@ -113,27 +113,10 @@ class ThrownBall(Claim):
 
     def _descents(self, at: Problem) -> tuple[dict[str, tuple[float, float]], list[float], np.ndarray]:
         """Return mean end points with standard errors, shares of alpha = 0 (published, with a baseline, its code), and a first-order path."""
-        ends: dict[str, tuple[float, float]] = {}
+        first, path = stochastic_descent(at, False, 0.1, 0.1, 1000, seed=3)
+        ends = {"fobg": centre(first), "reinforce": centre(stochastic_descent(at, True, 0.1, 0.1, 1000, seed=33)[0])}
         share: list[float] = []
-        path = np.empty(0)
-        draw = np.random.default_rng(3)
-        for name, runs in (("fobg", 20), ("reinforce", 20)):
-            method = estimator(name)
-            noise = draw.standard_normal((1000, 1, runs * 50))
-
-            def step(theta: np.ndarray, i: int, noise: np.ndarray = noise, name: str = name) -> np.ndarray:
-                every = np.repeat(theta, 50)[None]
-                if name == "fobg":
-                    values = at.grad(every, noise[i])[0]
-                else:
-                    base = np.repeat(at.value(theta[None], np.zeros((1, runs))), 50)
-                    values = (at.value(every, noise[i]) - base) * noise[i, 0] / SIGMA
-                return values.reshape(runs, 50).mean(axis=1)
-
-            assert method.name == name
-            final, path_of = descend(step, np.full(runs, 0.1), 0.1, 1000)
-            ends[name] = centre(final)
-            path = path_of[::20, 0] if name == "fobg" else path
+        draw = np.random.default_rng(333)
         noise = draw.standard_normal((2, 1000, 1, 50))
         for name, baseline in (("alpha_order", 0.0), ("with a baseline", 1.0)):
             finals, zeros = [], []
@@ -149,7 +132,7 @@ class ThrownBall(Claim):
         code = estimator("alpha_order[gamma=0.01,delta=0.95,sharing=shared]")
         decided = [code.explained(at, np.array([0.1]), w.T[None])[1]["alpha"][0] for w in noise[0]]
         share.append(float(np.mean(np.array(decided) == 0)))
-        return ends, share, path
+        return ends, share, path[::20, 0]
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both gradients, and where the descents end."""

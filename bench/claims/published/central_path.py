@@ -54,7 +54,9 @@ class CentralPath(Claim):
         _, (first, first_error) = moments(at, estimator("fobg"))
         _, (zeroth, zeroth_error) = moments(at, estimator("reinforce"))
         figures = [
-            Figure("largest difference of derivative and chance", "0.0", float(np.abs(relaxed - chance).max()), spread=1e-9),
+            Figure(
+                "largest difference of derivative and chance", "0.0", float(np.abs(relaxed - chance).max()), spread=1e-9
+            ),
             Figure("sigma of the closest Gaussian, in sqrt(c)", "1.990", float(closest.x), 1e-3),
             Figure("its largest difference", "0.0313", float(closest.fun), 1e-5),
             Figure("first-order sd at the kink, 500 samples", "0.02236", (first / 500) ** 0.5, first_error / 20),

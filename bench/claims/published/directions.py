@@ -31,13 +31,16 @@ class Directions(Claim):
 
     def measure(self) -> Outcome:
         """Sample estimates at two noise levels."""
-        figures, series = [], {"n": [20, 100, 400], "gauss": [], "sphere": []}
+        figures: list[Figure] = []
+        series: dict[str, list[float]] = {"n": [20, 100, 400], "gauss": [], "sphere": []}
         draw = np.random.default_rng(7)
         for count, texts in ((20, ("1.05", "0.95")), (100, ("0.21", "0.19")), (400, ("0.0525", "0.0475"))):
             noise = draw.standard_normal((REPEATS, count, D))
             for sigma in (0.1, 3.0) if count == 20 else (0.1,):
                 at = problem(f"linear[dimension={D},sigma={sigma}]", backend="numpy")
-                for (name, key), text in zip((("randomized_smoothing", "gauss"), ("sphere_smoothing", "sphere")), texts, strict=True):
+                for (name, key), text in zip(
+                    (("randomized_smoothing", "gauss"), ("sphere_smoothing", "sphere")), texts, strict=True
+                ):
                     error = self._error(at, estimator(name), noise)
                     figures.append(Figure(f"{name}, N = {count}, sigma = {sigma:g}", text, *error))
                     if sigma == 0.1:

@@ -40,7 +40,9 @@ class Sticking(Claim):
 
     name = "L4"
     lesson = "The price of smoothing"
-    statement = "A sticking block's exact derivative is 0; smoothed it is Phi((F - mu)/s) + Phi((-F - mu)/s), .3173 at F = 0."
+    statement = (
+        "A sticking block's exact derivative is 0; smoothed it is Phi((F - mu)/s) + Phi((-F - mu)/s), .3173 at F = 0."
+    )
     source = "Le Lidec et al. 2023"
     learned = "An exact zero can be right and still of no use to an optimiser; noise looks past the edge of the cone."
     labels = ("push F", "derivative of the acceleration")
@@ -58,9 +60,17 @@ class Sticking(Claim):
             Figure("exact derivative at rest", "0.0", exact),
             Figure("smoothed, first order", "0.3173", first, first_error),
             Figure("smoothed, zeroth order", "0.3173", zeroth, zeroth_error),
-            Figure("largest difference from the formula, F from -4 to 4", "0.0", float(np.abs(smooth - formula).max()), spread=2e-3),
+            Figure(
+                "largest difference from the formula, F from -4 to 4",
+                "0.0",
+                float(np.abs(smooth - formula).max()),
+                spread=2e-3,
+            ),
         ]
-        return Outcome(figures, series={"force": forces.tolist(), "smooth": smooth, "exact": (np.abs(forces) > 1).astype(float).tolist()})
+        return Outcome(
+            figures,
+            series={"force": forces.tolist(), "smooth": smooth, "exact": (np.abs(forces) > 1).astype(float).tolist()},
+        )
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw the exact and the smoothed derivative."""

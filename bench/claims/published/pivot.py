@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.pieces import centre, descend, expectation, problem
+from bench.claims.pieces import centre, expectation, problem, stochastic_descent
 from bench.model import Array, FunctionScene, param
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class Pivot(FunctionScene):
 
     def cost(self, xp: Any, x: Array) -> Array:
         """Return the cost."""
-        value = -xp.sin(x[0]) ** 2
+        value = -(xp.sin(x[0]) ** 2)
         return xp.where(xp.abs(x[0]) <= math.pi / 4, value, 0.0 * value)
 
 
@@ -61,24 +61,14 @@ class FallingPivot(Claim):
         figures = []
         for text, x, label in (("-0.7586", 0.74, "0.74"), ("-4.453", 0.76, "0.76"), ("-9.974", math.pi / 4, "pi/4")):
             (first, error), (truth, truth_error) = means(x)
-            figures.append(Figure(f"first-order mean less the gradient at {label}", text, first - truth, error + truth_error))
-        draw, runs = np.random.default_rng(4), 20
-        noise = draw.standard_normal((2, 500, 1, runs * 50))
-
-        def first_step(theta: np.ndarray, i: int) -> np.ndarray:
-            return at.grad(np.repeat(theta, 50)[None], noise[0, i])[0].reshape(runs, 50).mean(axis=1)
-
-        def zeroth_step(theta: np.ndarray, i: int) -> np.ndarray:
-            every = np.repeat(theta, 50)[None]
-            base = np.repeat(at.value(theta[None], np.zeros((1, runs))), 50)
-            terms = (at.value(every, noise[1, i]) - base) * noise[1, i, 0] / SIGMA
-            return terms.reshape(runs, 50).mean(axis=1)
-
-        fallen, _ = descend(first_step, np.full(runs, 0.1), 0.01, 500)
-        stopped, _ = descend(zeroth_step, np.full(runs, 0.1), 0.01, 500)
+            figures.append(
+                Figure(f"first-order mean less the gradient at {label}", text, first - truth, error + truth_error)
+            )
+        fallen, _ = stochastic_descent(at, False, 0.1, 0.01, 500, seed=4)
+        stopped, _ = stochastic_descent(at, True, 0.1, 0.01, 500, seed=44)
         figures += [
             Figure("end of the first-order descent", "0.843", *centre(fallen), spread=0.002),
-            Figure("cost there", "0.0", float(at.value(fallen[None], np.zeros((1, runs))).max())),
+            Figure("cost there", "0.0", float(at.value(fallen[None], np.zeros((1, fallen.size))).max())),
             Figure("end of the zeroth-order descent", "0.74", *centre(stopped), spread=0.02),
         ]
         grid = np.linspace(0.6, 0.9, 61)

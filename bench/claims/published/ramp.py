@@ -84,7 +84,9 @@ class Ramp(Claim):
         for (name, values), published in zip(found.items(), expected, strict=True):
             mean, error = centre(np.array(values))
             once = float(np.std(values, ddof=1))
-            figures.append(Figure(f"{name}-order mean absolute error, {count} samples", published, mean, error, 2 * once))
+            figures.append(
+                Figure(f"{name}-order mean absolute error, {count} samples", published, mean, error, 2 * once)
+            )
         return figures
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:

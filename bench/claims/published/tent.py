@@ -62,9 +62,13 @@ class Chaos(Claim):
             found[steps] = [spread(values) for values in pair]
             if steps in (10, 20):
                 (v1, e1), (v0, e0) = found[steps]
-                figures.append(Figure(f"first-order variance, T = {steps}", {10: "1.05e6", 20: "1.10e12"}[steps], v1, e1))
+                figures.append(
+                    Figure(f"first-order variance, T = {steps}", {10: "1.05e6", 20: "1.10e12"}[steps], v1, e1)
+                )
                 figures.append(Figure(f"zeroth-order variance, T = {steps}", "70", v0, e0))
-                figures.append(Figure(f"size of every gradient, T = {steps}", f"{2.0**steps:.1f}", float(np.abs(pair[0]).max())))
+                figures.append(
+                    Figure(f"size of every gradient, T = {steps}", f"{2.0**steps:.1f}", float(np.abs(pair[0]).max()))
+                )
         (v1, e1), (v0, e0) = found[20]
         # weights in inverse proportion to the variances, whose covariance is far below both
         mixed = v1 * v0 / (v1 + v0)
@@ -73,7 +77,11 @@ class Chaos(Claim):
         figures.append(Figure("the same with the samples split", "7.8e9", v1 / half, v1 / half * (e0 / v0)))
         return Outcome(
             figures,
-            series={"steps": list(found), "first": [v[0][0] for v in found.values()], "zeroth": [v[1][0] for v in found.values()]},
+            series={
+                "steps": list(found),
+                "first": [v[0][0] for v in found.values()],
+                "zeroth": [v[1][0] for v in found.values()],
+            },
         )
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:

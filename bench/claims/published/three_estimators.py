@@ -98,7 +98,14 @@ class ThreeEstimators(Claim):
             figures.append(Figure(f"sum of {d} squares, pathwise, per coordinate", "4.0", first, error))
             score, error = spread(terms(at, methods["score"], w, np.ones(d))[:, :1])
             # at theta = 1 with k = 0: 30 + 22 (D - 1) + 4 (D - 1)^2
-            figures.append(Figure(f"sum of {d} squares, score, per coordinate", _exact(str(30 + 22 * (d - 1) + 4 * (d - 1) ** 2)), score, error))
+            figures.append(
+                Figure(
+                    f"sum of {d} squares, score, per coordinate",
+                    _exact(str(30 + 22 * (d - 1) + 4 * (d - 1) ** 2)),
+                    score,
+                    error,
+                )
+            )
         return Outcome(
             figures,
             series={"k": list(waves), **{n: [v[i][0] for v in waves.values()] for i, n in enumerate(methods)}},
@@ -110,7 +117,9 @@ class ThreeEstimators(Claim):
         best = (cost * score**2) @ weights / (score**2 @ weights)
         values = (cost - best) * score
         variance = float(values**2 @ weights - (values @ weights) ** 2)
-        return Figure(f"score with the best constant baseline, k = {k:g}", {-3.0: "134.0", 1.0: "6.00"}[k], variance, 1e-9)
+        return Figure(
+            f"score with the best constant baseline, k = {k:g}", {-3.0: "134.0", 1.0: "6.00"}[k], variance, 1e-9
+        )
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw the variances against the frequency."""
