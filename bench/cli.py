@@ -322,11 +322,25 @@ def _trace(words: list[str]) -> int:
     return 0
 
 
+def _claims(words: list[str]) -> int:
+    """Run published results again."""
+    from bench import claims
+
+    return claims.main(words)
+
+
 def _compare(words: list[str]) -> int:
     """Compare two directories of results, or two git revisions of them, cell by cell."""
     from bench import compare
 
     return compare.main(words)
+
+
+def _history(words: list[str]) -> int:
+    """Follow results over versions in one chart."""
+    from bench.compare import history
+
+    return history.main(words)
 
 
 VERBS = {
@@ -344,7 +358,7 @@ VERBS = {
     ),
     "list": Verb(
         _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
-        "KIND is scenes, contacts, integrators, backends, estimators or studies.\n",
+        "KIND is scenes, contacts, integrators, backends, estimators, optimizers or studies.\n",
     ),
     "check": Verb(
         _check, "check [NAME ...] [plugins=DIR]", "the conformance kit on some plugins, or all",
@@ -361,8 +375,19 @@ VERBS = {
     "bench-self": Verb(
         _bench_self, "bench-self [quick=true] [results_dir=DIR]", "the harness's own speed, beside a NumPy loop and native code",
     ),
+    "claims": Verb(
+        _claims, "claims [NAME ...] [--list] [--quick] [--again] [results_dir=DIR]", "published results run again, each with a verdict",
+        "What is stored under results_dir/claims is not measured again unless its code has changed, or with --again.\n"
+        "--quick: those that take less than 5 s. Exit status 1 when a claim is not reproduced.\n",
+    ),
     "compare": Verb(
         _compare, "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
-        "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH.\n",
+        "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
+        "times only with --timings, against the spread between runs: again=DIR,DIR names further runs of BEFORE.\n"
+        "Written to out=DIR (runs/compare): compare.csv, .md, .json, .xml (JUnit) and .html.\n",
+    ),
+    "history": Verb(
+        _history, "history DIR DIR ... [out=DIR]", "errors and failures over versions, as one small chart",
+        "Directories or git revisions, the oldest first. Written to out=DIR (runs/history): history.png, .csv and .md.\n",
     ),
 }  # fmt: skip
