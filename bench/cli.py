@@ -349,6 +349,13 @@ def _examine(words: list[str]) -> int:
     return command.main(words)
 
 
+def _history(words: list[str]) -> int:
+    """Follow results over versions in one chart."""
+    from bench.compare import history
+
+    return history.main(words)
+
+
 VERBS = {
     "run": Verb(
         _run, "+experiment=NAME [key=value ...]", "run what is missing, then write tables and charts",
@@ -387,6 +394,12 @@ VERBS = {
     ),
     "compare": Verb(
         _compare, "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
-        "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH.\n",
+        "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
+        "times only with --timings, against the spread between runs: again=DIR,DIR names further runs of BEFORE.\n"
+        "Written to out=DIR (runs/compare): compare.csv, .md, .json, .xml (JUnit) and .html.\n",
+    ),
+    "history": Verb(
+        _history, "history DIR DIR ... [out=DIR]", "errors and failures over versions, as one small chart",
+        "Directories or git revisions, the oldest first. Written to out=DIR (runs/history): history.png, .csv and .md.\n",
     ),
 }  # fmt: skip

@@ -197,7 +197,7 @@ def estimate(
 
     method: Estimator = _made("estimators", estimator)
     program = problem.program
-    if reason := method.refuses(program):
+    if reason := method.lacks(program, problem.provides, "this backend"):
         raise Unsupported(reason)
     w = noise.shared(seed, program.scene.name, repeats, samples, program.n_noise)
     estimates, decided = method.explained(problem, program.theta0, w)

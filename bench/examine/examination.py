@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -18,6 +19,8 @@ from bench.examine.simulator import Simulator
 from bench.examine.smoothing import PAIRS, Smoothed, directions, smoothed
 from bench.measure.gradcheck import EPS, Check, Options, check
 
+MADE = re.compile(r"_[0-9a-f]{8}$")
+"""What a module's name gets when it is loaded from a file."""
 RELATIVE = 0.01
 """Sigma of the lines, and of a cost with noise of its own, in units of each input's scale, where none is given."""
 SHARES = {"check": 0.6, "again": 0.5, "lines": 0.3}
@@ -109,6 +112,7 @@ def _called(function: Any) -> str:
         .replace("<locals>.", "")
         .replace("<lambda>", "lambda")
     )
+    module = MADE.sub("", module)
     return own if module in ("__main__", "builtins", "") else f"{module}.{own}"
 
 

@@ -25,8 +25,8 @@ FIRM = 1024
 """Pairs before which drawing does not stop early, however small the spread: a jump may be rare."""
 GROUPS = 32
 """Independent means that intervals are computed from."""
-ENOUGH = 0.01
-"""Standard error of grad J, relative to it, at which no more pairs are drawn."""
+ENOUGH = 0.03
+"""Standard error of grad J, relative to it, from which no more pairs are drawn once the bias is decided."""
 WANTED = 0.1
 """Relative error that the costs are stated for."""
 
@@ -75,9 +75,10 @@ class Smoothed:
         return self.norm > 4.0 * self.error
 
     @property
-    def doubtful(self) -> bool:
-        """Whether the interval of the bias is wider than 4% of |grad J|."""
-        return self.bias_high - self.bias_low > 4 * ENOUGH * self.norm
+    def decided(self) -> bool:
+        """Whether the bias is surely above or surely below 10% of |grad J|."""
+        edge = WANTED * self.norm
+        return not self.bias_low <= edge <= self.bias_high
 
     @property
     def biased(self) -> bool:
@@ -112,7 +113,7 @@ def smoothed(
         while size <= pairs:
             drawn.append(_draw(simulator, theta, sigma * scale, random, size if found is None else size // 2))
             found = _summary(sigma, scale, np.concatenate(drawn, axis=1), plain, simulator, clock)
-            if size >= FIRM and found.error <= ENOUGH * found.norm and not found.doubtful:
+            if size >= FIRM and found.error <= ENOUGH * found.norm and found.decided:
                 break
             size *= 2
     except OutOfTime:

@@ -194,8 +194,8 @@ def _in_columns(terms: Callable[[np.ndarray], np.ndarray], w: np.ndarray, column
 
 def _antithetic(problem: Problem, theta: np.ndarray, w: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Return zeroth-order terms averaged over w and -w, with the cost at w = 0 as baseline, ``(d, B)``."""
-    ahead = (problem.value(theta, w) - centre) * problem.score(theta, w)
-    return (ahead + (problem.value(theta, -w) - centre) * problem.score(theta, -w)) / 2
+    terms = ((problem.value(theta, s) - centre) * problem.score(theta, s) + problem.explicit(theta, s) for s in (w, -w))
+    return np.asarray(sum(terms) / 2)
 
 
 def _disagree(a: np.ndarray, b: np.ndarray) -> float:

@@ -24,6 +24,7 @@ class AlphaOrder(Estimator):
 
     name = "alpha_order"
     needs = frozenset({"value", "grad", "score"})
+    adds_explicit = True
     unbiased = False
     reports: ClassVar[tuple[str, ...]] = ("alpha", "eps")
 
