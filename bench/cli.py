@@ -335,6 +335,13 @@ def _trace(words: list[str]) -> int:
     return 0
 
 
+def _claims(words: list[str]) -> int:
+    """Run published results again."""
+    from bench import claims
+
+    return claims.main(words)
+
+
 def _compare(words: list[str]) -> int:
     """Compare two directories of results, or two git revisions of them, cell by cell."""
     from bench import compare
@@ -371,7 +378,7 @@ VERBS = {
     ),
     "list": Verb(
         _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
-        "KIND is scenes, contacts, integrators, backends, estimators or studies.\n",
+        "KIND is scenes, contacts, integrators, backends, estimators, optimizers or studies.\n",
     ),
     "check": Verb(
         _check, "check [NAME ...] [plugins=DIR]", "the conformance kit on some plugins, or all",
@@ -391,6 +398,11 @@ VERBS = {
     ),
     "bench-self": Verb(
         _bench_self, "bench-self [quick=true] [results_dir=DIR]", "the harness's own speed, beside a NumPy loop and native code",
+    ),
+    "claims": Verb(
+        _claims, "claims [NAME ...] [--list] [--quick] [--again] [results_dir=DIR]", "published results run again, each with a verdict",
+        "What is stored under results_dir/claims is not measured again unless its code has changed, or with --again.\n"
+        "--quick: those that take less than 5 s. Exit status 1 when a claim is not reproduced.\n",
     ),
     "compare": Verb(
         _compare, "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",

@@ -36,6 +36,9 @@ class Estimator(Plugin):
     """Whether it adds :meth:`Problem.explicit` to cost times score; if not, it is refused where theta sets the initial
     state and noise is on the actions, since cost times score alone is then biased."""
 
+    gives_gradient: ClassVar[bool] = True
+    """Whether its estimates are of a gradient, so that an optimizer can descend along them."""
+
     @abstractmethod
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return R independent estimates ``(R, d)`` at ``theta (d,)`` from standard normal ``noise (R, N, n_w)``.
