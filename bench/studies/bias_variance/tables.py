@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.measure.statistics import UNEXPLAINED, unexplained
 from bench.report.tables import csv, escape_latex, escape_markdown, latex_number, number_format
 from bench.report.text import axis_value, number
 from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, bias_text, pareto, unsteady
@@ -22,8 +23,10 @@ from bench.sweep.files import write_all
 
 PAGE_ROWS = 40
 """Most rows of a LaTeX table that fit a page."""
+DOUBTED = " ?"
 FOOTNOTES = [
-    "0 (< u): the bias is not distinguishable from 0, its 95% interval reaches up to u.",
+    "0 (< u): the bias is not distinguishable from 0, its 95% interval reaches up to u. "
+    f"{DOUBTED.strip()}: the estimator declares to be unbiased and the interval excludes 0, so {UNEXPLAINED}.",
     "relative bias and rel. RMSE: divided by the norm of the reference gradient. A relative RMSE above 1 is worse "
     "than answering zero.",
     "variance: trace of the covariance of one estimate. time: one estimate, steady state, without compilation. "
@@ -161,7 +164,8 @@ def _results(row: Any) -> list[str]:
     if row["status"] != "ok":
         return ["-"] * 6
     return [
-        bias_text(row), bias_text(row, row["reference_norm"], interval=False),
+        bias_text(row) + DOUBTED * unexplained(row["reason"]),
+        bias_text(row, row["reference_norm"], interval=False),
         number(row["variance"], 3), number(row["rmse_rel"], 3), number(row["cosine"], 3),
         number(row["time_s"] * 1e3, 3) + UNSTEADY * bool(unsteady(row)),
     ]  # fmt: skip
