@@ -48,6 +48,11 @@ class Watched(Problem):
         """Return scores, if allowed."""
         return self._use("score", theta, w)
 
+    def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return explicit derivatives, which belong to scores."""
+        require("score" in self._allowed, "uses explicit, and score is not in needs")
+        return self._inner.explicit(theta, w)
+
     def _use(self, capability: str, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         require(capability in self._allowed, f"uses {capability}, which is not in needs")
         self.used.add(capability)

@@ -32,6 +32,12 @@ class Estimator(Plugin):
     """Whether it is also unbiased when the cost jumps in theta."""
     reports: ClassVar[tuple[str, ...]] = ()
     """Names of the auxiliaries that :meth:`explained` gives beside the estimates, a weight for example."""
+    adds_explicit: ClassVar[bool] = False
+    """Whether it adds :meth:`Problem.explicit` to cost times score; if not, it is refused where theta sets the initial
+    state and noise is on the actions, since cost times score alone is then biased."""
+
+    gives_gradient: ClassVar[bool] = True
+    """Whether its estimates are of a gradient, so that an optimizer can descend along them."""
 
     @abstractmethod
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -47,9 +53,26 @@ class Estimator(Plugin):
         """
         return self.estimate(problem, theta, noise), {}
 
+    def declares_unbiased(self, program: Program) -> bool:
+        """Whether its expectation is grad J_sigma of the program, by what it declares."""
+        return self.unbiased and self.target == "smoothed" and (program.continuous or self.across_jumps)
+
     def refuses(self, program: Program) -> str | None:
         """Return why this estimator cannot be used on the program, or None."""
         return None
+
+    def lacks(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
+        """Return why it cannot be used on a program run by a backend that ``provides`` certain capabilities, or None."""
+        missing = self.needs - provides
+        if missing:
+            return f"{self.name} needs {', '.join(sorted(missing))}, which {backend} lacks"
+        if "score" in self.needs and program.explicit:
+            start = f"theta sets the initial state of {program.scene.name} while noise is on the actions, so "
+            if not self.adds_explicit:
+                return f"{start}cost times score lacks a term, which {self.name} does not add"
+            if "explicit" not in provides:
+                return f"{start}{self.name} needs explicit, which {backend} lacks"
+        return self.refuses(program)
 
 
 @dataclass(frozen=True)
@@ -81,7 +104,7 @@ def per_repeat(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
 def halves(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return first-order terms of the first half of the samples, zeroth-order terms of the rest, each ``(R, N/2, d)``.
 
-    The zeroth-order terms are (f - f at w = 0) times the score. Raises ValueError below 4 samples.
+    The zeroth-order terms are (f - f at w = 0) times the score, plus the explicit derivative. Raises ValueError below 4 samples.
     """
     half = noise.shape[1] // 2
     if half < 2:
@@ -95,7 +118,7 @@ def first_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.nd
 
 
 def zeroth_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return (f - f at w = 0) times the score of each sample, ``(R, N, d)``."""
+    """Return (f - f at w = 0) times the score of each sample plus the explicit derivative, ``(R, N, d)``."""
     w = columns(noise)
     cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))
-    return per_repeat(cost * problem.score(theta, w), noise)
+    return per_repeat(cost * problem.score(theta, w) + problem.explicit(theta, w), noise)

@@ -19,6 +19,7 @@ class InverseVariance(Estimator):
 
     name = "inverse_variance"
     needs = frozenset({"value", "grad", "score"})
+    adds_explicit = True
     unbiased = False
     reports: ClassVar[tuple[str, ...]] = ("weight",)
 
