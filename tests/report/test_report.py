@@ -279,14 +279,14 @@ def test_nothing_swept_gives_an_overview():
 
 def test_a_parameter_in_an_identity_string_is_an_axis():
     """The default value is left out of identity strings, and so is the one value that no string has."""
-    sweep = {"gamma": [0.1, 1.0, 10.0]}
-    rows = table([row(estimator="alpha_order", estimator_params=p) for p in ("", "gamma=0.1", "delta=0.3,gamma=10")])
+    sweep = {"ratio": [0.1, 1.5, 10.0]}
+    rows = table([row(estimator="alpha_order", estimator_params=p) for p in ("", "ratio=0.1", "delta=0.3,ratio=10")])
     rows = pd.concat([rows, table([row()])], ignore_index=True)
     shown = views.arranged(experiment(sweep=sweep), rows)
-    found = views.along(shown, named(shown, "gamma"))
-    assert list(found["x"]) == [1.0, 0.1, 10.0]
+    found = views.along(shown, named(shown, "ratio"))
+    assert list(found["x"]) == [1.5, 0.1, 10.0]
     assert list(found["estimator_params"]) == ["", "", "delta=0.3"]
-    assert "bias_variance_gamma" in drawn(rows, ["gamma"], sweep=sweep)
+    assert "bias_variance_ratio" in drawn(rows, ["ratio"], sweep=sweep)
 
 
 def test_the_parameter_behind_smoothing_is_an_axis():
