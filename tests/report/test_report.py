@@ -279,12 +279,12 @@ def test_nothing_swept_gives_an_overview():
 
 def test_a_parameter_in_an_identity_string_is_an_axis():
     """The default value is left out of identity strings, and so is the one value that no string has."""
-    sweep = {"ratio": [0.1, 1.5, 10.0]}
-    rows = table([row(estimator="alpha_order", estimator_params=p) for p in ("", "ratio=0.1", "delta=0.3,ratio=10")])
+    sweep = {"ratio": [3.0, 1.5, 10.0]}
+    rows = table([row(estimator="alpha_order", estimator_params=p) for p in ("", "ratio=3", "delta=0.3,ratio=10")])
     rows = pd.concat([rows, table([row()])], ignore_index=True)
     shown = views.arranged(experiment(sweep=sweep), rows)
     found = views.along(shown, named(shown, "ratio"))
-    assert list(found["x"]) == [1.5, 0.1, 10.0]
+    assert list(found["x"]) == [1.5, 3.0, 10.0]
     assert list(found["estimator_params"]) == ["", "", "delta=0.3"]
     assert "bias_variance_ratio" in drawn(rows, ["ratio"], sweep=sweep)
 
