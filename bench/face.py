@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -161,6 +161,8 @@ class Estimates:
     reference_method: str
     summary: Summary
     """Bias, variance and their 95% intervals; see :class:`bench.measure.statistics.Summary`."""
+    auxiliaries: Mapping[str, np.ndarray]
+    """What the estimator reports of itself by name, a weight for example: ``(R,)`` or ``(R, d)``."""
 
     def __str__(self) -> str:
         s = self.summary
@@ -195,9 +197,13 @@ def estimate(
 
     method: Estimator = _made("estimators", estimator)
     program = problem.program
-    if reason := method.refuses(program):
+    if reason := method.lacks(program, problem.provides, "this backend"):
         raise Unsupported(reason)
     w = noise.shared(seed, program.scene.name, repeats, samples, program.n_noise)
-    values = np.asarray(method.estimate(problem, program.theta0, w), dtype=np.float64)
+    estimates, decided = method.explained(problem, program.theta0, w)
+    values = np.asarray(estimates, dtype=np.float64)
     truth = reference.certify(problem, problem.provides, reference_samples, tolerance)
-    return Estimates(values, truth.gradient, truth.method, statistics.summarise(values, truth.known(), samples))
+    unbiased = method.declares_unbiased(program)
+    summary = statistics.summarise(values, truth.known(), samples, unbiased=unbiased)
+    summary = replace(summary, note="; ".join(part for part in (summary.note, truth.note) if part))
+    return Estimates(values, truth.gradient, truth.method, summary, decided)

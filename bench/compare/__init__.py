@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
@@ -10,26 +12,44 @@ import pandas as pd
 from bench.compare.cells import compared
 from bench.compare.report import Comparison, show, write
 from bench.compare.sources import Results, opened
+from bench.compare.timings import RUNS
 from bench.errors import UserError, unknown
 from bench.model import registry
 from bench.sweep.columns import Column
 
-SETTINGS = ("timings", "out", "plugins")
+SETTINGS = ("timings", "again", "out", "plugins")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a command line asks for."""
+
+    before: str
+    after: str
+    out: Path
+    timings: bool = False
+    again: tuple[str, ...] = ()
+    """Further runs of before, which show how much times differ between runs."""
 
 
 def main(words: Sequence[str]) -> int:
     """Compare the two results named in ``words``; returns 1 if something got worse. Raises :class:`UserError`."""
-    before, after, timings, out = _parsed(words)
-    with opened(before) as old, opened(after) as new:
-        comparison = compare(before, old, after, new, timings)
-    show(comparison, write(comparison, out))
+    asked = _parsed(words)
+    with ExitStack() as stack:
+        old, new, *again = (stack.enter_context(opened(name)) for name in (asked.before, asked.after, *asked.again))
+        comparison = compare(asked, old, new, again)
+    show(comparison, write(comparison, asked.out))
     return 1 if comparison.worse else 0
 
 
 def compare(
-    before: str, old: Mapping[str, Results], after: str, new: Mapping[str, Results], timings: bool
+    asked: Asked,
+    old: Mapping[str, Results],
+    new: Mapping[str, Results],
+    again: Sequence[Mapping[str, Results]] = (),
 ) -> Comparison:
-    """Compare the experiments that two results have in common; times of different machines only with ``timings``."""
+    """Compare the experiments that two results have in common: accuracy, and times only where they are asked for."""
+    before, after = asked.before, asked.after
     shared = [name for name in old if name in new]
     if not shared:
         raise UserError(f"{before} ({', '.join(old)}) and {after} ({', '.join(new)}) have no experiment in common")
@@ -45,10 +65,13 @@ def compare(
         one, two = old[name], new[name]
         if one.study != two.study:
             raise UserError(f"{name} is of study {one.study} in {before} and of study {two.study} in {after}")
-        same = bool(one.machine) and one.machine == two.machine
-        remarks += [f"{name}: {remark}" for remark in _older(one, two) + timing_remarks(one, two, same, timings)]
+        runs = [results[name].rows for results in again if name in results]
         judged |= {column.name: column for column in one.columns.judged}
-        parts.append(compared(one.rows, two.rows, one.columns, timings or same).assign(experiment=name))
+        table, said = compared(one.rows, two.rows, one.columns, asked.timings, runs)
+        remarks += [
+            f"{name}: {remark}" for remark in (*_older(one, two), *machine_remarks(one, two, asked.timings), *said)
+        ]
+        parts.append(table.assign(experiment=name))
     table = pd.concat(parts, ignore_index=True)
     return Comparison(f"{before} against {after}", table, remarks, list(judged.values()), old[shared[0]].study)
 
@@ -61,25 +84,24 @@ def _older(old: Results, new: Results) -> list[str]:
     ]
 
 
-def timing_remarks(old: Results, new: Results, same: bool, timings: bool) -> list[str]:
-    """Return why times are not compared or are doubtful; nothing where the study judges no times."""
+def machine_remarks(old: Results, new: Results, timings: bool) -> list[str]:
+    """Return what other machines mean for the comparison, and, where times are judged, why those are doubtful."""
     remarks: list[str] = []
-    if not any(column.judged and column.judged.by == "time" for column in old.columns.judged):
-        return remarks
-    if not same:
-        which = f"timings of different machines ({old.machine or 'unknown'}; {new.machine or 'unknown'})"
-        remarks.append(
-            f"WARNING: {which} are compared" if timings else f"{which} are not compared: add --timings to do so"
-        )
-    if same or timings:
+    which = f"{old.machine or 'unknown'}; {new.machine or 'unknown'}"
+    other = not old.machine or old.machine != new.machine
+    if timings and other:
+        remarks.append(f"WARNING: timings of different machines ({which}) are compared")
+    elif other:
+        remarks.append(f"made on different machines ({which}): rounding may move the estimates of chaotic cells")
+    if timings:
         for when, results in (("before", old), ("after", new)):
             if results.busy:
                 remarks.append(f"WARNING: the machine was busy {when} ({results.busy}), so timings are doubtful")
     return remarks
 
 
-def _parsed(words: Sequence[str]) -> tuple[str, str, bool, Path]:
-    names, settings = [], {"timings": "false", "out": "runs/compare"}
+def _parsed(words: Sequence[str]) -> Asked:
+    names, settings = [], {"timings": "false", "out": "runs/compare", "again": ""}
     for word in words:
         key, equals, value = word.partition("=")
         if word == "--timings":
@@ -98,4 +120,11 @@ def _parsed(words: Sequence[str]) -> tuple[str, str, bool, Path]:
         )
     if settings["timings"] not in ("true", "false"):
         raise unknown("value for timings:", settings["timings"], ("true", "false"))
-    return names[0], names[1], settings["timings"] == "true", Path(settings["out"]).expanduser()
+    again = tuple(filter(None, settings["again"].split(",")))
+    if again and settings["timings"] == "false":
+        raise UserError("again= names further runs for their times: add --timings")
+    if again and len(again) + 1 < RUNS:
+        raise UserError(
+            f"a spread between runs takes {RUNS} runs of before or more: again= names {len(again)} besides it"
+        )
+    return Asked(names[0], names[1], Path(settings["out"]).expanduser(), settings["timings"] == "true", again)

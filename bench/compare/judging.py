@@ -2,16 +2,18 @@
 
 The study says how a column is judged (:class:`bench.sweep.columns.Judged`):
 
+- ``paired``: the cells of both sides have the same seed and noise, so unchanged code gives the same mean estimate. It
+  moved where the mean or the variance differ by more than ROUNDING. It got worse or better where the root mean squared
+  error changed by a factor of PAIRED at least, with both sides' errors measured against the reference of *before*.
 - ``interval``: the two 95% intervals are apart.
 - ``spread``: the two 95% intervals are apart where both are stored, else the ratio leaves the central 99% of an F
   distribution with R - 1 degrees of freedom on both sides (normal estimates with one dominant component, the fewest
   possible). In either case the change must also be at least EFFECT.
 - ``exact``, computed and not estimated: it changed by EFFECT at least, and by more than ROUNDING of what it is relative
   to.
-- ``time``: the medians differ by EFFECT at least and, of the stored times of single calls, a two-sided Mann-Whitney
-  test (Mann and Whitney 1947) has p < ALPHA; without those, the middle halves of the calls (median and half its
-  interquartile range on each side) are apart.
 - ``verdict``: it moved in the study's order, which is worst first.
+
+Times (``time``) are judged by :mod:`bench.compare.timings`, over all cells together.
 """
 
 from __future__ import annotations
@@ -22,26 +24,30 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.report.text import duration, number
+from bench.report.text import number
 from bench.sweep.columns import Column, Columns, Judged
 
 EFFECT = 1.25
-"""Ratio below which neither a variance, a computed error nor a time counts as changed."""
+"""Ratio below which neither a variance nor a computed error counts as changed."""
+PAIRED = 1.01
+"""Ratio below which an error measured with the same noise counts as neither worse nor better, only as changed."""
 ALPHA = 0.01
 ROUNDING = 1e-6
-"""Change of a computed error that the rounding of another machine may cause through a long rollout."""
+"""Relative change that the rounding of another machine may cause through a long rollout."""
+SIGMAS = 4.0
+"""Standard errors between two references beyond which the reference itself moved."""
 NOTES = (
-    "worse, better: an estimated error whose 95% interval no longer overlaps the one before; a variance whose interval "
+    "Both sides have the same seeds and noise, so unchanged code gives the same estimates. A mean estimate or a variance "
+    f"that moved by more than {ROUNDING:g} is a change of the code: worse or better where the RMSE about the reference of "
+    f"before changed by {PAIRED - 1:.0%} or more, else changed.",
+    "Also worse or better: a bias whose 95% interval no longer overlaps the one before; a variance whose interval "
     "no longer overlaps either (or, where no interval is stored, that is outside 99% of an F test) and that changed by a "
-    f"factor of {EFFECT:g} or more; "
-    f"a time that changed by a factor of {EFFECT:g} or more with p < {ALPHA:g} in a Mann-Whitney test of the single calls "
-    "(or, without them, with interquartile ranges that do not overlap).",
+    f"factor of {EFFECT:g} or more.",
     f"Errors computed without noise count where they changed by a factor of {EFFECT:g} or more and by more than {ROUNDING:g}. "
     "Verdicts count by the order that their study gives them. Where neither more nor less is better, a "
     "change counts as changed, neither worse nor better.",
-    "A cell that was ok and no longer is, or is gone, is worse. New cells are neither, nor are cells whose intervals a remark "
-    "calls doubtful.",
-    f"Each cell is judged by itself: of cells that did not change, up to {ALPHA:.0%} may be reported as changed by chance.",
+    "A cell that was ok and no longer is, or is gone, is worse. New cells are neither. A bias or variance whose interval a "
+    "remark calls doubtful is changed, neither worse nor better, unless the paired RMSE decides.",
 )
 
 Row = Mapping[str, Any]
@@ -68,14 +74,90 @@ def judge(column: Column, columns: Columns, old: Row, new: Row) -> Change | None
     return change
 
 
-def time_basis(column: Column, old: Row, new: Row) -> str:
-    """Return what a time is judged by: ``calls``, ``interquartile range``, or why it is not; nothing without times."""
-    if not (value(old, column.name) > 0 and value(new, column.name) > 0):
-        return ""
-    if all(len(_calls(column, row)) >= 4 for row in (old, new)):
-        return "calls"
-    spreads = (value(row, f"{_stem(column)}_iqr_s") for row in (old, new))
-    return "interquartile range" if all(map(math.isfinite, spreads)) else "not compared: no spread is stored"
+class _Pair(NamedTuple):
+    """Two mean estimates on the same noise, with variances and references; each before and after."""
+
+    means: list[np.ndarray]
+    variances: list[float]
+    references: list[np.ndarray]
+    scale: float
+    """The larger root mean square of one estimate."""
+
+    @property
+    def moved(self) -> float:
+        """Distance between the two means."""
+        return float(np.linalg.norm(self.means[1] - self.means[0]))
+
+    @property
+    def same(self) -> bool:
+        """Whether the estimates are the same, up to rounding."""
+        was, now = map(math.sqrt, self.variances)
+        return max(self.moved, abs(now - was)) <= ROUNDING * self.scale
+
+
+def _pair(judged: Judged, old: Row, new: Row) -> _Pair | None:
+    """Return what two rows of the same noise store, or None where a side does not."""
+    if judged.by != "paired":
+        return None
+    means, references = ([_list(row, name) for row in (old, new)] for name in (judged.mean, judged.reference))
+    variances = [value(row, judged.variance) for row in (old, new)]
+    if not means[0].size or not means[0].shape == means[1].shape == references[0].shape:
+        return None
+    if not np.isfinite([*means[0], *means[1], *references[0], *variances]).all():
+        return None
+    # hypot, since the squares of exploding gradients overflow
+    scale = max(math.hypot(*mean, math.sqrt(v)) for mean, v in zip(means, variances, strict=True))
+    return _Pair(means, variances, references, scale)
+
+
+def same_estimates(column: Column, old: Row, new: Row) -> bool:
+    """Return whether a paired column has the same estimates on both sides; False where they are not stored."""
+    pair = _pair(_judged(column), old, new)
+    return pair is not None and pair.same
+
+
+def _paired(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
+    """Judge an error by the mean estimates on the same noise; None where a side does not store them."""
+    judged = _judged(column)
+    pair = _pair(judged, old, new)
+    if pair is None:
+        return None
+    if pair.same:
+        return _other_reference(pair, [value(row, f"{_stem(judged.reference)}_se") for row in (old, new)])
+    was, now = (
+        math.hypot(*(mean - pair.references[0]), math.sqrt(v))
+        for mean, v in zip(pair.means, pair.variances, strict=True)
+    )
+    outcome = "changed"
+    if max(was, now) >= PAIRED * min(was, now) and abs(now - was) > ROUNDING * pair.scale:
+        outcome = "worse" if now > was else "better"
+    text = f"{judged.called} {number(was, 3)} to {number(now, 3)} on the same noise"
+    norm = math.hypot(*pair.means[0])
+    if norm > 0:
+        text += f", the mean estimate moved by {number(pair.moved / norm)} of itself"
+    return Change(outcome, text)
+
+
+def _other_reference(pair: _Pair, errors: list[float]) -> Change | None:
+    """Return a change where the estimates are the same and the reference is not, beyond both standard errors."""
+    old, new = pair.references
+    if new.shape != old.shape or not np.isfinite(new).all():
+        return None
+    uncertain = SIGMAS * math.hypot(*(error if error > 0 else 0.0 for error in errors))
+    apart = float(np.linalg.norm(new - old))
+    if apart <= uncertain + ROUNDING * float(np.linalg.norm(old)):
+        return None
+    return Change("changed", f"the same estimates, but the reference moved by {number(apart, 3)}")
+
+
+def _stem(reference: str) -> str:
+    """Return the prefix of the columns beside a reference: ``reference`` of ``reference_gradient``."""
+    return reference.partition("_")[0]
+
+
+def _list(row: Row, name: str) -> np.ndarray:
+    numbers = row.get(name)
+    return np.asarray(numbers, dtype=float) if isinstance(numbers, list | np.ndarray) else np.empty(0)
 
 
 def _interval(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
@@ -108,24 +190,6 @@ def _exact(column: Column, columns: Columns, old: Row, new: Row) -> Change | Non
     return _by_size(column, old, new) if changed else None
 
 
-def _time(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
-    was, now = value(old, column.name), value(new, column.name)
-    basis = time_basis(column, old, new)
-    if basis == "calls":
-        from scipy.stats import mannwhitneyu
-
-        calls = [_calls(column, row) for row in (old, new)]
-        apart = float(mannwhitneyu(*calls, alternative="two-sided").pvalue) < ALPHA
-    elif basis == "interquartile range":
-        apart = abs(now - was) > sum(value(row, f"{_stem(column)}_iqr_s") for row in (old, new)) / 2
-    else:
-        return None
-    if not apart or max(was, now) < EFFECT * min(was, now):
-        return None
-    text = f"{_judged(column).called} {duration(was)} to {duration(now)} ({now / was:.2g} times)"
-    return Change("worse" if now > was else "better", text)
-
-
 def _verdict(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
     was, now = old.get(column.name, ""), new.get(column.name, "")
     if was == now:
@@ -139,7 +203,7 @@ def _verdict(column: Column, columns: Columns, old: Row, new: Row) -> Change | N
 
 
 RULES: dict[str, Callable[[Column, Columns, Row, Row], Change | None]] = {
-    "interval": _interval, "spread": _spread, "exact": _exact, "time": _time, "verdict": _verdict,
+    "paired": _paired, "interval": _interval, "spread": _spread, "exact": _exact, "verdict": _verdict,
 }  # fmt: skip
 
 
@@ -168,13 +232,3 @@ def _ends(column: Column, columns: Columns) -> tuple[str, str]:
 def _apart(column: Column, columns: Columns, old: Row, new: Row) -> bool:
     low, high = _ends(column, columns)
     return value(new, low) > value(old, high) or value(new, high) < value(old, low)
-
-
-def _stem(column: Column) -> str:
-    """Return the prefix of the columns beside a time: ``time`` of ``time_s``."""
-    return column.name.removesuffix("_s")
-
-
-def _calls(column: Column, row: Row) -> np.ndarray:
-    seconds = row.get(f"{_stem(column)}_samples")
-    return np.asarray(seconds, dtype=float) if isinstance(seconds, list | np.ndarray) else np.empty(0)

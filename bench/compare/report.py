@@ -14,8 +14,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from bench.compare import timings
 from bench.compare.cells import FIRST, LAST, OUTCOMES, both_sides
 from bench.compare.judging import NOTES
+from bench.compare.machine import as_json, as_junit, counts
 from bench.model import registry
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted
@@ -28,6 +30,8 @@ from bench.sweep.files import make_directory, write_all
 
 PRINTED = 30
 """Most changes that are printed; the files have all of them."""
+LISTED = 100
+"""Most changes that the Markdown lists, since CI servers show it above a run."""
 LOOKS = dict(
     zip(
         OUTCOMES,
@@ -71,26 +75,36 @@ def summary(table: pd.DataFrame) -> str:
 
 
 def write(comparison: Comparison, out: Path) -> list[Path]:
-    """``compare`` as .csv, .md and .html in a directory; raises :class:`StorageError` where it cannot be written."""
+    """``compare`` as .csv, .md, .json, .xml (JUnit) and .html; raises :class:`StorageError` where it cannot be written."""
     make_directory(out)
     table = comparison.table
-    listed = table[table["outcome"] != "same"]
-    texts = [
-        f"# {comparison.title}",
-        summary(table),
-        *comparison.remarks,
-        plain_markdown(_readable(listed, _names(table))),
-        *(f"- {note}" for note in NOTES),
-    ]
+    names = _cells(table, _names(table))
     columns = ["experiment", *FIRST, *both_sides(comparison.judged), *LAST]
     return write_all(
         out,
         {
             "compare.csv": table[columns].to_csv(index=False, lineterminator="\n"),
-            "compare.md": "\n\n".join(texts) + "\n",
+            "compare.md": markdown(comparison),
+            "compare.json": as_json(comparison.title, table, names, comparison.remarks),
+            "compare.xml": as_junit(comparison.title, table, names),
             "compare.html": page(comparison),
         },
     )
+
+
+def markdown(comparison: Comparison) -> str:
+    """Return the summary: the sentence, counts by experiment, the remarks and the first changes, the worst first."""
+    table = comparison.table
+    listed = _worst_first(table[table["outcome"] != "same"])
+    by_experiment = pd.DataFrame(
+        [{"experiment": str(name)} | counts(part) for name, part in table.groupby("experiment", sort=False)]
+    ).astype(str)
+    texts = [f"# {comparison.title}", summary(table), plain_markdown(by_experiment), *comparison.remarks]
+    if not listed.empty:
+        texts.append(plain_markdown(_readable(listed, _names(table)).head(LISTED)))
+    if len(listed) > LISTED:
+        texts.append(f"And {len(listed) - LISTED} more in `compare.csv`.")
+    return "\n\n".join([*texts, "\n".join(f"- {note}" for note in (*NOTES, timings.NOTE))]) + "\n"
 
 
 def show(comparison: Comparison, paths: Sequence[Path]) -> None:
@@ -126,12 +140,16 @@ def _names(table: pd.DataFrame) -> list[str]:
     return [column.name for column in identity_columns(table)]
 
 
+def _cells(table: pd.DataFrame, names: Sequence[str]) -> list[str]:
+    """Return a name for each cell, from some identity columns."""
+    return [", ".join(filter(None, map(_named, names, row))) for row in table[list(names)].to_numpy(dtype=object)]
+
+
 def _readable(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
     """Return the changed cells as texts, each by some identity columns."""
     if table.empty:
         return pd.DataFrame({"outcome": [], "experiment": [], "cell": [], "change": []})
-    cells = [", ".join(filter(None, map(_named, names, row))) for row in table[list(names)].to_numpy(dtype=object)]
-    return table[["outcome", "experiment"]].assign(cell=cells, change=table["change"])
+    return table[["outcome", "experiment"]].assign(cell=_cells(table, names), change=table["change"])
 
 
 def _named(name: str, value: Any) -> str:
@@ -160,7 +178,7 @@ def page(comparison: Comparison) -> str:
             *STATUS,
         ],
         charts=[_before_after(column) for column in numbers if rows[f"{column.name}_after"].notna().any()],
-        answers=pd.DataFrame({"remark": [*comparison.remarks, *NOTES]}),
+        answers=pd.DataFrame({"remark": [*comparison.remarks, *NOTES, timings.NOTE]}),
         answers_title="How it was judged",
         looks=LOOKS,
     )

@@ -48,6 +48,11 @@ class Watched(Problem):
         """Return scores, if allowed."""
         return self._use("score", theta, w)
 
+    def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return explicit derivatives, which belong to scores."""
+        require("score" in self._allowed, "uses explicit, and score is not in needs")
+        return self._inner.explicit(theta, w)
+
     def _use(self, capability: str, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         require(capability in self._allowed, f"uses {capability}, which is not in needs")
         self.used.add(capability)
@@ -156,6 +161,24 @@ def shape_and_repeatability(estimator: Estimator) -> str:
     if not labels:
         raise Skipped("refuses every oracle")
     return f"{len(labels)} oracles"
+
+
+@verifies(Estimator)
+def reports_are_as_declared(estimator: Estimator) -> str:
+    """Verify that ``explained`` gives the estimates, and finite ``(R,)`` or ``(R, d)`` arrays of the declared names."""
+    oracle = lively_oracle(estimator)
+    noise = draw_noise(oracle, 6, 8)
+    values, decided = estimator.explained(oracle.problem, oracle.problem.program.theta0, noise)
+    same = np.array_equal(values, estimates(estimator, oracle, noise))
+    require(same, "explained and estimate give different estimates")
+    require(
+        tuple(decided) == estimator.reports, f"reports {', '.join(decided)}, declares {', '.join(estimator.reports)}"
+    )
+    for name, array in decided.items():
+        shapes = [(6,), (6, oracle.problem.dim)]
+        require(np.shape(array) in shapes, f"{name} has shape {np.shape(array)}, not one of {shapes}")
+        require(np.isfinite(array).all(), f"{name} is not finite")
+    return ", ".join(decided) or "nothing"
 
 
 @verifies(Estimator)

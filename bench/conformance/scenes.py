@@ -31,6 +31,9 @@ from bench.conformance.subjects import (
 )
 from bench.model import ContactScene, EngineScene, ImpulseLaw, MechanicalScene, Program, Scene, compose
 
+SCORED_STEPS = 8
+"""Longest rollouts whose scores are compared with differences."""
+
 
 @verifies(Scene)
 def theta_and_noise_are_declared(scene: Scene) -> str:
@@ -154,6 +157,39 @@ def _sampled_gradient(program: Program) -> tuple[np.ndarray, np.ndarray]:
     else:
         terms = (problem.value(theta, w) - problem.value(theta, -w)) / 2 * problem.score(theta, w)
     return terms.mean(axis=1), terms.std(axis=1) / math.sqrt(w.shape[1])
+
+
+@verifies(Scene)
+def score_gives_the_gradient(scene: Scene) -> str:
+    """Verify that cost times score, plus the explicit derivative, has the mean of the cost's differences.
+
+    Rollouts are cut to :data:`SCORED_STEPS` steps, since the spread of both grows with their length.
+    """
+    if isinstance(scene, MechanicalScene):
+        scene = dataclasses.replace(scene, horizon=min(scene.horizon, SCORED_STEPS))
+    runs = [p for p in programs(scene) if p.continuous and plain_backend().lacks(p) is None]
+    if not runs:
+        raise Skipped("no continuous program runs on the plain backend")
+    program = runs[0]
+    problem, theta = plain_backend().compile(program), program.theta0[:, None]
+    w = rng("score", scene.name).standard_normal((program.n_noise, 1 << 13))
+    centre = problem.value(theta, np.zeros((program.n_noise, 1)))
+    # w and -w together: their mean has the same expectation, and less spread
+    terms = sum(
+        (
+            (problem.value(theta, s) - centre) * problem.score(theta, s)
+            + problem.explicit(theta, s)
+            - problem.grad(theta, s)
+        )
+        / 2
+        for s in (w, -w)
+    )
+    mean, error = terms.mean(axis=1), terms.std(axis=1) / math.sqrt(w.shape[1])
+    size = DIFFERENCED * (1 + np.abs(problem.grad(theta, w[:, :1])).max())
+    beyond = np.maximum(np.abs(mean) - size, 0.0)
+    z = float(np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0).max())
+    require(z < LIMIT, f"{title(program)}: E[cost score] is {z:.1f} standard errors from the mean difference of costs")
+    return f"{z:.1f} standard errors from differences, {'with' if program.explicit else 'no'} explicit dependence"
 
 
 @verifies(Scene)

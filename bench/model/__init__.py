@@ -13,9 +13,21 @@ from bench.errors import Unsupported
 from bench.model.backend import Backend
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
-from bench.model.estimator import Estimator, SampleMean, columns, halves, per_repeat
+from bench.model.estimator import (
+    Auxiliaries,
+    Estimator,
+    SampleMean,
+    columns,
+    first_order,
+    halves,
+    per_repeat,
+    zeroth_order,
+)
 from bench.model.integrator import Integrator
+from bench.model.known import KnownOptimum, KnownValue
 from bench.model.ops import Array, LoopOps, Ops, State
+from bench.model.optimizer import Answer, Descent, Optimizer, Population
+from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
 from bench.model.program import Decision, FunctionProgram, Program, Rollout, compose, rollout
@@ -32,7 +44,9 @@ from bench.model.scene import (
 )
 
 __all__ = [
+    "Answer",
     "Array",
+    "Auxiliaries",
     "Backend",
     "Compilations",
     "Contact",
@@ -40,6 +54,7 @@ __all__ = [
     "ContactScene",
     "DampedScene",
     "Decision",
+    "Descent",
     "Dynamics",
     "EngineScene",
     "EngineTwin",
@@ -51,11 +66,16 @@ __all__ = [
     "ImpulseLaw",
     "Integrator",
     "Jacobians",
+    "KnownOptimum",
+    "KnownValue",
     "LoopOps",
     "MechanicalScene",
     "Ops",
+    "Optimizer",
+    "OptimizerState",
     "Oscillator",
     "Plugin",
+    "Population",
     "Problem",
     "Program",
     "Rollout",
@@ -67,8 +87,10 @@ __all__ = [
     "Usage",
     "columns",
     "compose",
+    "first_order",
     "halves",
     "param",
     "per_repeat",
     "rollout",
+    "zeroth_order",
 ]

@@ -17,7 +17,9 @@ class Backend(Plugin):
 
     kind: ClassVar[str] = "backends"
     provides: ClassVar[frozenset[str]] = frozenset({"value", "grad", "score"})
-    """Capabilities, out of ``value``, ``grad``, ``score``, ``root`` and ``physics``.
+    """Capabilities, out of ``value``, ``grad``, ``score``, ``explicit``, ``root`` and ``physics``.
+
+    With ``explicit`` it differentiates the cost by theta under given actions, see :meth:`Problem.explicit`.
 
     With ``physics`` the backend steps a scene's :meth:`~EngineTwin.mjcf` twin by an integrator and a contact solver of
     its own, so its programs differ from those of other backends and need reference gradients of their own.
@@ -38,7 +40,10 @@ class Backend(Plugin):
         return None
 
     def lacks(self, program: Program) -> str | None:
-        """Return why this backend cannot run the program: its own refusal, or a capability that it lacks; or None."""
+        """Return why this backend cannot run the program: its own or the scene's refusal, or a lack; or None."""
+        only = program.scene.backends
+        if only and self.name not in only:
+            return f"scene {program.scene.name} runs on {' and '.join(only)} only"
         if program.needs_root and "root" not in self.provides:
             part = next(p for p in (program.contact, program.integrator) if p is not None and p.needs_root)
             return f"{part.name} solves an equation each step, backend {self.name} has no root finder"

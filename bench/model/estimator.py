@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,6 +12,9 @@ import numpy as np
 from bench.model.parameters import Plugin
 from bench.model.problem import Problem
 from bench.model.program import Program
+
+Auxiliaries = Mapping[str, np.ndarray]
+"""What decided estimates, by name."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,14 @@ class Estimator(Plugin):
     """Whether the expectation is the target for continuous costs."""
     across_jumps: ClassVar[bool] = False
     """Whether it is also unbiased when the cost jumps in theta."""
+    reports: ClassVar[tuple[str, ...]] = ()
+    """Names of the auxiliaries that :meth:`explained` gives beside the estimates, a weight for example."""
+    adds_explicit: ClassVar[bool] = False
+    """Whether it adds :meth:`Problem.explicit` to cost times score; if not, it is refused where theta sets the initial
+    state and noise is on the actions, since cost times score alone is then biased."""
+
+    gives_gradient: ClassVar[bool] = True
+    """Whether its estimates are of a gradient, so that an optimizer can descend along them."""
 
     @abstractmethod
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -34,9 +46,33 @@ class Estimator(Plugin):
         All randomness comes from ``noise``: estimate r depends on ``noise[r]`` and on nothing else random.
         """
 
+    def explained(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Auxiliaries]:
+        """Return the estimates, and by name what decided them: one array ``(R,)`` or ``(R, d)`` for each of ``reports``.
+
+        An estimator that reports something defines this method, and :meth:`estimate` as its first part.
+        """
+        return self.estimate(problem, theta, noise), {}
+
+    def declares_unbiased(self, program: Program) -> bool:
+        """Whether its expectation is grad J_sigma of the program, by what it declares."""
+        return self.unbiased and self.target == "smoothed" and (program.continuous or self.across_jumps)
+
     def refuses(self, program: Program) -> str | None:
         """Return why this estimator cannot be used on the program, or None."""
         return None
+
+    def lacks(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
+        """Return why it cannot be used on a program run by a backend that ``provides`` certain capabilities, or None."""
+        missing = self.needs - provides
+        if missing:
+            return f"{self.name} needs {', '.join(sorted(missing))}, which {backend} lacks"
+        if "score" in self.needs and program.explicit:
+            start = f"theta sets the initial state of {program.scene.name} while noise is on the actions, so "
+            if not self.adds_explicit:
+                return f"{start}cost times score lacks a term, which {self.name} does not add"
+            if "explicit" not in provides:
+                return f"{start}{self.name} needs explicit, which {backend} lacks"
+        return self.refuses(program)
 
 
 @dataclass(frozen=True)
@@ -68,13 +104,21 @@ def per_repeat(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
 def halves(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return first-order terms of the first half of the samples, zeroth-order terms of the rest, each ``(R, N/2, d)``.
 
-    The zeroth-order terms are (f - f at w = 0) times the score. Raises ValueError below 4 samples.
+    The zeroth-order terms are (f - f at w = 0) times the score, plus the explicit derivative. Raises ValueError below 4 samples.
     """
     half = noise.shape[1] // 2
     if half < 2:
         raise ValueError(f"needs at least 4 samples, got {noise.shape[1]}")
-    a, b = noise[:, :half], noise[:, half:]
-    first = per_repeat(problem.grad(theta, columns(a)), a)
-    w = columns(b)
+    return first_order(problem, theta, noise[:, :half]), zeroth_order(problem, theta, noise[:, half:])
+
+
+def first_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return the gradient of each sample, ``(R, N, d)``."""
+    return per_repeat(problem.grad(theta, columns(noise)), noise)
+
+
+def zeroth_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return (f - f at w = 0) times the score of each sample plus the explicit derivative, ``(R, N, d)``."""
+    w = columns(noise)
     cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))
-    return first, per_repeat(cost * problem.score(theta, w), b)
+    return per_repeat(cost * problem.score(theta, w) + problem.explicit(theta, w), noise)

@@ -14,6 +14,8 @@ from bench.errors import Unsupported
 from bench.model import blocks
 from bench.model.program import Program
 
+NO_EXPLICIT = "{} cannot move the initial state by theta under given actions, which the score needs here"
+
 
 class Trajectory(NamedTuple):
     """The states x = (q, v) and the controls of rollouts."""
@@ -134,7 +136,20 @@ class Problem(ABC):
         """Return per-sample scores d log p(actions | theta)/dtheta, ``(d, B)``; w / sigma where noise is on theta."""
         if self.noise_on_theta:
             return w / self.sigma
+        if self.program.explicit and type(self)._explicit is Problem._explicit:
+            raise Unsupported(NO_EXPLICIT.format(type(self).__name__))
         return self._blocks(self._score, theta, w, (self.dim,))
+
+    def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return per-sample derivatives of the cost by theta along every path but the actions, ``(d, B)``.
+
+        The gradient is the mean of cost times score plus these. They are 0 unless the program is
+        :attr:`~Program.explicit`, where they count as gradients.
+        """
+        if not self.program.explicit:
+            return np.zeros((self.dim, w.shape[1]))
+        self.usage.gradients += w.shape[1]
+        return self._blocks(self._explicit, theta, w, (self.dim,))
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
         """Return states and controls along each rollout; raises :class:`Unsupported` where there are none."""
@@ -175,3 +190,6 @@ class Problem(ABC):
 
     @abstractmethod
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...
+
+    def _explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        raise Unsupported(NO_EXPLICIT.format(type(self).__name__))

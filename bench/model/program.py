@@ -34,6 +34,8 @@ class Decision:
     at: tuple[float, ...] | None = None
 
 
+TRIED = 8
+"""Random thetas of each size at which the initial state is compared with that of theta0."""
 OWN = Decision()
 """The scene's own theta, where the scene puts it."""
 
@@ -132,6 +134,14 @@ class Program(ABC):
         return not self.action_noise
 
     @property
+    def explicit(self) -> bool:
+        """Whether theta acts on the cost, or on the states that a policy sees, other than through the actions' mean.
+
+        Then E[f score] is not the gradient: it lacks the derivative of f along that path, see :meth:`explicit_cost`.
+        """
+        return False
+
+    @property
     def n_noise(self) -> int:
         """n_w, the count of normal numbers in one rollout."""
         return self.dim
@@ -154,6 +164,7 @@ class Program(ABC):
 
     def bind(self, parameters: Any) -> Program:
         """Return this program with other values, possibly traced ones, for :meth:`parameters`."""
+        _ = self.explicit  # kept in the copy: it cannot be found out from traced values
         places = [(axis, name) for axis, plugin in self.parts.items() for name in traced(plugin)]
         return self._with(dict(zip(places, parameters, strict=False)))
 
@@ -234,6 +245,14 @@ class Program(ABC):
         Needed only where noise is on the actions of a policy; elsewhere the score is w / sigma.
         """
 
+    def explicit_cost(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> Array:
+        """Return the cost at ``theta_moved`` of the actions that theta and w lead to, ``(B,)``.
+
+        With E over the actions, grad J = E[f score + d explicit_cost / d theta_moved] (Williams 1992 for the score,
+        Schulman et al. 2015, eq. 3, for both). Needed only where the program is :attr:`explicit`.
+        """
+        return self.cost(ops, theta, w)
+
     def _own_theta(self, xp: Any, theta: Array, w: Array) -> tuple[Program, Array]:
         """Return the program with the parameter values in theta, ``(B,)`` each, and the scene's theta ``(d', B)``."""
         noisy = theta + self.scene.sigma * w
@@ -271,8 +290,30 @@ class Rollout(Program):
 
     @property
     def noise_on_theta(self) -> bool:
-        """Whether noise is on theta: parameter noise, or action noise where theta is the controls themselves."""
-        return not self.action_noise or self.scene.open_loop
+        """Whether noise is on theta: parameter noise, or action noise where theta is the controls and nothing else."""
+        return not self.action_noise or (self.scene.open_loop and self._only_controls and not self._moves_start)
+
+    @property
+    def explicit(self) -> bool:
+        """Whether theta sets the initial state of a program whose noise is on the actions."""
+        return self.action_noise and self._moves_start
+
+    @property
+    def _only_controls(self) -> bool:
+        """Whether u_t = theta_t + sigma w_t: a control law of its own may use theta in another way."""
+        own = type(self.scene)
+        return all(getattr(own, law) is getattr(MechanicalScene, law) for law in ("planned_controls", "feedback"))
+
+    @cached_property
+    def _moves_start(self) -> bool:
+        """Whether the initial state differs between thetas: tried at and around theta0, near and far."""
+        draw = np.random.default_rng(0)
+        theta = self.scene.theta0()[:, None]
+        sizes = np.repeat([1e-3, self.scene.sigma, 1.0 + float(np.abs(theta).max(initial=0.0))], TRIED)
+        moved = np.concatenate([theta, theta + sizes * draw.standard_normal((theta.size, sizes.size))], axis=1)
+        with np.errstate(all="ignore"):
+            start = self.scene.initial_state(np, moved)
+        return any(not np.array_equal(part, np.broadcast_to(part[:, :1], part.shape), equal_nan=True) for part in start)
 
     @property
     def n_noise(self) -> int:
@@ -287,9 +328,16 @@ class Rollout(Program):
     def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
         """Return sum_t w_t . pi(theta_scored, x_t) / sigma along the states x_t that theta and w lead to.
 
-        This is the part of log p(actions | states) that is linear in the policy's change.
+        This is the part of log p(actions) that is linear in the policy's change. Where the program is
+        :attr:`explicit`, the states are those of ``theta_scored`` under the same actions.
         """
+        if self.explicit:
+            return self._replayed(ops, theta, theta_scored, w)[1] / self.scene.sigma
         return self._rollout(ops, theta, w, theta_scored)[1] / self.scene.sigma
+
+    def explicit_cost(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> Array:
+        """Return the cost from the initial state of ``theta_moved``, under the actions that theta and w lead to."""
+        return self._replayed(ops, theta, theta_moved, w)[0]
 
     def resolved(self, ops: Ops, theta: Array, w: Array) -> tuple[Rollout, Array, Array]:
         """Return program, theta and noise with the parameters named by theta filled in; unchanged if it names none."""
@@ -364,6 +412,30 @@ class Rollout(Program):
 
         state, cost, logp = ops.scan(step, (state, zero, zero), scanned + extra, scene.horizon)
         return cost + scene.terminal_cost(xp, state.q, state.v), logp
+
+    def _replayed(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> tuple[Array, Array]:
+        """Return cost and sum_t w_t . pi(theta_moved, x_t) along the states of ``theta_moved`` under theta's actions."""
+        scene, xp = self.scene, ops.xp
+        theta, first, scanned = self.start(ops, theta, w)
+        theta_moved, second, scanned_moved = self.start(ops, theta_moved, w)
+        zero = xp.zeros_like(w[0, :])
+
+        def step(
+            carry: tuple[State, State, Array, Array], slices: tuple[Array, ...]
+        ) -> tuple[State, State, Array, Array]:
+            state, moved, cost, logp = carry
+            drawn, planned = slices[: len(scanned)], slices[len(scanned) :]
+            u = self.control(ops, theta, state, drawn)
+            for part in (*planned, scene.feedback(xp, theta_moved, moved.q, moved.v)):
+                if part is not None:
+                    logp = logp + xp.sum(drawn[-1] * part, axis=0)
+            cost = cost + scene.stage_cost(xp, moved.q, moved.v, u)
+            return self.step(ops, state, u), self.step(ops, moved, u), cost, logp
+
+        # of the moved program only the plan is needed besides: its noise is the same
+        inputs = scanned + scanned_moved[:-1]
+        _, last, cost, logp = ops.scan(step, (first, second, zero, zero), inputs, scene.horizon)
+        return cost + scene.terminal_cost(xp, last.q, last.v), logp
 
 
 class _VaryingOps:

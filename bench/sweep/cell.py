@@ -193,10 +193,6 @@ class Cell:
         backend, estimator = self.backend, self.parts.get("estimator")
         if reason := backend.lacks(program):
             return "unsupported", reason
-        if isinstance(estimator, Estimator):
-            lacking = estimator.needs - backend.provides
-            if lacking:
-                return "unsupported", f"{estimator.name} needs {', '.join(sorted(lacking))}, which {backend.name} lacks"
-            if reason := estimator.refuses(program):
-                return "unsupported", reason
+        if isinstance(estimator, Estimator) and (reason := estimator.lacks(program, backend.provides, backend.name)):
+            return "unsupported", reason
         return None

@@ -20,17 +20,22 @@ class Judged:
     - ``interval``: estimated, with columns ``<name>_low`` and ``<name>_high``; changed where the two intervals are
       apart.
     - ``spread``: an interval as above, and a ratio that has to be large enough to matter (a variance).
+    - ``paired``: an error estimated from noise that is the same in both results; changed where the mean estimate in
+      the column ``mean`` moved by more than rounding, judged by its distance from the gradient in ``reference`` before.
     - ``exact``: computed without noise; changed by a ratio that matters and by more than rounding.
-    - ``time``: seconds of single calls.
+    - ``time``: seconds, judged only when asked for, against the spread between runs.
     - ``verdict``: one of ``order``, the worst first.
     """
 
-    by: Literal["interval", "spread", "exact", "time", "verdict"]
+    by: Literal["interval", "spread", "paired", "exact", "time", "verdict"]
     called: str
     """The column's name in the sentence."""
     neutral: bool = False
     """Whether a change is neither better nor worse."""
     order: tuple[str, ...] = ()
+    mean: str = ""
+    variance: str = ""
+    reference: str = ""
 
 
 @dataclass(frozen=True)

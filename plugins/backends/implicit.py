@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bench.model import Array, Backend, Ops
+from bench.model import Array, Ops
 
 from .jax import Jax, JaxOps
 
@@ -22,7 +22,7 @@ class Implicit(Jax):
 
     name = "implicit"
     requires: ClassVar[tuple[str, ...]] = ("jax", "optimistix", "lineax")
-    provides = Backend.provides | {"root"}
+    provides = Jax.provides | {"root"}
     reference_rank: ClassVar[int | None] = 1
 
     def ops(self) -> Ops:

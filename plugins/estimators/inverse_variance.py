@@ -1,10 +1,11 @@
 """Inverse-variance weighting of first and zeroth order."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Estimator, Problem, halves
+from bench.model import Auxiliaries, Estimator, Problem, halves
 
 
 @dataclass(frozen=True)
@@ -13,19 +14,25 @@ class InverseVariance(Estimator):
 
     The weights are v0 / (v0 + v1) and v1 / (v0 + v1) on independent halves of the samples (total propagation, Parmas et
     al. 2018). Requires costs, gradients and scores. Follows whichever mean has the lower variance, right or
-    wrong; the weights depend on the samples, so it is biased at finite N too.
+    wrong; the weights depend on the samples, so it is biased at finite N too. Reports the first-order ``weight``.
     """
 
     name = "inverse_variance"
     needs = frozenset({"value", "grad", "score"})
+    adds_explicit = True
     unbiased = False
+    reports: ClassVar[tuple[str, ...]] = ("weight",)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return estimates with one weight per repeat and coordinate."""
+        return self.explained(problem, theta, noise)[0]
+
+    def explained(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Auxiliaries]:
+        """Return the estimates, and the first-order weights ``(R, d)``."""
         first, zeroth = halves(problem, theta, noise)
         v1 = first.var(axis=1, ddof=1) / first.shape[1]
         v0 = zeroth.var(axis=1, ddof=1) / zeroth.shape[1]
         total = v0 + v1
         # with both variances 0 any weight is right
         weight = np.divide(v0, total, out=np.full_like(total, 0.5), where=total > 0)
-        return weight * first.mean(axis=1) + (1 - weight) * zeroth.mean(axis=1)
+        return weight * first.mean(axis=1) + (1 - weight) * zeroth.mean(axis=1), {"weight": weight}

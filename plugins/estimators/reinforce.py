@@ -11,12 +11,15 @@ from bench.model import Estimator, Problem, columns, param, per_repeat
 class Reinforce(Estimator):
     """Approximates grad J_sigma with the mean of (f - b) d log p(actions)/dtheta (Williams 1992).
 
+    Where theta also sets the initial state, the derivative of f along that path, at given actions, is added.
+
     Baseline b: ``none``; ``center``, f at w = 0; ``leave_one_out``, the mean cost of the other samples of the batch.
     Requires costs and scores. Unbiased for any cost, even one with jumps.
     """
 
     name = "reinforce"
     needs = frozenset({"value", "score"})
+    adds_explicit = True
     across_jumps = True
 
     baseline: str = param("center", "what is subtracted from f", choices=("none", "center", "leave_one_out"))
@@ -32,4 +35,5 @@ class Reinforce(Estimator):
             if f.shape[1] < 2:
                 raise ValueError("baseline leave_one_out needs at least 2 samples")
             f = (f - f.mean(axis=1, keepdims=True)) * f.shape[1] / (f.shape[1] - 1)
-        return np.einsum("rn,rnd->rd", f, score) / f.shape[1]
+        explicit = per_repeat(problem.explicit(theta, w), noise)
+        return np.einsum("rn,rnd->rd", f, score) / f.shape[1] + explicit.mean(axis=1)

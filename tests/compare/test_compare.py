@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
+import planted
 import pytest
+import yaml
 from helpers import experiment, loaded, small_rows
 
 from bench import cli, compare
-from bench.compare import cells, judging, sources
+from bench.compare import cells, judging, sources, timings
 from bench.model import registry
 from bench.report.tables import csv
 from bench.studies.bias_variance.columns import COLUMNS
@@ -32,8 +37,8 @@ def given(calls=20, seed=1):
     return rows
 
 
-def compared(before, after, timings, columns: Columns = COLUMNS):
-    return cells.compared(before, after, columns, timings)
+def compared(before, after, timings=False, columns: Columns = COLUMNS, again=()):
+    return cells.compared(before, after, columns, timings, again)[0]
 
 
 def of_study(name, *words):
@@ -129,11 +134,6 @@ def test_cells_are_matched_by_all_their_parameters():
     assert len(compared(rows, rows.assign(seed=1), False, columns)) == 2
 
 
-def test_equal_results_are_the_same_whatever_the_noise_of_their_times():
-    found = compared(given(seed=1), given(seed=2), timings=True)
-    assert set(found["outcome"]) == {"same"}
-
-
 @pytest.mark.parametrize(("factor", "outcome"), [(10.0, "worse"), (0.1, "better")])
 @pytest.mark.parametrize("column", ["bias", "variance"])
 def test_accuracy_beyond_the_intervals_is_a_change(factor, outcome, column):
@@ -164,35 +164,105 @@ def test_variances_without_intervals_are_judged_by_an_f_test():
     assert np.mean([judging.outside_f(4 * a / b, 64, 64) for a, b in equal]) > 0.99
 
 
-@pytest.mark.parametrize(("factor", "outcome"), [(2.0, "worse"), (0.5, "better")])
-@pytest.mark.parametrize("calls", [5, 64])
-def test_a_time_that_differs_by_more_than_its_spread_is_a_change(factor, outcome, calls):
-    before, after = given(calls), given(calls, seed=2)
-    place = good(after)
-    after.at[place, "time_samples"] = factor * after.at[place, "time_samples"]
-    after.loc[place, "time_s"] *= factor
-    assert only(compared(before, after, timings=True), outcome).startswith("time")
-    assert set(compared(before, after, timings=False)["outcome"]) == {"same"}
+# --------------------------------------------------------------------------------------------- paired estimates
 
 
-def test_a_time_that_differs_by_less_than_the_least_effect_is_none_however_sure():
-    before, after = given(200), given(200)
-    after["time_samples"] = [1.2 * samples for samples in after["time_samples"]]
-    after["time_s"] *= 1.2
-    assert set(compared(before, after, timings=True)["outcome"]) == {"same"}
+def paired(mean=(1.0, 2.0), variance=0.5, reference=(1.1, 1.9), se=0.0, **more):
+    """One ok row that stores its mean estimate, and its error from that."""
+    row = given().loc[[good(given())]].assign(variance=variance, reference_se=se, **more)
+    row["mean_estimate"], row["reference_gradient"] = [np.array(mean)], [np.array(reference)]
+    return row.assign(rmse=np.hypot(np.linalg.norm(np.subtract(mean, reference)), np.sqrt(variance)))
 
 
-def test_times_without_single_calls_are_judged_by_their_interquartile_range():
-    before = given().drop(columns="time_samples")
-    after = before.copy()
-    place = good(after)
-    before["time_iqr_s"] = after["time_iqr_s"] = 0.1 * before["time_s"]
-    after.loc[place, "time_s"] *= 2
-    assert only(compared(before, after, timings=True), "worse").startswith("time")
-    after["time_iqr_s"] = np.nan
-    found = compared(before, after, timings=True)
-    assert set(found["outcome"]) == {"same"}
-    assert found["time_judged_by"].str.startswith("not compared").any()
+@pytest.mark.parametrize("factor", [1.02, 1.1, -1.0])
+@pytest.mark.parametrize("variance", [0.0, 0.5, 1e8], ids=["exact", "usual", "exploding"])
+def test_scaled_estimates_are_worse_on_equal_noise_however_large_their_variance(factor, variance):
+    before = paired(variance=variance, reference=(1.0, 2.0))
+    after = paired(factor * np.array([1.0, 2.0]), factor**2 * variance, (1.0, 2.0))
+    found = compared(before, after)
+    # a sign changes no spread, so at a huge variance it is a change that nothing shows to be worse
+    assert only(found, "changed" if factor < 0 and variance > 1e3 else "worse").startswith("RMSE")
+    assert compared(after, before)["outcome"].iloc[0] in ("better", "changed")
+
+
+def test_a_remark_on_the_interval_does_not_hide_a_paired_change():
+    before, after = paired(reason="heavy tails"), paired((1.5, 2.5), reason="heavy tails")
+    assert "on the same noise" in only(compared(before, after), "worse")
+
+
+def test_rounding_is_no_change_and_a_small_move_is_neither_worse_nor_better():
+    before = paired()
+    assert set(compared(before, paired((1 + 1e-9, 2.0)))["outcome"]) == {"same"}
+    assert "moved by" in only(compared(before, paired((1.0001, 2.0))), "changed")
+
+
+def test_a_better_reference_is_no_merit_or_fault_of_the_same_estimates():
+    """Intervals of the bias move with the reference; the estimates on the same noise are what they were."""
+    before = paired(bias=0.0, bias_low=0.0, bias_high=0.1)
+    after = paired(bias=1.0, bias_low=0.9, bias_high=1.1, reference=(2.1, 1.9))
+    assert only(compared(before, after), "changed") == "the same estimates, but the reference moved by 1.00"
+    assert set(compared(before, after.assign(reference_se=0.5))["outcome"]) == {"same"}
+
+
+def test_a_fault_in_program_and_reference_alike_is_worse():
+    """The reference of before is the measure, so a fault that the reference shares cannot hide."""
+    assert only(compared(paired(), paired((1.1, 2.2), 0.605, (1.21, 2.09))), "worse")
+
+
+@pytest.mark.parametrize("scene", ["pushing", "quadratic"])
+def test_planted_faults_of_the_gradient_are_caught(scene):
+    found = planted.judged(scene, ("none", "gradient * 1.02", "gradient * 1.1", "sign of one component"))
+    assert list(found["outcome"]) == ["same", "worse", "worse", "worse"]
+
+
+# ------------------------------------------------------------------------------------------------------- times
+
+
+def runs(count, seed=0, spread=0.1, cells=40):
+    """Rows of one experiment run several times: times of a cell spread between runs, and not within one."""
+    generator = np.random.default_rng(seed)
+    two = given().iloc[:2]
+    rows = pd.concat([two.assign(seed=i) for i in range(cells // 2)], ignore_index=True)
+    rows["key"] = rows.index.astype(str)
+    usual = np.exp(generator.normal(-7, 1, len(rows)))
+    made = []
+    for _ in range(count):
+        load = generator.normal(0, spread)
+        time = usual * np.exp(load + generator.normal(0, spread, len(rows)))
+        made.append(rows.assign(time_s=time, time_iqr_s=1e-9, time_samples=[np.full(20, t) for t in time]))
+    return made
+
+
+@pytest.mark.parametrize("again", [0, 3])
+def test_times_of_unchanged_code_are_the_same_although_every_call_of_one_run_agrees(again):
+    """As in load, a run is slower or faster as a whole, and each cell by itself; at most 1% of cells are alarms."""
+    generator = np.random.default_rng(again)
+    usual, alarms, cells, repeats = generator.normal(-7, 1, 40), 0, 40, 200
+    for _ in range(repeats):
+        logs = usual + generator.normal(0, 0.2, (2 + again, 1)) + generator.normal(0, 0.2, (2 + again, cells))
+        made = [{i: {"backend": "jax", "time_s": math.exp(log)} for i, log in enumerate(run)} for run in logs]
+        alarms += len(timings.judged("time_s", "time", made[0], made[1], made[2:])[0])
+    assert alarms <= 0.01 * cells * repeats
+
+
+@pytest.mark.parametrize(("factor", "outcome"), [(4.0, "worse"), (0.25, "better")])
+@pytest.mark.parametrize("again", [0, 3])
+def test_a_time_beyond_the_spread_between_runs_is_a_change_where_times_are_asked_for(factor, outcome, again):
+    before, after, *more = runs(2 + again, spread=0.05)
+    after.loc[0, "time_s"] *= factor
+    assert only(compared(before, after, True, again=more), outcome).startswith("time")
+    assert set(compared(before, after, False)["outcome"]) == {"same"}
+
+
+def test_a_slower_run_is_a_remark_with_two_runs_and_a_finding_with_more():
+    before, after, *more = runs(5, spread=0.02)
+    after["time_s"] *= 2
+    table, remarks = cells.compared(before, after, COLUMNS, True)
+    assert set(table["outcome"]) == {"same"}
+    assert "2 times those before in the median: two runs cannot say" in remarks[0]
+    table, remarks = cells.compared(before, after, COLUMNS, True, more)
+    assert set(table["outcome"]) == {"worse"}
+    assert not remarks
 
 
 @pytest.mark.parametrize(("was", "now", "outcome"), [("ok", "error", "worse"), ("timeout", "ok", "better"), ("error", "crashed", "changed")])  # fmt: skip
@@ -237,19 +307,44 @@ def test_committed_tables_are_enough(tmp_path):
     assert run(old, new, out=tmp_path / "out") == 1
 
 
-def test_timings_of_another_machine_are_compared_only_when_asked(tmp_path, capsys):
-    before, after = given(), given()
-    after["time_samples"] = [3 * samples for samples in after["time_samples"]]
-    after["time_s"] *= 3
-    old = save(before, tmp_path / "old")
+def test_times_are_compared_only_when_asked(tmp_path, capsys):
+    before, after, *_ = runs(2, spread=0.02)
+    after.loc[0, "time_s"] *= 9
+    old, new = save(before, tmp_path / "old"), save(after, tmp_path / "new")
+    for words in ((), ("timings=false",)):
+        assert run(old, new, *words, out=tmp_path / "out") == 0
     new = save(after, tmp_path / "new", machine=MACHINE | {"cores": 64, "load_average": [500.0]})
     assert run(old, new, out=tmp_path / "out") == 0
-    assert "not compared: add --timings" in capsys.readouterr().out
+    assert "made on different machines" in capsys.readouterr().out
     for asked in ("--timings", "timings=true"):
         assert run(old, new, asked, out=tmp_path / "out") == 1
         printed = capsys.readouterr().out
         assert "WARNING: timings of different machines" in printed
         assert "busy after" in printed
+
+
+def test_further_runs_of_before_are_read(tmp_path):
+    before, after, *more = runs(4, spread=0.02)
+    after["time_s"] *= 9
+    old, new, *again = (save(rows, tmp_path / str(i)) for i, rows in enumerate((before, after, *more)))
+    assert run(old, new, "--timings", out=tmp_path / "out") == 0
+    assert run(old, new, "--timings", f"again={again[0]},{again[1]}", out=tmp_path / "out") == 1
+
+
+def test_json_and_junit_say_what_the_exit_status_says(tmp_path):
+    before, after = given(), given()
+    after.loc[good(after), ["status", "reason"]] = ["error", "it broke\x00 <badly> & \x1b[31m"]
+    old, new = save(before, tmp_path / "old"), save(after, tmp_path / "new")
+    for other, failures in ((old, 0), (new, 1)):
+        assert run(old, other, out=tmp_path / "out") == failures
+        result = json.loads((tmp_path / "out" / "compare.json").read_text())
+        assert result["worse"] == bool(failures)
+        assert result["counts"]["worse"] == len(result["cells"]) == failures
+        assert sum(result["counts"].values()) == len(before)
+        suites = ElementTree.parse(tmp_path / "out" / "compare.xml").getroot()
+        assert int(suites.get("failures")) == len(suites.findall("./testsuite/testcase/failure")) == failures
+        assert len(suites.findall("./testsuite/testcase")) == len(before)
+    assert "<badly>" in suites.find(".//failure").get("message")
 
 
 def test_git_revisions_are_compared(tmp_path, monkeypatch, capsys):
@@ -283,6 +378,8 @@ def test_git_revisions_are_compared(tmp_path, monkeypatch, capsys):
         ([".", "."], "no results"),
         ([".", ".", "timing=true"], "did you mean 'timings'"),
         ([".", ".", "timings=perhaps"], "allowed: false, true"),
+        ([".", ".", "again=a,b"], "add --timings"),
+        ([".", ".", "--timings", "again=a"], "takes 3 runs of before or more"),
     ],
 )
 def test_bad_input_is_refused(words, said, tmp_path, monkeypatch, capsys):
@@ -353,4 +450,49 @@ def test_stored_rows_without_single_calls_stay_readable_beside_new_ones(tmp_path
     both.to_parquet(tmp_path / "rows.parquet", index=False)
     again = pd.read_parquet(tmp_path / "rows.parquet")
     assert again["time_samples"].isna().sum() == len(rows)
-    assert compare.report.summary(compared(again, again, timings=True)).startswith("Of ")
+    assert compare.report.summary(compared(again, again, True)).startswith("Of ")
+
+
+# ----------------------------------------------------------------------------------------------------- history
+
+
+def test_history_follows_errors_and_failures_in_the_order_given(tmp_path):
+    rows = given()
+    rows["rmse"] = 1.0
+    worse = rows.assign(rmse=2.0)
+    worse.loc[good(worse), "status"] = "error"
+    places = [save(r, tmp_path / name) for name, r in (("a", rows), ("b", rows), ("c", worse))]
+    assert cli.main(["history", *map(str, places), f"out={tmp_path / 'out'}"]) == 0
+    table = pd.read_csv(tmp_path / "out" / "history.csv")
+    fobg = table[table["series"] == "fobg"]
+    assert list(fobg["error"]) == [1.0, 1.0, 2.0]
+    assert list(fobg["failed"] - fobg["failed"].iloc[0]) == [0, 0, 1]
+    assert (tmp_path / "out" / "history.png").stat().st_size > 0
+    assert "fobg" in (tmp_path / "out" / "history.plotted.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"), [(["."], "name two results or more"), ([".", ".", "output=x"], "did you mean 'out'")]
+)
+def test_bad_input_to_history_is_refused(words, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["history", *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------------------------------------------- workflow
+
+
+def test_the_workflow_of_the_docs_runs_the_gate_as_it_is():
+    """It is YAML; its bench commands have settings that there are, and its last one ends with the status of compare."""
+    page = (Path(__file__).resolve().parents[2] / "docs" / "ci.md").read_text()
+    workflow = yaml.safe_load(page.split("```yaml\n")[1].split("```")[0])
+    scripts = {step["name"]: step["run"] for step in workflow["jobs"]["gate"]["steps"] if "run" in step}
+    assert list(scripts) == ["Before", "After", "Gate"]
+    (line,) = (line for line in scripts["Gate"].splitlines() if "compare runs" in line)
+    words = line.split("bench compare ")[1].partition(" || ")[0].split()
+    asked = compare._parsed([word for word in words if not word.startswith("plugins=")])
+    assert (asked.before, asked.after) == ("runs/before", "runs/after")
+    assert scripts["Gate"].strip().endswith("exit $status")
+    for script, folder in (("Before", asked.before), ("After", asked.after)):
+        assert f"results_dir={folder}" in scripts[script]

@@ -83,8 +83,8 @@ def test_wrong_adjoint(pendulum, factor):
     assert verdicts(Planted(pendulum, grad=lambda g, _: factor * g)) == {"start": {"wrong_adjoint"}}
 
 
-def test_gradient_that_is_no_number_is_a_wrong_adjoint(pendulum):
-    assert verdicts(Planted(pendulum, grad=lambda g, _: np.nan * g)) == {"start": {"wrong_adjoint"}}
+def test_gradient_that_is_no_number_has_its_own_verdict(pendulum):
+    assert verdicts(Planted(pendulum, grad=lambda g, _: np.nan * g)) == {"start": {"nan_gradient"}}
 
 
 def test_wrong_adjoint_beside_a_contact_switch_and_on_it(bounce):

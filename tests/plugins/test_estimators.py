@@ -1,11 +1,14 @@
 """Estimators against closed-form biases and variances, and where two of them really differ."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
 from bench.plugins.backends.jax import Jax
+from bench.plugins.backends.numpy import Numpy
 from bench.plugins.backends.torch import Torch
+from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.estimators.alpha_order import AlphaOrder
 from bench.plugins.estimators.finite_difference import FiniteDifference
 from bench.plugins.estimators.fobg import Fobg
@@ -15,6 +18,7 @@ from bench.plugins.estimators.reinforce import Reinforce
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.cartpole import Cartpole
 from bench.plugins.scenes.heaviside import Heaviside
+from bench.plugins.scenes.pushing import Pushing
 from bench.plugins.scenes.soft_heaviside import SoftHeaviside
 from scipy import stats
 
@@ -37,11 +41,17 @@ def measured(scene, estimator, backend=None, integrator=None, samples=SAMPLES, r
     return summarise(estimator.estimate(problem, problem.program.theta0, w), truth.known(), samples)
 
 
-def moments(terms):
-    """Mean and variance of ``terms(w)``, w standard normal, by a fine midpoint rule between -9 and 9."""
+@cache
+def midpoints():
+    """Nodes between -9 and 9 and their weights under the standard normal density."""
     w = np.linspace(-9, 9, 2_000_001)
     w = (w[1:] + w[:-1]) / 2
-    weight = stats.norm.pdf(w) * (w[1] - w[0])
+    return w, stats.norm.pdf(w) * (w[1] - w[0])
+
+
+def moments(terms):
+    """Mean and variance of ``terms(w)``, w standard normal, by a fine midpoint rule."""
+    w, weight = midpoints()
     values = terms(w)
     mean = float(values @ weight)
     return mean, float((values - mean) ** 2 @ weight)
@@ -144,6 +154,36 @@ def test_confidence_radius_uses_the_failure_probability():
     assert below == pytest.approx(zeroth, rel=1e-12)
     assert above[0, 0] != below[0, 0]
     assert abs(above - below).max() <= 0.0011 * eps
+
+
+def weights(estimator, stiffness, samples=100, repeats=12):
+    program = compose(Pushing(horizon=10, sigma=0.1), Penalty(stiffness=stiffness), SemiImplicitEuler())
+    problem = Numpy().compile(program)
+    w = noise.draw(0, "pushing", repeats, samples, program.n_noise, "cells")
+    truth = certify(problem, Numpy().provides, 1 << 14, 0.005)
+    values, decided = estimator.explained(problem, program.theta0, w)
+    return summarise(values, truth.known(), samples).rmse_rel, decided.get("alpha")
+
+
+@pytest.mark.parametrize("stiffness", [10.0, 1e3])
+def test_the_default_accuracy_leaves_alpha_order_its_first_order_share(stiffness):
+    error, alpha = weights(AlphaOrder(), stiffness)
+    assert (alpha > 0).all()
+    assert error < 0.5 * weights(Reinforce(), stiffness)[0]
+
+
+def test_a_fixed_accuracy_far_below_eps_is_the_zeroth_order_alone():
+    assert (weights(AlphaOrder(gamma=0.01), 1e3)[1] == 0).all()
+
+
+def test_sharing_takes_every_sample_for_both_orders():
+    problem = Torch().compile(compose(SoftHeaviside(nu=0.2)))
+    theta, w = problem.program.theta0, noise.draw(5, "shared", 3, 64, 1, "cells")
+    shared, decided = AlphaOrder(sharing="shared").explained(problem, theta, w)
+    alpha = decided["alpha"][:, None]
+    expected = alpha * Fobg().estimate(problem, theta, w) + (1 - alpha) * Reinforce().estimate(problem, theta, w)
+    np.testing.assert_allclose(shared, expected, rtol=1e-12)
+    assert (alpha > 0).all()
 
 
 @pytest.mark.parametrize("model", ["action", "parameter"])

@@ -123,7 +123,7 @@ EDITED = ["scenes=[quadratic,linear]", "backends=[numpy]", "estimators=[fobg,rei
         ("bench/sweep/workers.py", 0),
         ("bench/sweep/store.py", 0),
         ("bench/measure/timing.py", 6),
-        ("bench/measure/gradcheck.py", 0),
+        ("bench/measure/gradcheck/direction.py", 0),
     ],
 )
 def test_editing_a_file_reruns_what_it_decides_and_only_that(tree, path, missing):
@@ -151,7 +151,10 @@ def missing_after(tree, path, added, replaced=("", "")) -> int:
 
 
 STUDIES = [
-    ("gradient_check", {"measure/gradcheck", "measure/noise", "measure/contacts", "studies/gradient_check/measure"}),
+    (
+        "gradient_check",
+        {"measure/gradcheck/direction", "measure/noise", "measure/contacts", "studies/gradient_check/measure"},
+    ),
     (
         "three_errors",
         {"measure/noise", "measure/statistics", "studies/three_errors/measure"},

@@ -47,9 +47,10 @@ class BiasVariance(Study):
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
         """Print the digest: the main table, condensed where it is long, and the findings from it."""
-        from bench.studies.bias_variance import fastest, terminal
+        from bench.studies.bias_variance import fastest, reported, terminal
 
         terminal.show(experiment, rows)
+        reported.show(rows)
         fastest.show(experiment, rows)
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:

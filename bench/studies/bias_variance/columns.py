@@ -24,7 +24,10 @@ COLUMNS = Columns.ordered(
     Column("variance_low", "lower end of its 95% interval", table=False),
     Column("variance_high", "upper end of its 95% interval", table=False),
     Column("variance_per_sample", "samples * variance"),
-    Column("rmse", "root mean squared distance of one estimate from the reference"),
+    Column("variance_per_sample_low", "lower end of its 95% interval", table=False),
+    Column("variance_per_sample_high", "upper end of its 95% interval", table=False),
+    Column("rmse", "root mean squared distance of one estimate from the reference",
+           judged=Judged("paired", "RMSE", mean="mean_estimate", variance="variance", reference="reference_gradient")),
     Column("rmse_rel", "rmse / reference_norm; above 1 an estimate is worse than answering zero"),
     Column("cosine", "mean cosine between one estimate and the reference"),
     Column("sign_agreement", "share of coordinates of one estimate whose sign is the reference's"),
@@ -44,4 +47,6 @@ COLUMNS = Columns.ordered(
     text("shapes", "hashes of the programs asked for", table=False, measured=True),
     numbers("mean_estimate", "mean estimate, signed, by coordinate of theta", table=False),
     numbers("reference_gradient", "reference gradient, signed, by coordinate of theta", table=False),
+    text("auxiliaries", "what the estimator reports of itself, such as a weight: JSON of mean, quantiles and share of exact zeros",
+         table=False),
 )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import asdict, replace
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bench.measure import noise, statistics, timing
-from bench.model import Problem
+from bench.model import Auxiliaries, Problem
 from bench.sweep.cell import Cell
 from bench.sweep.session import Session
 
@@ -23,8 +24,12 @@ def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
     problem = session.problem(cell)
     w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, program.n_noise)
 
-    def estimate(block: np.ndarray) -> np.ndarray:
-        result = np.asarray(cell.estimator.estimate(problem, theta, block), dtype=np.float64)
+    decided: dict[int, Auxiliaries] = {}
+
+    def estimate(start: int, stop: int) -> np.ndarray:
+        block = w[start:stop]
+        result, decided[start] = cell.estimator.explained(problem, theta, block)
+        result = np.asarray(result, dtype=np.float64)
         if result.shape != (block.shape[0], problem.dim):
             raise ValueError(
                 f"{cell.estimator.name} returned shape {result.shape}, not {(block.shape[0], problem.dim)}"
@@ -36,11 +41,11 @@ def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
     # usage covers the timed calls only: the reference may have used the same problem
     problem.reset_usage()
     started = time.perf_counter()
-    parts, clock = timing.timed(lambda r: estimate(w[r : r + 1]), calls)
+    parts, clock = timing.timed(lambda r: estimate(r, r + 1), calls)
     # a copy, since the remaining estimates count on
     usage = replace(problem.usage)
     if calls < cell.repeats:
-        parts.append(estimate(w[calls:]))
+        parts.append(estimate(calls, cell.repeats))
     spent = time.perf_counter() - started
     estimates = np.concatenate(parts)
 
@@ -61,16 +66,32 @@ def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
         "shapes": " ".join(sorted(session.compilations.shapes)),
         "mean_estimate": estimates.mean(axis=0).tolist(),
         "reference_gradient": truth.gradient.tolist(),
+        "auxiliaries": summarised([decided[start] for start in sorted(decided)]),
     }
     if not np.isfinite(truth.batches).all():
         return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}
-    summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
-    result |= {"reason": summary.pop("note"), **summary}
+    unbiased = cell.estimator.declares_unbiased(program)
+    summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples, unbiased=unbiased))
+    result |= {"reason": "; ".join(part for part in (summary.pop("note"), truth.note) if part), **summary}
     bad = ~np.isfinite(estimates).all(axis=1)
     if bad.any():
         result["status"] = "nonfinite"
         result["reason"] += f"; {first_bad(cell, problem, w, int(np.argmax(bad)))}"
     return result
+
+
+def summarised(decided: list[Auxiliaries]) -> str:
+    """Return as JSON, for each auxiliary, its mean, its 5, 50 and 95% quantiles and the share of exact zeros."""
+    table = {}
+    for name in decided[0]:
+        values = np.concatenate([np.ravel(one[name]) for one in decided]).astype(np.float64)
+        if np.isfinite(values).all():
+            low, median, high = np.quantile(values, (0.05, 0.5, 0.95)).tolist()
+            table[name] = {
+                "mean": float(values.mean()), "low": low, "median": median, "high": high,
+                "zero": float((values == 0).mean()),
+            }  # fmt: skip
+    return json.dumps(table) if table else ""
 
 
 def first_bad(cell: Cell, problem: Problem, w: np.ndarray, repeat: int) -> str:

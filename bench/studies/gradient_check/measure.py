@@ -116,30 +116,25 @@ def examine(
     if modes is not None:
         met = (boundary(modes, theta, direction, still, number, search) for number, direction in enumerate(directions))
         places += itertools.chain(*itertools.islice(filter(None, met), search.directions))
-    step = gradcheck.EPS * scale_of(theta)
-    shifts = np.concatenate([-step, step, [0.0]])
-    thetas = np.stack([p.theta + s * p.direction for p in places for s in shifts], axis=1)
-    noises = np.stack([p.w for p in places for _ in shifts], axis=1)
+    scale, count = scale_of(theta), gradcheck.EPS.size
+    thetas = np.concatenate([gradcheck.points(p.theta, scale * p.direction[:, None], unit) for p in places], axis=1)
+    each = thetas.shape[1] // len(places)
+    noises = np.repeat(np.stack([p.w for p in places], axis=1), each, axis=1)
     first, second = (problem.value(thetas, noises).reshape(len(places), -1) for _ in range(2))
     gradients = problem.grad(np.stack([p.theta for p in places], axis=1), np.stack([p.w for p in places], axis=1))
     signatures = [""] * thetas.shape[1] if modes is None else modes(thetas, noises)
-    found = []
-    for i, place in enumerate(places):
-        names = signatures[i * shifts.size : (i + 1) * shifts.size]
-        sides = list(zip(names[: step.size], names[step.size : -1], strict=True))
-        sample = gradcheck.Sample(
-            step,
-            minus=first[i, : step.size],
-            centre=float(first[i, -1]),
-            plus=first[i, step.size : -1],
-            derivative=float(place.direction @ gradients[:, i]),
-            crossing=np.array([a != b for a, b in sides]),
-            repeatable=np.array_equal(first[i], second[i], equal_nan=True),
-            scale=scale_of(theta),
-            slope=float(np.linalg.norm(gradients[:, i])),
-            unit=unit,
-        )
-        found.append((sample, sides))
+    names = np.array(signatures, dtype=object).reshape(len(places), -1)
+    minus, plus = names[:, :count], names[:, count : 2 * count]
+    samples = gradcheck.samples(
+        first,
+        np.full(len(places), scale),
+        np.array([place.direction @ gradients[:, i] for i, place in enumerate(places)]),
+        unit,
+        crossing=minus != plus,
+        repeatable=((first == second) | (np.isnan(first) & np.isnan(second))).all(axis=1),
+    )
+    sides = [list(zip(*both, strict=True)) for both in zip(minus, plus, strict=True)]
+    found = list(zip(samples, sides, strict=True))
     return places, found
 
 

@@ -1,0 +1,391 @@
+"""The whole check of a gradient: each component, random directions, other thetas, and the cause of what is wrong.
+
+Nothing here knows problems: a cost and a gradient are callables of theta.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from . import roughness
+from .causes import of_ratios
+from .direction import EPS, GUARD, Finding, Sample, judge
+from .sampling import order, points, samples, shifts
+from .verdicts import FAULTS, MEANING, TRUSTED, UNTRUSTED, VERDICTS, worst
+
+Cost = Callable[[np.ndarray], np.ndarray]
+"""Costs of columns: ``(d, B)`` to ``(B,)``."""
+Gradient = Callable[[np.ndarray], np.ndarray]
+"""The gradient at one theta: ``(d,)`` to ``(d,)``."""
+Modes = Callable[[np.ndarray], Sequence[str]]
+"""Names of the contact modes of columns: ``(d, B)`` to ``B`` strings."""
+SUSPICIOUS = 4
+"""Directions at most that are scanned for a staircase."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a check looks at."""
+
+    components: int = 16
+    """Components checked one by one: all of them, or the half with the largest and the half with the smallest share."""
+    directions: int = 2
+    """Random directions, in units of each input's own scale."""
+    draws: int = 8
+    """Other thetas around the given one, each checked along the random directions."""
+    reach: float = 0.05
+    """Standard deviation of those thetas, in units of each input's own scale."""
+    eps: np.ndarray = field(default_factory=lambda: EPS)
+    """Steps, relative to each input's own scale, falling."""
+    unit: float = float(np.finfo(np.float64).eps)
+    """Unit roundoff that the arithmetic is declared to have; the noise of the cost is measured beside it."""
+    scale: np.ndarray | None = None
+    """The scale of each input ``(d,)``; None for :func:`scales`."""
+    seed: int = 0
+    """Of the random directions and thetas."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One derivative checked: a component of the gradient, or the slope along a random direction."""
+
+    name: str
+    """``component 3``, ``direction 0`` or ``draw 2 direction 0``."""
+    component: int | None
+    program: float
+    """The program's number."""
+    difference: float
+    """What the differences settle on."""
+    uncertainty: float
+    """The error of that, by its neighbours and the noise of the cost."""
+    step: float
+    """The step it was taken at, in units of the input."""
+    left: float
+    """One-sided slope towards smaller values."""
+    right: float
+    """One-sided slope towards larger values."""
+    order: float
+    """Order of the Taylor remainder: 2 for a right gradient, 1 for a wrong one, NaN where noise or nothing is left."""
+    verdict: str
+    sample: Sample
+
+    @property
+    def ratio(self) -> float:
+        """Program's number over difference; NaN for 0 / 0."""
+        with np.errstate(all="ignore"):
+            return float(np.float64(self.program) / np.float64(self.difference))
+
+    @property
+    def error(self) -> float:
+        """|program - difference| over the larger of the two; 0 for two zeros."""
+        size = max(abs(self.program), abs(self.difference))
+        return 0.0 if size == 0.0 else abs(self.program - self.difference) / size
+
+
+@dataclass(frozen=True)
+class Check:
+    """The outcome of a check."""
+
+    cause: str
+    """The worst verdict, one of :data:`VERDICTS`."""
+    theta: np.ndarray
+    gradient: np.ndarray
+    scale: np.ndarray
+    parts: tuple[Part, ...]
+    """Components and random directions at theta."""
+    draws: tuple[Part, ...]
+    """Random directions at other thetas."""
+    noise: float
+    """Measured standard deviation of the cost's noise."""
+    roundoff: float
+    """That noise relative to the cost: the unit roundoff that the arithmetic shows, at least that declared."""
+    order: float
+    """Median order of the Taylor remainder along the random directions, NaN where it cannot be seen."""
+    evaluations: int
+    """Costs asked for."""
+    gradients: int
+    """Gradients asked for."""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the gradient may be used."""
+        return self.cause in TRUSTED
+
+    @property
+    def components(self) -> tuple[Part, ...]:
+        """The components, without random directions."""
+        return tuple(part for part in self.parts if part.component is not None)
+
+    @property
+    def guilty(self) -> tuple[Part, ...]:
+        """The parts that have the worst verdict, those at theta if there are any."""
+        here = tuple(part for part in self.parts if part.verdict == self.cause)
+        return here or tuple(part for part in self.draws if part.verdict == self.cause)
+
+    def sentence(self) -> str:
+        """Say in one sentence what was found, with the numbers of the worst part."""
+        text = f"{self.cause}: {MEANING[self.cause]}"
+        if not self.guilty:
+            return text
+        part = max(self.guilty, key=lambda p: (p.component is not None, np.nan_to_num(p.error, nan=np.inf)))
+        if self.cause == "kink":
+            return f"{text}; {part.name}: slopes {part.left:.6g} and {part.right:.6g}, the program's {part.program:.6g}"
+        if self.trusted:
+            return text
+        return (
+            f"{text}; {part.name}: the program's {part.program:.6g}, differences {part.difference:.6g} "
+            f"+- {part.uncertainty:.1g} at a step of {part.step:.1g} (ratio {part.ratio:.6g})"
+        )
+
+
+def scales(theta: np.ndarray) -> np.ndarray:
+    """Return the scale of each input: its own size, or 1 for one that is 0 or no more than rounding of the largest."""
+    size = np.abs(theta)
+    least = 1e-14 * max(1.0, float(size.max(initial=0.0)))
+    return np.where(size > least, size, 1.0)
+
+
+def check(
+    cost: Cost,
+    gradient: Gradient | None,
+    theta: np.ndarray,
+    options: Options | None = None,
+    modes: Modes | None = None,
+) -> Check:
+    """Check a gradient against differences of its cost; ``theta (d,)``.
+
+    Each component is judged on its own at the steps of ``options.eps``, relative to its own scale; random directions
+    see all components at once, here and at other thetas. The gradient is asked for at theta first and last, so that one
+    that is kept from an earlier call, or that is drawn, shows. ``modes`` names contact modes, if there are any. Without
+    a gradient, the cost alone is judged.
+
+    Raises :class:`TypeError` for complex costs or gradients and :class:`ValueError` for wrong shapes.
+    """
+    return _Checker(cost, gradient, np.array(theta, dtype=np.float64), options or Options(), modes).run()
+
+
+class _Checker:
+    """One check: the callables, and the counts of their calls."""
+
+    def __init__(
+        self, cost: Cost, gradient: Gradient | None, theta: np.ndarray, options: Options, modes: Modes | None
+    ) -> None:
+        if theta.ndim != 1 or not theta.size:
+            raise ValueError(f"theta is a vector of at least one number, not of shape {theta.shape}")
+        self._cost, self._gradient, self._modes = cost, gradient, modes
+        self.theta, self.options, self.unit = theta, options, options.unit
+        self.scale = scales(theta) if options.scale is None else np.asarray(options.scale, dtype=np.float64)
+        self.evaluations = self.gradients = 0
+        self.random = np.random.default_rng([options.seed, 0x67726164])
+
+    def cost(self, thetas: np.ndarray) -> np.ndarray:
+        self.evaluations += thetas.shape[1]
+        values = np.asarray(self._cost(thetas))
+        if np.iscomplexobj(values):
+            raise TypeError("the cost is complex; a check needs a real one")
+        if values.shape != (thetas.shape[1],):
+            raise ValueError(f"cost of {thetas.shape[1]} columns has shape {values.shape}, not {(thetas.shape[1],)}")
+        return values.astype(np.float64)
+
+    def gradient(self, theta: np.ndarray) -> np.ndarray:
+        if self._gradient is None:
+            return np.full(theta.size, np.nan)
+        self.gradients += 1
+        found = np.asarray(self._gradient(theta.copy()))
+        if np.iscomplexobj(found):
+            raise TypeError("the gradient is complex; a check needs a real one")
+        if found.shape != theta.shape:
+            raise ValueError(f"the gradient has shape {found.shape}, not that of theta, {theta.shape}")
+        return found.astype(np.float64)
+
+    def run(self) -> Check:
+        theta, options = self.theta, self.options
+        first = self.gradient(theta)
+        chosen = self._chosen(first)
+        around = theta[:, None] + options.reach * self.scale[:, None] * self.random.standard_normal(
+            (theta.size, options.draws)
+        )
+        # as far from theta as its last digits, so that what changes is rounding's
+        with np.errstate(invalid="ignore"):
+            doubt = np.abs(self.gradient(theta + 4.0 * self.unit * self.scale) - first)
+        at_draws = [self.gradient(other) for other in around.T]
+        again = self.gradient(theta)
+        names = [f"component {i}" for i in chosen] + [f"direction {i}" for i in range(options.directions)]
+        vectors, rates = self._directions(chosen)
+        parts = self._parts(theta, vectors, rates, first, names, [*chosen, *[None] * options.directions], doubt)
+        draws: list[Part] = []
+        for k, (other, found) in enumerate(zip(around.T, at_draws, strict=True)):
+            vectors, rates = self._directions([])
+            drawn = [f"draw {k} direction {i}" for i in range(options.directions)]
+            draws += self._parts(other, vectors, rates, found, drawn, [None] * options.directions, doubt, twice=False)
+        parts, draws = self._explained(parts, draws, around, at_draws)
+        causes = [part.verdict for part in parts]
+        # elsewhere, only what is certain counts: theta itself is on no kink of another theta
+        causes += [part.verdict for part in draws if part.verdict in FAULTS]
+        if not np.isfinite(first).all() and self._gradient is not None and np.isfinite(self.cost(theta[:, None])).all():
+            causes.append("nan_gradient")
+        elif not np.array_equal(first, again, equal_nan=True):
+            causes.append("nondeterministic")
+        centres = [part.sample for part in parts]
+        noise = max((sample.noise or 0.0 for sample in centres), default=0.0)
+        size = max((abs(sample.centre) for sample in centres), default=0.0)
+        orders = [part.order for part in parts if part.component is None and np.isfinite(part.order)]
+        return Check(
+            cause=worst(causes),
+            theta=theta,
+            gradient=first,
+            scale=self.scale,
+            parts=tuple(parts),
+            draws=tuple(draws),
+            noise=noise,
+            roundoff=max(self.unit, noise / size if size else 0.0),
+            order=float(np.median(orders)) if orders else float("nan"),
+            evaluations=self.evaluations,
+            gradients=self.gradients,
+        )
+
+    def _chosen(self, gradient: np.ndarray) -> list[int]:
+        """Return the components that are checked one by one."""
+        dim, most = gradient.size, self.options.components
+        if dim <= most:
+            return list(range(dim))
+        share = np.argsort(np.nan_to_num(np.abs(gradient * self.scale), nan=np.inf), kind="stable")
+        return sorted(int(i) for i in np.r_[share[: most // 2], share[dim - (most - most // 2) :]])
+
+    def _directions(self, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the chosen components' and random directions' vectors ``(d, M)``, and what a unit of each counts as.
+
+        A component's derivative is by its own unit, that along a random direction by the inputs' scales.
+        """
+        dim, count = self.theta.size, self.options.directions
+        random = self.random.standard_normal((dim, count))
+        random *= self.scale[:, None] / np.linalg.norm(random, axis=0)
+        vectors = np.concatenate([np.diag(self.scale)[:, chosen], random], axis=1)
+        return vectors, np.concatenate([self.scale[chosen], np.ones(count)])
+
+    def _parts(
+        self,
+        theta: np.ndarray,
+        vectors: np.ndarray,
+        lengths: np.ndarray,
+        gradient: np.ndarray,
+        names: list[str],
+        components: Sequence[int | None],
+        doubt: np.ndarray,
+        twice: bool = True,
+    ) -> list[Part]:
+        """Check the derivatives along ``vectors (d, M)`` at one theta."""
+        eps, count = self.options.eps, vectors.shape[1]
+        if not count:
+            return []
+        at = points(theta, vectors, self.unit, eps)
+        values = self.cost(at).reshape(count, -1)
+        repeatable = np.ones(count, bool)
+        if twice:
+            # in another order, so that no column depends on its neighbours
+            same = self._same(values, self.cost(at[:, ::-1])[::-1].reshape(count, -1))
+            repeatable = np.asarray(same.all(axis=1))
+        crossing = None
+        if self._modes is not None:
+            names_ = np.array(self._modes(at), dtype=object).reshape(count, -1)
+            crossing = np.asarray(names_[:, : eps.size] != names_[:, eps.size : 2 * eps.size])
+        with np.errstate(invalid="ignore"):
+            program = np.where(vectors != 0.0, vectors * gradient[:, None], 0.0).sum(axis=0) / lengths
+        if self._gradient is None:
+            program = np.zeros(count)
+        doubts = np.abs(vectors).T @ np.nan_to_num(doubt, nan=0.0, posinf=0.0) / lengths
+        found = samples(values, lengths, program, self.unit, eps, crossing, repeatable, doubts)
+        if self._gradient is None:
+            found = [replace(s, derivative=judge(s).difference) for s in found]
+        judged = [judge(sample) for sample in found]
+        if twice:
+            judged = self._scanned(theta, vectors, found, judged)
+        return [
+            _part(names[m], components[m], sample, finding)
+            for m, (sample, finding) in enumerate(zip(found, judged, strict=True))
+        ]
+
+    def _same(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return where two calls agree."""
+        return (a == b) | (np.isnan(a) & np.isnan(b))
+
+    def _scanned(
+        self, theta: np.ndarray, vectors: np.ndarray, found: list[Sample], judged: list[Finding]
+    ) -> list[Finding]:
+        """Look for staircases in the cost along the directions that are not plainly right."""
+        plain = ("smooth", "nonlinear", "mode_crossing", "zero", "nonfinite", "nondeterministic")
+        asked = [m for m, finding in enumerate(judged) if finding.verdict not in plain][:SUSPICIOUS]
+        along = roughness.scans(1.0, self.unit)
+        for m in asked:
+            at = theta[:, None] + vectors[:, m : m + 1] * along.reshape(1, -1)
+            values = self.cost(at).reshape(along.shape)
+            for spacing, row in zip(along, values, strict=True):
+                if roughness.treads(row, 8.0 * self.unit * float(np.abs(row).max())):
+                    judged[m] = self._stepped(found[m], judged[m], row, float(spacing[1]))
+                    break
+        return judged
+
+    def _stepped(self, sample: Sample, finding: Finding, row: np.ndarray, spacing: float) -> Finding:
+        """Return the finding on a staircase: ``precision`` where the gradient is right beyond its treads.
+
+        A cast to a shorter float leaves the gradient as it is, one to an integer cuts it off.
+        """
+        tread = float(np.ptp(np.diff(row)))
+        if GUARD * float(self.unit) * abs(sample.centre) >= tread:
+            return finding
+        coarse = judge(replace(sample, noise=max(sample.noise or 0.0, tread)))
+        right = coarse.verdict in TRUSTED and sample.derivative != 0.0
+        return replace(coarse, verdict="precision" if right else "staircase")
+
+    def _explained(
+        self, parts: list[Part], draws: list[Part], around: np.ndarray, at_draws: list[np.ndarray]
+    ) -> tuple[list[Part], list[Part]]:
+        """Give wrong parts a finer cause: what their ratios to the differences are, here and at other thetas."""
+        wrong = [part for part in (*parts, *draws) if part.verdict in ("wrong_adjoint", "disconnected")]
+        if not wrong:
+            return parts, draws
+        still = bool(at_draws) and all(np.array_equal(g, at_draws[0]) for g in at_draws)
+        here = [part for part in parts if part.verdict in FAULTS]
+        if still and at_draws[0].any() and not here:
+            return parts, [_named(part, "stale_gradient", ("wrong_adjoint",)) for part in draws]
+        guilty = [part.component for part in wrong if part.component is not None]
+        ratios = {i: [part.ratio for part in parts if part.component == i] for i in guilty}
+        for other, found in list(zip(around.T, at_draws, strict=True))[:4]:
+            vectors = np.diag(self.scale)[:, guilty]
+            again = self._parts(
+                other, vectors, self.scale[guilty], found, [""] * len(guilty), guilty, np.zeros(other.size), twice=False
+            )
+            for i, part in zip(guilty, again, strict=True):
+                if part.verdict == "wrong_adjoint" or part.verdict in TRUSTED:
+                    ratios[i].append(part.ratio)
+        whole = [part for part in (*parts, *draws) if part.component is None and part.verdict == "wrong_adjoint"]
+        right = any(part.verdict in TRUSTED and part.verdict != "zero" for part in parts if part.component is not None)
+        cause = of_ratios(ratios, [part.ratio for part in whole], right)
+        renamed = [_named(part, cause.get(part.component, cause[None]), ("wrong_adjoint",)) for part in parts]
+        return renamed, [_named(part, cause[None], ("wrong_adjoint",)) for part in draws]
+
+
+def _part(name: str, component: int | None, sample: Sample, finding: Finding) -> Part:
+    return Part(
+        name=name,
+        component=component,
+        program=sample.derivative,
+        difference=finding.difference,
+        uncertainty=finding.uncertainty,
+        step=float(sample.step[finding.index]),
+        left=finding.left,
+        right=finding.right,
+        order=order(sample),
+        verdict=finding.verdict,
+        sample=sample,
+    )
+
+
+def _named(part: Part, verdict: str, instead: Sequence[str]) -> Part:
+    return replace(part, verdict=verdict) if part.verdict in instead else part
+
+
+__all__ = ["UNTRUSTED", "VERDICTS", "Check", "Options", "Part", "check", "scales", "shifts"]

@@ -1,0 +1,324 @@
+"""Judges the derivative along one direction from differences of the cost over many step sizes: arrays in, name out.
+
+A central difference of step h errs by h^2 f'''/6 from the bend of the cost and by about u |f| / h from rounding, so
+that its error always rises at both ends (Nocedal and Wright 2006, section 8.1). A difference is believed where its
+neighbours agree with it and where no smaller step contradicts it by more than the noise of the cost explains: on an
+amplifying rollout, differences over wide steps agree with each other on nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+EPS = np.logspace(-2, -10, 17)
+"""Step sizes, two per decade, in units of the natural scale."""
+GUARD = 64.0
+"""Rounding errors granted to a rollout in its cost, and in moving theta."""
+MEASURED = 8.0
+"""Standard deviations granted to a cost whose noise is measured, and rounding errors beside them."""
+RISE = 0.01
+"""Relative error from which an end of the curve counts as risen."""
+WINDOW = 7
+"""Neighbouring steps (three decades of them) along which a kink has to stay the same."""
+BRIEFLY = 4
+"""Neighbouring steps along which a slope has to stay the same in an exploding rollout, and a jump at the smallest."""
+ALIKE = 0.1
+"""Relative spread within which values count as the same."""
+FEWEST = 7
+"""Steps with finite costs on both sides without which nothing is judged."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A cost along one direction at one point, and the derivative that the program gives there.
+
+    ``step (K,)`` are displacements, falling; ``minus`` and ``plus (K,)`` the costs there, ``centre`` that of the point
+    itself. ``crossing (K,)`` marks where the contact mode differs between the two sides. ``scale`` is the size of
+    theta, ``slope`` the norm of the program's gradient and ``unit`` the unit roundoff of its arithmetic. ``noise`` is
+    the measured standard deviation of the cost's noise (None: not measured) and ``doubt`` the error that the program's
+    derivative has from rounding theta.
+    """
+
+    step: np.ndarray
+    minus: np.ndarray
+    centre: float
+    plus: np.ndarray
+    derivative: float
+    crossing: np.ndarray
+    repeatable: bool = True
+    scale: float = 1.0
+    slope: float = 0.0
+    unit: float = float(np.finfo(np.float64).eps)
+    noise: float | None = None
+    doubt: float = 0.0
+
+    @property
+    def differences(self) -> np.ndarray:
+        """Central differences, ``(K,)``."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray((self.plus - self.minus) / (2.0 * self.step))
+
+    @property
+    def right(self) -> np.ndarray:
+        """One-sided slopes towards plus, ``(K,)``."""
+        return np.asarray((self.plus - self.centre) / self.step)
+
+    @property
+    def left(self) -> np.ndarray:
+        """One-sided slopes towards minus, ``(K,)``."""
+        return np.asarray((self.centre - self.minus) / self.step)
+
+    @property
+    def errors(self) -> np.ndarray:
+        """|a - b| / max(1, |a|, |b|) of derivative and differences, ``(K,)``."""
+        a, b = self.derivative, self.differences
+        return np.asarray(np.abs(a - b) / np.maximum(np.maximum(1.0, abs(a)), np.abs(b)))
+
+    @property
+    def finite(self) -> np.ndarray:
+        """Where both costs are numbers, ``(K,)``."""
+        return np.isfinite(self.minus) & np.isfinite(self.plus)
+
+    def rounding(self, unit: float) -> np.ndarray:
+        """Return the error of the differences that rounding at that unit roundoff explains, ``(K,)``."""
+        costs = np.maximum(np.maximum(np.abs(self.minus), np.abs(self.plus)), abs(self.centre))
+        if self.noise is None:
+            return np.asarray(GUARD * unit * (costs + self.slope * self.scale) / self.step)
+        # what was measured has more in it than the guess above, and no word of the program's
+        return np.asarray(MEASURED * unit * (costs + np.abs(self.differences) * self.scale) / self.step)
+
+    @property
+    def uncertainty(self) -> np.ndarray:
+        """The error of the differences that rounding and measured noise explain, ``(K,)``."""
+        return np.asarray(self.rounding(self.unit) + MEASURED * (self.noise or 0.0) / self.step)
+
+    def size(self, index: int) -> float:
+        """Return the larger of derivative and difference at one step, the unit of relative errors."""
+        return max(abs(self.derivative), abs(float(self.differences[index])))
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A verdict, and the numbers it rests on; NaN where there is none.
+
+    ``difference`` is the slope believed, with its own ``uncertainty``, at the step ``index``; ``left`` and ``right``
+    are the one-sided slopes there (of a kink, where they are best resolved).
+    """
+
+    verdict: str
+    index: int = 0
+    difference: float = float("nan")
+    uncertainty: float = float("nan")
+    left: float = float("nan")
+    right: float = float("nan")
+
+
+def best(sample: Sample) -> int:
+    """Return the index of the step with the smallest error; 0 when no error is a number."""
+    # argmin takes a NaN for the smallest number
+    return int(np.argmin(np.nan_to_num(sample.errors, nan=np.inf)))
+
+
+def diagnose(sample: Sample) -> str:
+    """Return the cause of the differences' errors: the verdict of :func:`judge`."""
+    return judge(sample).verdict
+
+
+def judge(sample: Sample) -> Finding:
+    """Return what the differences say about the derivative.
+
+    - ``nondeterministic``: the same call gives another cost. ``nonfinite``: the cost, or that at too many steps, is NaN
+      or infinite. ``nan_gradient``: only the derivative is.
+    - ``zero``: derivative and differences are exactly 0. ``disconnected``: only the derivative is.
+    - ``jump``: at the smallest steps the costs differ by a constant. ``kink``: the one-sided slopes do, over three
+      decades of steps. A kink's derivative must lie between the two slopes. Where the slopes are the same over
+      fewer steps, as in an exploding rollout, and the sides meet different contacts, it must be one of the two.
+    - ``unsettled``: the differences agree at no step, or smaller steps contradict them, so that they prove nothing.
+    - ``wrong_adjoint``: they settle on a value other than the derivative, by their own size.
+    - the derivative is right, and exactly 0 at the smallest steps only (``saturated``), or its differences err at small
+      steps by more than ten times what float64 explains (``rounding``), at large ones with a change of contact mode
+      (``mode_crossing``) or without (``nonlinear``), or at neither (``smooth``).
+    """
+    if not sample.repeatable:
+        return Finding("nondeterministic")
+    finite = sample.finite
+    if not np.isfinite(sample.centre) or finite.sum() < FEWEST:
+        return Finding("nonfinite")
+    if not np.isfinite(sample.derivative):
+        return Finding("nan_gradient")
+    where = np.flatnonzero(finite)
+    parts = {name: getattr(sample, name)[where] for name in ("step", "minus", "plus", "crossing")}
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = _judge(replace(sample, **parts))
+    return replace(found, index=int(where[found.index]))
+
+
+def _judge(sample: Sample) -> Finding:
+    still = (sample.plus == sample.centre) & (sample.minus == sample.centre)
+    if sample.derivative == 0.0 and still.all():
+        return Finding("zero", 0, 0.0, float(sample.uncertainty[0]), 0.0, 0.0)
+    noise = sample.uncertainty
+    if _jumps(sample, noise):
+        return _at(sample, "jump", sample.step.size - 1, float("nan"))
+    bend = sample.right - sample.left
+    kink = _settled(bend, 2.0 * noise)
+    if kink is not None:
+        return _at(sample, "kink" if _between(sample, noise) else _wrong(sample), kink, float(noise[kink]))
+    index, spread = plateau(sample, noise)
+    uncertainty = spread + float(noise[index])
+    # ten times the spread, since the best of many spreads is a lucky one
+    tolerance = 10.0 * spread + float(noise[index]) + _resolution(sample, index) + sample.doubt
+    apart = abs(float(sample.differences[index]) - sample.derivative)
+    resolved = uncertainty <= max(ALIKE * sample.size(index), GUARD * float(sample.rounding(sample.unit)[index]))
+    if apart <= tolerance and resolved:
+        return _at(sample, _ends(sample, index, still), index, uncertainty)
+    if sample.crossing[index]:
+        return _at(sample, _sided(sample, noise), index, uncertainty)
+    settled = apart > tolerance and _believed(sample, index, uncertainty, tolerance)
+    return _at(sample, _wrong(sample) if settled else "unsettled", index, uncertainty)
+
+
+def _at(sample: Sample, verdict: str, index: int, uncertainty: float) -> Finding:
+    sides = float(sample.left[index]), float(sample.right[index])
+    return Finding(verdict, index, float(sample.differences[index]), uncertainty, *sides)
+
+
+def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
+    """Return the index of the step whose difference is best believed, and by how much its neighbours disagree.
+
+    Noise counts as disagreement, because differences rounded to 0 agree without meaning anything. A step is left out
+    where a smaller one contradicts it, and where the contact mode changes across it when three others remain.
+    """
+    differences = sample.differences
+    spread = _spread(differences)
+    apart = np.abs(differences[:, None] - differences)
+    allowed = 3.0 * spread[:, None] + noise[:, None] + 2.0 * noise
+    contradicted = (np.triu(apart > allowed, 1)).any(axis=1)
+    worth = spread + noise
+    worth = np.where(contradicted, np.inf, worth)
+    if (~sample.crossing & np.isfinite(worth)).sum() >= 3:
+        worth = np.where(sample.crossing, np.inf, worth)
+    if sample.derivative != 0.0 and differences.any() and (np.isfinite(worth) & (differences != 0.0)).any():
+        worth = np.where(differences == 0.0, np.inf, worth)
+    index = int(np.argmin(worth))
+    return index, float(spread[index])
+
+
+def _spread(differences: np.ndarray) -> np.ndarray:
+    """Return by how much each difference and the ones next to it disagree, ``(K,)``."""
+    apart = np.abs(np.diff(differences))
+    return np.fmax(np.r_[apart[0], apart], np.r_[apart, apart[-1]])
+
+
+def _believed(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:
+    """Return whether differences that contradict the derivative may be believed.
+
+    Where the noise exceeds rounding's, as in an amplifying rollout, they are known to within ALIKE of their own size,
+    over BRIEFLY neighbouring steps. Elsewhere it is enough that they are apart by twice what is tolerated.
+    """
+    differences = sample.differences
+    near = np.asarray(np.abs(differences - differences[index]) <= ALIKE * abs(differences[index]))
+    lasting = np.asarray(_windows(near, BRIEFLY).all(axis=1))
+    settled = bool(lasting[max(0, index - BRIEFLY + 1) : index + 1].any())
+    if settled and uncertainty <= ALIKE * abs(differences[index]):
+        return True
+    plain = (sample.noise or 0.0) / sample.step[index] <= sample.rounding(sample.unit)[index]
+    return bool(plain and abs(differences[index] - sample.derivative) > 2.0 * tolerance)
+
+
+def _sided(sample: Sample, noise: np.ndarray) -> str:
+    """Return the verdict by one-sided slopes, where the two sides of every difference meet different contacts.
+
+    A slope settles where it is the same over BRIEFLY neighbouring steps. In an exploding rollout that happens
+    only at the smallest steps, where rounding is amplified like the state, and over fewer steps than a kink needs.
+    """
+    settled = False
+    for slopes in (sample.left, sample.right):
+        for window, noises in zip(_windows(slopes, BRIEFLY), _windows(noise, BRIEFLY)[:, -1], strict=True):
+            middle, spread = float(np.median(window)), float(np.ptp(window))
+            if spread + noises > ALIKE * abs(middle):
+                continue
+            settled = True
+            tolerance = 2.0 * spread + noises + float(np.cbrt(sample.unit)) * abs(middle)
+            if abs(middle - sample.derivative) <= tolerance:
+                return "kink"
+    return _wrong(sample) if settled else "unsettled"
+
+
+def _resolution(sample: Sample, index: int) -> float:
+    """Return u^(1/3) of the derivative's size, the relative step that balances a central difference's two errors."""
+    return float(np.cbrt(sample.unit)) * sample.size(index)
+
+
+def _wrong(sample: Sample) -> str:
+    return "disconnected" if sample.derivative == 0.0 else "wrong_adjoint"
+
+
+def _between(sample: Sample, noise: np.ndarray) -> bool:
+    """Return whether the derivative lies between the one-sided slopes over the smallest step that rounding resolves.
+
+    A slope is trusted to within its change since the step before, which exceeds its error of order h.
+    """
+    resolved = [i for i in range(1, noise.size) if noise[i] <= _resolution(sample, i)]
+    finest = resolved[-1] if resolved else int(np.argmin(noise[1:])) + 1
+    slopes = [(side[finest], abs(side[finest] - side[finest - 1])) for side in (sample.left, sample.right)]
+    tolerance = noise[finest] + _resolution(sample, finest)
+    low = min(slope - change for slope, change in slopes) - tolerance
+    high = max(slope + change for slope, change in slopes) + tolerance
+    return bool(low <= sample.derivative <= high)
+
+
+def _jumps(sample: Sample, noise: np.ndarray) -> bool:
+    """Return whether the cost jumps at theta: it differs between two points by what no smaller step reduces.
+
+    Two neighbouring steps give the limit of the difference at step 0, as what is linear in the step cancels. The limit
+    must be the same over BRIEFLY + 1 of the smallest steps, and exceed the noise.
+    """
+    height = noise * sample.step
+    ratio = sample.step[:-1] / sample.step[1:]
+    for rise in (sample.plus - sample.minus, sample.plus - sample.centre, sample.centre - sample.minus):
+        limits = ((ratio * rise[1:] - rise[:-1]) / (ratio - 1.0))[-BRIEFLY:]
+        error = 2.0 * ((ratio * height[1:] + height[:-1]) / (ratio - 1.0))[-BRIEFLY:]
+        middle = abs(float(np.median(limits)))
+        if np.ptp(limits) <= ALIKE * middle + error.max() and middle > 2.0 * error.max():
+            return True
+    return False
+
+
+def _settled(values: np.ndarray, noise: np.ndarray) -> int | None:
+    """Return the end of the last window of values that is constant to within ``ALIKE``, exceeds the noise, and stands.
+
+    It does not stand where values at smaller steps contradict it by more than their own noise.
+    """
+    windows, noises = _windows(values, WINDOW), _windows(noise, WINDOW).max(axis=1)
+    middles = np.median(windows, axis=1)
+    for start in range(len(windows) - 1, -1, -1):
+        middle = float(middles[start])
+        if np.ptp(windows[start]) > ALIKE * abs(middle) or abs(middle) <= noises[start]:
+            continue
+        after = slice(start + WINDOW, None)
+        if (np.abs(values[after] - middle) <= ALIKE * abs(middle) + 2.0 * noise[after]).all():
+            return start + WINDOW - 1
+    return None
+
+
+def _windows(values: np.ndarray, size: int) -> np.ndarray:
+    """Return each run of ``size`` neighbouring values, ``(K - size + 1, size)``."""
+    return np.lib.stride_tricks.sliding_window_view(values, size)
+
+
+def _ends(sample: Sample, index: int, still: np.ndarray) -> str:
+    """Return the verdict on a derivative that is right, by how its differences err at small and at large steps."""
+    if sample.derivative == 0.0 and still[-FEWEST:].all():
+        return "saturated"
+    errors = np.abs(sample.differences - sample.derivative)
+    small = np.arange(errors.size) > index
+    guard = 10.0 if sample.noise is None else 10.0 * GUARD / MEASURED
+    if (errors > guard * sample.rounding(float(np.finfo(np.float64).eps)))[small].sum() >= 3:
+        return "rounding"
+    risen = (errors > RISE * sample.size(index)) & ~small & (errors > sample.uncertainty)
+    if (risen & sample.crossing).any():
+        return "mode_crossing"
+    return "nonlinear" if risen.any() else "smooth"

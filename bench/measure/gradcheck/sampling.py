@@ -1,0 +1,71 @@
+"""Where a gradient check evaluates the cost, and the samples it makes of the values: one batch for all directions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .direction import EPS, Sample
+from .roughness import POINTS, noise, offsets, scatter
+
+
+def shifts(unit: float, eps: np.ndarray = EPS) -> np.ndarray:
+    """Return displacements, relative to a direction's length: down, up, none, and those that measure the noise."""
+    return np.concatenate([-eps, eps, [0.0], offsets(unit).ravel()])
+
+
+def points(theta: np.ndarray, vectors: np.ndarray, unit: float, eps: np.ndarray = EPS) -> np.ndarray:
+    """Return theta moved along each column of ``vectors (d, M)`` by each of the :func:`shifts`, ``(d, M * S)``."""
+    moved = theta[:, None, None] + vectors[:, :, None] * shifts(unit, eps)
+    return np.asarray(moved.reshape(theta.size, -1))
+
+
+def samples(
+    values: np.ndarray,
+    lengths: np.ndarray,
+    derivatives: np.ndarray,
+    unit: float,
+    eps: np.ndarray = EPS,
+    crossing: np.ndarray | None = None,
+    repeatable: np.ndarray | None = None,
+    doubts: np.ndarray | None = None,
+) -> list[Sample]:
+    """Return a sample per direction from the costs at its :func:`points`, ``values (M, S)``.
+
+    A displacement of 1 along direction m has the length ``lengths[m]``, in the units of its ``derivatives[m]``.
+    """
+    count = eps.size
+    found = []
+    for m, row in enumerate(values):
+        with np.errstate(over="ignore", invalid="ignore"):
+            minus, centre, plus = row[:count], float(row[2 * count]), row[count : 2 * count]
+            measured = noise(row[2 * count + 1 :].reshape(2, POINTS))
+            sample = Sample(
+                eps * lengths[m], minus, centre, plus,
+                derivative=float(derivatives[m]),
+                crossing=np.zeros(count, bool) if crossing is None else crossing[m],
+                repeatable=True if repeatable is None else bool(repeatable[m]),
+                scale=float(lengths[m]),
+                unit=unit,
+                noise=measured,
+                doubt=0.0 if doubts is None else float(doubts[m]),
+            )  # fmt: skip
+            found.append(replace(sample, noise=max(measured, scatter(sample.step, sample.differences))))
+    return found
+
+
+def order(sample: Sample) -> float:
+    """Return the order in h of the Taylor remainder |f(x + h d) - f(x) - h g d|: 2 for a right gradient, 1 for a wrong one.
+
+    It needs no best step: it is the median slope, in log scales, over the five smallest steps whose remainder exceeds
+    ten times the noise, on either side. NaN where fewer than four do, as for a cost that is linear.
+    """
+    slopes: list[float] = []
+    for side, sign in ((sample.plus, 1.0), (sample.minus, -1.0)):
+        with np.errstate(all="ignore"):
+            rest = np.abs(side - sample.centre - sign * sample.step * sample.derivative)
+            clear = np.flatnonzero(np.isfinite(rest) & (rest > 10.0 * sample.uncertainty * sample.step))[-5:]
+        if clear.size >= 4:
+            slopes += list(np.diff(np.log(rest[clear])) / np.diff(np.log(sample.step[clear])))
+    return float(np.median(slopes)) if slopes else float("nan")
