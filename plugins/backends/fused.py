@@ -8,42 +8,49 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.model import Array, LoopOps, Ops, Problem, Program, Unsupported
+from bench.model import Array, Backend, LoopOps, Problem, Program
 
 from ..fused import emit, kernels, trace
 from ..fused.graph import Refused
-from .jax import Jax, JaxProblem
+from .jax import Jax, JaxOps, JaxProblem
 
 
 @dataclass(frozen=True)
-class Fused(Jax):
+class Fused(Backend):
     """Gradients: exact derivative of the program by JAX's rules for single operations; float64 or float32; no roots.
 
     JAX traces the program once for one rollout. Its step and the step's adjoint become scalar code, the loop over time
-    lies inside, and rollouts are the lanes of vector instructions, so that states stay near the core. Equal to ``jax`` up
-    to rounding, including ties; trajectories and step Jacobians come from ``jax`` itself. A program with an operation
-    that has no scalar form is refused by the operation's name.
+    lies inside, and rollouts are the lanes of vector instructions, so that states stay near the core. Equal to ``jax``
+    up to rounding, ties included; trajectories, step Jacobians and explicit derivatives come from ``jax`` itself. A
+    program with an operation that has no scalar form is refused by the operation's name.
     """
 
     name = "fused"
     requires: ClassVar[tuple[str, ...]] = ("jax", "numba")
-    reference_rank: ClassVar[int | None] = -1
+    provides = Jax.provides
 
     def compile(self, program: Program) -> Problem:
-        """Return the program, whose kernels are compiled at the first call of each function."""
-        return FusedProblem(program, self.ops(), self.dtype, self.mode)
+        """Return the program, whose kernels are compiled at the first call of each function, for any batch."""
+        _use_double()
+        return FusedProblem(program, JaxOps(), self.dtype, "reverse")
 
     def refuses(self, program: Program) -> str | None:
         """Return the operation that has no form as scalar code, or None."""
-        if program.needs_root:
+        if program.needs - self.provides:
             return None
-        self.ops()
+        _use_double()
         try:
             for function in ("value", "grad"):
                 _source(_Structure(program), function, self.dtype)
         except Refused as error:
             return f"backend {self.name} has no scalar code for {error}"
         return None
+
+
+def _use_double() -> None:
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
 
 
 class _PlainOps(LoopOps):
@@ -96,7 +103,11 @@ def _source(structure: _Structure, function: str, dtype: str) -> _Source:
 
     shapes = {"parameter": len(program.parameters()), "theta": program.dim, "noise": program.n_noise}
     wrt = {"value": None, "grad": "theta", "score": "scored"}[function]
-    loop = trace.traced(log_probability, shapes | {"scored": program.dim}) if wrt == "scored" else trace.traced(cost, shapes)
+    loop = (
+        trace.traced(log_probability, shapes | {"scored": program.dim})
+        if wrt == "scored"
+        else trace.traced(cost, shapes)
+    )
     text = emit.source(loop, dtype, wrt, program.dim, f"{function} of {program.scene.name}", cache=False)
     flat = [np.concatenate(part) if part else np.zeros(1) for part in (loop.constants, loop.indices)]
     return _Source(text, loop.length, flat[0].astype(dtype), flat[1].astype(np.int64))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from .graph import Graph, Node, reached
+from .graph import Graph, Node, Refused, reached
 
 
 @cache
@@ -20,7 +20,9 @@ def _rule(op: str, data: Any, count: int, which: int) -> Any:
             return lax.integer_pow(args[0], data)
         if op == "select_n":
             return lax.select_n(args[0] > 0.5, *args[1:])
-        return _FUNCTIONS[op](lax)(*args)
+        if op not in SMOOTH:
+            raise Refused(f"the derivative of {op}")
+        return getattr(lax, op)(*args)
 
     def pulled(*args: Any) -> Any:
         rest = list(args[:-1])
@@ -34,14 +36,12 @@ def _rule(op: str, data: Any, count: int, which: int) -> Any:
     return jax.make_jaxpr(pulled)(*[shape] * (count + 1))
 
 
-_FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {
-    name: (lambda lax, name=name: getattr(lax, name))
-    for name in (
-        "abs", "acos", "acosh", "add", "asin", "asinh", "atan", "atan2", "atanh", "cos", "cosh", "div", "erf", "exp",
-        "expm1", "log", "log1p", "logistic", "max", "min", "mul", "neg", "pow", "rem", "rsqrt", "sin", "sinh", "sqrt",
-        "stop_gradient", "sub", "tan", "tanh",
-    )
-}  # fmt: skip
+SMOOTH = frozenset({
+    "abs", "acos", "acosh", "add", "asin", "asinh", "atan", "atan2", "atanh", "cos", "cosh", "div", "erf", "exp",
+    "expm1", "log", "log1p", "logistic", "max", "min", "mul", "neg", "pow", "rem", "rsqrt", "sin", "sinh", "sqrt",
+    "stop_gradient", "sub", "tan", "tanh",
+})  # fmt: skip
+"""Operations whose derivative JAX gives under their own name in jax.lax."""
 FLAT = frozenset({
     "and", "ceil", "eq", "floor", "ge", "gt", "is_finite", "le", "lt", "ne", "not", "or", "sign", "stop_gradient", "xor",
 })  # fmt: skip
@@ -79,9 +79,9 @@ def pullback(graph: Graph, seeds: list[tuple[Node, Node]], wanted: Callable[[Nod
         add(node, cotangent)
     found: dict[Node, Node] = {}
     for node in reversed(nodes):
-        cotangent = cotangents.pop(node.number, None)
-        if cotangent is None:
+        if node.number not in cotangents:
             continue
+        cotangent = cotangents[node.number]
         if wanted(node):
             found[node] = cotangent
             continue

@@ -7,13 +7,14 @@ lane. A forward pass keeps the carries that the backward pass reads; the backwar
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from .adjoint import active, pullback
-from .graph import Graph, Node, reached
+from .graph import Node, reached
 from .trace import Loop
 
 LANES = 32
@@ -79,7 +80,6 @@ class _Kernel:
             self.timed[node.number] = node.op in leaves or any(self.is_timed(arg) for arg in node.args)
         return self.timed[node.number]
 
-
     def text(self, dtype: str, title: str, cache: bool) -> str:
         """Return the module."""
         loop = self.loop
@@ -106,7 +106,7 @@ class _Kernel:
         body = self.code.lines
         helpers = _helpers(everything)
         text = HEAD.format(title=title, dtype=dtype, helpers=helpers, cache=cache)
-        return text + "\n".join("    " + line for line in body) + "\n"
+        return text + _renumbered("\n".join("    " + line for line in body)) + "\n"
 
     def _needed(self, roots: Iterable[Node], carries: Iterable[int] = ()) -> list[int]:
         """Return the carries that numbers after the loop, and some carries, depend on."""
@@ -123,7 +123,8 @@ class _Kernel:
     def _backward(self) -> _Backward:
         """Return the expressions of the backward pass."""
         loop, graph, wrt = self.loop, self.graph, self.wrt
-        assert loop.result is not None and wrt is not None
+        assert loop.result is not None
+        assert wrt is not None
         fixed, varying = wrt, f"{wrt}@"
         live = self._live_carries(fixed, varying)
 
@@ -179,6 +180,7 @@ class _Kernel:
         loop = self.loop
         found = {i for i in self.kept if active(reached([loop.first[i]]), lambda n: n.op == fixed)}
         while True:
+
             def wanted(node: Node, found: set[int] = found) -> bool:
                 return node.op in (fixed, varying) or (node.op == "carry" and node.data in found)
 
@@ -214,7 +216,10 @@ class _Kernel:
         late = {n.number for n in steady if any(m.op in ("final", "before", "total") for m in reached([n]))}
         early = [n for n in steady if n.number not in late]
         inside = [*forward.values(), *(backward.inside() if backward else [])]
-        after = [*(backward.seeds.values() if backward else [loop.result]), *(backward.ends.values() if backward else [])]
+        after = [
+            *(backward.seeds.values() if backward else [loop.result]),
+            *(backward.ends.values() if backward else []),
+        ]
         crossing = self._crossing(early, inside, [n for n in after if n is not None])
 
         rows: list[str] = [f"c{i}" for i in forward]
@@ -250,7 +255,9 @@ class _Kernel:
             code.add(1, "for t in range(horizon):")
             self._at_step(2, forward.values())
             loads = {self.graph.leaf("carry", i).number: f"lane[{self.slots[f'c{i}']} + l]" for i in forward}
-            keep = [f"kept[at((horizon - 1 - t) * {len(history) * LANES} + {j * LANES} + l)] = " for j in history.values()]
+            keep = [
+                f"kept[at((horizon - 1 - t) * {len(history) * LANES} + {j * LANES} + l)] = " for j in history.values()
+            ]
 
             def store(names: dict[int, str]) -> list[str]:
                 kept = [text + names[self.graph.leaf("carry", i).number] for text, i in zip(keep, history, strict=True)]
@@ -311,14 +318,18 @@ class _Kernel:
             for table in backward.tables:
                 code.add(2, f"o{table} = index[{table} * horizon + t] * out_row + b")
             width = len(history) * LANES
-            loads = {graph.leaf("carry", i).number: f"kept[at(back * {width} + {j * LANES} + l)]" for i, j in history.items()}
+            loads = {
+                graph.leaf("carry", i).number: f"kept[at(back * {width} + {j * LANES} + l)]" for i, j in history.items()
+            }
             loads |= {graph.leaf("adjoint", i).number: f"lane[{self.slots[f'a{i}']} + l]" for i in backward.step}
 
             write = "=" if self.covers(backward) else "+="
 
             def store(names: dict[int, str]) -> list[str]:
                 lines = [f"lane[{self.slots[f'a{i}']} + l] = {names[n.number]}" for i, n in backward.step.items()]
-                lines += [f"lane[{self.slots[f't{b.number}']} + l] += {names[n.number]}" for b, n in backward.totals.items()]
+                lines += [
+                    f"lane[{self.slots[f't{b.number}']} + l] += {names[n.number]}" for b, n in backward.totals.items()
+                ]
                 slots = [(self.slots[f"o{k}"], n) for k, n in backward.tables.items()]
                 return lines + [f"lane[{slot} + l] = {names[n.number]}" for slot, n in slots]
 
@@ -329,7 +340,9 @@ class _Kernel:
                 code.add(3, f"out[at(o{table} + l)] {write} lane[{self.slots[f'o{table}']} + l]")
         ends = backward.ends
         loads = finals | {graph.leaf("before", i).number: f"lane[{self.slots[f'a{i}']} + l]" for i in backward.step}
-        loads |= {graph.leaf("total", n.number).number: f"lane[{self.slots[f't{n.number}']} + l]" for n in backward.totals}
+        loads |= {
+            graph.leaf("total", n.number).number: f"lane[{self.slots[f't{n.number}']} + l]" for n in backward.totals
+        }
         if ends:
             self._pass(1, list(ends.values()), loads, lambda names: [
                 f"out[at({i} * out_row + b + l)] += {names[n.number]}" for i, n in ends.items()
@@ -420,6 +433,12 @@ class _Backward:
     def inside(self) -> list[Node]:
         """Return what is computed in each step."""
         return [*self.step.values(), *self.totals.values(), *self.tables.values()]
+
+
+def _renumbered(code: str) -> str:
+    """Return code with its names numbered in order: nodes also count inputs, of which a longer horizon has more."""
+    known: dict[str, str] = {}
+    return re.sub(r"\b([rsuv])(\d+)\b", lambda m: m[1] + known.setdefault(m[2], str(len(known))), code)
 
 
 def _number(value: float) -> str:

@@ -33,7 +33,6 @@ class Node:
         return self.data if self.op == "literal" else None
 
 
-
 FOLD: dict[str, Callable[..., Any]] = {
     "abs": np.abs, "acos": np.arccos, "acosh": np.arccosh, "add": np.add, "and": np.logical_and, "asin": np.arcsin,
     "asinh": np.arcsinh, "atan": np.arctan, "atan2": np.arctan2, "atanh": np.arctanh, "ceil": np.ceil, "cos": np.cos,

@@ -152,7 +152,10 @@ class _Tracer:
         a = np.moveaxis(left, over_left, range(left.ndim - len(over_left), left.ndim))
         b = np.moveaxis(right, over_right, range(len(over_right)))
         kept = a.shape[: a.ndim - len(over_left)] + b.shape[len(over_right) :]
-        a, b = a.reshape(-1, int(np.prod(a.shape[a.ndim - len(over_left) :]))), b.reshape(-1, int(np.prod(b.shape[len(over_right) :])))
+        a, b = (
+            a.reshape(-1, int(np.prod(a.shape[a.ndim - len(over_left) :]))),
+            b.reshape(-1, int(np.prod(b.shape[len(over_right) :]))),
+        )
         graph = self.loop.graph
         entries = []
         for row in a:
