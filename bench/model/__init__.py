@@ -10,6 +10,8 @@ so never branch on it in Python; every other type is static.
 """
 
 from bench.errors import Unsupported
+from bench.model.adjoint import Slopes, slopes
+from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
@@ -81,10 +83,12 @@ __all__ = [
     "Rollout",
     "SampleMean",
     "Scene",
+    "Slopes",
     "State",
     "Trajectory",
     "Unsupported",
     "Usage",
+    "adjoint_gradient",
     "columns",
     "compose",
     "first_order",
@@ -92,5 +96,6 @@ __all__ = [
     "param",
     "per_repeat",
     "rollout",
+    "slopes",
     "zeroth_order",
 ]
