@@ -26,7 +26,7 @@ from bench.model.estimator import (
     zeroth_order,
 )
 from bench.model.integrator import Integrator
-from bench.model.known import KnownOptimum, KnownValue
+from bench.model.known import Identified, KnownOptimum, KnownValue
 from bench.model.ops import Array, LoopOps, Ops, State
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
@@ -65,6 +65,7 @@ __all__ = [
     "FrictionScene",
     "FunctionProgram",
     "FunctionScene",
+    "Identified",
     "ImpulseLaw",
     "Integrator",
     "Jacobians",
