@@ -104,7 +104,8 @@ class Information:
 
 def product(names: tuple[str, ...], exponents: np.ndarray) -> str:
     """Write a product of powers: ``stiffness/mass``, ``damping^2*mass``."""
-    above, below = [], []
+    above: list[str] = []
+    below: list[str] = []
     for name, exponent in zip(names, exponents, strict=True):
         if abs(exponent) > 1e-4:
             power = _power(abs(exponent))

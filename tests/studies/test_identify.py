@@ -129,7 +129,7 @@ def test_single_shooting_is_lost_beyond_its_basin_and_windows_are_not():
 
 def test_a_row_in_all_ways():
     row = measure(
-        cell_of("scenes=[mass_spring_damper[horizon=40]]", "integrators=[rk4]", "repeats=12"),
+        cell_of("scenes=[mass_spring_damper[horizon=80]]", "integrators=[rk4]", "repeats=12"),
         made("scenes=[mass_spring_damper]").study,
     )
     assert row["shooting"] == ["single", "multiple", "windows"]
