@@ -33,6 +33,19 @@ Settings: scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[.
 STATUS = """\
 Exit status: 0 every cell has a row that is not 'error'; 1 some cell failed unexpectedly; 2 bad input.
 """
+EXAMINE = """\
+  theta=1,0            where: numbers, names with numbers (mass:1,gain:2), or a name in the file; by default theta
+  grad=jax             jax, torch, or a function: a name in the file, or FILE:NAME; without it, differences alone
+  sigma=0.003,0.05     standard deviations of noise on theta
+  noise=200            the cost is cost(theta, w), with w of that many standard normal numbers
+  budget=60s           time for everything
+  batch=loop           how it takes several thetas: loop, vmap, columns (d, B) or rows (B, d); by default detected
+  scale=1,0.1          the size of each input; by default its own
+  seed=0               of the random directions and noise
+  save=DIR             write text, tables, charts and report.html there
+  --quiet              no progress
+Exit status: 0 the gradient can be trusted; 1 something cannot; 2 bad input.
+"""
 QUIET, CONFIG_DIR = "--quiet", "--config-dir"
 
 
@@ -354,11 +367,25 @@ def _trace(words: list[str]) -> int:
     return 0
 
 
+def _claims(words: list[str]) -> int:
+    """Run published results again."""
+    from bench import claims
+
+    return claims.main(words)
+
+
 def _compare(words: list[str]) -> int:
     """Compare two directories of results, or two git revisions of them, cell by cell."""
     from bench import compare
 
     return compare.main(words)
+
+
+def _examine(words: list[str]) -> int:
+    """Examine a simulator of one's own."""
+    from bench.examine import command
+
+    return command.main(words)
 
 
 def _history(words: list[str]) -> int:
@@ -383,7 +410,7 @@ VERBS = {
     ),
     "list": Verb(
         _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
-        "KIND is scenes, contacts, integrators, backends, estimators or studies.\n",
+        "KIND is scenes, contacts, integrators, backends, estimators, optimizers or studies.\n",
     ),
     "check": Verb(
         _check, "check [NAME ...] [plugins=DIR]", "the conformance kit on some plugins, or all",
@@ -393,12 +420,21 @@ VERBS = {
         _gradcheck, "gradcheck SCENE ... [key=value ...]", "gradients against differences of the cost, and what is wrong",
         f"Exit status 1 when a gradient must not be used.\n{SETTINGS}",
     ),
+    "examine": Verb(
+        _examine, "examine FILE:COST [key=value ...]", "your own simulator: its gradient, jumps, and what to use",
+        EXAMINE,
+    ),
     "trace": Verb(
         _trace, "trace SCENE ... [key=value ...]", "one rollout: do gradient spikes line up with contact switches?",
         f"Without noise, or with seed=S the first sample of that seed.\n{SETTINGS}",
     ),
     "bench-self": Verb(
         _bench_self, "bench-self [quick=true] [results_dir=DIR]", "the harness's own speed, beside a NumPy loop and native code",
+    ),
+    "claims": Verb(
+        _claims, "claims [NAME ...] [--list] [--quick] [--again] [results_dir=DIR]", "published results run again, each with a verdict",
+        "What is stored under results_dir/claims is not measured again unless its code has changed, or with --again.\n"
+        "--quick: those that take less than 5 s. Exit status 1 when a claim is not reproduced.\n",
     ),
     "compare": Verb(
         _compare, "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",

@@ -24,7 +24,10 @@ from bench.model.estimator import (
     zeroth_order,
 )
 from bench.model.integrator import Integrator
+from bench.model.known import KnownOptimum, KnownValue
 from bench.model.ops import Array, LoopOps, Ops, State
+from bench.model.optimizer import Answer, Descent, Optimizer, Population
+from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
 from bench.model.program import Decision, FunctionProgram, Program, Rollout, compose, rollout
@@ -41,6 +44,7 @@ from bench.model.scene import (
 )
 
 __all__ = [
+    "Answer",
     "Array",
     "Auxiliaries",
     "Backend",
@@ -50,6 +54,7 @@ __all__ = [
     "ContactScene",
     "DampedScene",
     "Decision",
+    "Descent",
     "Dynamics",
     "EngineScene",
     "EngineTwin",
@@ -61,11 +66,16 @@ __all__ = [
     "ImpulseLaw",
     "Integrator",
     "Jacobians",
+    "KnownOptimum",
+    "KnownValue",
     "LoopOps",
     "MechanicalScene",
     "Ops",
+    "Optimizer",
+    "OptimizerState",
     "Oscillator",
     "Plugin",
+    "Population",
     "Problem",
     "Program",
     "Rollout",

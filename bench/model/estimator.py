@@ -36,6 +36,9 @@ class Estimator(Plugin):
     """Whether it adds :meth:`Problem.explicit` to cost times score; if not, it is refused where theta sets the initial
     state and noise is on the actions, since cost times score alone is then biased."""
 
+    gives_gradient: ClassVar[bool] = True
+    """Whether its estimates are of a gradient, so that an optimizer can descend along them."""
+
     @abstractmethod
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return R independent estimates ``(R, d)`` at ``theta (d,)`` from standard normal ``noise (R, N, n_w)``.
@@ -49,6 +52,10 @@ class Estimator(Plugin):
         An estimator that reports something defines this method, and :meth:`estimate` as its first part.
         """
         return self.estimate(problem, theta, noise), {}
+
+    def declares_unbiased(self, program: Program) -> bool:
+        """Whether its expectation is grad J_sigma of the program, by what it declares."""
+        return self.unbiased and self.target == "smoothed" and (program.continuous or self.across_jumps)
 
     def refuses(self, program: Program) -> str | None:
         """Return why this estimator cannot be used on the program, or None."""

@@ -48,7 +48,7 @@ class Plugin(ABC):  # noqa: B024, each kind has abstract methods of its own
     """The base of all plugins: a name, and parameters as dataclass fields."""
 
     kind: ClassVar[str] = ""
-    """The plural of its axis: scenes, contacts, integrators, backends, estimators, studies, or a kind of your own."""
+    """The plural of its axis: scenes, contacts, integrators, backends, estimators, optimizers, studies, or a kind of your own."""
     name: ClassVar[str] = ""
     """The one name used on the command line, in tables, legends and caches."""
     requires: ClassVar[tuple[str, ...]] = ()

@@ -29,7 +29,7 @@ from bench.errors import UserError, printable, unknown
 from bench.model.parameters import Plugin, build, parameters, remember, singular
 
 BUILT_IN = ("bench.plugins", "bench.studies")
-KINDS = ("scenes", "contacts", "integrators", "backends", "estimators", "studies")
+KINDS = ("scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "studies")
 """The kinds that come with the package, in the order in which they are listed; a plugin may declare another."""
 ENTRY_POINT_GROUP = "bench.plugins"
 NAME = re.compile(r"\w[\w.-]*")

@@ -11,6 +11,7 @@ from bench.model import Decision, MechanicalScene, Plugin, Scene
 from bench.model.parameters import build, coerce, parameters, singular
 from bench.sweep.cell import Cell
 from bench.sweep.experiment import Choice, Experiment
+from bench.sweep.study import study_of
 
 COUNTS = ("samples", "repeats", "seed")
 """What a sweep can vary besides plugin parameters."""
@@ -167,7 +168,7 @@ class _Expansion:
                 assert isinstance(scene, Scene)
         experiment = self._experiment
         return Cell(
-            parts, **self._counts(point), study=experiment.study, decision=experiment.decision,
+            study_of(experiment).parts(parts), **self._counts(point), study=experiment.study, decision=experiment.decision,
             timing=experiment.timing, budget=experiment.budget,
         )  # fmt: skip
 

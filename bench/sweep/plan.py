@@ -14,6 +14,7 @@ from bench.sweep.cell import Cell
 from bench.sweep.experiment import Experiment
 from bench.sweep.grid import cells
 from bench.sweep.store import Store
+from bench.sweep.study import study_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,7 +44,7 @@ def plan(experiment: Experiment, store: Store) -> list[Planned]:
 
 
 def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, str]]) -> Planned:
-    refusal = cell.refusal()
+    refusal = cell.refusal() or _refused(experiment, cell)
     if cell.key not in stored:
         return Planned(cell, False, refusal)
     status, made_by = stored[cell.key]
@@ -53,6 +54,11 @@ def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, st
     # a plugin that was missing when the row was stored is there now
     installed = status == "unavailable" and refusal is None
     return Planned(cell, not (again or installed), refusal, aged)
+
+
+def _refused(experiment: Experiment, cell: Cell) -> tuple[str, str] | None:
+    reason = study_of(experiment).refuses(cell)
+    return None if reason is None else ("unsupported", reason)
 
 
 def expected_seconds(runs: Sequence[Planned], rows: pd.DataFrame) -> float:

@@ -39,6 +39,14 @@ class Study(Plugin):
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Return status, reason and the study's columns for one cell; an exception becomes status and reason."""
 
+    def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
+        """Return a cell's plugins by axis, without those that make no difference to it; by default all."""
+        return given
+
+    def refuses(self, cell: Cell) -> str | None:
+        """Return why the study cannot measure a cell, or None; asked when a run is planned."""
+        return None
+
     @abstractmethod
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         """Write tables and charts from rows, and return the files' paths; it prints nothing."""

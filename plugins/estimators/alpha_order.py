@@ -17,8 +17,9 @@ class AlphaOrder(Estimator):
     eps = sqrt(2 V ln((d+1)/delta) / N) + (2 L / 3 N) ln((d+1)/delta), V the per-sample zeroth-order variance.
     gamma is ``ratio`` eps unless it is given: a fixed gamma far below eps switches the method off, so that it is the
     zeroth order on fewer samples. A ratio of 1.25 caps a in many estimates of a smooth cost of one variable, at 4 to 20
-    times the variance; a larger one lets more of a jump's bias through, up to (ratio - 1) eps. Both orders take independent halves of the samples, or the same ones
-    (``sharing=shared``, as in the source). Reports a as ``alpha``, and ``eps``.
+    times the variance; a larger one lets more of a jump's bias through, up to (ratio - 1) eps. Both orders take
+    independent halves of the samples, or the same ones (``sharing=shared``, as in the source). Reports a as ``alpha``,
+    and ``eps``.
     Requires costs, gradients and scores. Biased by at most about gamma - eps, since a depends on the samples.
     """
 

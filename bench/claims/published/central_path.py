@@ -1,0 +1,79 @@
+"""C5: the central path of contact is smoothing by noise, and the price is variance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.special import ndtr
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.pieces import estimator, moments, problem
+from bench.model import Array, FunctionScene
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True)
+class Kink(FunctionScene):
+    """f = max(0, x): the gap of one contact after its force."""
+
+    name = "kink"
+
+    def theta0(self) -> np.ndarray:
+        """Return the kink's place."""
+        return np.zeros(1)
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """Return the positive part."""
+        return xp.where(x[0] > 0, x[0], 0.0 * x[0])
+
+
+class CentralPath(Claim):
+    """Relaxed complementarity and randomized smoothing."""
+
+    name = "C5"
+    lesson = "The price of smoothing"
+    statement = "Relaxing complementarity by kappa equals smoothing by Student t noise of two degrees of freedom."
+    source = "Suh, Pang, Tedrake 2022; Pang et al. 2023"
+    learned = "Analytic smoothing and smoothing by noise are the same thing; only the analytic one has no variance."
+    labels = ("gap without force / sqrt(c)", "derivative of the gap after it")
+
+    def measure(self) -> Outcome:
+        """Compare the relaxed derivative with the chance under that noise, and the kink's variances."""
+        a = np.linspace(-8, 8, 801)
+        relaxed = (1 + a / np.sqrt(a * a + 4)) / 2
+        # the chance that w > -a for the density 2 / (w^2 + 4)^1.5, by integrating it, not from its formula
+        chance = _chance(a)
+        closest = minimize_scalar(lambda s: np.abs(relaxed - ndtr(a / s)).max(), bounds=(1, 3), method="bounded")
+        at = problem(Kink(sigma=0.1))
+        _, (first, first_error) = moments(at, estimator("fobg"))
+        _, (zeroth, zeroth_error) = moments(at, estimator("reinforce"))
+        figures = [
+            Figure(
+                "largest difference of derivative and chance", "0.0", float(np.abs(relaxed - chance).max()), spread=1e-9
+            ),
+            Figure("sigma of the closest Gaussian, in sqrt(c)", "1.990", float(closest.x), 1e-3),
+            Figure("its largest difference", "0.0313", float(closest.fun), 1e-5),
+            Figure("first-order sd at the kink, 500 samples", "0.02236", (first / 500) ** 0.5, first_error / 20),
+            Figure("zeroth-order sd at the kink, 500 samples", "0.0500", (zeroth / 500) ** 0.5, zeroth_error / 20),
+        ]
+        return Outcome(
+            figures,
+            series={"a": a[::8].tolist(), "relaxed": relaxed[::8].tolist(), "gauss": ndtr(a / closest.x)[::8].tolist()},
+        )
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw the relaxed derivative and its Gaussian neighbour."""
+        axes.plot(series["a"], series["relaxed"], label="central path = t(2) noise")
+        axes.plot(series["a"], series["gauss"], "--", label="closest Gaussian")
+
+
+def _chance(a: np.ndarray) -> np.ndarray:
+    from scipy.integrate import quad
+
+    return np.array([quad(lambda w: 2 / (w * w + 4) ** 1.5, -x, np.inf, epsabs=1e-13)[0] for x in a])

@@ -1,0 +1,62 @@
+"""C7: how many random directions a linear function needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.pieces import centre, estimator, problem
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+D, REPEATS = 20, 4000
+
+
+class Directions(Claim):
+    """Gaussian directions, directions on a sphere, and differences along the axes."""
+
+    name = "C7"
+    lesson = "Which variance is smaller"
+    statement = (
+        "On a linear function of n variables the relative squared error of N random directions is (n + 1)/N if Gaussian, "
+        "(n - 1)/N on a sphere, whatever sigma; differences along the axes have none."
+    )
+    source = "Nesterov, Spokoiny 2017; Berahas et al. 2022"
+    learned = "Zeroth order pays for dimension: it needs as many samples as variables to be 100% off."
+    labels = ("samples N", "relative squared error")
+
+    def measure(self) -> Outcome:
+        """Sample estimates at two noise levels."""
+        figures: list[Figure] = []
+        series: dict[str, list[float]] = {"n": [20, 100, 400], "gauss": [], "sphere": []}
+        draw = np.random.default_rng(7)
+        for count, texts in ((20, ("1.05", "0.95")), (100, ("0.21", "0.19")), (400, ("0.0525", "0.0475"))):
+            noise = draw.standard_normal((REPEATS, count, D))
+            for sigma in (0.1, 3.0) if count == 20 else (0.1,):
+                at = problem(f"linear[dimension={D},sigma={sigma}]", backend="numpy")
+                for (name, key), text in zip(
+                    (("randomized_smoothing", "gauss"), ("sphere_smoothing", "sphere")), texts, strict=True
+                ):
+                    error = self._error(at, estimator(name), noise)
+                    figures.append(Figure(f"{name}, N = {count}, sigma = {sigma:g}", text, *error))
+                    if sigma == 0.1:
+                        series[key].append(error[0])
+        at = problem(f"linear[dimension={D}]", backend="numpy")
+        exact = self._error(at, estimator("finite_difference"), draw.standard_normal((8, 20, D)))
+        figures.append(Figure("finite_difference, N = 20", "0.0", exact[0], spread=1e-15))
+        return Outcome(figures, series=series)
+
+    def _error(self, at: Any, method: Any, noise: np.ndarray) -> tuple[float, float]:
+        """Return the mean squared error over the squared norm of the gradient, with its standard error."""
+        truth = at.program.closed_form_gradient()
+        values = method.estimate(at, at.program.theta0, noise)
+        return centre(((values - truth) ** 2).sum(axis=1) / (truth**2).sum())
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw both errors against the number of samples."""
+        axes.loglog(series["n"], series["gauss"], "o-", label="Gaussian: (n + 1)/N")
+        axes.loglog(series["n"], series["sphere"], "s--", label="sphere: (n - 1)/N")

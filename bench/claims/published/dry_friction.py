@@ -1,0 +1,78 @@
+"""L4: a block that sticks has no derivative, until noise gives it one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.special import ndtr
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.pieces import estimator, moments, problem
+from bench.model import Array, FunctionScene, param
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True)
+class DryFriction(FunctionScene):
+    """A block at rest pushed by x: it accelerates by x - mu sign(x) where |x| > mu, else not at all."""
+
+    name = "dry_friction"
+    mu: float = param(1.0, "largest friction force")
+    push: float = param(0.0, "force at theta")
+
+    def theta0(self) -> np.ndarray:
+        """Return the push."""
+        return np.array([self.push])
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """Return the acceleration."""
+        beyond = xp.abs(x[0]) - self.mu
+        return xp.sign(x[0]) * xp.where(beyond > 0, beyond, 0.0 * beyond)
+
+
+class Sticking(Claim):
+    """Dry friction at rest."""
+
+    name = "L4"
+    lesson = "The price of smoothing"
+    statement = (
+        "A sticking block's exact derivative is 0; smoothed it is Phi((F - mu)/s) + Phi((-F - mu)/s), .3173 at F = 0."
+    )
+    source = "Le Lidec et al. 2023"
+    learned = "An exact zero can be right and still of no use to an optimiser; noise looks past the edge of the cone."
+    labels = ("push F", "derivative of the acceleration")
+
+    def measure(self) -> Outcome:
+        """Take the exact derivative, and integrate both orders over the noise."""
+        at = problem(DryFriction(sigma=1.0))
+        exact = float(at.grad(np.zeros(1), np.zeros((1, 1)))[0, 0])
+        (first, first_error), _ = moments(at, estimator("fobg"))
+        (zeroth, zeroth_error), _ = moments(at, estimator("reinforce"))
+        forces = np.linspace(-4, 4, 41)
+        smooth = [moments(at, estimator("fobg"), f, 20_000)[0][0] for f in forces]
+        formula = ndtr(forces - 1) + ndtr(-forces - 1)
+        figures = [
+            Figure("exact derivative at rest", "0.0", exact),
+            Figure("smoothed, first order", "0.3173", first, first_error),
+            Figure("smoothed, zeroth order", "0.3173", zeroth, zeroth_error),
+            Figure(
+                "largest difference from the formula, F from -4 to 4",
+                "0.0",
+                float(np.abs(smooth - formula).max()),
+                spread=2e-3,
+            ),
+        ]
+        return Outcome(
+            figures,
+            series={"force": forces.tolist(), "smooth": smooth, "exact": (np.abs(forces) > 1).astype(float).tolist()},
+        )
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw the exact and the smoothed derivative."""
+        axes.step(series["force"], series["exact"], where="mid", label="exact")
+        axes.plot(series["force"], series["smooth"], label="smoothed, s = mu")

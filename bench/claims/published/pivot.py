@@ -1,0 +1,85 @@
+"""C4: a pivot that falls off: descent on first-order gradients walks over the edge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.pieces import centre, expectation, problem, stochastic_descent
+from bench.model import Array, FunctionScene, param
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SIGMA = 0.02
+
+
+@dataclass(frozen=True)
+class Pivot(FunctionScene):
+    """f = -sin^2 x up to |x| = pi/4, 0 beyond: the further the better, until it falls."""
+
+    name = "pivot"
+    continuous: ClassVar[bool] = False
+    start: float = param(0.1, "angle at theta", "rad")
+
+    def theta0(self) -> np.ndarray:
+        """Return the angle."""
+        return np.array([self.start])
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """Return the cost."""
+        value = -(xp.sin(x[0]) ** 2)
+        return xp.where(xp.abs(x[0]) <= math.pi / 4, value, 0.0 * value)
+
+
+class FallingPivot(Claim):
+    """The edge of a reward."""
+
+    name = "C4"
+    lesson = "Low variance is not low bias"
+    statement = "A first-order descent towards the best angle of a pivot walks over its edge; a zeroth-order one stops in front."
+    source = "Suh et al. 2022, ICML"
+    learned = "Near the edge the first-order gradient misses exactly the part that warns: the jump times its density."
+    labels = ("angle", "mean gradient")
+
+    def measure(self) -> Outcome:
+        """Integrate the missing part, and descend."""
+        at = problem(Pivot(sigma=SIGMA))
+
+        def means(x: float, count: int = 200_000) -> tuple[tuple[float, float], tuple[float, float]]:
+            theta = np.array([x])
+            return (
+                expectation(lambda w: at.grad(theta, w)[0], count),
+                expectation(lambda w: at.value(theta, w) * w[0] / SIGMA, count),
+            )
+
+        figures = []
+        for text, x, label in (("-0.7586", 0.74, "0.74"), ("-4.453", 0.76, "0.76"), ("-9.974", math.pi / 4, "pi/4")):
+            (first, error), (truth, truth_error) = means(x)
+            figures.append(
+                Figure(f"first-order mean less the gradient at {label}", text, first - truth, error + truth_error)
+            )
+        fallen, _ = stochastic_descent(at, False, 0.1, 0.01, 500, seed=4)
+        stopped, _ = stochastic_descent(at, True, 0.1, 0.01, 500, seed=44)
+        figures += [
+            Figure("end of the first-order descent", "0.843", *centre(fallen), spread=0.002),
+            Figure("cost there", "0.0", float(at.value(fallen[None], np.zeros((1, fallen.size))).max())),
+            Figure("end of the zeroth-order descent", "0.74", *centre(stopped), spread=0.02),
+        ]
+        grid = np.linspace(0.6, 0.9, 61)
+        both = [means(x, 20_000) for x in grid]
+        return Outcome(
+            figures,
+            series={"x": grid.tolist(), "first": [a[0] for a, _ in both], "truth": [b[0] for _, b in both]},
+        )
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw both gradients around the edge."""
+        axes.plot(series["x"], series["truth"], label="true")
+        axes.plot(series["x"], series["first"], label="first-order mean")
+        axes.axvline(math.pi / 4, color="#404040", linewidth=0.6)

@@ -1,0 +1,96 @@
+"""C2: a steep ramp: unbiased and useless."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.pieces import centre, estimator, moments, problem
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SIGMA, NU = 0.1, 0.005
+
+
+class Ramp(Claim):
+    """A ramp of width nu from -1 to 1, noise 0.1."""
+
+    name = "C2"
+    lesson = "Low variance is not low bias"
+    statement = (
+        "On a ramp of width nu the first-order gradient is unbiased, and beats the zeroth order only above nu = 1.5 sigma; "
+        "on a steep ramp 100 samples often all miss it."
+    )
+    source = "Suh et al. 2022, ICML"
+    learned = "An unbiased gradient can be useless: in finite samples a steep ramp is a jump."
+    labels = ("width of the ramp / sigma", "variance of one sample")
+
+    def measure(self) -> Outcome:
+        """Find the crossing of the variances, and errors of small batches."""
+        first, zeroth = estimator("fobg"), estimator("reinforce")
+
+        def gap(nu: float) -> float:
+            at = problem(f"soft_heaviside[nu={nu!r},sigma={SIGMA}]")
+            return float(np.log(moments(at, first)[1][0] / moments(at, zeroth)[1][0]))
+
+        low, high = 0.1, 0.2
+        for _ in range(14):
+            middle = (low + high) / 2
+            low, high = (middle, high) if gap(middle) > 0 else (low, middle)
+        at = problem(f"soft_heaviside[nu={NU},sigma={SIGMA}]")
+        draw = np.random.default_rng(2)
+        batches = 40_000
+        gradient = at.grad(np.zeros(1), draw.standard_normal((1, 100 * batches)))
+        missed = (gradient.reshape(batches, 100) == 0).all(axis=1)
+        figures = [
+            Figure("crossing of the variances, in sigma", "1.517", (low + high) / 2 / SIGMA, (high - low) / SIGMA),
+            Figure("chance that 100 samples all have gradient 0", "0.1334", *centre(missed.astype(float))),
+        ]
+        for count, expected in ((1, ("2.05", "1.49")), (100, ("0.754", "0.210")), (1000, ("0.251", "0.068"))):
+            figures += self._errors(at, draw, count, expected)
+        widths = np.geomspace(0.02, 4, 15) * SIGMA
+        problems = [problem(f"soft_heaviside[nu={float(nu)!r},sigma={SIGMA}]") for nu in widths]
+        return Outcome(
+            figures,
+            series={
+                "width": (widths / SIGMA).tolist(),
+                "first": [moments(one, first, count=40_000)[1][0] for one in problems],
+                "zeroth": [moments(one, zeroth, count=40_000)[1][0] for one in problems],
+            },
+        )
+
+    def _errors(self, at: Any, draw: np.random.Generator, count: int, expected: tuple[str, str]) -> list[Figure]:
+        """Return mean absolute errors over 1,000 theta in [-1, 1]; the source drew them once, so its spread counts."""
+        from scipy.special import ndtr
+
+        repeats = max(4, 4000 // count)
+        theta = np.linspace(-1, 1, 1000)
+        truth = (ndtr((NU / 2 - theta) / SIGMA) - ndtr((-NU / 2 - theta) / SIGMA)) * 2 / NU
+        found: dict[str, list[float]] = {"first": [], "zeroth": []}
+        for _ in range(repeats):
+            w = draw.standard_normal((1, 1000 * count))
+            every = np.repeat(theta, count)[None]
+            gradient = at.grad(every, w)[0].reshape(1000, count).mean(axis=1)
+            base = at.value(theta[None], np.zeros((1, 1000)))
+            cost = at.value(every, w).reshape(1000, count) - base[:, None]
+            score = (cost * w.reshape(1000, count) / SIGMA).mean(axis=1)
+            found["first"].append(float(np.abs(gradient - truth).mean()))
+            found["zeroth"].append(float(np.abs(score - truth).mean()))
+        figures = []
+        for (name, values), published in zip(found.items(), expected, strict=True):
+            mean, error = centre(np.array(values))
+            once = float(np.std(values, ddof=1))
+            figures.append(
+                Figure(f"{name}-order mean absolute error, {count} samples", published, mean, error, 2 * once)
+            )
+        return figures
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw both variances against the width."""
+        axes.loglog(series["width"], series["first"], label="first order")
+        axes.loglog(series["width"], series["zeroth"], label="zeroth order")
+        axes.axvline(1.517, color="#404040", linewidth=0.6)

@@ -1,0 +1,90 @@
+"""C19: a chaotic map: the first order's variance grows by 4 each step, the zeroth order's stays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.pieces import estimator, problem, spread, terms
+from bench.model import Array, FunctionScene, param
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SAMPLES = 400_000
+
+
+@dataclass(frozen=True)
+class Tent(FunctionScene):
+    """x is mapped to 1 - |1 - 2 x| again and again; f is the last value."""
+
+    name = "tent"
+    steps: int = param(10, "iterations", positive=True)
+
+    def theta0(self) -> np.ndarray:
+        """Return the start."""
+        return np.array([0.3])
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """Return the last iterate."""
+        value = x[0]
+        for _ in range(self.steps):
+            value = 1.0 - xp.abs(1.0 - 2.0 * value)
+        return value
+
+
+class Chaos(Claim):
+    """The tent map."""
+
+    name = "C19"
+    lesson = "Chaos"
+    statement = (
+        "Through T steps of a chaotic map the first order's variance grows as 4^T while the zeroth order's stays, so that "
+        "the best mixture is 1.6e10 times better at T = 20."
+    )
+    source = "Metz et al. 2021; Parmas et al. 2018; figures for the tent map in closed form"
+    learned = "Beyond the horizon of chaos derivatives are right and useless; sampling does not care."
+    labels = ("steps T", "variance of one sample")
+
+    def measure(self) -> Outcome:
+        """Sample both orders at several horizons."""
+        first, zeroth = estimator("fobg"), estimator("reinforce")
+        draw = np.random.default_rng(19)
+        found, figures = {}, []
+        for steps in (1, 2, 5, 10, 14, 20):
+            at = problem(Tent(sigma=0.05, steps=steps))
+            w = draw.standard_normal((1, SAMPLES))
+            pair = terms(at, first, w), terms(at, zeroth, w)
+            found[steps] = [spread(values) for values in pair]
+            if steps in (10, 20):
+                (v1, e1), (v0, e0) = found[steps]
+                figures.append(
+                    Figure(f"first-order variance, T = {steps}", {10: "1.05e6", 20: "1.10e12"}[steps], v1, e1)
+                )
+                figures.append(Figure(f"zeroth-order variance, T = {steps}", "70", v0, e0))
+                figures.append(
+                    Figure(f"size of every gradient, T = {steps}", f"{2.0**steps:.1f}", float(np.abs(pair[0]).max()))
+                )
+        (v1, e1), (v0, e0) = found[20]
+        # weights in inverse proportion to the variances, whose covariance is far below both
+        mixed = v1 * v0 / (v1 + v0)
+        figures.append(Figure("gain of the best mixture, T = 20", "1.6e10", v1 / mixed, v1 / mixed * (e0 / v0)))
+        half = 2 * v1 * 2 * v0 / (2 * v1 + 2 * v0)
+        figures.append(Figure("the same with the samples split", "7.8e9", v1 / half, v1 / half * (e0 / v0)))
+        return Outcome(
+            figures,
+            series={
+                "steps": list(found),
+                "first": [v[0][0] for v in found.values()],
+                "zeroth": [v[1][0] for v in found.values()],
+            },
+        )
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw both variances against the horizon."""
+        axes.semilogy(series["steps"], series["first"], "o-", label="first order: 4^T")
+        axes.semilogy(series["steps"], series["zeroth"], "s-", label="zeroth order")

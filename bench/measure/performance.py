@@ -1,0 +1,153 @@
+"""How well searches did: shares, times to a target, summaries and rank correlations, each with a 95% interval.
+
+Sources: Wilson 1927 (shares), Hansen et al. 2016, *COCO performance assessment* (average runtime, ECDF with simulated
+restarts), Agarwal et al. 2021, *Deep RL at the edge of the statistical precipice* (interquartile mean, probability of
+improvement), Dahl et al. 2023, *AlgoPerf* (the integral of the performance profile), Efron 1979 (bootstrap).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+Z = 1.959963984540054
+"""The normal quantile of 0.975."""
+DRAWS = 1000
+"""Bootstrap samples of an interval."""
+
+Interval = tuple[float, float]
+
+
+def wilson(successes: int, trials: int, z: float = Z) -> Interval:
+    """Return Wilson's score interval of a share.
+
+    >>> [round(x, 4) for x in wilson(8, 10)]
+    [0.4902, 0.9433]
+    """
+    if trials == 0:
+        return 0.0, 1.0
+    share, weight = successes / trials, z * z / trials
+    middle = (share + weight / 2) / (1 + weight)
+    half = z / (1 + weight) * math.sqrt(share * (1 - share) / trials + weight / (4 * trials))
+    # rounding must not exclude a share of 0 or 1 itself
+    low = 0.0 if successes == 0 else max(0.0, middle - half)
+    return low, 1.0 if successes == trials else min(1.0, middle + half)
+
+
+def bootstrap(
+    strata: Sequence[np.ndarray], statistic: Callable[[Sequence[np.ndarray]], float], seed: int = 0, draws: int = DRAWS
+) -> Interval:
+    """Return the percentile interval of a statistic of strata, each resampled along its first axis by itself.
+
+    An infinite statistic stays infinite: where a quarter of the resamples has no success, an upper end is infinite.
+    """
+    rng = np.random.default_rng(seed)
+    values = np.array(
+        [statistic([part[rng.integers(0, len(part), len(part))] for part in strata]) for _ in range(draws)]
+    )
+    values = values[~np.isnan(values)]
+    if not values.size:
+        return math.nan, math.nan
+    low, high = np.quantile(values, [0.025, 0.975], method="nearest")
+    return float(low), float(high)
+
+
+def average_runtime(spent: np.ndarray, reached: np.ndarray) -> float:
+    """Return all cost spent, by searches that failed too, over the number of successes; infinite without one.
+
+    ``spent (n,)`` is the cost until the target, or until the search stopped; ``reached (n,)`` whether it got there.
+
+    >>> average_runtime(np.array([10.0, 30.0, 20.0]), np.array([True, False, True]))
+    30.0
+    """
+    count = int(np.count_nonzero(reached))
+    return float(np.sum(spent) / count) if count else math.inf
+
+
+def runtimes(spent: np.ndarray, reached: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
+    """Return ``count`` runtimes with simulated restarts: runs drawn at random, costs added up, until one succeeds.
+
+    All are infinite without a success.
+    """
+    if not np.any(reached):
+        return np.full(count, math.inf)
+    rng, total, done = np.random.default_rng(seed), np.zeros(count), np.zeros(count, dtype=bool)
+    while not done.all():
+        drawn = rng.integers(0, len(spent), count)
+        total += np.where(done, 0.0, spent[drawn])
+        done |= reached[drawn]
+    return total
+
+
+def interquartile_mean(values: np.ndarray) -> float:
+    """Return the mean of the middle half of some values, those at its ends counted by their share.
+
+    >>> interquartile_mean(np.array([0.0, 1.0, 2.0, 9.0]))
+    1.5
+    """
+    ordered, n = np.sort(np.ravel(values)), np.size(values)
+    if not n:
+        return math.nan
+    edges = np.arange(n + 1) / n
+    inside = np.clip(np.minimum(edges[1:], 0.75) - np.maximum(edges[:-1], 0.25), 0.0, None)
+    return float(ordered @ inside / inside.sum())
+
+
+def improvement(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Return the share of pairs in which ours is smaller, a tie counting half."""
+    return float(np.mean((ours < theirs) + 0.5 * (ours == theirs)))
+
+
+def profile_score(ratios: np.ndarray, most: float = 4.0) -> float:
+    """Return 1 / (most - 1) of the integral over [1, most] of the share of problems whose ratio to the best is below.
+
+    >>> profile_score(np.array([1.0, 2.5, np.inf]))
+    0.5
+    """
+    gained = np.clip(most - np.maximum(np.where(np.isnan(ratios), np.inf, ratios), 1.0), 0.0, None)
+    return float(np.mean(gained) / (most - 1.0)) if np.size(ratios) else math.nan
+
+
+def ranks(values: np.ndarray) -> np.ndarray:
+    """Return ranks from 1 on, ties sharing the mean of theirs; infinities rank last, together."""
+    values = np.asarray(values, dtype=float)
+    below = (values[:, None] > values[None, :]).sum(axis=1)
+    equal = (values[:, None] == values[None, :]).sum(axis=1)
+    return below + (equal + 1) / 2
+
+
+def spearman(x: np.ndarray, y: np.ndarray) -> float:
+    """Return Spearman's rank correlation; NaN where one side does not vary or there are fewer than three points."""
+    if len(x) < 3:
+        return math.nan
+    a, b = ranks(x), ranks(y)
+    a, b = a - a.mean(), b - b.mean()
+    size = math.sqrt(float((a @ a) * (b @ b)))
+    return float(a @ b) / size if size else math.nan
+
+
+def spearman_interval(points: Sequence[np.ndarray], seed: int = 0, draws: int = DRAWS) -> Interval:
+    """Return the bootstrap interval of Spearman's rho of points ``(n, 2)`` in strata, resampled stratum by stratum."""
+
+    def rho(parts: Sequence[np.ndarray]) -> float:
+        both = np.concatenate(parts)
+        return spearman(both[:, 0], both[:, 1])
+
+    return bootstrap(points, rho, seed, draws)
+
+
+def spearman_chance(points: Sequence[np.ndarray], seed: int = 0, draws: int = DRAWS) -> float:
+    """Return the chance of a rho at least as far from 0 if the order within each stratum of points ``(n, 2)`` were random.
+
+    Few points give a narrow bootstrap interval when they happen to be in order; this chance then stays large.
+    """
+    rng = np.random.default_rng(seed)
+    whole = np.concatenate(points)
+    seen = abs(spearman(whole[:, 0], whole[:, 1]))
+    if math.isnan(seen):
+        return 1.0
+    y = np.stack([np.concatenate([rng.permutation(part[:, 1]) for part in points]) for _ in range(draws)])
+    far = sum(abs(spearman(whole[:, 0], one)) >= seen - 1e-12 for one in y)
+    return (1 + far) / (1 + draws)

@@ -1,0 +1,121 @@
+"""Does a better gradient get a better controller, sooner? A search per problem, estimator, optimizer and seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from bench.model import KnownOptimum, Optimizer, Plugin, param
+from bench.model.program import OWN
+from bench.sweep.cell import Cell
+from bench.sweep.columns import Column, Columns, Judged, numbers, text
+from bench.sweep.experiment import Experiment
+from bench.sweep.session import Session
+from bench.sweep.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Optimise(Study):
+    """Searches for the best theta with each estimator and optimizer, and keeps the whole path."""
+
+    name = "optimise"
+    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "estimator", "optimizer")
+    timed: ClassVar[bool] = True
+    columns: ClassVar[Columns] = Columns.of(
+        text("optimizer", "identity string of the optimizer"),
+        text("stopped", "what ended the search: budget, target, plateau or diverged"),
+        text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification"),
+        Column("iterations", "steps of the optimizer"),
+        Column("rollouts", "rollouts spent, those of the scores of the path not counted"),
+        Column("gradients", "gradients spent"),
+        Column("gradient_ratio", "seconds of a gradient over those of a rollout, measured", measured=True),
+        Column("search_s", "seconds of the search, compilation and scores not counted", "s", measured=True),
+        Column("start_cost", "objective at the start"),
+        Column("final_cost", "objective at the last theta", judged=Judged("exact", "final cost")),
+        Column("best_cost", "lowest objective on the path"),
+        Column("optimum", "least cost known before the search, J*"),
+        text("optimum_status", "how J* is known"),
+        Column("score", "share of the way from the start to J*, between 0 and 1; empty without J*"),
+        Column("quality_rmse_rel", "relative root mean squared error of the estimator's gradients at the start"),
+        Column("quality_cosine", "mean cosine of its gradients with the reference there"),
+        Column("quality_bias_share", "share of the squared error that is bias"),
+        numbers("path_iteration", "iterations at which the path is kept", table=False),
+        numbers("path_cost", "objective there", table=False),
+        numbers("path_rollouts", "rollouts spent by then", table=False),
+        numbers("path_gradients", "gradients spent by then", table=False),
+        numbers("path_s", "seconds spent by then", "s", table=False, measured=True),
+        numbers("path_quality_iteration", "iterations at which the gradient's quality was measured", table=False),
+        numbers("path_quality_rmse_rel", "relative error of the gradients there", table=False),
+        numbers("path_quality_cosine", "their cosine with the reference", table=False),
+        numbers("theta", "the last theta", table=False),
+    )  # fmt: skip
+
+    budget: int = param(20_000, "rollouts that a search may spend, a gradient counting as gradient_cost", positive=True)
+    gradient_cost: float = param(4.0, "rollouts that a gradient counts as in the budget", positive=True)
+    iterations: int | None = param(None, "most iterations; null: as the budget allows", positive=True)
+    target: float | None = param(None, "cost at which a search has arrived; null: it goes on")
+    patience: int | None = param(
+        None, "iterations without a better cost after which a search ends; null: any", positive=True
+    )
+    limit: float = param(1e3, "a search has diverged at a cost above this many times |J0| + 1", positive=True)
+    scored: str = param(
+        "plain", "objective on which paths are scored: f at w = 0, or its mean", choices=("plain", "smoothed")
+    )
+    evaluations: int = param(256, "rollouts of a smoothed objective", positive=True)
+    sigma_decay: float = param(0.0, "the noise at iteration i has sigma / i^sigma_decay", low=0.0)
+    quality: str = param("start", "where the gradient's quality is measured", choices=("none", "start", "path"))
+    quality_samples: int = param(4096, "gradients of the reference of the quality", low=64)
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Search once."""
+        from bench.studies.optimise.measure import measure
+
+        return measure(cell, session, self)
+
+    def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
+        """Leave out the estimator where the optimizer looks at costs only: all would give the same search."""
+        optimizer = given.get("optimizer")
+        if isinstance(optimizer, Optimizer) and "gradient" not in optimizer.needs:
+            return given | {"estimator": None}
+        return given
+
+    def refuses(self, cell: Cell) -> str | None:
+        """Refuse an optimizer whose needs nothing meets, and a target below the least cost."""
+        optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
+        assert isinstance(optimizer, Optimizer)
+        gives = {"value", *(("gradient",) if estimator is not None and estimator.gives_gradient else ())}  # type: ignore[attr-defined]
+        lacking = sorted(optimizer.needs - gives)
+        if lacking:
+            source = f"estimator {estimator.name}" if estimator is not None else f"scene {cell.scene.name}"
+            return f"optimizer {optimizer.name} needs {' and '.join(lacking)}, which {source} does not give"
+        if self.target is not None and isinstance(cell.scene, KnownOptimum) and cell.decision == OWN:
+            least, how = cell.scene.optimum()
+            if self.target < least:
+                return f"target={self.target:g} is below the least cost {least:.10g} of scene {cell.scene.name} ({how})"
+        return None
+
+    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+        """Write the tables and charts."""
+        from bench.studies.optimise import report
+
+        return report.write(experiment, rows)
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
+        """Print the findings and the tables."""
+        from bench.studies.optimise import report
+
+        report.show(experiment, rows)
+
+    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
+        """Return the findings, the chart of quality against runtime, paths and learning rates."""
+        from bench.studies.optimise.page import content
+
+        return content(experiment, rows)
+
+    def chart(self, experiment: Experiment, rows: pd.DataFrame) -> tuple[str, ...]:
+        """Return the chart of quality against runtime, then the paths."""
+        return ("quality_runtime", "anytime")

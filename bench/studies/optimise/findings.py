@@ -1,0 +1,82 @@
+"""What searches show, in sentences with their intervals; what they cannot tell is said as such."""
+
+from __future__ import annotations
+
+import math
+
+import pandas as pd
+
+from bench.report.text import counted, number
+from bench.studies.optimise import races
+from bench.studies.optimise.races import Races
+
+CHANCE = 0.05
+"""Chance above which an order may be random."""
+
+
+def sentences(found: Races, default: float) -> list[str]:
+    """Return the findings, the answer to the question first."""
+    if not len(found.rows):
+        return ["No search gave a result: the table has the reason of each."]
+    summed = races.summary(found, default)
+    said = [pays(races.correlations(races.quality(found, default))), ranking(summed), tuning(summed), stops(found)]
+    return [sentence for sentence in said if sentence]
+
+
+def pays(rho: pd.DataFrame) -> str:
+    """Say for each class of scene whether the smaller error arrives sooner: yes, no, or cannot be told."""
+    if rho.empty:
+        return "Whether a better gradient pays cannot be told: no search has a gradient whose quality was measured."
+    parts = []
+    for row in rho[rho["scene_class"] != "all"].to_dict("records"):
+        if math.isnan(row["rho"]) or row["points"] < 4:
+            parts.append(f"{row['scene_class']}: cannot be told from {counted(row['points'], 'point')}")
+            continue
+        figures = f"rho {row['rho']:.2f} [{row['rho_low']:.2f}, {row['rho_high']:.2f}], {row['points']} points"
+        if row["chance"] > CHANCE:
+            parts.append(
+                f"{row['scene_class']}: cannot be told ({figures}; random order does as well {row['chance']:.0%} of the time)"
+            )
+        elif row["rho_low"] > 0:
+            parts.append(f"{row['scene_class']}: yes ({figures})")
+        elif row["rho_high"] < 0:
+            parts.append(f"{row['scene_class']}: no, the reverse ({figures})")
+        else:
+            parts.append(f"{row['scene_class']}: cannot be told ({figures})")
+    return "Does the gradient with the smaller error at the start arrive sooner? " + "; ".join(parts) + "."
+
+
+def ranking(summed: pd.DataFrame) -> str:
+    """Say which method has the best score, and which cannot be distinguished from it."""
+    known = summed[summed["score"].notna()].sort_values("score", ascending=False)
+    if known.empty:
+        return ""
+    first = known.iloc[0]
+    text = f"Best score: {first['method']} with {number(first['score'], 3)} [{number(first['score_low'], 3)}, {number(first['score_high'], 3)}]"
+    level = known.iloc[1:][known.iloc[1:]["score_high"] >= first["score_low"]]["method"]
+    return text + (
+        f"; not distinguishable from it: {', '.join(level)}." if len(level) else "; no other interval reaches it."
+    )
+
+
+def tuning(summed: pd.DataFrame) -> str:
+    """Say how far the tuning alone moves a method, beside how far the methods are apart."""
+    tuned = summed[(summed["tunings"] > 1) & summed["score"].notna()]
+    if tuned.empty:
+        return "Nothing was tuned: a comparison at one rate is one of rates as much as of gradients."
+    lost = (tuned["score"] - tuned["median_score"]).max()
+    worst = tuned.loc[(tuned["score"] - tuned["median_score"]).idxmax()]
+    apart = summed["score"].max() - summed["score"].min()
+    return (
+        f"Tuning alone moves the score of {worst['method']} by {number(lost)} (best of {worst['tunings']} against their "
+        f"median), the methods at their best are {number(apart)} apart."
+    )
+
+
+def stops(found: Races) -> str:
+    """Say how many searches diverged."""
+    lost = found.rows[found.rows["stopped"] == "diverged"]
+    if lost.empty:
+        return "No search diverged."
+    by = ", ".join(f"{name} {count}" for name, count in lost["method"].value_counts().items())
+    return f"Of {counted(len(found.rows), 'search', 'searches')} {len(lost)} diverged: {by}."

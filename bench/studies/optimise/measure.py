@@ -1,0 +1,355 @@
+"""One search: an optimizer asks, a problem and an estimator answer, and the path is scored on the true objective."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bench.errors import StorageError
+from bench.measure import noise
+from bench.measure.solve import solve
+from bench.model import Answer, Estimator, KnownOptimum, Optimizer, Problem, Rollout
+from bench.model.program import OWN
+from bench.sweep.cell import Cell
+from bench.sweep.files import make_directory, write_whole
+from bench.sweep.session import Session
+
+KEPT = 300
+"""Points of a path that are kept, those of the first iterations all."""
+LARGEST = 1000
+"""Longest theta whose optimum is looked for by Newton's method."""
+
+
+Settings = Any
+"""The study, whose parameters say how to search; it imports this module, so its type has no name here."""
+
+
+class Quieter(Problem):
+    """A problem whose noise is multiplied by a factor: the same compiled program, its sigma smaller by that factor."""
+
+    def __init__(self, inner: Problem, factor: float) -> None:
+        super().__init__(inner.program)
+        self._inner, self._factor = inner, factor
+        self.usage = inner.usage
+
+    @property
+    def sigma(self) -> float:
+        """The smaller standard deviation."""
+        return self._factor * self._inner.sigma
+
+    def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return costs under the smaller noise."""
+        return self._inner.value(theta, self._factor * w)
+
+    def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return gradients under the smaller noise."""
+        return self._inner.grad(theta, self._factor * w)
+
+    def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return scores of the smaller noise: linear in w, and one over sigma."""
+        return self._inner.score(theta, self._factor * w) / self._factor**2
+
+    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
+        """Return the step Jacobians under the smaller noise."""
+        return self._inner.jacobians(theta, self._factor * w)
+
+    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Any:
+        """Return the states under the smaller noise."""
+        return self._inner.trajectory(theta, self._factor * w)
+
+    _value = _grad = _score = None  # type: ignore[assignment]
+
+
+@dataclass
+class Path:
+    """What is kept of a search, a line per iteration."""
+
+    iteration: list[int] = field(default_factory=list)
+    cost: list[float] = field(default_factory=list)
+    rollouts: list[int] = field(default_factory=list)
+    gradients: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+
+    def kept(self) -> np.ndarray:
+        """Return the places to keep: closer at the start, with the last and the lowest among them."""
+        count = len(self.iteration)
+        if count <= KEPT:
+            return np.arange(count)
+        spaced = np.unique(np.round(np.geomspace(1, count, KEPT)).astype(int)) - 1
+        return np.unique(np.append(spaced, np.nanargmin(self.cost)))
+
+
+class Search:
+    """One search on one problem, which can be stepped."""
+
+    def __init__(self, cell: Cell, problem: Problem, settings: Settings) -> None:
+        self.cell, self.problem, self.settings = cell, problem, settings
+        optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
+        assert isinstance(optimizer, Optimizer)
+        assert estimator is None or isinstance(estimator, Estimator)
+        self.optimizer, self.estimator = optimizer, estimator
+        width = problem.program.n_noise
+        self._still = np.zeros((width, 1))
+        drawn = noise.draw(cell.seed, cell.scene.name, 1, settings.evaluations, width, "optimise: scores")[0].T
+        self._scored = self._still if settings.scored == "plain" else drawn
+
+    def objective(self, theta: np.ndarray) -> float:
+        """Return the objective at ``theta (d,)``, from noise that no step has seen."""
+        before = self.problem.usage.rollouts
+        cost = float(self.problem.value(theta, self._scored).mean())
+        self.problem.usage.rollouts = before
+        return cost
+
+    def step(self, state: dict[str, Any], iteration: int) -> dict[str, Any]:
+        """Return the state after iteration number ``iteration``, the first being 1."""
+        dim = self.problem.dim
+        normal = noise.draw(
+            self.cell.seed, self.cell.scene.name, 1, self.optimizer.draws(dim), dim, f"optimise: points {iteration}"
+        )[0].T
+        points = self.optimizer.ask(state, normal)
+        wanted = self.optimizer.wants(state)
+        value = self._values(points, iteration) if "value" in wanted else None
+        gradient = self._gradients(points, iteration) if "gradient" in wanted else None
+        return self.optimizer.tell(state, points, Answer(value, gradient))
+
+    def _noise(self, iteration: int) -> np.ndarray:
+        width = self.problem.program.n_noise
+        return noise.draw(
+            self.cell.seed, self.cell.scene.name, 1, self.cell.samples, width, f"optimise: samples {iteration}"
+        )
+
+    def _values(self, points: np.ndarray, iteration: int) -> np.ndarray:
+        """Return the costs of points ``(d, B)``: at w = 0, or means over the samples where the objective is smoothed."""
+        count = points.shape[1]
+        if self.settings.scored == "plain":
+            return self.problem.value(points, np.repeat(self._still, count, axis=1))
+        w = self._noise(iteration)[0].T
+        spread = np.repeat(points, w.shape[1], axis=1)
+        return self.problem.value(spread, np.tile(w, (1, count))).reshape(count, -1).mean(axis=1)
+
+    def _gradients(self, points: np.ndarray, iteration: int) -> np.ndarray:
+        assert self.estimator is not None
+        problem = self.problem
+        if self.settings.sigma_decay:
+            problem = Quieter(problem, iteration**-self.settings.sigma_decay)
+        drawn = self._noise(iteration)
+        return np.stack([self.estimator.estimate(problem, point, drawn)[0] for point in points.T], axis=1)
+
+
+def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
+    """Search until the budget, the target, a plateau or divergence."""
+    problem = session.problem(cell)
+    least, how = known_optimum(cell, problem, session, settings)
+    search = Search(cell, problem, settings)
+    theta0 = np.array(problem.program.theta0, dtype=np.float64)
+    found = qualities(search, theta0, settings, ("start",)) if settings.quality != "none" else {}
+    state = search.optimizer.start(theta0)
+    search.step(state, 1)  # compiles, untimed
+    path, stopped, thetas = walk(search, state, settings)
+    kept = path.kept()
+    start, final, best = path.cost[0], path.cost[-1], float(np.nanmin(path.cost))
+    if settings.quality == "path" and stopped != "diverged":
+        found |= qualities(search, thetas[len(thetas) // 2], settings, (f"{path.iteration[len(thetas) // 2]}",))
+    result = {
+        "status": "diverged" if stopped == "diverged" else "ok",
+        "reason": f"the cost left {settings.limit:g} (|J0| + 1) or is not finite" if stopped == "diverged" else "",
+        "stopped": stopped,
+        "scene_class": scene_class(cell, problem),
+        "iterations": path.iteration[-1],
+        "rollouts": path.rollouts[-1],
+        "gradients": path.gradients[-1],
+        "gradient_ratio": gradient_ratio(problem, cell) if cell.timing and search.estimator is not None else np.nan,
+        "search_s": path.seconds[-1],
+        "start_cost": start,
+        "final_cost": final,
+        "best_cost": best,
+        "optimum": least,
+        "optimum_status": how,
+        "score": float(np.clip((start - final) / (start - least), 0.0, 1.0)) if start > least else np.nan,
+        **{f"path_{name}": np.asarray(getattr(path, name))[kept].tolist() for name in PATHS},
+        "path_s": np.asarray(path.seconds)[kept].tolist(),
+        "theta": thetas[-1].tolist(),
+    }
+    if found:
+        first = found.get("start")
+        if first is not None:
+            result |= {f"quality_{name}": value for name, value in first.items()}
+        places = {0 if place == "start" else int(place): quality for place, quality in found.items()}
+        result["path_quality_iteration"] = list(places)
+        for name in ("rmse_rel", "cosine"):
+            result[f"path_quality_{name}"] = [quality[name] for quality in places.values()]
+    if not np.isfinite(result["score"]) and stopped == "diverged":
+        result["score"] = 0.0
+    return result
+
+
+PATHS = ("iteration", "cost", "rollouts", "gradients")
+
+
+def walk(search: Search, state: dict[str, Any], settings: Settings) -> tuple[Path, str, list[np.ndarray]]:
+    """Return the path, what ended it, and theta at each of its points."""
+    problem, path, thetas = search.problem, Path(), []
+    problem.usage.rollouts = problem.usage.gradients = 0
+    spent_s, best, waited, stopped = 0.0, np.inf, 0, ""
+    iteration = 0
+    while True:
+        cost = search.objective(state["theta"])
+        path.iteration.append(iteration)
+        path.cost.append(cost)
+        path.rollouts.append(problem.usage.rollouts)
+        path.gradients.append(problem.usage.gradients)
+        path.seconds.append(spent_s)
+        thetas.append(np.array(state["theta"]))
+        waited = 0 if cost < best - 1e-12 * abs(best) or not np.isfinite(best) else waited + 1
+        best = min(best, cost)
+        spent = problem.usage.rollouts + settings.gradient_cost * problem.usage.gradients
+        if not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path.cost[0]) + 1.0):
+            stopped = "diverged"
+        elif settings.target is not None and cost <= settings.target:
+            stopped = "target"
+        elif spent >= settings.budget or (settings.iterations is not None and iteration >= settings.iterations):
+            stopped = "budget"
+        elif settings.patience is not None and waited >= settings.patience:
+            stopped = "plateau"
+        if stopped:
+            return path, stopped, thetas
+        iteration += 1
+        started = time.perf_counter()
+        state = search.step(state, iteration)
+        spent_s += time.perf_counter() - started
+
+
+# ------------------------------------------------------------------------------------------------ the objective
+
+
+def known_optimum(cell: Cell, problem: Problem, session: Session, settings: Settings) -> tuple[float, str]:
+    """Return J* and how it is known: by the scene, by Newton's method once for all cells, or NaN."""
+    if settings.scored != "plain":
+        return np.nan, "unknown: the objective is smoothed"
+    if isinstance(cell.scene, KnownOptimum) and cell.decision == OWN:
+        return cell.scene.optimum()
+    if problem.dim > LARGEST or not problem.program.continuous or "grad" not in cell.backend.provides:
+        return np.nan, "unknown"
+    path = session.experiment.results_dir / "references" / f"optimum_{cell.program_key}.json"
+    try:
+        stored = json.loads(path.read_text())
+        return float(stored["cost"]), str(stored["how"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    found = solve(problem)
+    if not np.isfinite(found.cost):
+        return np.nan, "unknown"
+    digits = f"|gradient| {found.gradient:.0e}, least curvature {found.curvature:.1g}"
+    how = f"local optimum by Newton's method, {digits}" if found.certified else f"lowest cost found, {digits}"
+    try:
+        make_directory(path.parent)
+        write_whole(path, json.dumps({"cost": found.cost, "how": how}).encode())
+    except StorageError:
+        raise
+    return found.cost, how
+
+
+_classes: dict[str, str] = {}
+
+
+def scene_class(cell: Cell, problem: Problem) -> str:
+    """Return the class of a problem: what makes its gradients difficult.
+
+    Chaotic is a continuous problem without contact whose gradients vary more than its zeroth-order terms do.
+    """
+    program = problem.program
+    if cell.decision.names:
+        return "identification"
+    if not program.continuous:
+        return "discontinuous"
+    if isinstance(program, Rollout) and program.scene.n_contacts:
+        return "stiff"
+    if cell.program_key not in _classes:
+        w = noise.draw(0, cell.scene.name, 1, 128, program.n_noise, "optimise: class")[0].T
+        with np.errstate(all="ignore"):
+            first = problem.grad(program.theta0, w).var(axis=1).sum()
+            cost = problem.value(program.theta0, w) - problem.value(program.theta0, 0.0 * w[:, :1])
+            zeroth = (cost * problem.score(program.theta0, w)).var(axis=1).sum()
+        _classes[cell.program_key] = "chaotic" if not first < zeroth else "smooth"
+    return _classes[cell.program_key]
+
+
+_ratios: dict[tuple[str, str], float] = {}
+
+
+def gradient_ratio(problem: Problem, cell: Cell, calls: int = 5) -> float:
+    """Return the seconds of a batch of gradients over those of a batch of costs, the fastest of a few calls."""
+    key = (cell.program_key, cell.backend.name)
+    if key not in _ratios:
+        theta, w = problem.program.theta0, noise.draw(0, "ratio", 1, 128, problem.program.n_noise, "optimise: ratio")
+        seconds = []
+        for function in (problem.value, problem.grad):
+            function(theta, w[0].T)
+            taken = []
+            for _ in range(calls):
+                started = time.perf_counter()
+                function(theta, w[0].T)
+                taken.append(time.perf_counter() - started)
+            seconds.append(min(taken))
+        _ratios[key] = seconds[1] / seconds[0]
+    return _ratios[key]
+
+
+# ---------------------------------------------------------------------------------------------- gradient quality
+
+_qualities: dict[tuple[Any, ...], dict[str, float]] = {}
+
+
+def qualities(
+    search: Search, theta: np.ndarray, settings: Settings, places: tuple[str, ...]
+) -> dict[str, dict[str, float]]:
+    """Return, by place, the relative error, cosine and share of bias of the estimator's gradients at theta.
+
+    The reference is a mean of many gradients, or of many zeroth-order terms where the cost jumps; its own noise, and
+    that of the mean estimate, are subtracted from the bias.
+    """
+    cell, problem, estimator = search.cell, search.problem, search.estimator
+    if estimator is None:
+        return {}
+    key = (
+        cell.program_key,
+        cell.backend,
+        estimator,
+        cell.samples,
+        cell.repeats,
+        settings.quality_samples,
+        theta.tobytes(),
+    )
+    if key not in _qualities:
+        program, scene = problem.program, cell.scene.name
+        w = noise.draw(0, scene, 1, settings.quality_samples, program.n_noise, "optimise: reference")[0].T
+        if program.continuous and "grad" in cell.backend.provides:
+            terms = problem.grad(theta, w)
+        else:
+            cost = problem.value(theta, w) - problem.value(theta, 0.0 * w[:, :1])
+            terms = cost * problem.score(theta, w)
+        drawn = noise.draw(0, scene, max(cell.repeats, 2), cell.samples, program.n_noise, "optimise: quality")
+        _qualities[key] = compared(estimator.estimate(problem, theta, drawn), terms)
+    return dict.fromkeys(places, _qualities[key])
+
+
+def compared(estimates: np.ndarray, terms: np.ndarray) -> dict[str, float]:
+    """Compare estimates ``(R, d)`` with the mean of reference terms ``(d, M)``."""
+    truth = terms.mean(axis=1)
+    own = float(terms.var(axis=1, ddof=1).sum()) / terms.shape[1]
+    norm = float(np.linalg.norm(truth))
+    off = estimates - truth
+    error = max(float((off**2).sum(axis=1).mean()) - own, 0.0)
+    spread = float(estimates.var(axis=0, ddof=1).sum())
+    bias = max(float((off.mean(axis=0) ** 2).sum()) - spread / len(estimates) - own, 0.0)
+    sizes = np.linalg.norm(estimates, axis=1) * norm
+    cosines = np.divide(estimates @ truth, sizes, out=np.zeros(len(estimates)), where=sizes > 0)
+    return {
+        "rmse_rel": float(np.sqrt(error)) / norm if norm else np.nan,
+        "cosine": float(cosines.mean()),
+        "bias_share": min(bias / error, 1.0) if error else 0.0,
+    }

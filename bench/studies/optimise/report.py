@@ -1,0 +1,314 @@
+"""Writes searches as tables and charts: quality against runtime, anytime curves, times to targets, learning rates."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from bench.report.figures import save, styled
+from bench.report.page import WIDTH, columns
+from bench.report.scales import log_axis
+from bench.report.style import MARKERS, PALETTE, VARIANTS, colour, plain
+from bench.report.tables import plain_markdown
+from bench.report.text import counted, number
+from bench.studies.optimise import findings, races
+from bench.studies.optimise.races import Races
+from bench.sweep.axes import table
+from bench.sweep.experiment import Experiment
+from bench.sweep.files import write_all
+
+NOTES = (
+    "score: share of the way from the first cost to J*, interquartile mean over searches, with a bootstrap interval "
+    "stratified by problem. beats fobg: chance of a lower final cost, paired by problem and seed. profile: integral of the "
+    "share of targets reached within 1 to 4 times the best method's runtime. aRT: average runtime in rollouts (a gradient "
+    "counts as many as it takes the time of): all that the searches spent, over the number that arrived; inf if none did. "
+    "Each method is shown at its best tuning on each problem, chosen by median final cost of the same seeds; the median "
+    "score over all its tunings stands beside it, and their number is what the tuning cost.",
+)
+
+DEPTH = 1e-7
+"""Regrets below this share of the largest are not drawn: one search reaches 0 where J* is the lowest cost of any."""
+
+
+def default_ratio(experiment: Experiment) -> float:
+    """Return the rollouts that a gradient counts as where no times were measured."""
+    return float(getattr(experiment.study, "gradient_cost", 4.0))
+
+
+def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+    """Write ``optimise`` (.csv, .md), ``targets.csv`` and ``summary.csv``, and the charts."""
+    found, default = races.races(experiment, rows), default_ratio(experiment)
+    contents = {"optimise.csv": table(experiment, rows).to_csv(index=False, lineterminator="\n")}
+    if not len(found.rows):
+        contents["optimise.md"] = f"# {experiment.name}\n\nNo search gave a result.\n"
+        return write_all(experiment.directory, contents)
+    reached, summed = races.targets(found, default), races.summary(found, default)
+    contents["targets.csv"] = reached.to_csv(index=False, lineterminator="\n")
+    contents["summary.csv"] = summed.to_csv(index=False, lineterminator="\n")
+    texts = [f"# {experiment.name}: does a better gradient get there sooner?", *findings.sentences(found, default)]
+    texts += ["## Methods", plain_markdown(methods(summed)), "## Times to targets", plain_markdown(arrivals(reached))]
+    texts += ["## Least costs", plain_markdown(optima(found)), *NOTES]
+    contents["optimise.md"] = "\n\n".join(texts) + "\n"
+    paths = write_all(experiment.directory, contents)
+    drawings = {
+        "quality_runtime": quality_figure, "anytime": anytime_figure, "targets": targets_figure, "learning_rates": rates_figure,
+    }  # fmt: skip
+    with styled():
+        for stem, draw in drawings.items():
+            figure = draw(found, default)
+            if figure is not None:
+                paths += save(figure, experiment.directory / stem, experiment.formats)
+    return paths
+
+
+# ------------------------------------------------------------------------------------------------------- tables
+
+
+def methods(summed: pd.DataFrame) -> pd.DataFrame:
+    """Return the summary as a table of texts, the best score first."""
+    lines = []
+    for row in summed.sort_values("score", ascending=False).to_dict("records"):
+        lines.append({
+            "method": row["method"], "score": interval(row, "score", 3), "beats fobg": interval(row, "improvement"),
+            "profile": number(row["profile"]), "tunings": str(row["tunings"]), "median over tunings": number(row["median_score"]),
+            "diverged": f"{row['diverged']} of {row['searches']}",
+        })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
+def interval(row: Any, name: str, digits: int = 2) -> str:
+    """Write a number with its interval."""
+    if not isinstance(row[name], float) or math.isnan(row[name]):
+        return "-"
+    return "{} [{}, {}]".format(*(number(row[key], digits) for key in (name, f"{name}_low", f"{name}_high")))
+
+
+def arrivals(reached: pd.DataFrame) -> pd.DataFrame:
+    """Return the times to targets as a table of texts."""
+    lines = []
+    for row in reached.to_dict("records"):
+        rate = f"{row['successes']}/{row['searches']} [{number(row['rate_low'])}, {number(row['rate_high'])}]"
+        lines.append({
+            "problem": row["problem"], "method": row["method"], "tuning": row["tuning"], "regret": f"1/{row['target']:g}",
+            "arrived": rate, "aRT": interval(row, "art"),
+        })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
+def optima(found: Races) -> pd.DataFrame:
+    """Return J* of each problem, and how it is known."""
+    first = found.rows.drop_duplicates("problem")
+    return pd.DataFrame({
+        "problem": first["problem"], "class": first["scene_class"], "J0": first["start_cost"].map(lambda x: f"{x:.6g}"),
+        "J*": first["least"].map(lambda x: f"{x:.8g}"), "known as": first["least_status"],
+    })  # fmt: skip
+
+
+def show(experiment: Experiment, rows: pd.DataFrame) -> None:
+    """Print the findings, the methods, and the reasons of searches without a result."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False, markup=False, emoji=False)
+    if not console.is_terminal:
+        console.width = max(console.width, 160)
+    counts = ", ".join(f"{n} {status}" for status, n in rows["status"].value_counts().items())
+    console.print(f"\n{experiment.name}: {experiment.question}\n{counted(len(rows), 'cell')}: {counts}")
+    found, default = races.races(experiment, rows), default_ratio(experiment)
+    if len(found.rows):
+        for lines in (methods(races.summary(found, default)), arrivals(races.targets(found, default)), optima(found)):
+            grid = Table(box=None, padding=(0, 2, 0, 0))
+            for name in lines:
+                grid.add_column(str(name))
+            for line in lines.to_numpy():
+                grid.add_row(*map(str, line))
+            console.print(grid, "")
+        for sentence in findings.sentences(found, default):
+            console.print(sentence)
+    for reason in rows.loc[rows["reason"] != "", "reason"].unique():
+        console.print(reason)
+    console.print(*NOTES)
+
+
+# ------------------------------------------------------------------------------------------------------- charts
+
+
+def looks(found: Races) -> dict[str, dict[str, Any]]:
+    """Return a colour, marker and line style for each method."""
+    return {
+        method: {
+            "color": colour(i), "marker": MARKERS[i % len(MARKERS)], "linestyle": VARIANTS[(i // len(PALETTE)) % len(VARIANTS)]
+        }
+        for i, method in enumerate(found.methods)
+    }  # fmt: skip
+
+
+def _grid(count: int, most: int, height: float, title: str) -> tuple[Figure, list[Axes]]:
+    across = columns(count, most)
+    down = math.ceil(count / across)
+    drawn = Figure(figsize=(WIDTH, height * down + 1.0), layout="constrained")
+    FigureCanvasAgg(drawn)
+    drawn.suptitle(title, fontsize=9, fontweight="bold")
+    panels = list(drawn.subplots(down, across, squeeze=False).ravel())
+    for spare in panels[count:]:
+        spare.remove()
+    return drawn, panels[:count]
+
+
+def _legend(drawn: Figure, names: dict[str, dict[str, Any]], extra: tuple[Any, ...] = ()) -> None:
+    handles = [Line2D([], [], label=plain(name), **style) for name, style in names.items()]
+    drawn.legend(handles=[*handles, *extra], loc="outside lower center", ncols=3, columnspacing=1.2)
+
+
+def quality_figure(found: Races, default: float) -> Figure | None:
+    """Draw runtime to a tenth of the first regret against the gradient's error at the start, a panel per class of scene."""
+    points = races.quality(found, default)
+    if points.empty:
+        return None
+    rho = races.correlations(points).set_index("scene_class")
+    groups = list(points.groupby("scene_class", sort=False))
+    drawn, panels = _grid(len(groups), 3, 2.3, "Does the better gradient arrive sooner?")
+    styles = {name: style for name, style in looks(found).items() if name in set(points["method"])}
+    marks = {problem: MARKERS[i % len(MARKERS)] for i, problem in enumerate(dict.fromkeys(points["problem"]))}
+    for panel, (name, part) in zip(panels, groups, strict=True):
+        reached = part[np.isfinite(part["art"])]
+        missed = part[~np.isfinite(part["art"])]
+        # a search that never arrives is drawn at the upper edge, hollow
+        top = 3.0 * max([*reached["art"], *missed["most"], 1.0])
+        for row in part.to_dict("records"):
+            style = {**styles[row["method"]], "marker": marks[row["problem"]], "linestyle": "none"}
+            arrived = math.isfinite(row["art"])
+            panel.plot(
+                [max(row["rmse_rel"], 1e-6)], [max(row["art"], 1.0) if arrived else top], label=plain(row["method"]),
+                markerfacecolor=style["color"] if arrived else "#ffffff", **style,
+            )  # fmt: skip
+        low = max(min(reached["art"].min() if len(reached) else top, top) / 3, 0.3)
+        log_axis(panel, "x", max(part["rmse_rel"].min(), 1e-6) / 2, max(part["rmse_rel"].max(), 1e-6) * 2)
+        log_axis(panel, "y", low, top * 1.6)
+        line = rho.loc[name]
+        text = (
+            f"rho {line['rho']:.2f} [{line['rho_low']:.2f}, {line['rho_high']:.2f}]"
+            if line["rho"] == line["rho"]
+            else "rho -"
+        )
+        text += f",\nchance {line['chance']:.2f} in random order" if line["rho"] == line["rho"] else ""
+        panel.set_title(f"{name}: {text}")
+        panel.set_xlabel("relative error of a gradient, at the start")
+        panel.set_ylabel("aRT to regret/10 [rollouts]")
+    shapes = tuple(
+        Line2D([], [], label=plain(problem), color="#808080", marker=mark, linestyle="none")
+        for problem, mark in marks.items()
+    )
+    hollow = Line2D(
+        [], [], label="never arrived", color="#808080", marker="o", markerfacecolor="#ffffff", linestyle="none"
+    )
+    _legend(
+        drawn, {name: {**style, "marker": "", "linestyle": "-"} for name, style in styles.items()}, (*shapes, hollow)
+    )
+    return drawn
+
+
+def anytime_figure(found: Races, default: float) -> Figure:
+    """Draw regret against rollouts, and against seconds where they were measured: median and 20% to 80% of seeds."""
+    timed = bool(found.rows["search_s"].notna().any())
+    rows = 2 if timed else 1
+    names, styles = found.problems, looks(found)
+    drawn = Figure(figsize=(max(WIDTH, 2.4 * len(names)), 2.4 * rows + 1.0), layout="constrained")
+    FigureCanvasAgg(drawn)
+    drawn.suptitle("Regret on the way, each method at its best tuning", fontsize=9, fontweight="bold")
+    grid = drawn.subplots(rows, len(names), squeeze=False)
+    for line, unit in zip(grid, ("rollouts", "seconds"), strict=False):
+        for panel, problem in zip(line, names, strict=True):
+            part = found.best[found.best["problem"] == problem]
+            ratio = races.ratio_of(found.rows[found.rows["problem"] == problem], default)
+            for method, own in part.groupby("method", sort=False):
+                places = [
+                    races.spent(row, ratio) if unit == "rollouts" else np.asarray(row["path_s"], dtype=float)
+                    for _, row in own.iterrows()
+                ]
+                _draw_curve(panel, own, places, styles[str(method)])
+            panel.set_yscale("log")
+            low, high = panel.get_ylim()
+            panel.set_ylim(max(low, DEPTH * high), high)
+            panel.set_xscale("log")
+            panel.set_xlabel(unit if unit == "seconds" else "rollouts, a gradient at its time")
+        line[0].set_ylabel("J - J*")
+    for panel, problem in zip(grid[0], names, strict=True):
+        first = found.rows[found.rows["problem"] == problem].iloc[0]
+        panel.set_title(f"{plain(problem)}\nJ* = {first['least']:.6g}, {short(first['least_status'])}", fontsize=7)
+    _legend(drawn, {name: {**style, "marker": ""} for name, style in styles.items()})
+    return drawn
+
+
+def short(status: str) -> str:
+    """Return how J* is known in a few words."""
+    return status.partition(",")[0] if len(status) > 34 else status
+
+
+def _draw_curve(panel: Axes, rows: pd.DataFrame, places: list[np.ndarray], style: dict[str, Any]) -> None:
+    ends = [place[-1] for place in places if len(place) > 1]
+    starts = [place[1] for place in places if len(place) > 1]
+    if not ends or max(ends) <= 0:
+        return
+    grid = np.geomspace(max(min(starts), 1e-6), max(ends), 80)
+    low, middle, high = np.where(np.isfinite(found := races.curve(rows, places, grid)), found, np.nan)
+    panel.fill_between(grid, low, high, color=style["color"], alpha=0.15, linewidth=0)
+    panel.plot(grid, middle, **{**style, "marker": ""})
+
+
+def targets_figure(found: Races, default: float) -> Figure:
+    """Draw the share of problems, targets and restarts that are reached, against rollouts."""
+    drawn, (panel,) = _grid(1, 1, 2.6, "How many targets are reached by when?")
+    styles, times = looks(found), races.runtimes(found, default)
+    longest = max([1.0, *(float(t[np.isfinite(t)].max()) for t in times.values() if np.isfinite(t).any())])
+    shortest = min(
+        [
+            longest,
+            *(float(t[np.isfinite(t) & (t > 0)].min()) for t in times.values() if (np.isfinite(t) & (t > 0)).any()),
+        ]
+    )
+    grid = np.geomspace(max(shortest, 1.0) / 1.5, longest * 1.5, 120)
+    for method, values in times.items():
+        panel.plot(grid, [(values <= x).mean() for x in grid], **{**styles[method], "marker": ""}, label=plain(method))
+    panel.set_xscale("log")
+    panel.set_ylim(-0.02, 1.02)
+    panel.set_xlabel("rollouts with simulated restarts, a gradient at its time")
+    panel.set_ylabel("share of targets (regret/10, /100, /1000)")
+    _legend(drawn, {name: {**styles[name], "marker": ""} for name in times})
+    return drawn
+
+
+def rates_figure(found: Races, default: float) -> Figure | None:
+    """Draw the score against each tuned parameter, a panel per problem; None where nothing is tuned."""
+    lines = races.rates(found)
+    lines = (
+        lines[lines.groupby(["problem", "method", "axis"])["value"].transform("nunique") > 1] if len(lines) else lines
+    )
+    if not len(lines):
+        return None
+    groups = list(lines.groupby(["axis", "problem"], sort=False))
+    drawn, panels = _grid(len(groups), 3, 2.0, "How far does the tuning alone move each method?")
+    styles = {name: style for name, style in looks(found).items() if name in set(lines["method"])}
+    for panel, ((axis, problem), part) in zip(panels, groups, strict=True):
+        for method, own in part.groupby("method", sort=False):
+            own = own.sort_values("value")
+            panel.fill_between(
+                own["value"], own["low"], own["high"], color=styles[str(method)]["color"], alpha=0.15, linewidth=0
+            )
+            panel.plot(own["value"], own["score"], **styles[str(method)], label=plain(str(method)))
+        if (part["value"] > 0).all():
+            log_axis(panel, "x", part["value"].min() / 1.3, part["value"].max() * 1.3, sorted(set(part["value"])))
+        panel.set_ylim(-0.03, 1.03)
+        panel.set_title(plain(str(problem)), fontsize=7)
+        panel.set_xlabel(plain(str(axis)))
+        panel.set_ylabel("score")
+    _legend(drawn, styles)
+    return drawn

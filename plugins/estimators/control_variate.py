@@ -1,0 +1,58 @@
+"""Zeroth order with the linear part of the cost as a control variate."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from bench.model import Auxiliaries, Estimator, Problem, Program, columns, per_repeat, zeroth_order
+
+
+@dataclass(frozen=True)
+class ControlVariate(Estimator):
+    """Approximates grad J_sigma with the zeroth order minus c (g . w) w plus c g, g being df/dtheta at w = 0.
+
+    (g . w) w has the known expectation g, so that the result is unbiased for any cost and any c, even where g is wrong.
+    c is the regression coefficient of the other half of the samples: independent, hence no bias. It removes the
+    variance of the cost's linear part, as a Taylor control variate does (Glasserman 2003, ch. 4; Mohamed et al. 2020,
+    section 7), and it goes to 0 where g has nothing to do with the cost. Requires costs, gradients and scores, with
+    noise on theta, at least 4 samples. Reports c as ``coefficient``, the mean of both halves.
+    """
+
+    name = "control_variate"
+    needs = frozenset({"value", "grad", "score"})
+    across_jumps = True
+    reports: ClassVar[tuple[str, ...]] = ("coefficient",)
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the mean of the controlled terms."""
+        return self.explained(problem, theta, noise)[0]
+
+    def explained(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Auxiliaries]:
+        """Return the estimates, and the coefficient ``(R,)``."""
+        if noise.shape[1] < 4:
+            raise ValueError(f"{self.name} needs at least 4 samples, got {noise.shape[1]}")
+        centre = problem.grad(theta, np.zeros((noise.shape[2], 1)))[:, 0]
+        zeroth = zeroth_order(problem, theta, noise)
+        w = columns(noise)[: problem.dim]
+        control = per_repeat((centre @ w) * w, noise)
+        half = noise.shape[1] // 2
+        parts = (slice(0, half), slice(half, None))
+        # each half is corrected with the coefficient of the other
+        coefficients = [_slope(control[:, part], zeroth[:, part]) for part in reversed(parts)]
+        corrected = [
+            zeroth[:, part] - c[:, None, None] * (control[:, part] - centre)
+            for part, c in zip(parts, coefficients, strict=True)
+        ]
+        return np.concatenate(corrected, axis=1).mean(axis=1), {"coefficient": np.mean(coefficients, axis=0)}
+
+    def refuses(self, program: Program) -> str | None:
+        """Refuse noise that is not on theta, where (g . w) w has another expectation."""
+        return None if program.noise_on_theta else f"{self.name} needs the noise on theta, not on a policy's actions"
+
+
+def _slope(control: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the regression coefficient of values on the control over samples, one per repeat, 0 without spread."""
+    control = control - control.mean(axis=1, keepdims=True)
+    both, own = (np.einsum("rnd,rnd->r", control, other) for other in (values, control))
+    return np.divide(both, own, out=np.zeros_like(own), where=own > 0)

@@ -1,0 +1,49 @@
+"""Zeroth order in the subspace that first-order gradients span."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.model import Estimator, Problem, Program, columns, first_order, param, per_repeat
+
+
+@dataclass(frozen=True)
+class Guided(Estimator):
+    """Approximates grad J_sigma with central differences along v = P w + sqrt(share) (1 - P) w.
+
+    P projects on the span of the gradients of the first ``subspace`` samples; the differences use the others. The
+    expectation is the gradient itself inside the subspace and ``share`` times it outside, on a linear cost, while the
+    variance falls from d + 1 to about ``subspace`` + share d squared gradients: useful where gradients point into the
+    right subspace with wrong lengths and signs, useless where they vanish (Maheswaranathan et al. 2019, guided
+    evolutionary strategies). Requires costs and gradients, and more samples than ``subspace``. Biased.
+    """
+
+    name = "guided"
+    needs = frozenset({"value", "grad"})
+    unbiased = False
+
+    subspace: int = param(4, "samples whose gradients span the subspace", positive=True)
+    share: float = param(0.1, "part of the gradient outside the subspace that is kept", low=0.0, high=1.0)
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the mean of the differences along guided directions."""
+        if noise.shape[1] <= self.subspace:
+            raise ValueError(f"{self.name} needs more than {self.subspace} samples, got {noise.shape[1]}")
+        past, fresh = noise[:, : self.subspace], noise[:, self.subspace :]
+        gradients = first_order(problem, theta, past)
+        _, sizes, basis = np.linalg.svd(gradients, full_matrices=False)
+        # directions that rounding alone has made are none; a gradient of 0 spans nothing
+        basis = basis * (sizes > 1e-9 * sizes.max(axis=1, keepdims=True))[..., None]
+        w = fresh[..., : problem.dim]
+        inside = np.einsum("rkd,rke,rne->rnd", basis, basis, w)
+        s = problem.sigma
+        shift = s * columns(inside + np.sqrt(self.share) * (w - inside))
+        still = np.zeros((noise.shape[2], shift.shape[1]))
+        change = problem.displaced(shift, theta, still) - problem.displaced(-shift, theta, still)
+        return per_repeat(change * shift / (2.0 * s * s), fresh).mean(axis=1)
+
+    def refuses(self, program: Program) -> str | None:
+        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
+        if program.n_noise >= program.dim:
+            return None
+        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"

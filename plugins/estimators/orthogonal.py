@@ -1,0 +1,52 @@
+"""Zeroth order along directions that are orthogonal to each other."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.model import Estimator, Problem, Program, columns, param, per_repeat
+
+
+@dataclass(frozen=True)
+class Orthogonal(Estimator):
+    """Approximates grad J_s with (f(theta + s v) - f(theta - s v)) v / 2s, the v of up to d samples orthogonal.
+
+    Each block of d samples is a random rotation, so that together they see every direction. With ``lengths=drawn`` each
+    v has the length of its own normal vector and is normal by itself: unbiased, like ``randomized_smoothing``. With
+    ``lengths=fixed`` all have the length sqrt(d): the target is then another smoothing, and d samples are exact on a
+    linear cost (Choromanski et al. 2018). Requires only costs.
+    """
+
+    name = "orthogonal"
+    across_jumps = True
+
+    lengths: str = param("drawn", "lengths of the directions", choices=("drawn", "fixed"))
+
+    @property
+    def unbiased(self) -> bool:  # type: ignore[override]
+        """True for drawn lengths."""
+        return self.lengths == "drawn"
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the mean of central differences along the rotated directions."""
+        d, s = problem.dim, problem.sigma
+        normal = noise[..., :d]
+        v = np.concatenate([_rotated(normal[:, i : i + d]) for i in range(0, noise.shape[1], d)], axis=1)
+        lengths = np.linalg.norm(normal, axis=2, keepdims=True) if self.lengths == "drawn" else np.sqrt(d)
+        shift = s * columns(lengths * v)
+        still = np.zeros((noise.shape[2], shift.shape[1]))
+        change = problem.displaced(shift, theta, still) - problem.displaced(-shift, theta, still)
+        return per_repeat(change * shift / (2.0 * s * s), noise).mean(axis=1)
+
+    def refuses(self, program: Program) -> str | None:
+        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
+        if program.n_noise >= program.dim:
+            return None
+        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"
+
+
+def _rotated(normal: np.ndarray) -> np.ndarray:
+    """Return orthonormal vectors, uniform over rotations, from normal ones ``(R, m, d)`` with m <= d."""
+    q, r = np.linalg.qr(np.moveaxis(normal, 1, 2))
+    # the sign of R's diagonal is the factorisation's own choice; with it the rotation is uniform
+    return np.moveaxis(q * np.sign(np.einsum("rii->ri", r))[:, None, :], 2, 1)

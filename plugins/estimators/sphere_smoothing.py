@@ -1,0 +1,39 @@
+"""Zeroth order along directions of one length."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.model import Problem, Program, SampleMean, param
+
+
+@dataclass(frozen=True)
+class SphereSmoothing(SampleMean):
+    """Approximates grad J_sigma with d (f(theta + r u) - f(theta - r u)) u / 2r, u uniform on the unit sphere.
+
+    Its expectation is the gradient of the cost averaged over a *ball* of radius r. By default r = sigma sqrt(d + 2),
+    at which ball and Gaussian have the same covariance, so that both agree for cubic costs; others differ, hence it is
+    declared biased. On a linear cost its relative squared error is (d - 1) / N, Gaussian directions give (d + 1) / N
+    (Flaxman et al. 2005; Berahas et al. 2022). Requires only costs.
+    """
+
+    name = "sphere_smoothing"
+    unbiased = False
+
+    radius: float | None = param(None, "r, in units of theta; null: sigma sqrt(d + 2)", positive=True)
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return one central difference per sample, along its own direction."""
+        d = problem.dim
+        r = problem.sigma * np.sqrt(d + 2.0) if self.radius is None else self.radius
+        normal = problem.directions(w)
+        u = normal / np.linalg.norm(normal, axis=0)
+        still = np.zeros_like(w)
+        change = problem.displaced(r * u, theta, still) - problem.displaced(-r * u, theta, still)
+        return d * change * u / (2.0 * r)
+
+    def refuses(self, program: Program) -> str | None:
+        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
+        if program.n_noise >= program.dim:
+            return None
+        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"

@@ -1,0 +1,1 @@
+"""Optimizers: how costs and gradient estimates become the next theta."""

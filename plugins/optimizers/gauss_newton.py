@@ -1,0 +1,54 @@
+"""Gauss-Newton with Levenberg's damping."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from bench.model import Answer, Optimizer, OptimizerState, param
+
+
+@dataclass(frozen=True)
+class GaussNewton(Optimizer):
+    """Minimises |r|^2 / 2 by steps of (J'J + damping diag(J'J))^-1 J'r (Levenberg 1944, Marquardt 1963).
+
+    Requires residuals and their Jacobian. A step that raises the cost is taken back and the damping grows tenfold; one
+    that lowers it divides the damping by ten. Where J'J is singular the least-squares step of least length is taken.
+    """
+
+    name = "gauss_newton"
+    needs: ClassVar[frozenset[str]] = frozenset({"residual", "jacobian"})
+
+    damping: float = param(1e-3, "first damping, relative to the diagonal of J'J", positive=True)
+
+    def start(self, theta: np.ndarray) -> OptimizerState:
+        """Start with the first damping, no point known yet."""
+        return super().start(theta) | {"damping": self.damping, "known": None, "next": np.array(theta, dtype=float)}
+
+    def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
+        """Return the next point."""
+        return np.array(state["next"][:, None])
+
+    def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
+        """Take the point if it is better, and step from the best one."""
+        assert answer.residual is not None
+        assert answer.jacobian is not None
+        residual, jacobian = answer.residual[:, 0], answer.jacobian[..., 0]
+        finite = np.isfinite(residual).all() and np.isfinite(jacobian).all()
+        cost = 0.5 * float(residual @ residual) if finite else np.inf
+        known, damping, best = state["known"], state["damping"], state["theta"]
+        if known is None or cost <= known[0]:
+            damping = max(damping / 10, 1e-15) if known is not None else damping
+            known, best = (cost, residual, jacobian), theta[:, 0]
+        else:
+            damping = damping * 10
+        if not np.isfinite(known[0]):
+            return {"theta": best, "damping": damping, "known": None, "next": best}
+        return {"theta": best, "damping": damping, "known": known, "next": best - self._move(known, damping)}
+
+    @staticmethod
+    def _move(known: tuple[float, np.ndarray, np.ndarray], damping: float) -> np.ndarray:
+        _, residual, jacobian = known
+        scale = np.sqrt(damping) * np.linalg.norm(jacobian, axis=0)
+        stacked = np.concatenate([jacobian, np.diag(scale)])
+        return np.asarray(np.linalg.lstsq(stacked, np.concatenate([residual, 0.0 * scale]), rcond=None)[0])

@@ -1,0 +1,21 @@
+"""Gradient descent."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.model import OptimizerState
+
+from .clipped import Clipped
+
+
+@dataclass(frozen=True)
+class GradientDescent(Clipped):
+    """theta - rate g. On a curvature k with gradient variance v it settles at E J - J* = rate v / (2 (2 - rate k))."""
+
+    name = "gradient_descent"
+
+    def step(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
+        """Move against the clipped gradient."""
+        i = state["iteration"] + 1
+        return {"theta": state["theta"] - self.rate_at(i) * self.clipped(gradient), "iteration": i}

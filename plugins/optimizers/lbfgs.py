@@ -1,0 +1,58 @@
+"""Limited-memory BFGS."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.model import OptimizerState, param
+
+from .searching import Searching
+
+
+@dataclass(frozen=True)
+class Lbfgs(Searching):
+    """L-BFGS by the two-loop recursion (Nocedal, Wright 2006, algorithm 7.4) with Armijo backtracking from step 1.
+
+    Made for gradients without noise: pairs with y.s <= 1e-10 |y||s| are left out, and before the first pair the
+    direction is the gradient scaled to ``first_move``.
+    """
+
+    name = "lbfgs"
+
+    first: float = param(1.0, "longest step that is tried", positive=True)
+    shrink: float = param(0.5, "factor between two steps that are tried", positive=True, high=0.99)
+    slope: float = param(1e-4, "share of the promised descent that a step has to keep", positive=True, high=1.0)
+    tries: int = param(16, "steps that are tried", positive=True)
+    memory: int = param(10, "pairs of steps and gradient differences that are kept", positive=True)
+    first_move: float = param(0.1, "length of the first direction", positive=True)
+
+    def start(self, theta: np.ndarray) -> OptimizerState:
+        """Start without pairs."""
+        return super().start(theta) | {"steps": [], "changes": [], "last": None}
+
+    def noted(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
+        """Return the state with a new gradient and the pair that it completes."""
+        steps, changes = list(state["steps"]), list(state["changes"])
+        if state["last"] is not None:
+            s, y = state["theta"] - state["last"][0], gradient - state["last"][1]
+            if y @ s > 1e-10 * np.linalg.norm(y) * np.linalg.norm(s):
+                steps, changes = [*steps, s][-self.memory :], [*changes, y][-self.memory :]
+        return state | {
+            "gradient": gradient, "steps": steps, "changes": changes, "last": (state["theta"], gradient),
+        }  # fmt: skip
+
+    def direction(self, state: OptimizerState) -> np.ndarray:
+        """Return minus the approximate inverse Hessian times the gradient."""
+        q = np.array(state["gradient"])
+        pairs = list(zip(state["steps"], state["changes"], strict=True))
+        if not pairs:
+            return -q * (self.first_move / max(float(np.linalg.norm(q)), 1e-300))
+        shares = []
+        for s, y in reversed(pairs):
+            shares.append((s @ q) / (y @ s))
+            q = q - shares[-1] * y
+        s, y = pairs[-1]
+        q = q * ((s @ y) / (y @ y))
+        for (s, y), share in zip(pairs, reversed(shares), strict=True):
+            q = q + s * (share - (y @ q) / (y @ s))
+        return -q

@@ -1,0 +1,43 @@
+"""Model-predictive path integral control, as an optimizer."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.model import Answer, OptimizerState, Population, param
+
+
+@dataclass(frozen=True)
+class Mppi(Population):
+    """The mean of normal samples weighted by exp(-cost / temperature) (Williams et al. 2017).
+
+    On (u - u*)'H (u - u*) / 2 with variance S and infinitely many samples it moves from mu to
+    (H / temperature + S^-1)^-1 (H u* / temperature + S^-1 mu). At a high temperature it is a zeroth-order gradient
+    step of length S / temperature; at a low one the best sample.
+    """
+
+    name = "mppi"
+
+    population: int = param(100, "points per iteration", low=2)
+    width: float = param(0.3, "standard deviation of the samples, in units of theta", positive=True)
+    temperature: float = param(1.0, "cost by which a weight falls to 1/e", positive=True)
+    relative: bool = param(True, "whether the temperature is in units of the standard deviation of the costs")
+
+    def draws(self, dim: int) -> int:
+        """Return the size of the population."""
+        return self.population
+
+    def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
+        """Return the samples."""
+        return np.asarray(state["theta"][:, None] + self.width * noise)
+
+    def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
+        """Move to the weighted mean; points without a finite cost have no weight."""
+        assert answer.value is not None
+        known = np.isfinite(answer.value)
+        if not known.any():
+            return state
+        cost = answer.value[known]
+        unit = float(cost.std()) if self.relative else 1.0
+        weight = np.exp(-(cost - cost.min()) / (self.temperature * (unit or 1.0)))
+        return {"theta": theta[:, known] @ (weight / weight.sum())}

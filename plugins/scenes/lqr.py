@@ -1,0 +1,81 @@
+"""A mass brought to rest under a quadratic cost: the linear-quadratic regulator."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.model import Array, KnownOptimum, KnownValue, MechanicalScene, State, param
+
+
+@dataclass(frozen=True)
+class Lqr(KnownOptimum, KnownValue, MechanicalScene):
+    """q'' = u from (q, v) = (``start``, 0); f = sum of position q^2 + speed v^2 + effort u^2, plus the end state's.
+
+    theta is the control of each step (d = horizon). Made for semi-implicit Euler, whose step is x' = A x + B u with
+    A = [[1, h], [0, 1]] and B = [h^2, h]. J* = x0'P x0 with P from the Riccati recursion: 10.988683643 at the default.
+    Noise of sigma on the controls adds sigma^2 (tr R + tr B'P B) per step to the best that feedback reaches.
+    """
+
+    name = "lqr"
+    leaves_out = "contact, limits"
+    open_loop: ClassVar[bool] = True
+    n_q: ClassVar[int] = 1
+    n_u: ClassVar[int] = 1
+
+    sigma: float = param(0.1, "standard deviation of the noise on each control", "m/s^2", positive=True)
+    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    horizon: int = param(100, "number of time steps", "steps", positive=True)
+    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    start: float = param(1.0, "q at the start", "m")
+    control: float = param(0.0, "control of every step at theta", "m/s^2")
+    position: float = param(1.0, "weight of q^2", "1/m^2", low=0.0)
+    speed: float = param(0.1, "weight of v^2", "s^2/m^2", low=0.0)
+    effort: float = param(0.01, "weight of u^2", "s^4/m^2", positive=True)
+    end_position: float = param(10.0, "weight of q^2 at the end", "1/m^2", low=0.0)
+    end_speed: float = param(1.0, "weight of v^2 at the end", "s^2/m^2", low=0.0)
+
+    def theta0(self) -> np.ndarray:
+        """Return the same control for every step."""
+        return np.full(self.horizon, self.control)
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Start at rest."""
+        zero = 0.0 * theta[:1]
+        return State(zero + self.start, zero)
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return the control."""
+        return u
+
+    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return the weighted squares before the step."""
+        return self.position * q[0] ** 2 + self.speed * v[0] ** 2 + self.effort * u[0] ** 2
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return the weighted squares of the end state."""
+        return self.end_position * q[0] ** 2 + self.end_speed * v[0] ** 2
+
+    def optimum(self) -> tuple[float, str]:
+        """Return x0'P x0."""
+        return float(self.start**2 * _values(self)[0][0, 0]), "Riccati recursion"
+
+    def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:
+        """Return x'P x with the P of that step."""
+        x = np.concatenate([q, v])
+        return np.einsum("ib,ij,jb->b", x, _values(self)[step], x)
+
+
+@cache
+def _values(scene: Lqr) -> list[np.ndarray]:
+    """Return P of every step, the last being the end's weights, for semi-implicit Euler."""
+    h = scene.dt
+    a, b = np.array([[1.0, h], [0.0, 1.0]]), np.array([[h * h], [h]])
+    p = np.diag([scene.end_position, scene.end_speed])
+    values = [p]
+    for _ in range(scene.horizon):
+        gain = np.linalg.solve(scene.effort + b.T @ p @ b, b.T @ p @ a)
+        p = np.diag([scene.position, scene.speed]) + a.T @ p @ (a - b @ gain)
+        values.append(p)
+    return values[::-1]

@@ -1,0 +1,90 @@
+"""Copies of x' = x + u under one matrix of gains: a policy of which most directions make no difference."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.model import Array, KnownOptimum, KnownValue, MechanicalScene, State, param
+
+
+@dataclass(frozen=True)
+class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
+    """``copies`` of x' = x + u under the policy u = K x from x = (1, .., 1), with K any matrix (d = copies^2), at first 0.
+
+    f = sum over the steps of x'x + effort u'u, plus ``end`` x'x. All copies move alike, so that only K 1 matters: the
+    other copies (copies - 1) of copies^2 directions are gauge. With 100 copies over 10 steps, effort .1 and end 10, J goes
+    from 2000 at K = 0 to 109.1607978 at every K with K 1 = -.9160798. The step length is 1, under explicit or
+    semi-implicit Euler alike: x is the velocity, and positions make no difference.
+    """
+
+    name = "static_gain"
+    leaves_out = "positions, coupling of the copies"
+
+    sigma: float = param(0.1, "standard deviation of the noise on the gains, or on each control", positive=True)
+    noise: str = param("parameter", "what the noise perturbs", choices=("parameter", "action"))
+    horizon: int = param(10, "number of time steps", "steps", positive=True)
+    dt: float = param(1.0, "length of a time step", "s", positive=True)
+    copies: int = param(2, "length of x", low=1)
+    gain: float = param(0.0, "every diagonal element of K at theta")
+    effort: float = param(0.1, "weight of u'u", positive=True)
+    end: float = param(10.0, "weight of x'x at the end", low=0.0)
+
+    @property
+    def n_q(self) -> int:  # type: ignore[override]
+        """The number of copies: their sums, which nothing depends on, stand where a scene has positions."""
+        return self.copies
+
+    @property
+    def n_u(self) -> int:  # type: ignore[override]
+        """The number of copies."""
+        return self.copies
+
+    def theta0(self) -> np.ndarray:
+        """Return K row by row: ``gain`` on its diagonal."""
+        return (self.gain * np.eye(self.copies)).ravel()
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Start at (1, .., 1)."""
+        zero = 0.0 * theta[:1]
+        return State(xp.concat([zero] * self.copies), xp.concat([zero + 1.0] * self.copies))
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return the control."""
+        return u
+
+    def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
+        """Return K x."""
+        gains = xp.reshape(theta, (self.copies, self.copies, theta.shape[1]))
+        return xp.sum(gains * v[None], axis=1)
+
+    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return x'x + effort u'u."""
+        return xp.sum(v * v, axis=0) + self.effort * xp.sum(u * u, axis=0)
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return the weighted square of the end state."""
+        return self.end * xp.sum(v * v, axis=0)
+
+    def optimum(self) -> tuple[float, str]:
+        """Return the least cost of a gain k per copy, the minimum of a polynomial of k."""
+        cost = self.cost_of(np.linspace(-2.0, 0.0, 201))
+        low, high = np.linspace(-2.0, 0.0, 201)[[max(int(cost.argmin()) - 1, 0), min(int(cost.argmin()) + 1, 200)]]
+        for _ in range(8):
+            k = np.linspace(low, high, 101)
+            best = int(self.cost_of(k).argmin())
+            low, high = k[max(best - 1, 0)], k[min(best + 1, 100)]
+        return float(self.copies * self.cost_of(np.array([0.5 * (low + high)]))[0]), "closed form of a constant gain"
+
+    def cost_of(self, k: np.ndarray) -> np.ndarray:
+        """Return the cost of one copy under u = k x: a geometric sum."""
+        factor = (1.0 + self.dt * k) ** 2
+        powers = factor[None] ** np.arange(self.horizon + 1)[:, None]
+        return (1.0 + self.effort * k * k) * powers[:-1].sum(axis=0) + self.end * powers[-1]
+
+    def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:
+        """Return p x'x with the p of that step, from the scalar Riccati recursion."""
+        p = self.end
+        for _ in range(self.horizon - step):
+            p = 1.0 + p - (self.dt * p) ** 2 / (self.effort + self.dt**2 * p)
+        return p * (v * v).sum(axis=0)

@@ -1,0 +1,181 @@
+"""Claims: their verdicts can fail, their results are kept, and those of other packages are found."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bench import cli
+from bench.claims import Claim, Figure, Outcome, results, shelf
+from bench.claims.claim import NOT_REPRODUCED, REPRODUCED, RESERVED, UNDECIDED, last_digit, verdict
+
+CHEAP = ("C5", "C19", "L4")
+"""Claims that take a second or two."""
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """What the cheap claims measure."""
+    return {name: results.measured(shelf.claims()[name]) for name in CHEAP}
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_cheap_claims_are_reproduced(measured, name):
+    assert measured[name].verdict == REPRODUCED, measured[name]
+
+
+def planted(figure):
+    """The same figure with a wrong published number: off by 5%, by its sign, by a square."""
+    value = figure.value
+    wrongs = [value**2] if not 0.5 < abs(value) < 2 and figure.factor == 0 else []
+    if figure.resolution < 0.047:
+        wrongs += [1.05 * value, 0.95 * value]
+    return [replace(figure, published=f"{wrong:.9g}") for wrong in [*wrongs, -value]]
+
+
+def unnoticed(result):
+    """The wrong numbers among a result's figures that leave the verdict as it was."""
+    missed = []
+    for i, figure in enumerate(result.figures):
+        for wrong in planted(figure) if figure.value else [replace(figure, published="1.0")]:
+            figures = [*result.figures[:i], wrong, *result.figures[i + 1 :]]
+            if verdict(figures, result.remark) != NOT_REPRODUCED:
+                missed.append(f"{result.name}: {figure.what} {figure.published} as {wrong.published}")
+    return missed
+
+
+def test_planted_wrong_figures_are_not_reproduced(measured):
+    assert [missed for result in measured.values() for missed in unnoticed(result)] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(shelf.claims()))
+def test_every_claim_holds_and_would_fail_with_a_wrong_figure(name):
+    result = results.measured(shelf.claims()[name])
+    assert result.verdict in (REPRODUCED, RESERVED), (result.remark, [f for f in result.figures if not f.agrees])
+    assert unnoticed(result) == []
+
+
+def test_a_figure_agrees_within_its_digits_its_spread_and_its_errors():
+    assert Figure("x", "34.085", 34.0854).agrees
+    assert not Figure("x", "34.085", 34.0857).agrees
+    assert Figure("x", "34.085", 34.09, error=0.002).agrees
+    assert Figure("x", "0.494", 0.4965, spread=0.003).agrees
+    assert Figure("x", "1e10", 3e9, factor=4.0).agrees
+    assert not Figure("x", "1e10", -1e10, factor=4.0).agrees
+    assert not Figure("x", "1.0", float("nan"), error=float("inf")).agrees
+
+
+@pytest.mark.parametrize(("text", "digit"), [("3.9", 0.1), ("70", 1.0), ("1.6e10", 1e9), ("4.5e-4", 1e-5), ("-7", 1.0)])
+def test_the_last_digit_of_a_printed_number(text, digit):
+    assert last_digit(text) == pytest.approx(digit)
+
+
+def test_what_cannot_fail_is_not_decidable():
+    loose = Figure("x", "1.0", 1.1, error=1.0)
+    assert verdict([loose]) == UNDECIDED
+    assert verdict([loose, Figure("y", "2.0", 2.0)]) == REPRODUCED
+    assert verdict([loose, Figure("y", "2.0", 2.0)], "but") == RESERVED
+    assert verdict([loose, Figure("y", "2.0", 2.2)], "but") == NOT_REPRODUCED
+
+
+class Toy(Claim):
+    """A claim that counts how often it is measured."""
+
+    name, lesson, statement, source, learned = "T1", "Tests", "one is one", "here", "that it is"
+    labels = ("x", "y")
+    calls = 0
+    value = 1.0
+
+    def measure(self):
+        type(self).calls += 1
+        if self.value is None:
+            raise ValueError("no value")
+        return Outcome([Figure("one", "1.00", self.value)], series={"x": [0, 1], "y": [0, 1]})
+
+    def draw(self, axes, series):
+        axes.plot(series["x"], series["y"], label="line")
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    monkeypatch.setattr(shelf, "claims", lambda: {"T1": Toy})
+    monkeypatch.setattr(Toy, "calls", 0)
+    return Toy
+
+
+def test_results_are_kept_and_measured_again_when_asked(toy, tmp_path, capsys):
+    words = ["claims", "t1", f"results_dir={tmp_path}"]
+    assert cli.main(words) == 0
+    assert cli.main(words) == 0
+    assert toy.calls == 1
+    assert "as stored" in capsys.readouterr().out
+    assert cli.main([*words, "--again"]) == 0
+    assert toy.calls == 2
+    names = {path.name for path in (tmp_path / "claims").iterdir()}
+    assert {"T1.json", "T1.png", "claims.md", "claims.csv", "claims.tex", "claims.html"} <= names
+    assert "one is one" in (tmp_path / "claims" / "claims.html").read_text()
+    assert r"T1 & here & one & 1.00 & 1.000 & reproduced \\" in (tmp_path / "claims" / "claims.tex").read_text()
+
+
+def test_a_spoilt_file_or_other_code_is_measured_again(toy, tmp_path):
+    words = ["claims", f"results_dir={tmp_path}"]
+    cli.main(words)
+    path = tmp_path / "claims" / "T1.json"
+    path.write_text(path.read_text()[:50])
+    cli.main(words)
+    assert toy.calls == 2
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"key": "of other code"}))
+    cli.main(words)
+    assert toy.calls == 3
+
+
+def test_a_wrong_claim_and_a_broken_one_give_exit_status_1(toy, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(toy, "value", 1.05)
+    assert cli.main(["claims", f"results_dir={tmp_path}"]) == 1
+    assert "published 1.00, measured 1.05" in capsys.readouterr().out
+    monkeypatch.setattr(toy, "value", None)
+    assert cli.main(["claims", "--again", f"results_dir={tmp_path}"]) == 1
+    assert "ValueError: no value" in capsys.readouterr().out
+
+
+def test_names_options_and_folders_are_checked(capsys):
+    for words, said in (
+        (["C33"], "'C3'"),
+        (["--fast"], "--quick"),
+        (["folder=x"], "results_dir"),
+        (["results_dir="], "results_dir"),
+    ):
+        assert cli.main(["claims", *words]) == 2
+        assert said in capsys.readouterr().err
+    assert cli.main(["claims", "--list", "--quick"]) == 0
+    assert "C19" in capsys.readouterr().out
+
+
+def test_claims_of_other_packages_are_found(monkeypatch):
+    point = SimpleNamespace(name="toys", load=lambda: Toy)
+    monkeypatch.setattr(shelf, "entry_points", lambda group: [point] if group == shelf.ENTRY_POINT_GROUP else [])
+    shelf.claims.cache_clear()
+    try:
+        assert list(shelf.claims())[-1] == "T1"
+    finally:
+        shelf.claims.cache_clear()
+
+
+def test_every_claim_says_what_where_and_why():
+    for name, claim in shelf.claims().items():
+        assert claim.lesson in shelf.LESSONS, name
+        assert all((claim.statement, claim.source, claim.learned, all(claim.labels))), name
+
+
+def test_measured_intervals_of_sampled_moments_cover():
+    from bench.claims.pieces import spread
+
+    draw = np.random.default_rng(0)
+    z = []
+    for _ in range(200):
+        variance, error = spread(draw.standard_normal((2000, 2)))
+        z.append((variance - 2.0) / error)
+    assert np.std(z) == pytest.approx(1.0, abs=0.2)  # 0.2: 200 draws, Student with 49 degrees

@@ -1,0 +1,284 @@
+"""Optimizers against their closed forms, torch.optim, optax and the constants of cma."""
+
+import math
+
+import numpy as np
+import pytest
+from bench.plugins.optimizers.adam import Adam
+from bench.plugins.optimizers.cem import Cem
+from bench.plugins.optimizers.cma_es import CmaEs, constants
+from bench.plugins.optimizers.gauss_newton import GaussNewton
+from bench.plugins.optimizers.gradient_descent import GradientDescent
+from bench.plugins.optimizers.lbfgs import Lbfgs
+from bench.plugins.optimizers.line_search import LineSearch
+from bench.plugins.optimizers.momentum import Momentum
+from bench.plugins.optimizers.mppi import Mppi
+from scipy.stats import norm
+
+from bench.conformance import optimizers as kit
+from bench.conformance.kit import Failed
+from bench.model import Answer
+
+SAMPLES = 400_000
+"""Samples of the population methods' limits: the mean of a normal is then known to 0.0016 standard deviations."""
+LIMIT = 0.01
+"""Six standard errors at that many samples."""
+SAME = 1e-12
+"""Relative difference from other implementations of the same formula, after 100 updates."""
+
+
+def gradients(dim=5, steps=100):
+    """Gradients of any size, some of them above every limit."""
+    rng = np.random.default_rng(1)
+    return rng.standard_normal((steps, dim)) * np.exp(rng.standard_normal((steps, 1)))
+
+
+def path(optimizer, found):
+    state = optimizer.start(np.ones(found.shape[1]))
+    for gradient in found:
+        points = optimizer.ask(state, np.empty((found.shape[1], 0)))
+        state = optimizer.tell(state, points, Answer(gradient=gradient[:, None]))
+    return state["theta"]
+
+
+CASES = {
+    "gradient_descent": (GradientDescent(rate=0.02), lambda t, p: t.optim.SGD([p], lr=0.02), lambda o: o.sgd(0.02)),
+    "momentum": (
+        Momentum(rate=0.02),
+        lambda t, p: t.optim.SGD([p], lr=0.02, momentum=0.9),
+        lambda o: o.sgd(0.02, momentum=0.9),
+    ),
+    "nesterov": (
+        Momentum(rate=0.02, nesterov=True),
+        lambda t, p: t.optim.SGD([p], lr=0.02, momentum=0.9, nesterov=True),
+        lambda o: o.sgd(0.02, momentum=0.9, nesterov=True),
+    ),
+    "adam": (Adam(rate=0.02), lambda t, p: t.optim.Adam([p], lr=0.02), lambda o: o.adam(0.02)),
+    "adam, clipped by norm": (
+        Adam(rate=0.02, clip=1.0),
+        lambda t, p: t.optim.Adam([p], lr=0.02),
+        lambda o: o.chain(o.clip_by_global_norm(1.0), o.adam(0.02)),
+    ),
+    "adam, clipped by element": (
+        Adam(rate=0.02, clip=0.5, clip_by="element"),
+        lambda t, p: t.optim.Adam([p], lr=0.02),
+        lambda o: o.chain(o.clip(0.5), o.adam(0.02)),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_100_updates_are_those_of_torch(case):
+    torch = pytest.importorskip("torch")
+    optimizer, theirs, _ = CASES[case]
+    parameter = torch.ones(5, dtype=torch.float64, requires_grad=True)
+    method = theirs(torch, parameter)
+    for gradient in gradients():
+        parameter.grad = torch.tensor(gradient)
+        if optimizer.clip is not None:
+            if optimizer.clip_by == "norm":
+                # not torch's own function, which divides by norm + 1e-6
+                parameter.grad *= min(1.0, optimizer.clip / float(np.linalg.norm(gradient)))
+            else:
+                torch.nn.utils.clip_grad_value_([parameter], optimizer.clip)
+        method.step()
+    assert path(optimizer, gradients()) == pytest.approx(parameter.detach().numpy(), rel=SAME)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_100_updates_are_those_of_optax(case):
+    optax = pytest.importorskip("optax")
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    optimizer, _, theirs = CASES[case]
+    method = theirs(optax)
+    theta = jax.numpy.ones(5)
+    state = method.init(theta)
+    for gradient in gradients():
+        moves, state = method.update(jax.numpy.asarray(gradient), state)
+        theta = optax.apply_updates(theta, moves)
+    assert path(optimizer, gradients()) == pytest.approx(np.asarray(theta), rel=SAME)
+
+
+@pytest.mark.parametrize(("share", "move", "factor"), [(0.1, -1.754983, 0.169135), (0.2, -1.399810, 0.218643)])
+def test_cem_on_a_linear_cost(share, move, factor):
+    """The mean moves by -sigma phi(z)/rho, the variance by 1 - z phi/rho - (phi/rho)^2 (z the quantile of rho)."""
+    z = norm.ppf(share)
+    assert move == pytest.approx(-norm.pdf(z) / share, abs=1e-6)
+    optimizer = Cem(population=SAMPLES, elites=int(share * SAMPLES), width=0.7)
+    state = optimizer.start(np.array([2.0, 0.0]))
+    points = optimizer.ask(state, np.random.default_rng(0).standard_normal((2, SAMPLES)))
+    after = optimizer.tell(state, points, Answer(value=3.0 * points[0]))
+    assert after["theta"] == pytest.approx([2.0 + 0.7 * move, 0.0], abs=LIMIT)
+    assert (after["deviation"] / 0.7) ** 2 == pytest.approx([factor, 1.0], abs=LIMIT)
+    wide = Cem(population=SAMPLES, elites=int(share * SAMPLES), width=0.7, spread="old")
+    square = (wide.tell(state, points, Answer(value=3.0 * points[0]))["deviation"] / 0.7) ** 2
+    assert square[0] == pytest.approx(factor + move**2, abs=2 * LIMIT)
+
+
+def test_mppi_on_a_bowl():
+    """With H = 1, lambda = .1, S = .09 the mean goes from 0 to .473684 of the way."""
+    optimizer = Mppi(population=SAMPLES, width=0.3, temperature=0.1, relative=False)
+    state = optimizer.start(np.zeros(1))
+    points = optimizer.ask(state, np.random.default_rng(0).standard_normal((1, SAMPLES)))
+    after = optimizer.tell(state, points, Answer(value=0.5 * (points[0] - 2.0) ** 2))
+    assert after["theta"] == pytest.approx([2 * 0.473684], abs=LIMIT)
+
+
+def test_mppi_at_a_high_temperature_is_a_gradient_step():
+    optimizer = Mppi(population=SAMPLES, width=0.3, temperature=100.0, relative=False)
+    state = optimizer.start(np.array([1.0]))
+    points = optimizer.ask(state, np.random.default_rng(0).standard_normal((1, SAMPLES)))
+    after = optimizer.tell(state, points, Answer(value=5.0 * points[0] ** 2))
+    # S / lambda times the gradient 10; the error is that of the mean of the samples
+    assert after["theta"] == pytest.approx([1.0 - 0.09 / 100 * 10.0], abs=6 * 0.3 / math.sqrt(SAMPLES))
+
+
+def test_noise_floor_of_gradient_descent():
+    """E J - J* = a v / (2 (2 - a k)) on k theta^2 / 2 with gradient variance v: variance too sets the final cost."""
+    rate, k, v, rng = 0.3, 2.0, 0.5, np.random.default_rng(3)
+    paths = 4000
+    optimizer = GradientDescent(rate=rate)
+    state = optimizer.start(np.zeros(paths))  # paths that do not touch, side by side
+    costs = []
+    for i in range(300):
+        noisy = k * state["theta"] + math.sqrt(v) * rng.standard_normal(paths)
+        state = optimizer.tell(state, state["theta"][:, None], Answer(gradient=noisy[:, None]))
+        if i >= 100 and i % 20 == 0:  # (1 - a k)^20: nothing is left of the last one
+            costs.append(0.5 * k * state["theta"] ** 2)
+    found = np.concatenate(costs)
+    error = found.std() / math.sqrt(found.size)
+    assert abs(found.mean() - rate * v / (2 * (2 - rate * k))) < 4 * error
+
+
+def test_clipping_each_step_keeps_the_sign_only():
+    """A soft step of slope 2/nu on a share p: clipped at c, the expected gradient is c p."""
+    optimizer = GradientDescent(rate=1.0, clip=0.1)
+    assert path(optimizer, np.array([[50.0], [0.0], [-50.0], [50.0]])) == pytest.approx([1.0 - 0.1])
+
+
+def test_decay_of_the_rate():
+    assert path(GradientDescent(rate=1.0, decay=1.0), np.ones((4, 1))) == pytest.approx(
+        [1 - (1 + 1 / 2 + 1 / 3 + 1 / 4)]
+    )
+
+
+@pytest.mark.parametrize(("dim", "population"), [(2, 6), (5, 8), (10, 10), (100, 17)])
+def test_constants_of_cma(dim, population):
+    """At the default populations; for larger ones cma damps the step size more."""
+    cma = pytest.importorskip("cma")
+    search = cma.CMAEvolutionStrategy(dim * [0.0], 1.0, {"popsize": population, "verbose": -9, "seed": 1})
+    search.adapt_sigma.initialize(search)
+    theirs, size, ours = search.sp, search.adapt_sigma, constants(dim, population)
+    assert ours.weights == pytest.approx(list(theirs.weights)[: population // 2], rel=SAME)
+    assert ours.mu_eff == pytest.approx(theirs.weights.mueff, rel=SAME)
+    assert (ours.c_c, ours.c_1, ours.c_mu) == pytest.approx((theirs.cc, theirs.c1, theirs.cmu), rel=SAME)
+    assert (ours.c_sigma, ours.d_sigma) == pytest.approx((size.cs, size.damps), rel=SAME)
+
+
+def test_cma_es_on_a_narrow_valley():
+    optimizer, scale = CmaEs(width=0.5), np.logspace(0, 3, 6)
+    state = optimizer.start(np.ones(6))
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        points = optimizer.ask(state, rng.standard_normal((6, optimizer.draws(6))))
+        state = optimizer.tell(state, points, Answer(value=scale @ points**2))
+    assert scale @ state["theta"] ** 2 < 1e-12  # from 1500
+
+
+@pytest.mark.parametrize("optimizer", [Lbfgs(), LineSearch(first=1.0, shrink=0.5, slope=1e-4, tries=20)])
+def test_searches_with_steps_descend_on_a_banana(optimizer):
+    state = optimizer.start(np.array([-1.2, 1.0]))
+    costs = [banana(state["theta"][:, None])[0][0]]
+    for _ in range(200):
+        points = optimizer.ask(state, np.empty((2, 0)))
+        value, gradient = banana(points)
+        wanted = optimizer.wants(state)
+        known = {"value": value, "gradient": gradient}
+        state = optimizer.tell(state, points, Answer(**{name: known[name] for name in wanted}))
+        costs.append(banana(state["theta"][:, None])[0][0])
+    assert (np.diff(costs) <= 0).all()
+    assert costs[-1] < (1e-12 if isinstance(optimizer, Lbfgs) else 5.0)
+
+
+def banana(x):
+    cost = 100 * (x[1] - x[0] ** 2) ** 2 + (1 - x[0]) ** 2
+    return cost, np.stack([-400 * x[0] * (x[1] - x[0] ** 2) - 2 * (1 - x[0]), 200 * (x[1] - x[0] ** 2)])
+
+
+def test_gauss_newton_takes_back_a_bad_step():
+    optimizer = GaussNewton()
+    state = optimizer.start(np.array([3.0]))
+    for _ in range(60):
+        x = optimizer.ask(state, np.empty((1, 0)))
+        state = optimizer.tell(state, x, Answer(residual=np.arctan(x), jacobian=(1 / (1 + x**2))[:, None]))
+    assert abs(state["theta"][0]) < 1e-6  # undamped steps diverge from |x| > 1.39
+
+
+def test_gauss_newton_where_only_a_ratio_is_known():
+    optimizer = GaussNewton()
+    state = optimizer.start(np.array([1.0, 1.0]))
+    for _ in range(60):
+        a, b = optimizer.ask(state, np.empty((2, 0)))[:, 0]
+        answer = Answer(residual=np.array([[a / b - 2.0]]), jacobian=np.array([[[1 / b], [-a / b**2]]]))
+        state = optimizer.tell(state, np.array([[a], [b]]), answer)
+    assert state["theta"][0] / state["theta"][1] == pytest.approx(2.0)
+
+
+def test_nothing_finite_is_no_step():
+    for optimizer in (Cem(population=4, elites=2), Mppi(population=4), CmaEs(population=4)):
+        state = optimizer.start(np.zeros(2))
+        points = optimizer.ask(state, np.random.default_rng(0).standard_normal((2, 4)))
+        after = optimizer.tell(state, points, Answer(value=np.full(4, np.nan)))
+        assert np.isfinite(after["theta"]).all()
+
+
+# ------------------------------------------------------------------------------------------------ planted faults
+
+
+class Forgetful(GradientDescent):
+    """It keeps the iteration outside its state."""
+
+    def step(self, state, gradient):
+        counts = self.__dict__.setdefault("counts", [0])
+        counts[0] += 1
+        return {"theta": state["theta"] - 0.1 / counts[0] * gradient, "iteration": 0}
+
+
+class Careless(GradientDescent):
+    """It changes the state it was given."""
+
+    def step(self, state, gradient):
+        state["theta"] -= 0.1 * gradient
+        return {"theta": state["theta"].copy(), "iteration": state["iteration"]}
+
+
+class Greedy(Cem):
+    """It declares a need that it never has."""
+
+    needs = frozenset({"value", "gradient"})
+
+    def wants(self, state):
+        return frozenset({"value"})
+
+
+class Climbing(GradientDescent):
+    """The wrong sign."""
+
+    def step(self, state, gradient):
+        return {"theta": state["theta"] + 0.1 * gradient, "iteration": 0}
+
+
+@pytest.mark.parametrize(
+    ("fault", "check", "message"),
+    [
+        (Forgetful(), kit.path_repeats_after_a_stop, "takes another path"),
+        (Careless(), kit.state_is_left_alone, "has changed the state"),
+        (Greedy(), kit.needs_are_declared, "declares"),
+        (Climbing(), kit.descends_on_a_bowl, "the cost goes from"),
+    ],
+)
+def test_kit_catches(fault, check, message):
+    with pytest.raises(Failed, match=message):
+        check(fault)

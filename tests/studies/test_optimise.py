@@ -1,0 +1,352 @@
+"""The study of searches: known optima, stops, refusals, tables and charts, and the statistics that sum them up."""
+
+import math
+
+import numpy as np
+import pytest
+from bench.plugins.scenes.lqr import Lqr
+from bench.plugins.scenes.static_gain import StaticGain
+from bench.plugins.scenes.two_balls import TwoBalls
+
+import bench
+from bench.cli import main
+from bench.measure import performance
+from bench.measure.solve import solve
+from bench.studies.optimise import races
+from bench.studies.optimise.measure import compared
+from bench.sweep import config
+from bench.sweep.execute import store_of
+from bench.sweep.grid import cells
+from bench.sweep.plan import plan
+from bench.sweep.session import Session
+from bench.sweep.study import study_of
+
+CHECKED = 1e-6
+"""Relative agreement with the checked optima."""
+
+
+# --------------------------------------------------------------------------------------------------- known optima
+
+
+def lqr_by_hand(kind):
+    """J* of the double integrator from a Riccati recursion written here, for one discretisation."""
+    h = 0.05
+    a = np.array([[1.0, h], [0.0, 1.0]])
+    b = {"semi_implicit": [[h * h], [h]], "explicit": [[0.0], [h]], "zoh": [[h * h / 2], [h]]}[kind]
+    b, p, q = np.array(b), np.diag([10.0, 1.0]), np.diag([1.0, 0.1])
+    for _ in range(100):
+        p = q + a.T @ p @ a - a.T @ p @ b @ np.linalg.inv(0.01 + b.T @ p @ b) @ b.T @ p @ a
+    return p[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "least"), [("semi_implicit", 10.988683643), ("zoh", 11.477231463), ("explicit", 11.988683643)]
+)
+def test_checked_optima_of_the_regulator(kind, least):
+    assert lqr_by_hand(kind) == pytest.approx(least, rel=1e-9)
+
+
+def test_regulator_knows_its_optimum_and_value():
+    least, _ = Lqr().optimum()
+    assert least == pytest.approx(lqr_by_hand("semi_implicit"), rel=1e-12)
+    problem = bench.problem("lqr[horizon=12]", backend="numpy")
+    scene = problem.program.scene
+    found = solve(problem)
+    assert found.certified
+    assert found.cost == pytest.approx(scene.optimum()[0], rel=CHECKED)
+    path = problem.trajectory(found.theta, np.zeros((12, 1))).states[:, :, 0]
+    # what is left to pay on the optimal path is the value of the state reached
+    for step in (0, 5, 12):
+        rest = [
+            scene.stage_cost(np, path[t, :1, None], path[t, 1:, None], found.theta[t : t + 1, None])[0]
+            for t in range(step, 12)
+        ]
+        rest.append(scene.terminal_cost(np, path[12, :1, None], path[12, 1:, None])[0])
+        assert scene.cost_to_go(path[step, :1, None], path[step, 1:, None], step)[0] == pytest.approx(
+            sum(rest), rel=CHECKED
+        )
+
+
+def test_scalar_regulator():
+    """A = B = Q = 1, R = .1, Q_f = 10, T = 10: J* 1.0916079783, J(0) 20, and 100 copies of it with one constant gain."""
+    scene = StaticGain(copies=1)
+    assert scene.cost_to_go(np.zeros((1, 1)), np.ones((1, 1)), 0)[0] == pytest.approx(1.0916079783, rel=1e-9)
+    assert StaticGain(copies=100).optimum()[0] == pytest.approx(109.1607978, rel=1e-9)
+    problem = bench.problem("static_gain[copies=3]", backend="numpy")
+    costs = problem.value(
+        np.stack([np.zeros(9), np.full(9, -0.9160798 / 3), -0.9160798 * np.eye(3).ravel()], axis=1), np.zeros((9, 3))
+    )
+    assert costs == pytest.approx([60.0, 3.274823934, 3.274823934], rel=1e-8)  # every K with K 1 = -.9160798
+
+
+def test_two_balls():
+    assert TwoBalls().optimum()[0] == pytest.approx(1.39654216, rel=1e-8)
+    problem = bench.problem("two_balls", contact="impulse", backend="numpy")
+    assert problem.value(np.zeros(240), np.zeros((240, 1)))[0] == pytest.approx(2.0)
+    assert TwoBalls(effort=10.0).optimum()[0] == 2.0  # no blow is worth it
+
+
+@pytest.mark.parametrize(
+    ("scene", "start", "least"),
+    [("pendulum_swing[dt=0.02]", 2008.0153, 872.590419), ("pendulum_swing", 2022.303027, 349.49046)],
+)
+@pytest.mark.slow
+def test_newton_finds_the_checked_optima(scene, start, least):
+    problem = bench.problem(scene)
+    found = solve(problem)
+    assert problem.value(problem.program.theta0, np.zeros((200, 1)))[0] == pytest.approx(start, rel=CHECKED)
+    assert found.cost == pytest.approx(least, rel=CHECKED)
+    assert found.certified
+
+
+@pytest.mark.slow
+def test_newton_on_a_soft_push():
+    problem = bench.problem(
+        "pushing[horizon=400,dt=0.005,velocity_factor=0.998]", contact="penalty[stiffness=10]", theta0=[0.1] * 400
+    )
+    assert problem.value(problem.program.theta0, np.zeros((400, 1)))[0] == pytest.approx(2374.89381, rel=CHECKED)
+    assert solve(problem).cost == pytest.approx(1126.585263, rel=CHECKED)
+
+
+def test_a_cost_without_lower_bound_has_no_optimum():
+    found = solve(bench.problem("linear", backend="numpy"), steps=2)
+    assert not found.certified
+    assert found.cost == -math.inf
+
+
+# ------------------------------------------------------------------------------------------------------ a search
+
+WORDS = [
+    "name=small", "study=optimise[budget=600,gradient_cost=1,quality_samples=64]", "scenes=[quadratic]", "backends=[numpy]",
+    "estimators=[fobg,reinforce]", "optimizers=[gradient_descent,cem[population=20,elites=5]]", "sweep.rate=[0.01,0.1]",
+    "sweep.seed=[0,1]", "samples=8", "repeats=4", "workers=0",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("optimise")
+    assert main([*WORDS, f"results_dir={folder}"]) == 0
+    return folder / "small", config.load([*WORDS, f"results_dir={folder}"])
+
+
+def test_a_search_looking_at_costs_only_is_run_once_for_all_estimators(finished):
+    rows = bench.load(finished[0])
+    counts = rows.groupby(["estimator", "optimizer"]).size()
+    assert counts[("", "cem[elites=5,population=20]")] == 2
+    assert len(rows) == 2 + 2 * 2 * 2
+
+
+def test_paths_end_at_the_budget_and_near_the_optimum(finished):
+    rows = bench.load(finished[0])
+    assert set(rows["stopped"]) == {"budget"}
+    spent = rows["rollouts"] + rows["gradients"]
+    assert ((spent >= 600) & (spent < 650 + 100)).all()
+    good = rows[(rows["estimator"] == "fobg") & (rows["rate"] == 0.1)]
+    assert (good["score"] > 0.99).all()
+    assert (good["optimum"].abs() < 1e-12).all()
+    for _, row in rows.iterrows():
+        assert row["path_cost"][0] == row["start_cost"]
+        assert row["path_cost"][-1] == row["final_cost"]
+        assert list(row["path_rollouts"]) == sorted(row["path_rollouts"])
+
+
+def measured(*words, folder):
+    experiment = one(*words, f"results_dir={folder}")
+    (cell,) = cells(experiment)
+    return study_of(experiment).measure(cell, Session(experiment))
+
+
+def test_the_same_search_twice(tmp_path):
+    words = ("study=optimise[budget=300,quality=none]", "samples=4", "optimizers=[cem]")
+    first, again = (measured(*words, folder=tmp_path) for _ in range(2))
+    assert first["path_cost"] == again["path_cost"]
+    assert measured(*words, "seed=1", folder=tmp_path)["path_cost"] != first["path_cost"]
+
+
+def test_tables_charts_and_page(finished):
+    folder, experiment = finished
+    for name in (
+        "optimise.csv",
+        "optimise.md",
+        "targets.csv",
+        "summary.csv",
+        "quality_runtime.png",
+        "anytime.png",
+        "targets.png",
+        "learning_rates.png",
+        "report.html",
+    ):
+        assert (folder / name).stat().st_size > 0, name
+    text = (folder / "optimise.md").read_text()
+    assert "Best score" in text
+    assert "cannot be told" in text  # two methods on one problem say nothing about gradients in general
+    found = races.races(experiment, bench.load(folder))
+    assert found.methods == ["fobg, gradient_descent", "cem[elites=5,population=20]", "reinforce, gradient_descent"]
+    assert found.chosen[found.problems[0], "fobg, gradient_descent"] == "rate=0.1"
+
+
+def one(*words):
+    return config.load(
+        ["scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "optimizers=[gradient_descent]", *words]
+    )
+
+
+def refusals(tmp_path, *words):
+    experiment = one(*words, f"results_dir={tmp_path}")
+    return [item.refusal[1] for item in plan(experiment, store_of(experiment)) if item.refusal]
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["study=optimise[target=10]", "scenes=[lqr]"], "target=10 is below the least cost 10.98868364 of scene lqr"),
+        (["study=optimise", "optimizers=[gauss_newton]"], "optimizer gauss_newton needs jacobian and residual, which scene quadratic"),
+    ],
+)  # fmt: skip
+def test_refused_when_planned(tmp_path, words, reason):
+    (said,) = refusals(tmp_path, *words)
+    assert said.startswith(reason)
+
+
+def test_estimator_without_gradients_is_refused(tmp_path):
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "cost_only.py").write_text(COST_ONLY)
+    (said,) = refusals(tmp_path, "study=optimise", f"plugins=[{tmp_path}/plugins]", "estimators=[cost_only]")
+    assert said == "optimizer gradient_descent needs gradient, which estimator cost_only does not give"
+
+
+COST_ONLY = '''
+from dataclasses import dataclass
+import numpy as np
+from bench import Estimator, param
+
+@dataclass(frozen=True)
+class CostOnly(Estimator):
+    """It knows costs."""
+    name = "cost_only"
+    gives_gradient = False
+
+    def estimate(self, problem, theta, noise):
+        """No."""
+        raise NotImplementedError
+'''
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("study=optimise[budget=0]", r"optimise.budget=0 must be greater than 0"),
+        ("study=optimise[scored=best]", r"unknown value for optimise.scored: 'best'"),
+        ("optimizers=[adma]", r"unknown optimizer 'adma'; did you mean 'adam'"),
+        ("optimizer.cem.elite=3", r"unknown parameter of optimizer cem 'elite'; did you mean 'elites'"),
+    ],
+)
+def test_bad_input_is_named(word, message):
+    with pytest.raises(bench.UserError, match=message):
+        one("study=optimise", word)
+
+
+@pytest.mark.parametrize(
+    ("words", "stopped"),
+    [
+        (["study=optimise[target=0.5,quality=none]"], "target"),
+        (["study=optimise[patience=5,quality=none]", "optimizer.gradient_descent.rate=1e-18"], "plateau"),
+        (["study=optimise[quality=none]", "optimizer.gradient_descent.rate=10"], "diverged"),
+        (["study=optimise[quality=none,iterations=3]"], "budget"),
+    ],
+)
+def test_what_ends_a_search(tmp_path, words, stopped):
+    row = measured(*words, "samples=4", folder=tmp_path)
+    assert row["stopped"] == stopped
+    assert row["status"] == ("diverged" if stopped == "diverged" else "ok")
+
+
+def test_smaller_noise_is_that_of_a_smaller_sigma():
+    """The schedule's problem gives the estimates of a scene that has the smaller sigma."""
+    from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
+    from bench.plugins.estimators.reinforce import Reinforce
+
+    from bench.studies.optimise.measure import Quieter
+
+    noise = np.random.default_rng(0).standard_normal((2, 16, 5))
+    for scene, policy in (("cubic", False), ("cartpole[horizon=5,sigma=0.4]", True)):
+        wide = bench.problem(scene if policy else "cubic[sigma=0.4]", backend="numpy")
+        narrow = bench.problem(scene.replace("0.4", "0.1") if policy else "cubic[sigma=0.1]", backend="numpy")
+        theta = wide.program.theta0
+        for estimator in (Reinforce(), RandomizedSmoothing()):
+            expected = estimator.estimate(narrow, theta, noise)
+            assert estimator.estimate(Quieter(wide, 0.25), theta, noise) == pytest.approx(expected, rel=1e-6)
+
+
+def test_quality_subtracts_noise():
+    rng = np.random.default_rng(0)
+    terms = 3.0 + rng.standard_normal((4, 200_000))
+    unbiased = compared(3.0 + 0.5 * rng.standard_normal((4000, 4)), terms)
+    assert unbiased["rmse_rel"] == pytest.approx(0.5 / 3.0, rel=0.02)
+    assert unbiased["bias_share"] < 0.01
+    biased = compared(4.0 + 0.5 * rng.standard_normal((4000, 4)), terms)
+    assert biased["bias_share"] == pytest.approx(1.0 / 1.25, rel=0.02)
+
+
+# ---------------------------------------------------------------------------------------------------- statistics
+
+
+def test_wilson_covers():
+    rng = np.random.default_rng(0)
+    for n, p in ((10, 0.3), (40, 0.9), (25, 0.5)):
+        intervals = [performance.wilson(k, n) for k in rng.binomial(n, p, 2000)]
+        share = np.mean([low <= p <= high for low, high in intervals])
+        assert 0.91 < share < 0.99  # discrete: nominal 0.95
+    assert performance.wilson(0, 10)[0] == 0.0
+    assert performance.wilson(10, 10)[1] == 1.0
+
+
+def test_average_runtime_counts_failures():
+    spent, reached = np.array([10.0, 100.0, 30.0]), np.array([True, False, True])
+    assert performance.average_runtime(spent, reached) == 70.0
+    assert math.isinf(performance.average_runtime(spent, np.zeros(3, dtype=bool)))
+    # restarts draw from the same law: their mean is the average runtime
+    times = performance.runtimes(spent, reached, 40_000)
+    assert times.mean() == pytest.approx(70.0, rel=0.03)
+    assert np.isinf(performance.runtimes(spent, np.zeros(3, dtype=bool), 5)).all()
+
+
+def test_interquartile_mean_by_hand():
+    assert performance.interquartile_mean(np.array([1.0, 2, 3, 4, 5, 6])) == pytest.approx(
+        (2 * 0.5 + 3 + 4 + 5 * 0.5) / 3
+    )
+    assert performance.interquartile_mean(np.arange(8.0)) == pytest.approx(3.5)
+
+
+def test_spearman_is_scipys_and_a_miss_ranks_last():
+    from scipy.stats import spearmanr
+
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, 6, 30).astype(float), rng.standard_normal(30)
+    assert performance.spearman(x, y) == pytest.approx(spearmanr(x, y).statistic, rel=1e-12)
+    assert performance.ranks(np.array([3.0, np.inf, 1.0, np.inf])).tolist() == [2.0, 3.5, 1.0, 3.5]
+    assert math.isnan(performance.spearman(np.ones(5), np.arange(5.0)))
+
+
+def test_few_points_in_order_are_not_a_finding():
+    pairs = [np.array([[0.0, 0.0], [1.0, 1.0]])] * 2
+    assert performance.spearman_interval(pairs)[0] > 0.0  # the bootstrap is sure
+    assert performance.spearman_chance(pairs) > 0.2  # and should not be
+    assert performance.spearman_chance([np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])] * 4) < 0.02
+
+
+def test_bootstrap_interval_of_a_mean_covers():
+    rng = np.random.default_rng(1)
+    hits = 0
+    for seed in range(200):
+        low, high = performance.bootstrap(
+            [rng.standard_normal(30) + 1.0], lambda parts: float(parts[0].mean()), seed, 200
+        )
+        hits += low <= 1.0 <= high
+    assert hits / 200 > 0.88
+
+
+def test_cells_differ_by_optimizer_parameters():
+    made = cells(one("study=optimise", "sweep.rate=[0.1,0.2]"))
+    assert len({cell.key for cell in made}) == 2
