@@ -25,7 +25,7 @@ from bench.model.estimator import (
 )
 from bench.model.integrator import Integrator
 from bench.model.known import KnownOptimum, KnownValue
-from bench.model.ops import Array, LoopOps, Ops, State
+from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
@@ -92,5 +92,6 @@ __all__ = [
     "param",
     "per_repeat",
     "rollout",
+    "stopped",
     "zeroth_order",
 ]

@@ -62,6 +62,9 @@ class Estimator(Plugin):
         missing = self.needs - provides
         if missing:
             return f"{self.name} needs {', '.join(sorted(missing))}, which {backend} lacks"
+        if "grad" in self.needs and program.surrogate and "surrogate" not in provides:
+            law = program.contact.name if program.contact else ""
+            return f"{self.name} needs the surrogate gradient of contact law {law}, and {backend} takes differences of costs"
         if "score" in self.needs and program.explicit:
             start = f"theta sets the initial state of {program.scene.name} while noise is on the actions, so "
             if not self.adds_explicit:

@@ -100,6 +100,11 @@ class Program(ABC):
         """Whether the cost is continuous in theta."""
         return self.scene.continuous and (self.contact is None or self.contact.continuous)
 
+    @property
+    def surrogate(self) -> bool:
+        """Whether its gradient is, by its contact law's design, not the derivative of the program."""
+        return self.contact is not None and self.contact.surrogate
+
     @cached_property
     def theta0(self) -> np.ndarray:
         """The decision variable at which gradients are taken, ``(d,)``."""
