@@ -1,9 +1,10 @@
 """Compare gradient estimators through physics simulation: bias, variance and cost against a certified gradient.
 
-The Python face (:func:`run`, :func:`load`, :func:`problem`, :func:`estimate`) and the contracts that plugin authors import.
+The Python face (:func:`run`, :func:`load`, :func:`problem`, :func:`estimate`, :func:`examine`) and the contracts that plugin authors import.
 """
 
 from bench.errors import StorageError, UserError
+from bench.examine import Report, examine
 from bench.face import Estimates, estimate, load, problem, run
 from bench.model import *  # noqa: F403
 from bench.model import __all__ as _contracts
@@ -22,11 +23,13 @@ __all__ = [
     "Estimates",
     "Experiment",
     "Judged",
+    "Report",
     "Session",
     "StorageError",
     "Study",
     "UserError",
     "estimate",
+    "examine",
     "load",
     "problem",
     "run",

@@ -30,6 +30,19 @@ Settings: scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[.
 STATUS = """\
 Exit status: 0 every cell has a row that is not 'error'; 1 some cell failed unexpectedly; 2 bad input.
 """
+EXAMINE = """\
+  theta=1,0            where: numbers, names with numbers (mass:1,gain:2), or a name in the file; by default theta
+  grad=jax             jax, torch, or a function: a name in the file, or FILE:NAME; without it, differences alone
+  sigma=0.003,0.05     standard deviations of noise on theta
+  noise=200            the cost is cost(theta, w), with w of that many standard normal numbers
+  budget=60s           time for everything
+  batch=loop           how it takes several thetas: loop, vmap, columns (d, B) or rows (B, d); by default detected
+  scale=1,0.1          the size of each input; by default its own
+  seed=0               of the random directions and noise
+  save=DIR             write text, tables, charts and report.html there
+  --quiet              no progress
+Exit status: 0 the gradient can be trusted; 1 something cannot; 2 bad input.
+"""
 QUIET, CONFIG_DIR = "--quiet", "--config-dir"
 
 
@@ -336,6 +349,13 @@ def _compare(words: list[str]) -> int:
     return compare.main(words)
 
 
+def _examine(words: list[str]) -> int:
+    """Examine a simulator of one's own."""
+    from bench.examine import command
+
+    return command.main(words)
+
+
 def _history(words: list[str]) -> int:
     """Follow results over versions in one chart."""
     from bench.compare import history
@@ -367,6 +387,10 @@ VERBS = {
     "gradcheck": Verb(
         _gradcheck, "gradcheck SCENE ... [key=value ...]", "gradients against differences of the cost, and what is wrong",
         f"Exit status 1 when a gradient must not be used.\n{SETTINGS}",
+    ),
+    "examine": Verb(
+        _examine, "examine FILE:COST [key=value ...]", "your own simulator: its gradient, jumps, and what to use",
+        EXAMINE,
     ),
     "trace": Verb(
         _trace, "trace SCENE ... [key=value ...]", "one rollout: do gradient spikes line up with contact switches?",

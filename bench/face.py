@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -203,6 +203,7 @@ def estimate(
     estimates, decided = method.explained(problem, program.theta0, w)
     values = np.asarray(estimates, dtype=np.float64)
     truth = reference.certify(problem, problem.provides, reference_samples, tolerance)
-    return Estimates(
-        values, truth.gradient, truth.method, statistics.summarise(values, truth.known(), samples), decided
-    )
+    unbiased = method.declares_unbiased(program)
+    summary = statistics.summarise(values, truth.known(), samples, unbiased=unbiased)
+    summary = replace(summary, note="; ".join(part for part in (summary.note, truth.note) if part))
+    return Estimates(values, truth.gradient, truth.method, summary, decided)

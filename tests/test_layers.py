@@ -18,7 +18,7 @@ LAYERS = [
     ["sweep"],
     ["report"],
     ["studies", "trace"],
-    ["compare", "gallery", "benchself", "claims"],
+    ["compare", "gallery", "benchself", "examine", "claims"],
     ["face"],
     ["__init__"],
     ["cli"],

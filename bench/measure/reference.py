@@ -1,16 +1,19 @@
-"""Certified gradients: closed form, then quadrature, then long sampling with its own standard error."""
+"""Certified gradients: closed form, then quadrature, then long sampling, each with an error that is meant as a bound."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bench.measure import noise
-from bench.measure.statistics import Truth
-from bench.model import Problem
+from bench.measure.batches import in_columns
+from bench.measure.jumps import largest_jump
+from bench.measure.quadrature import integrate
+from bench.measure.statistics import Sampling, Truth, bias_interval, heavy_tails
+from bench.model import Problem, Program
 
 BATCHES = 64
 """Number of independent batch means that a sampled reference is stored as."""
@@ -19,9 +22,21 @@ COLUMNS = 4096
 
 One batch is also the budget for choosing the estimator of a sampled reference.
 """
+LEAST_SAMPLES = 16384
+"""Fewest samples of a sampled reference, where so many are allowed: a small spread of few samples proves nothing."""
 QUADRATURE_POINTS = 1 << 20
 QUADRATURE_TOLERANCE = 1e-3
-"""Relative error above which quadrature gives way to sampling."""
+"""Relative error above which quadrature is accepted only where sampling does no better."""
+TAIL_EVENTS = 10.0
+"""Samples that are expected in the tails whose contribution is estimated apart: too few to be shown by a spread."""
+DIRECTIONS = 16
+"""Directions in noise space whose tails and jumps are looked at: coordinates, and that of the largest mean effect."""
+FAR = 4.5
+"""Standard deviations to which jumps are looked for along a direction."""
+ROUNDING = 1e-9
+"""Share of a gradient below which first and zeroth order differ by rounding alone."""
+WARNED, REFUSED = 0.999, 1.0 - 1e-6
+"""Levels at which a difference between first and zeroth order is remarked on, and at which zeroth order is used."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +44,9 @@ class Reference:
     """A certified grad J_sigma.
 
     ``batches (K, d)`` are independent estimates whose mean is the gradient, or one row where it has no sampling
-    error. ``error`` bounds the norm of the error left by a deterministic method. ``plain (d,)`` is the program's
-    gradient at w = 0 and ``physical (d,)`` that of the physics it approximates; each is empty when unknown.
+    error. ``error`` is the norm of an error that their spread does not show: what a deterministic method may leave,
+    or what samples in the tails would change. ``plain (d,)`` is the program's gradient at w = 0 and ``physical (d,)``
+    that of the physics it approximates; each is empty when unknown. ``note`` says what could not be certified.
     """
 
     batches: np.ndarray
@@ -38,6 +54,7 @@ class Reference:
     error: float = 0.0
     plain: np.ndarray = field(default_factory=lambda: np.empty(0))
     physical: np.ndarray = field(default_factory=lambda: np.empty(0))
+    note: str = ""
 
     @property
     def gradient(self) -> np.ndarray:
@@ -45,9 +62,9 @@ class Reference:
         return self.batches.mean(axis=0)
 
     def known(self) -> Truth:
-        """Return the reference as the statistics take it: a mean and its sampling error."""
+        """Return the reference as the statistics take it: a mean, its sampling error, and what that does not show."""
         if len(self.batches) > 1:
-            return Truth.from_batches(self.batches)
+            return Truth.from_batches(self.batches, self.error)
         return Truth.exact(self.gradient, self.error)
 
     @property
@@ -65,9 +82,11 @@ def certify(
 ) -> Reference:
     """Compute the reference of a problem by the best method that applies.
 
-    Sampling stops at a standard error of ``tolerance`` times the gradient's norm, or after ``samples`` samples.
-    ``physical (d,)`` is the gradient that the program approximates, if known. A closed form belongs to the scene's own
-    program, so it is not used for a backend that ``provides`` physics of its own.
+    A closed form belongs to the scene's own program, so it is not used for a backend that ``provides`` physics of its
+    own. Quadrature takes noise of one or two dimensions on theta, unless the cost jumps in a plane at places that the
+    scene does not list; above a relative error of 0.1% it gives way to sampling, if that does better. Sampling stops at
+    an error of ``tolerance`` times the gradient's norm, or after ``samples`` samples. ``physical (d,)`` is the gradient
+    that the program approximates, if known.
     """
     program = problem.program
     theta = program.theta0
@@ -78,110 +97,225 @@ def certify(
     if closed is not None:
         found = Reference(np.asarray(closed, dtype=np.float64).reshape(1, -1), "closed_form")
     else:
-        quadrature = None
-        if program.n_noise <= 2 and program.noise_on_theta:
-            quadrature = _quadrature(problem, theta, min(QUADRATURE_POINTS, 64 * samples))
-        found = quadrature or _sampled(problem, theta, provides, samples, tolerance)
+        found = _computed(problem, theta, provides, samples, tolerance)
     if physical is None or "grad" not in provides:
         return found
     plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
-    return Reference(found.batches, found.method, found.error, plain, np.asarray(physical, dtype=np.float64))
+    return replace(found, plain=plain, physical=np.asarray(physical, dtype=np.float64))
 
 
-# ---------------------------------------------------------------------------------------------- quadrature
+def _computed(
+    problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float
+) -> Reference:
+    program = problem.program
+    quadrature = None
+    if program.noise_on_theta and program.n_noise <= (1 if _unlisted_jumps(program) else 2):
+        integral = integrate(problem, theta, min(QUADRATURE_POINTS, 64 * samples), COLUMNS)
+        if integral is not None:
+            method = f"quadrature[points={integral.points},spacing={integral.spacing:.2g}]"
+            quadrature = Reference(integral.gradient[None, :], method, integral.error)
+            if integral.error <= QUADRATURE_TOLERANCE * np.linalg.norm(integral.gradient):
+                return quadrature
+    sampled = _sampled(problem, theta, provides, samples, tolerance)
+    if quadrature is None:
+        return sampled
+    # a gradient near zero has no relative accuracy; what counts there is which method leaves less
+    if not np.isfinite(sampled.batches).all():
+        return quadrature
+    return sampled if 0.0 < sampled.known().standard_error < quadrature.error else quadrature
 
 
-def _quadrature(problem: Problem, theta: np.ndarray, points: int) -> Reference | None:
-    """Integrate E[(f(w) - f(0)) w] / sigma on Gauss-Legendre panels between breakpoints, refined until it settles.
-
-    The error is the change under the last halving of the panels. Returns None when the error stays above 0.1%.
-    """
-    width, dim = problem.program.n_noise, problem.dim
-    breaks = problem.program.breakpoints()
-    edges = []
-    for i in range(width):
-        inner = [(b - theta[i]) / problem.sigma for b in (breaks[i] if i < len(breaks) else ())]
-        # beyond 9 standard deviations the normal density is below 1e-17
-        edges.append(np.unique([-9.0, *(b for b in inner if abs(b) < 9.0), 9.0]))
-    # E[w] = 0, so subtracting f at w = 0 keeps the integral and loses fewer digits
-    centre = problem.value(theta, np.zeros((width, 1)))[0]
-    panels, previous, error = 16, None, math.inf
-    while (panels * 8) ** width <= points:
-        rules = [_panels(e, panels) for e in edges]
-        nodes = np.stack([axis.ravel() for axis in np.meshgrid(*(r[0] for r in rules), indexing="ij")])
-        weights = np.ones(1)
-        for _, weight in rules:
-            weights = np.outer(weights, weight).ravel()
-        f = problem.value(theta, nodes) - centre
-        gradient = nodes[:dim] @ (weights * f) / problem.sigma
-        if not np.isfinite(gradient).all():
-            return None
-        if previous is not None:
-            error = float(np.linalg.norm(gradient - previous))
-            if error <= 1e-10 * np.linalg.norm(gradient):
-                break
-        previous, panels = gradient, panels * 2
-    if previous is None or error > QUADRATURE_TOLERANCE * np.linalg.norm(gradient):
-        return None
-    return Reference(gradient[None, :], f"quadrature[points={nodes.shape[1]}]", error)
-
-
-def _panels(edges: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights (normal density included) of ``count`` 8-point Gauss-Legendre panels or a few more."""
-    x, w = np.polynomial.legendre.leggauss(8)
-    spans = np.diff(edges)
-    shares = np.maximum(1, np.round(count * spans / spans.sum()).astype(int))
-    cuts = np.unique(
-        np.concatenate([np.linspace(a, b, n + 1) for a, b, n in zip(edges, edges[1:], shares, strict=False)])
-    )
-    half = np.diff(cuts)[:, None] / 2
-    nodes = ((cuts[:-1, None] + half) + half * x).ravel()
-    return nodes, (half * w).ravel() * np.exp(-(nodes**2) / 2) / math.sqrt(2 * math.pi)
+def _unlisted_jumps(program: Program) -> bool:
+    """Whether the cost jumps at places that are not among the breakpoints: a contact law's, or those of no list."""
+    if program.contact is not None and not program.contact.continuous:
+        return True
+    return not program.continuous and not any(program.breakpoints())
 
 
 # ------------------------------------------------------------------------------------------------ sampling
 
 
+Terms = Callable[[np.ndarray], np.ndarray]
+"""Maps noise ``(n_w, B)`` to per-sample terms ``(d, B)`` whose expectation is the gradient."""
+
+
 def _sampled(
     problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float
 ) -> Reference:
-    """Sample with the valid estimator of lowest variance, in independent batches, cross-checked by zeroth order."""
+    """Sample with the valid estimator of lowest variance, in independent batches, held against zeroth order.
+
+    First order is valid where the cost is continuous. It gives way to zeroth order, with a note, where lines through the
+    samples find a jump, or the two disagree; both are unbiased otherwise.
+    """
     columns = min(COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
-    centre = problem.value(theta, np.zeros((problem.program.n_noise, 1)))
-    estimators: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-        "zeroth_order": lambda w: _antithetic(problem, theta, w, centre)
-    }
+    still = np.zeros((problem.program.n_noise, 1))
+    centre = problem.value(theta, still)
+    orders: dict[str, Terms] = {}
+    if not problem.program.explicit or "explicit" in provides:
+        orders["zeroth_order"] = lambda w: _antithetic(problem, theta, w, centre)
     if problem.program.continuous and "grad" in provides:
-        estimators["first_order"] = lambda w: problem.grad(theta, w)
-    pilots = {name: terms(_draw(problem, "pilot", columns, 0)) for name, terms in estimators.items()}
-    spread = {name: float(p.var(axis=1, ddof=1).sum()) for name, p in pilots.items() if np.isfinite(p).all()}
-    if not spread:
-        return Reference(np.full((1, problem.dim), math.nan), "sampling[failed: rollouts are not finite]", math.nan)
-    chosen = min(spread, key=lambda name: spread[name])
-    # first order misses something, such as a jump that the scene does not declare
-    if chosen == "first_order" and _disagree(pilots["first_order"], pilots["zeroth_order"]) > 5.0:
+        orders["first_order"] = lambda w: problem.grad(theta, w)
+    pilot = _draw(problem, "pilot", columns, 0)
+    pilots = {name: terms(pilot) for name, terms in orders.items()}
+    pilots = {name: terms for name, terms in pilots.items() if np.isfinite(terms).all()}
+    if not pilots:
+        reason = "rollouts are not finite" if orders else "needs explicit derivatives"
+        return Reference(np.full((1, problem.dim), math.nan), f"sampling[failed: {reason}]", math.nan)
+    effect = pilot @ (problem.value(theta, pilot) - centre)
+    directions = _directions(effect if np.isfinite(effect).all() else still[:, 0])
+    spread = {name: float(terms.var(axis=1, ddof=1).sum()) for name, terms in pilots.items()}
+    chosen, doubt = min(spread, key=lambda name: spread[name]), ""
+    if chosen == "first_order":
+        doubt = _doubt(problem, theta, pilots, pilot, directions, columns)
+    if doubt and "zeroth_order" in pilots:
         chosen = "zeroth_order"
 
+    def sample(order: str) -> Reference:
+        return _batches(problem, orders[order], order, pilots[order], directions, columns, samples, tolerance)
+
+    found = sample(chosen)
+    if chosen == "zeroth_order" or "zeroth_order" not in pilots:
+        return _noted(found, doubt)
+    # a pilot of heavy tails looks better than it is
+    error = found.known().standard_error
+    if 2.0 * spread["zeroth_order"] < _count(found) * error**2:
+        other = sample("zeroth_order")
+        if other.known().standard_error < error:
+            return _noted(other, "")
+    return _checked(problem, found, orders["zeroth_order"], columns, lambda: sample("zeroth_order"))
+
+
+def _doubt(
+    problem: Problem,
+    theta: np.ndarray,
+    pilots: dict[str, np.ndarray],
+    pilot: np.ndarray,
+    directions: np.ndarray,
+    columns: int,
+) -> str:
+    """Return why first order cannot be trusted, or nothing: the pilot's zeroth order disagrees, or the cost jumps."""
+    if "zeroth_order" in pilots:
+        # both from the same noise, so their difference is a sample of its own
+        paired = (pilots["first_order"] - pilots["zeroth_order"]).T
+        if bias_interval(paired.mean(axis=0), Sampling.of(paired), level=REFUSED)[1] > ROUNDING * np.abs(paired).max():
+            return "first and zeroth order disagree in the pilot, so zeroth order is used"
+    count = min(directions.shape[1], pilot.shape[1] // 3)
+    through, along = pilot[:, :count], directions[:, :count]
+    through = through - along * (along * through).sum(axis=0)
+    starts = np.concatenate([pilot[:, count : 2 * count], through - FAR * along], axis=1)
+    ends = np.concatenate([pilot[:, 2 * count : 3 * count], through + FAR * along], axis=1)
+    jump = largest_jump(lambda w: in_columns(lambda part: problem.value(theta, part), w, columns), starts, ends)
+    if jump:
+        return f"the cost jumps by {jump:.2g}, which its scene and contact law do not say, so zeroth order is used"
+    return ""
+
+
+def _batches(
+    problem: Problem,
+    terms: Terms,
+    order: str,
+    pilot: np.ndarray,
+    directions: np.ndarray,
+    columns: int,
+    samples: int,
+    tolerance: float,
+) -> Reference:
+    """Sample until the error, that of the tails included, is small enough, or the samples are spent."""
     size = columns // BATCHES
     batches = np.zeros((BATCHES, problem.dim))
     count = 0
     while True:
         w = _draw(problem, "reference", BATCHES * size, count)
-        terms = _in_columns(estimators[chosen], w, columns).reshape(problem.dim, BATCHES, size).mean(axis=2).T
-        batches = (batches * count + terms * size) / (count + size)
+        means = in_columns(terms, w, columns).reshape(problem.dim, BATCHES, size).mean(axis=2).T
+        batches = (batches * count + means * size) / (count + size)
         count += size
-        se = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)
-        # each pass doubles the samples, so stop if the next one would exceed the budget
-        if se <= tolerance * np.linalg.norm(batches.mean(axis=0)) or 2 * count * BATCHES > samples:
+        if not np.isfinite(batches).all():
             break
+        # each pass doubles the samples, so stop if the next one would exceed the budget
+        spent = 2 * count * BATCHES > samples
+        se = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)
+        enough = se <= tolerance * np.linalg.norm(batches.mean(axis=0)) and count * BATCHES >= LEAST_SAMPLES
+        if spent or enough:
+            unseen = _unseen(problem, terms, batches.mean(axis=0), directions, count * BATCHES, columns)
+            if spent or math.hypot(se, np.nan_to_num(unseen)) <= tolerance * np.linalg.norm(batches.mean(axis=0)):
+                break
         size = count
+    if not np.isfinite(batches).all():
+        return Reference(batches[:1] * math.nan, "sampling[failed: rollouts are not finite]", math.nan)
     note = ""
-    if chosen == "first_order":
-        w = _draw(problem, "check", max(columns, count * BATCHES // 4 // columns * columns), 0)
-        check = _in_columns(estimators["zeroth_order"], w, columns)
-        z = _disagree(batches.T, check)
-        note = f",check_z={z:.1f}"
-    return Reference(batches, f"sampling[{chosen},n={count * BATCHES}{note}]")
+    if math.isnan(unseen):
+        note, unseen = "rollouts in the far tails of the noise are not finite, so the reference may not exist", 0.0
+    elif heavy_tails(batches - batches.mean(axis=0)):
+        note = "the reference's batches have heavy tails, so that its standard error is uncertain"
+    elif not np.ptp(pilot) and not pilot.any():
+        note = (
+            f"no sample of the reference had a gradient: events rarer than {3.0 / (count * BATCHES):.1g} are not seen"
+        )
+    return Reference(batches, f"sampling[{order},n={count * BATCHES}]", unseen, note=note)
+
+
+def _checked(
+    problem: Problem, found: Reference, zeroth: Terms, columns: int, instead: Callable[[], Reference]
+) -> Reference:
+    """Hold a first-order reference against zeroth order of a quarter of its samples, and say what that could resolve."""
+    count = max(columns, _count(found) // 4 // columns * columns)
+    check = in_columns(zeroth, _draw(problem, "check", count, 0), columns)
+    check = check.reshape(problem.dim, BATCHES, -1).mean(axis=2).T
+    apart = found.gradient - check.mean(axis=0)
+    errors = Sampling.of(found.batches), Sampling.of(check)
+    trace = sum(error.trace for error in errors)
+    rows = np.concatenate([error.rows for error in errors])
+    spread = math.sqrt(2.0 * float(np.square(rows @ rows.T).sum()))
+    z = float((apart @ apart - trace) / spread) if spread else 0.0 if not apart.any() else math.inf
+    size = ROUNDING * (np.linalg.norm(found.gradient) + np.linalg.norm(check.mean(axis=0)))
+    at = {level: bias_interval(apart, *errors, level=level)[1] > size for level in (WARNED, REFUSED)}
+    said = f"first and zeroth order disagree by {np.linalg.norm(apart):.2g} (check_z={z:.1f})"
+    if at[REFUSED]:
+        return _noted(instead(), f"{said}, so zeroth order is used")
+    method = found.method.removesuffix("]") + f",check_z={z:.1f},check_resolves={2.0 * math.sqrt(trace):.2g}]"
+    return _noted(replace(found, method=method), said if at[WARNED] else "")
+
+
+def _unseen(
+    problem: Problem, terms: Terms, mean: np.ndarray, directions: np.ndarray, count: int, columns: int
+) -> float:
+    """Return what the far tails add to the mean, as the largest over some directions: they hold few samples or none.
+
+    Along each direction the tails begin where :data:`TAIL_EVENTS` of ``count`` samples are expected beyond, and are
+    sampled there; a spread of the samples themselves would show nothing of an event that none of them had.
+    """
+    from scipy.special import ndtri
+
+    share = min(1.0, TAIL_EVENTS / count)
+    each = max(1, columns // directions.shape[1])
+    along = np.repeat(directions, each, axis=1)
+    w = _draw(problem, "tails", along.shape[1], 0)
+    # the same noise with its component along the direction replaced by one beyond the quantile, of either sign
+    middle = (np.arange(each) + 0.5) / each
+    depth = -ndtri(0.5 * share * middle) * np.where(np.arange(each) % 2, 1.0, -1.0)
+    w = w + along * (np.tile(depth, directions.shape[1]) - (along * w).sum(axis=0))
+    found = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
+    if not np.isfinite(found).all():
+        return math.nan
+    return share * float(np.linalg.norm(found.mean(axis=2) - mean[:, None], axis=0).max())
+
+
+def _directions(effect: np.ndarray) -> np.ndarray:
+    """Return unit vectors in noise space, ``(n_w, L)``: coordinates, evenly chosen, and that of the mean effect."""
+    width = effect.size
+    chosen = np.unique(np.linspace(0, width - 1, min(width, DIRECTIONS)).astype(int))
+    directions = np.eye(width)[:, chosen] if width <= DIRECTIONS else np.zeros((width, chosen.size))
+    directions[chosen, np.arange(chosen.size)] = 1.0
+    length = float(np.linalg.norm(effect))
+    return np.column_stack([directions, effect / length]) if length and math.isfinite(length) else directions
+
+
+def _count(found: Reference) -> int:
+    return int(found.method.split("n=")[1].split(",")[0].rstrip("]"))
+
+
+def _noted(found: Reference, note: str) -> Reference:
+    return replace(found, note="; ".join(part for part in (note, found.note) if part))
 
 
 def _draw(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
@@ -191,19 +325,7 @@ def _draw(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
     return np.moveaxis(drawn, -1, 0).reshape(program.n_noise, count)
 
 
-def _in_columns(terms: Callable[[np.ndarray], np.ndarray], w: np.ndarray, columns: int) -> np.ndarray:
-    return np.concatenate([terms(w[:, i : i + columns]) for i in range(0, w.shape[1], columns)], axis=1)
-
-
 def _antithetic(problem: Problem, theta: np.ndarray, w: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Return zeroth-order terms averaged over w and -w, with the cost at w = 0 as baseline, ``(d, B)``."""
     terms = ((problem.value(theta, s) - centre) * problem.score(theta, s) + problem.explicit(theta, s) for s in (w, -w))
     return np.asarray(sum(terms) / 2)
-
-
-def _disagree(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the distance of two independent sample means ``(d, B)`` beyond its expectation, in standard deviations."""
-    mean = a.mean(axis=1) - b.mean(axis=1)
-    s = np.atleast_2d(np.cov(a)) / a.shape[1] + np.atleast_2d(np.cov(b)) / b.shape[1]
-    spread = math.sqrt(2 * np.trace(s @ s))
-    return float((mean @ mean - np.trace(s)) / spread) if spread > 0 else 0.0 if not mean.any() else math.inf

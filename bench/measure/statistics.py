@@ -20,7 +20,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-__all__ = ["Sampling", "Summary", "Truth", "bias_interval", "summarise", "variance_interval"]
+__all__ = [
+    "UNEXPLAINED",
+    "Sampling",
+    "Summary",
+    "Truth",
+    "bias_interval",
+    "heavy_tails",
+    "summarise",
+    "unexplained",
+    "variance_interval",
+    "variance_per_sample",
+]
 
 ROUNDING = 1e-12
 """Differences below this share of a gradient's size are rounding: no bias, and no spread of the estimates."""
@@ -29,6 +40,17 @@ FEW_REPEATS = 8
 CONCENTRATION = 0.75
 """Tails are heavy when (sum y)^2 / sum y^2 of the squared deviations y is below this times sqrt(R). That holds for 5%
 of cells with normal noise at R = 8, 1% at 16, none of thousands at 64, and half of cells with kurtosis 100."""
+VAGUE = 0.1
+"""Error of a reference, as a share of its norm, above which a note says that relative columns are no better."""
+THREE = 3.0
+"""An event that did not happen in n trials has a probability below 3 / n, at 95% (the rule of three)."""
+UNEXPLAINED = "tails unseen or gradient wrong"
+"""What a row says whose estimator declares to be unbiased while the interval of its bias excludes 0."""
+
+
+def unexplained(reason: str) -> bool:
+    """Whether a row's remark says that its bias contradicts what the estimator declares: no bias to report as found."""
+    return UNEXPLAINED in reason
 
 
 # ------------------------------------------------------------------------------------- what a mean is known to
@@ -48,6 +70,12 @@ class Sampling:
         """Return the covariance of the mean of the independent rows of ``sample (K, d)``, with K > 1."""
         count = len(sample)
         return cls((sample - sample.mean(axis=0)) / math.sqrt(count * (count - 1)), count - 1)
+
+    @classmethod
+    def without_direction(cls, error: float, dim: int) -> Sampling:
+        """Return the covariance of an error of norm ``error`` that may point anywhere, taken as known."""
+        rows = np.eye(dim) * (error / math.sqrt(max(dim, 1))) if error else np.zeros((0, dim))
+        return cls(rows, math.inf)
 
     @property
     def trace(self) -> float:
@@ -91,6 +119,8 @@ class Truth:
     """``(d,)``."""
     sampling: Sampling
     """Its error, independent of that of the estimates compared with it."""
+    unseen: float = 0.0
+    """Norm of an error, without direction, that ``sampling`` does not show."""
 
     def __post_init__(self) -> None:
         if self.mean.ndim != 1 or self.mean.size == 0 or self.sampling.rows.shape[1:] != self.mean.shape:
@@ -98,15 +128,15 @@ class Truth:
                 f"a reference gradient is a vector (d,) with errors (K, d), d > 0; given {self.mean.shape} "
                 f"with errors {self.sampling.rows.shape}"
             )
-        if not (np.isfinite(self.mean).all() and np.isfinite(self.sampling.rows).all()):
+        finite = np.isfinite(self.mean).all() and np.isfinite(self.sampling.rows).all()
+        if not (finite and math.isfinite(self.unseen)):
             raise ValueError("the reference gradient or its error is not finite, so nothing can be held to it")
 
     @classmethod
     def exact(cls, mean: np.ndarray, error: float = 0.0) -> Truth:
         """Make the truth of a closed form or quadrature ``(d,)``, whose error of norm ``error`` has no direction."""
         mean = np.asarray(mean, dtype=np.float64)
-        rows = np.eye(mean.size) * (error / math.sqrt(max(mean.size, 1))) if error else np.zeros((0, mean.size))
-        return cls(mean, Sampling(rows, math.inf))
+        return cls(mean, Sampling.without_direction(error, mean.size))
 
     @classmethod
     def from_covariance(cls, mean: np.ndarray, covariance: np.ndarray, degrees: float = math.inf) -> Truth:
@@ -118,12 +148,15 @@ class Truth:
         return cls(mean, Sampling((vectors * np.sqrt(np.maximum(values, 0.0))).T, degrees))
 
     @classmethod
-    def from_batches(cls, batches: np.ndarray) -> Truth:
-        """Make the truth of independent batch means of equal size ``(K, d)``, K > 1; their spread gives its error."""
+    def from_batches(cls, batches: np.ndarray, unseen: float = 0.0) -> Truth:
+        """Make the truth of independent batch means of equal size ``(K, d)``, K > 1; their spread gives its error.
+
+        ``unseen`` is the norm of an error that their spread does not show.
+        """
         batches = np.asarray(batches, dtype=np.float64)
         if batches.ndim != 2 or len(batches) < 2:
             raise ValueError(f"batch means have the shape (K, d) with K > 1; given {batches.shape}")
-        return cls(batches.mean(axis=0), Sampling.of(batches))
+        return cls(batches.mean(axis=0), Sampling.of(batches), unseen)
 
     @property
     def norm(self) -> float:
@@ -131,13 +164,23 @@ class Truth:
         return float(np.linalg.norm(self.mean))
 
     @property
+    def errors(self) -> tuple[Sampling, ...]:
+        """Its independent errors: that of sampling, and that which sampling does not show, if any."""
+        hidden = (Sampling.without_direction(self.unseen, self.mean.size),) if self.unseen else ()
+        return (self.sampling, *hidden)
+
+    @property
     def standard_error(self) -> float:
-        """Square root of the trace of the covariance of the mean."""
-        return float(np.linalg.norm(self.sampling.rows))
+        """Square root of the trace of the covariance of the mean, with the error that sampling does not show."""
+        return math.hypot(float(np.linalg.norm(self.sampling.rows)), self.unseen)
+
+    def vanishes(self) -> bool:
+        """Whether the gradient is not distinguishable from 0, so that nothing can be put in relation to it."""
+        return self.norm == 0.0 or (self.standard_error > 0.0 and bias_interval(self.mean, *self.errors)[1] == 0.0)
 
     def over(self, unit: float) -> Truth:
         """Return the same truth, measured in ``unit``."""
-        return Truth(self.mean / unit, self.sampling.over(unit))
+        return Truth(self.mean / unit, self.sampling.over(unit), self.unseen / unit)
 
 
 # ---------------------------------------------------------------------------------------------------- intervals
@@ -253,6 +296,42 @@ def variance_interval(deviations: np.ndarray, level: float = 0.95) -> tuple[floa
     return _exp(min(centre - reach, whole)), _exp(max(centre + reach, whole))
 
 
+def variance_per_sample(
+    sums: np.ndarray, squares: np.ndarray, samples: int, level: float = 0.95
+) -> tuple[float, float, float]:
+    """Return the trace of the covariance of one sample's term, with its interval, from all R x N terms.
+
+    ``sums (R, d)`` are the sums of the ``samples`` terms of each repeat, ``squares (R,)`` the sums of their squared
+    norms; take a common vector off all terms first where their mean is large against their spread. The interval is
+    the jackknife of the logarithm, a repeat left out at a time, so that it allows for tails. It is ``(0, inf)`` for
+    fewer than three repeats, NaN where there is one term in all.
+    """
+    sums, squares = np.asarray(sums, dtype=np.float64), np.asarray(squares, dtype=np.float64)
+    repeats = len(sums)
+    if sums.ndim != 2 or squares.shape != (repeats,) or repeats < 1 or samples < 1:
+        raise ValueError(
+            f"sums have the shape (R, d) and squares (R,) with R > 0 and one sample or more; given {sums.shape}, "
+            f"{squares.shape} and {samples}"
+        )
+    count = repeats * samples
+    if count < 2:
+        return (math.nan,) * 3
+    total, power = sums.sum(axis=0), float(squares.sum())
+    # below this share of the squares a difference is rounding
+    floor = 1e-14 * power
+    whole = power - float(total @ total) / count
+    value = max(0.0, whole) / (count - 1)
+    rest = total - sums
+    left = power - squares - np.einsum("rd,rd->r", rest, rest) / max(count - samples, 1)
+    if repeats < 3 or whole <= floor or left.min() <= floor:
+        return value, 0.0, math.inf
+    logarithm = math.log(value)
+    pseudo = repeats * logarithm - (repeats - 1) * (np.log(left) - math.log(count - samples - 1))
+    reach = _student_quantile(0.5 + level / 2.0, repeats - 1) * float(pseudo.std(ddof=1)) / math.sqrt(repeats)
+    centre = float(pseudo.mean())
+    return value, _exp(min(centre - reach, logarithm)), _exp(max(centre + reach, logarithm))
+
+
 def _exp(exponent: float) -> float:
     return math.exp(exponent) if exponent < 709.0 else math.inf
 
@@ -265,7 +344,8 @@ class Summary:
     """How R estimates of N samples each compare with the reference. Norms are Euclidean, intervals 95%.
 
     A field is NaN where it cannot be computed: all fields of the estimates when some are not finite, those of their
-    spread when there is only one, the relative and directional ones for a reference of 0.
+    spread when there is only one, the relative ones for a reference not distinguishable from 0, the directional ones
+    for a reference of 0.
     """
 
     grad_norm: float
@@ -284,7 +364,9 @@ class Summary:
     variance_low: float
     variance_high: float
     variance_per_sample: float
-    """``samples * variance``."""
+    """``samples * variance``, or from all samples where their sums are given."""
+    variance_per_sample_low: float
+    variance_per_sample_high: float
     rmse: float
     """Root mean squared distance of one estimate from the truth, less the reference's own error."""
     rmse_rel: float
@@ -304,10 +386,20 @@ class Summary:
         return self.bias_low <= 0.0
 
 
-def summarise(estimates: np.ndarray, truth: Truth, samples: int) -> Summary:
+def summarise(
+    estimates: np.ndarray,
+    truth: Truth,
+    samples: int,
+    terms: tuple[np.ndarray, np.ndarray] | None = None,
+    unbiased: bool = False,
+) -> Summary:
     """Return the statistics of independent ``estimates (R, d)``, each made of ``samples``, against the reference.
 
-    Raises ValueError for shapes that do not fit. Estimates that are not finite raise nothing: see :class:`Summary`.
+    ``terms`` are the sums and squares that :func:`variance_per_sample` takes, for estimates that are means of one term
+    per sample; without them that column is ``samples`` times the variance of an estimate. ``unbiased`` says that the
+    estimator declares to be, so that a bias found is remarked on as :data:`UNEXPLAINED`. The relative and directional
+    fields are NaN, with a remark, where the reference is not distinguishable from 0. Identical estimates have the width
+    that the rule of three leaves for an event of the size of the gradient that none of them saw. Raises ValueError for shapes that do not fit. Estimates that are not finite raise nothing: see :class:`Summary`.
     """
     estimates = np.asarray(estimates, dtype=np.float64)
     if estimates.ndim != 2 or len(estimates) < 1 or estimates.shape[1:] != truth.mean.shape:
@@ -333,17 +425,32 @@ def summarise(estimates: np.ndarray, truth: Truth, samples: int) -> Summary:
     norm = reference.norm
 
     bias = bias_low = bias_high = variance = variance_low = variance_high = math.nan
+    per_sample = (math.nan,) * 3
     if repeats > 1:
         variance = float(np.vdot(deviations, deviations)) / (repeats - 1)
         variance_low, variance_high = variance_interval(deviations)
         sampling = Sampling(deviations / math.sqrt(repeats * (repeats - 1)), repeats - 1)
-        bias, bias_low, bias_high = bias_interval(difference, sampling, reference.sampling)
+        bias, bias_low, bias_high = bias_interval(difference, sampling, *reference.errors)
+        if identical:
+            size = max(norm, float(np.linalg.norm(mean)))
+            rare = THREE / (repeats * samples)
+            bias_low, bias_high = bias_low - rare * size, bias_high + rare * size
+            variance_high = rare * size**2 / samples
+        per_sample = (variance * samples, variance_low * samples, variance_high * samples)
         if bias_low <= ROUNDING * (norm + float(np.linalg.norm(mean))):
             bias_low = 0.0
     errors = estimates - reference.mean
-    squared_error = float(np.vdot(errors, errors)) / repeats - reference.sampling.trace
+    squared_error = float(np.vdot(errors, errors)) / repeats - reference.standard_error**2
     rmse = math.sqrt(max(0.0, squared_error))
+    relative = math.nan if norm <= ROUNDING or reference.vanishes() else norm
     cosine, signs = _directions(estimates, reference.mean)
+    notes = _remarks(deviations, difference, samples, identical)
+    notes += _about(reference, relative)
+    if unbiased and bias_low > 0.0:
+        notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or 1 in 40 by chance")
+    scaled = tuple(value * unit * unit for value in per_sample)
+    if terms is not None:
+        scaled = variance_per_sample(*terms, samples)
     return Summary(
         grad_norm=float(np.linalg.norm(mean)) * unit,
         reference_norm=norm * unit,
@@ -351,17 +458,19 @@ def summarise(estimates: np.ndarray, truth: Truth, samples: int) -> Summary:
         bias=bias * unit,
         bias_low=bias_low * unit,
         bias_high=bias_high * unit,
-        bias_rel=bias / norm if norm else math.nan,
+        bias_rel=bias / relative,
         variance=variance * unit * unit,
         variance_low=variance_low * unit * unit,
         variance_high=variance_high * unit * unit,
-        variance_per_sample=variance * unit * unit * samples,
+        variance_per_sample=scaled[0],
+        variance_per_sample_low=scaled[1],
+        variance_per_sample_high=scaled[2],
         rmse=rmse * unit,
-        rmse_rel=rmse / norm if norm else math.nan,
+        rmse_rel=rmse / relative,
         cosine=cosine,
         sign_agreement=signs,
         finite_fraction=1.0,
-        note="; ".join(_remarks(deviations, difference, samples, identical)),
+        note="; ".join(notes),
     )
 
 
@@ -383,6 +492,30 @@ def _directions(estimates: np.ndarray, reference: np.ndarray) -> tuple[float, fl
     return float(np.clip(projections, -1.0, 1.0).mean()), float(agree.mean())
 
 
+def _about(reference: Truth, relative: float) -> list[str]:
+    """Return what the reference does to relative columns; ``relative`` is its norm, or NaN where it vanishes."""
+    norm, error = reference.norm, reference.standard_error
+    if math.isnan(relative):
+        if error == 0.0:
+            return []  # exactly 0, as many references are
+        share = f"{error / norm:.2g} times its norm" if norm else "all there is"
+        return [
+            f"the reference is not distinguishable from 0, its error is {share}: relative columns, cosine and signs mean nothing"
+        ]
+    if error > VAGUE * norm:
+        return [f"the reference is known to {100 * error / norm:.0f}% of its norm: relative columns are no better"]
+    return []
+
+
+def heavy_tails(deviations: np.ndarray) -> float:
+    """Return the largest share that one of the deviations ``(R, d)`` has of their squares, or 0 if tails are not heavy."""
+    squares = np.einsum("rd,rd->r", deviations, deviations)
+    total, fourth = float(squares.sum()), float(squares @ squares)
+    if fourth > 0.0 and total**2 / fourth < CONCENTRATION * math.sqrt(len(deviations)):
+        return float(squares.max()) / total
+    return 0.0
+
+
 def _remarks(deviations: np.ndarray, difference: np.ndarray, samples: int, identical: bool) -> list[str]:
     """Return the reasons to doubt intervals from deviations ``(R, d)`` and a difference of means ``(d,)``."""
     repeats = len(deviations)
@@ -390,20 +523,15 @@ def _remarks(deviations: np.ndarray, difference: np.ndarray, samples: int, ident
         return ["only 1 repeat: no variance, and no bias apart from it"]
     if identical:
         return [
-            "all estimates are identical: the bias interval allows for no noise of theirs, and an event rarer than about "
-            f"{3.0 / (repeats * samples):.2g} a sample would not have been seen"  # rule of three, 95%
+            "all estimates are identical: the intervals allow for an event of the gradient's size, rarer than about "
+            f"{THREE / (repeats * samples):.2g} a sample, which would not have been seen"
         ]
     if repeats < FEW_REPEATS:
         return [f"only {repeats} repeats: wide intervals, and no say about tails"]
-    along = deviations @ difference
-    for squares, where in (
-        (np.einsum("rd,rd->r", deviations, deviations), ""),
-        (along * along, " along the bias"),
-    ):
-        total, fourth = float(squares.sum()), float(squares @ squares)
-        if fourth > 0.0 and total**2 / fourth < CONCENTRATION * math.sqrt(repeats):
+    for part, where in ((deviations, ""), ((deviations @ difference)[:, None], " along the bias")):
+        if share := heavy_tails(part):
             return [
-                f"heavy tails: one repeat of {repeats} has {100 * float(squares.max()) / total:.0f}% of the squared "
+                f"heavy tails: one repeat of {repeats} has {100 * share:.0f}% of the squared "
                 f"deviations{where}, a fourth moment that makes the intervals unreliable"
             ]
     return []

@@ -42,7 +42,10 @@ class Backend(Plugin):
         return None
 
     def lacks(self, program: Program) -> str | None:
-        """Return why this backend cannot run the program: its own refusal, or a capability that it lacks; or None."""
+        """Return why this backend cannot run the program: its own or the scene's refusal, or a lack; or None."""
+        only = program.scene.backends
+        if only and self.name not in only:
+            return f"scene {program.scene.name} runs on {' and '.join(only)} only"
         if program.needs_root and "root" not in self.provides:
             part = next(p for p in (program.contact, program.integrator) if p is not None and p.needs_root)
             return f"{part.name} solves an equation each step, backend {self.name} has no root finder"

@@ -53,6 +53,10 @@ class Estimator(Plugin):
         """
         return self.estimate(problem, theta, noise), {}
 
+    def declares_unbiased(self, program: Program) -> bool:
+        """Whether its expectation is grad J_sigma of the program, by what it declares."""
+        return self.unbiased and self.target == "smoothed" and (program.continuous or self.across_jumps)
+
     def refuses(self, program: Program) -> str | None:
         """Return why this estimator cannot be used on the program, or None."""
         return None

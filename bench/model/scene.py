@@ -25,6 +25,8 @@ class Scene(Plugin):
     kind: ClassVar[str] = "scenes"
     leaves_out: ClassVar[str] = ""
     """What the scene does not model, in a few words."""
+    backends: ClassVar[tuple[str, ...]] = ()
+    """Names of the backends that it runs on; empty for all whose array namespace its code is written for."""
     continuous: ClassVar[bool] = True
     """Whether the cost is continuous in theta (given a continuous contact law)."""
 

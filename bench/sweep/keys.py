@@ -14,7 +14,7 @@ from bench.model.sources import hash_of, source_hash, sources
 
 CORE = {
     model: ("backend", "contact", "dynamics", "estimator", "integrator", "ops", "problem", "program", "scene"),
-    measure: ("noise", "reference", "statistics"),
+    measure: ("batches", "jumps", "noise", "quadrature", "reference", "statistics"),
 }
 """Modules that decide numbers in every study."""
 BOOKKEEPING = ("bench.errors", "bench.model", "bench.sweep", "bench.report")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from bench.measure.reference import Reference
 from bench.sweep.cell import Cell
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import make_directory, write_whole
+from bench.sweep.keys import fingerprint
 from bench.sweep.problems import Problems
 from bench.sweep.referees import ranked_backends, reference_backends, reference_key
 
@@ -35,13 +38,31 @@ class References:
         if key not in self._known:
             result = load(self._path(cell))
             if result is None:
-                backend = next(reference_backends(cell))
-                problem = self._problems.of(backend, cell)
-                budget = self._budget.samples, self._budget.tolerance
-                result = reference.certify(problem, backend.provides, *budget, self._stood_for(cell))
+                result = self._certified(cell)
                 save(result, self._path(cell))
             self._known[key] = result
         return self._known[key]
+
+    def _certified(self, cell: Cell) -> Reference:
+        """Compute the reference on the first backend that can; raises the first one's error where none can.
+
+        A backend may accept a program and fail at it, at a branch on a traced value for example.
+        """
+        failed: list[tuple[str, Exception]] = []
+        budget = self._budget.samples, self._budget.tolerance
+        for backend in {fingerprint(b): b for b in reference_backends(cell)}.values():
+            try:
+                problem = self._problems.of(backend, cell)
+                result = reference.certify(problem, backend.provides, *budget, self._stood_for(cell))
+            except Exception as error:
+                failed.append((backend.name, error))
+                continue
+            if not failed:
+                return result
+            said = ", ".join(f"{name} ({type(error).__name__})" for name, error in failed)
+            note = f"the reference is from {backend.name}, after a failure of {said}"
+            return replace(result, note="; ".join(part for part in (note, result.note) if part))
+        raise failed[0][1]
 
     def _path(self, cell: Cell) -> Path:
         return self._directory / f"{reference_key(cell)}.parquet"
@@ -58,7 +79,8 @@ class References:
             for backend in ranked_backends(cell):
                 if "grad" in backend.provides:
                     still = np.zeros((program.n_noise, 1))
-                    return self._problems.of(backend, cell).grad(program.theta0, still)[:, 0]
+                    with suppress(Exception):  # a backend that fails at the program gives way to the next
+                        return self._problems.of(backend, cell).grad(program.theta0, still)[:, 0]
         return physical
 
 
@@ -72,7 +94,7 @@ def save(reference: Reference, path: Path) -> None:
     ]
     table = pd.DataFrame(
         {"part": [name for name, _ in lines], "gradient": [list(row) for _, row in lines],
-         "method": reference.method, "error": reference.error}
+         "method": reference.method, "error": reference.error, "note": reference.note}
     )  # fmt: skip
     buffer = io.BytesIO()
     table.to_parquet(buffer, index=False)
@@ -90,6 +112,7 @@ def load(path: Path) -> Reference | None:
         table = pd.read_parquet(path)
         rows = {name: np.stack(list(part)) for name, part in table.groupby("part")["gradient"]}
         vectors = {name: rows[name][0] for name in ("plain", "physical") if name in rows}
-        return Reference(rows["batch"], str(table["method"][0]), float(table["error"][0]), **vectors)
+        words = str(table["method"][0]), float(table["error"][0])
+        return Reference(rows["batch"], *words, **vectors, note=str(table["note"][0]))
     except Exception:
         return None

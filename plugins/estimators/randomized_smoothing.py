@@ -34,6 +34,11 @@ class RandomizedSmoothing(SampleMean):
             return (ahead - problem.displaced(-s * direction, theta, still)) * direction / (2 * s)
         return (ahead - problem.value(theta, still[:, :1])) * direction / s
 
+    def declares_unbiased(self, program: Program) -> bool:
+        """Return whether it smoothes as J_sigma does: noise on theta, and no radius of its own."""
+        own = self.radius is not None and self.radius != program.scene.sigma
+        return program.noise_on_theta and not own and super().declares_unbiased(program)
+
     def refuses(self, program: Program) -> str | None:
         """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
         if program.n_noise >= program.dim:

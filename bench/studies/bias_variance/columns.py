@@ -24,6 +24,8 @@ COLUMNS = Columns.ordered(
     Column("variance_low", "lower end of its 95% interval", table=False),
     Column("variance_high", "upper end of its 95% interval", table=False),
     Column("variance_per_sample", "samples * variance"),
+    Column("variance_per_sample_low", "lower end of its 95% interval", table=False),
+    Column("variance_per_sample_high", "upper end of its 95% interval", table=False),
     Column("rmse", "root mean squared distance of one estimate from the reference",
            judged=Judged("paired", "RMSE", mean="mean_estimate", variance="variance", reference="reference_gradient")),
     Column("rmse_rel", "rmse / reference_norm; above 1 an estimate is worse than answering zero"),

@@ -70,8 +70,9 @@ def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
     }
     if not np.isfinite(truth.batches).all():
         return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}
-    summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
-    result |= {"reason": summary.pop("note"), **summary}
+    unbiased = cell.estimator.declares_unbiased(program)
+    summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples, unbiased=unbiased))
+    result |= {"reason": "; ".join(part for part in (summary.pop("note"), truth.note) if part), **summary}
     bad = ~np.isfinite(estimates).all(axis=1)
     if bad.any():
         result["status"] = "nonfinite"

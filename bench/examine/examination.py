@@ -1,0 +1,295 @@
+"""The examination itself: what is asked of a cost and its gradient, in which order, within one budget."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bench.errors import UserError
+from bench.examine.clock import Clock, OutOfTime, seconds
+from bench.examine.layout import Layout
+from bench.examine.lines import HALVINGS, PLACES, POINTS, Line, scan
+from bench.examine.report import Report
+from bench.examine.simulator import Simulator
+from bench.examine.smoothing import PAIRS, Smoothed, directions, smoothed
+from bench.measure.gradcheck import EPS, Check, Options, check
+
+MADE = re.compile(r"_[0-9a-f]{8}$")
+"""What a module's name gets when it is loaded from a file."""
+RELATIVE = 0.01
+"""Sigma of the lines, and of a cost with noise of its own, in units of each input's scale, where none is given."""
+SHARES = {"check": 0.6, "again": 0.5, "lines": 0.3}
+"""Most of the time left that a part may take; what it does not use is there for the next one."""
+POINTS_EACH = 2 * (2 * EPS.size + 17)
+"""Costs of a direction that is checked, about."""
+EFFORTS = (
+    Options(),
+    Options(draws=2),
+    Options(draws=1, directions=1),
+    Options(components=4, draws=0),
+    Options(components=0, draws=0, directions=1, eps=EPS[::2]),
+)
+"""What a check looks at, from the whole to the least, for simulators that are slow."""
+OTHER_NOISE = 2
+"""Draws of the simulator's own noise, besides the first, under which the gradient is checked along random directions."""
+
+
+def examine(
+    cost: Callable[..., Any],
+    theta: Any,
+    grad: str | Callable[..., Any] | None = None,
+    sigma: float | Sequence[float] = (),
+    noise: int = 0,
+    budget: float | str = 60.0,
+    batch: str | None = None,
+    scale: Any = None,
+    seed: int = 0,
+    name: str = "",
+    progress: bool = True,
+) -> Report:
+    """Say whether a gradient is right, where the cost breaks, what to use under noise, and what that costs.
+
+    ``cost(theta)`` returns one number; theta is an array, a number, or nested dicts, lists and dataclasses of them.
+    ``grad`` is ``"jax"``, ``"torch"`` or a function of theta; without it, differences alone. ``sigma`` are standard
+    deviations of noise on theta. ``noise=n`` makes it ``cost(theta, w)`` with ``w (n,)`` standard normal, the
+    simulator's own randomness, which is the same in costs that are compared. ``budget`` is the time for everything
+    (``60``, ``"2m"``); a single call that takes longer is not interrupted. ``batch`` says how several thetas are taken
+    at once: ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``; by default that is detected.
+    ``scale`` is the size of each input, with theta's structure; by default its own size, and for 0 that of its array.
+
+    Raises :class:`bench.UserError` for a cost that cannot be called.
+
+    >>> report = examine(lambda x: x[0] ** 2 + 3 * x[1], [1.0, 2.0], grad=lambda x: [2 * x[0], 3.0], progress=False)
+    >>> report.status, report.cause
+    (0, 'smooth')
+    """
+    clock = Clock(seconds(budget), progress)
+    levels = _levels(sigma)
+    if not isinstance(noise, int) or noise < 0:
+        raise UserError(f"noise={noise} is the length of w in cost(theta, w), a whole number")
+    layout = Layout(theta)
+    scales = layout.scales() if scale is None else _scales(layout, scale)
+    clock.stage("first call")
+    simulator = Simulator(cost, layout, grad, noise, batch, clock)
+    try:
+        return _Examination(simulator, layout, scales, levels, clock, seed, name or _called(cost)).run(_called(grad))
+    finally:
+        clock.clear()
+
+
+def _levels(sigma: float | Sequence[float]) -> list[float]:
+    given = [sigma] if isinstance(sigma, int | float) else list(sigma)
+    try:
+        levels = [float(one) for one in given]
+    except (TypeError, ValueError):
+        levels = [math.nan]
+    if not all(one > 0 and math.isfinite(one) for one in levels):
+        raise UserError(f"sigma={sigma} are standard deviations of noise on theta: numbers above 0")
+    return levels
+
+
+def _scales(layout: Layout, scale: Any) -> np.ndarray:
+    given = (
+        np.full(layout.vector.size, float(scale)) if isinstance(scale, int | float) else layout.take(scale, "scale")
+    ).astype(np.float64)
+    if not (np.isfinite(given).all() and (given > 0).all()):
+        raise UserError("scale has the size of each input: numbers above 0")
+    return given
+
+
+def _called(function: Any) -> str:
+    """Return a name for a function, ``mysim.cost``, or the library that differentiates."""
+    if function is None or isinstance(function, str):
+        return function or ""
+    module = getattr(function, "__module__", "") or ""
+    own = (
+        getattr(function, "__qualname__", type(function).__name__)
+        .replace("<locals>.", "")
+        .replace("<lambda>", "lambda")
+    )
+    module = MADE.sub("", module)
+    return own if module in ("__main__", "builtins", "") else f"{module}.{own}"
+
+
+class _Examination:
+    def __init__(
+        self,
+        simulator: Simulator,
+        layout: Layout,
+        scale: np.ndarray,
+        levels: Sequence[float],
+        clock: Clock,
+        seed: int,
+        name: str,
+    ) -> None:
+        self.simulator, self.layout, self.scale, self.levels = simulator, layout, scale, levels
+        self.clock, self.seed, self.name = clock, seed, name
+        self.theta = layout.vector
+        self.left_out: list[str] = []
+        self.random = np.random.default_rng([seed, 0x6578616D])
+        self.w = self.random.standard_normal((simulator.noise, 1)) if simulator.noise else None
+
+    def run(self, gradient: str) -> Report:
+        """Ask everything that the time allows, the gradient first."""
+        value, spread = self._repeated()
+        checked, more = None, []
+        if spread == 0:
+            checked = self._checked()
+            more = self._under_other_noise(checked)
+        lines = self._lines(checked)
+        found = self._smoothed(checked, spread == 0) if not self.simulator.gradient_error else []
+        simulator, clock = self.simulator, self.clock
+        notes = list(simulator.notes)
+        notes += [f"the cost raised {count} times: {text}" for text, count in list(simulator.raised.items())[:3]]
+        relative = not self.levels
+        return Report(
+            name=self.name,
+            gradient=gradient,
+            names=self.layout.names,
+            theta=self.theta,
+            cost=value,
+            precision=simulator.precision,
+            repeats=spread == 0,
+            spread=spread,
+            batch=simulator.batch,
+            costs=clock.costs,
+            gradients=clock.gradients,
+            seconds=clock.spent,
+            budget=clock.budget,
+            cost_s=clock.per_cost(),
+            gradient_s=clock.per_gradient() if simulator.has_gradient else math.nan,
+            check=checked,
+            more=more,
+            lines=lines,
+            reach=max(self.levels, default=RELATIVE),
+            relative=relative,
+            smoothed=found,
+            error=simulator.gradient_error,
+            notes=notes,
+            left_out=self.left_out,
+        )
+
+    # ------------------------------------------------------------------------------------------------ parts
+
+    def _costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+        """Return costs under one draw of the simulator's own noise."""
+        w = self.w if w is None else w
+        return self.simulator.costs(thetas, None if w is None else np.repeat(w, thetas.shape[1], axis=1))
+
+    def _repeated(self) -> tuple[float, float]:
+        """Return the cost at theta, and by how much equal calls differ; another theta stands between them."""
+        self.clock.stage("repeating a call")
+        other = self.theta + 1e-3 * self.scale
+        try:
+            values = [float(self._costs(at[:, None])[0]) for at in (self.theta, other, self.theta, other, self.theta)]
+        except OutOfTime:
+            self.left_out.append("repeating a call")
+            return math.nan, 0.0
+        same = np.array(values[::2])
+        pairs = [same, np.array(values[1::2])]
+        return values[0], max(0.0 if np.isnan(one).all() else float(np.ptp(one)) for one in pairs)
+
+    def _options(self, least: int = 0) -> Options:
+        """Return what can be looked at in the time that is left."""
+        each, slope = self.clock.per_cost(), self.clock.per_gradient()
+        each = 0.0 if math.isnan(each) else each
+        slope = 4 * each if math.isnan(slope) else slope
+        for effort in EFFORTS[least:-1]:
+            chosen = min(effort.components, self.theta.size) + effort.directions
+            calls = chosen * POINTS_EACH + effort.draws * effort.directions * POINTS_EACH // 2
+            if calls * each + (effort.draws + 3) * slope < SHARES["check"] * self.clock.left:
+                break
+        else:
+            effort = EFFORTS[-1]
+        if effort is not EFFORTS[0]:
+            what = f"{effort.components} components, {effort.directions} directions and {effort.draws} other thetas"
+            self.left_out.append(f"the whole check: it looks at {what} at most")
+        return replace(effort, scale=self.scale, unit=self.simulator.unit, seed=self.seed)
+
+    def _checked(self) -> Check | None:
+        self.clock.stage("checking the gradient")
+        options = self._options()
+        for attempt in (options, replace(options, components=0, draws=0, directions=1, eps=EPS[::2])):
+            self.clock.allow(SHARES["check"] if attempt is options else 1.0)
+            try:
+                return self._one_check(attempt)
+            except OutOfTime:
+                continue
+            finally:
+                self.clock.allow(1.0)
+        self.left_out.append("the gradient check")
+        return None
+
+    def _one_check(self, options: Options, w: np.ndarray | None = None) -> Check:
+        def gradient(theta: np.ndarray) -> np.ndarray:
+            drawn = self.w if w is None else w
+            return np.asarray(self.simulator.gradients(theta[:, None], drawn)[:, 0])
+
+        slope = gradient if self.simulator.has_gradient else None
+        return check(lambda thetas: self._costs(thetas, w), slope, self.theta, options)
+
+    def _under_other_noise(self, checked: Check | None) -> list[Check]:
+        """Check along random directions under other draws of the simulator's own noise."""
+        if self.w is None or checked is None or not checked.trusted:
+            return []
+        found = []
+        options = replace(EFFORTS[0], components=0, draws=0, scale=self.scale, unit=self.simulator.unit, seed=self.seed)
+        self.clock.allow(SHARES["again"])
+        try:
+            for _ in range(OTHER_NOISE):
+                found.append(self._one_check(options, self.random.standard_normal((self.simulator.noise, 1))))
+        except OutOfTime:
+            self.left_out.append("checks under other noise")
+        self.clock.allow(1.0)
+        return found
+
+    def _lines(self, checked: Check | None) -> list[Line]:
+        """Scan the cost for jumps and kinks along random directions."""
+        self.clock.stage("scanning lines")
+        spread = self.scale * RELATIVE if not self.levels else np.full(self.theta.size, max(self.levels))
+        along = directions(2, spread, self.seed)
+        each = self.clock.per_cost()
+        room = SHARES["lines"] * self.clock.left / len(along) / each if each > 0 else math.inf
+        points = int(min(POINTS, room - 2 * PLACES * HALVINGS))
+        if points < 17:
+            self.left_out.append("jumps and kinks on lines")
+            return []
+        if points < POINTS:
+            self.left_out.append(f"fine lines: {points} points instead of {POINTS}")
+        found = []
+        measured = checked.noise if checked is not None and math.isfinite(checked.noise) else 0.0
+        self.clock.allow(2 * SHARES["lines"])
+        try:
+            for direction in along:
+                size = float(np.abs(self._costs(self.theta[:, None])).max())
+                rounding = max(measured, self.simulator.unit * (size if math.isfinite(size) else 0.0))
+                found.append(scan(self._costs, self.theta, direction, rounding, points=points))
+        except OutOfTime:
+            self.left_out.append("jumps and kinks on lines")
+        self.clock.allow(1.0)
+        return found
+
+    def _smoothed(self, checked: Check | None, repeats: bool) -> list[Smoothed]:
+        """Measure the gradient under noise on theta, an equal share of the time for each sigma."""
+        levels, scale = list(self.levels), np.ones(self.theta.size)
+        if not levels and self.simulator.noise:
+            levels, scale = [RELATIVE], self.scale
+        plain = None
+        if checked is not None and checked.trusted and repeats and not self.simulator.noise:
+            plain = checked.gradient if self.simulator.has_gradient else None
+        found = []
+        for index, level in enumerate(levels):
+            self.clock.stage(f"noise of sigma {level:g}")
+            self.clock.allow(1.0 / (len(levels) - index))
+            one = smoothed(self.simulator, self.theta, level, scale, plain, self.clock, self.seed, PAIRS)
+            self.clock.allow(1.0)
+            if one is None:
+                self.left_out.append(f"noise of sigma {level:g}")
+            else:
+                found.append(one)
+        return found

@@ -1,0 +1,382 @@
+"""What an examination found: verdicts, text and tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.examine.lines import Line
+from bench.examine.smoothing import Smoothed
+from bench.measure.gradcheck import FAULTS, Check, Part
+from bench.report.text import counted, duration, number
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+WORDS = {
+    "nan_gradient": "the gradient is not a number where the cost is: a division, log, sqrt or norm at its edge, or a branch that "
+    "'where' takes back only in the value",
+    "nondeterministic": "the same call gives different numbers: noise that is drawn anew, or a state that outlasts a call; "
+    "pass the noise in as w, or fix its seed",
+    "stale_gradient": "the gradient stays that of another theta: a cache that is never emptied, or a copy made too early",
+    "staircase": "the cost is constant between steps: a cast to int, rounding, or a comparison inside",
+    "precision": "the cost has fewer digits than its type: a shorter float inside",
+    "disconnected": "the gradient is exactly 0 where the cost has a slope: detached, or an operation that cuts gradients",
+    "wrong_factor": "the ratio is constant: a factor or a sign is wrong",
+    "missing_term": "ratio not constant: a term is missing or detached",
+    "wrong_adjoint": "the differences agree with each other, on another number than the gradient",
+    "nonfinite": "the cost is not a number at theta or near it",
+    "unsettled": "the differences agree at no step: nothing is shown; chaotic, or noisier than any step",
+    "jump": "the cost jumps at theta, so that there is no derivative",
+    "kink": "theta is on a kink, so that there are two slopes and no derivative",
+    "saturated": "the gradient is right and exactly 0, though wider steps see a slope: clipped, or out of reach here",
+    "zero": "the gradient and all differences are exactly 0: does this input do anything?",
+}
+"""What a cause means to the owner of the simulator."""
+WARNED = ("zero", "saturated")
+"""Right, and yet worth a look."""
+
+
+@dataclass(frozen=True)
+class Findings:
+    """The findings about a cost and its gradient at a theta; ``print`` shows them as text."""
+
+    name: str
+    """What was examined."""
+    gradient: str
+    """How its gradient was had: ``jax``, ``torch``, a function's name, or empty for differences alone."""
+    names: Sequence[str]
+    """A name for each number of theta."""
+    theta: np.ndarray
+    """``(d,)``."""
+    cost: float
+    precision: str
+    repeats: bool
+    """Whether the same call gave the same cost."""
+    spread: float
+    """By how much calls differ that should not."""
+    batch: str
+    costs: int
+    """Calls of the cost, a theta each."""
+    gradients: int
+    """Calls of the gradient, a theta each."""
+    seconds: float
+    budget: float
+    cost_s: float
+    """Seconds of one cost."""
+    gradient_s: float
+    """Seconds of one gradient; NaN without one."""
+    check: Check | None
+    """The gradient check; None where it did not end within the budget."""
+    more: Sequence[Check]
+    """Checks under other noise of the simulator's own."""
+    lines: Sequence[Line]
+    reach: float
+    """One standard deviation on the lines: a sigma of theta, or a share of the scale of each input."""
+    relative: bool
+    """Whether sigma is relative to the scale of each input, as where none was given."""
+    smoothed: Sequence[Smoothed]
+    error: str
+    """What the gradient raised; empty if nothing."""
+    notes: Sequence[str]
+    left_out: Sequence[str]
+    """What the budget did not allow."""
+
+    # -------------------------------------------------------------------------------------------- verdicts
+
+    @property
+    def cause(self) -> str:
+        """The cause of what is wrong, or how it is right: a verdict of the gradient check.
+
+        ``raised`` where the gradient could not be computed, ``undecided`` where the budget ended before the check.
+        """
+        if self.error:
+            return "raised"
+        if not self.repeats:
+            return "nondeterministic"
+        if self.check is None:
+            return "undecided"
+        bad = [one.cause for one in (self.check, *self.more) if not one.trusted]
+        return bad[0] if bad else self.check.cause
+
+    @property
+    def problems(self) -> list[str]:
+        """Everything that cannot be trusted, in words, worst first; empty when all is right."""
+        found = []
+        if self.error:
+            found.append(f"raised: the gradient could not be computed: {self.error}")
+        elif not self.repeats:
+            found.append(f"nondeterministic: {WORDS['nondeterministic']} (costs differ by {number(self.spread)})")
+        elif self.check is None:
+            found.append("undecided: the budget ended before the gradient was checked")
+        else:
+            found += [self.sentence(one) for one in (self.check, *self.more) if not one.trusted][:1]
+        if not found:
+            for one in self.smoothed:
+                if one.biased:
+                    low, high = one.bias_low / one.norm, one.bias_high / one.norm
+                    found.append(
+                        f"biased: at sigma {number(one.sigma)} the mean of the gradients misses {number(100 * low)} to "
+                        f"{number(100 * high)}% of grad J, though each gradient is right: it does not see the jumps"
+                    )
+        return found
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is right, and yet worth a look."""
+        found = []
+        if self.check is not None and self.check.trusted:
+            for verdict in WARNED:
+                parts = [self.called(part) for part in self.check.components if part.verdict == verdict]
+                if parts:
+                    found.append(
+                        f"{verdict}: {', '.join(parts[:6])}{' ...' if len(parts) > 6 else ''}: {WORDS[verdict]}"
+                    )
+        if self.precision != "float64":
+            found.append(f"{self.precision}: a check in {self.precision} sees errors above about {self.resolution}")
+        found += [f"not done, for the budget: {what}" for what in self.left_out]
+        return found
+
+    @property
+    def resolution(self) -> str:
+        """The smallest relative error that a check in this precision sees, about u^(2/3) (central differences)."""
+        unit = 2.0**-7 if self.precision == "bfloat16" else float(np.finfo(self.precision).eps)
+        return f"{100 * unit ** (2 / 3):.1g}%"
+
+    @property
+    def status(self) -> int:
+        """The exit status: 0, or 1 where something cannot be trusted."""
+        return 1 if self.problems else 0
+
+    def called(self, part: Part) -> str:
+        """Return a part's name: that of its number in theta, or ``direction 0``."""
+        return self.names[part.component] if part.component is not None else part.name
+
+    def sentence(self, check: Check) -> str:
+        """Say what a check found wrong, with the numbers of the worst part."""
+        text = f"{check.cause}: {WORDS.get(check.cause, check.cause)}"
+        guilty = [part for part in check.guilty if part.component is not None] or list(check.guilty)
+        if not guilty:
+            return text
+        part = max(guilty, key=lambda p: np.nan_to_num(p.error, nan=math.inf))
+        if check.cause == "kink":
+            return f"{text} ({self.called(part)}: {number(part.left, 4)} and {number(part.right, 4)})"
+        if check.cause not in FAULTS:
+            return f"{text} ({self.called(part)})"
+        program = "" if not self.gradient else f"program {number(part.program, 6)}, "
+        return f"{text} ({self.called(part)}: {program}differences {number(part.difference, 6)})"
+
+    # ---------------------------------------------------------------------------------------------- tables
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """One row per derivative checked: its number, what the differences give, and the verdict."""
+        import pandas as pd
+
+        parts = [(self.called(part), part) for part in (*self.check.parts, *self.check.draws)] if self.check else []
+        shown = bool(self.gradient)
+        return pd.DataFrame(
+            {
+                "name": [name for name, _ in parts],
+                "program": [part.program if shown else math.nan for _, part in parts],
+                "difference": [part.difference for _, part in parts],
+                "uncertainty": [part.uncertainty for _, part in parts],
+                "step": [part.step for _, part in parts],
+                "ratio": [part.ratio if shown else math.nan for _, part in parts],
+                "left": [part.left for _, part in parts],
+                "right": [part.right for _, part in parts],
+                "order": [part.order if shown else math.nan for _, part in parts],
+                "verdict": [part.verdict for _, part in parts],
+            }
+        )
+
+    @property
+    def sigmas(self) -> pd.DataFrame:
+        """One row per sigma and method: its bias, and what a relative error of 10% costs."""
+        import pandas as pd
+
+        rows = []
+        for one in self.smoothed:
+            base = dict(
+                sigma=one.sigma, norm=one.norm, norm_se=one.error, pairs=one.pairs, bias=one.bias, bias_low=one.bias_low,
+                bias_high=one.bias_high, moved=one.moved, remark=one.remark,
+            )  # fmt: skip
+            for method in one.methods:
+                best = one.best is not None and one.best.name == method.name
+                rows.append(
+                    base
+                    | dict(
+                        method=method.name,
+                        samples=method.samples,
+                        calls=method.calls,
+                        seconds=method.seconds,
+                        best=best,
+                    )
+                )
+            if not one.methods:
+                rows.append(base | dict(method="", samples=math.nan, calls=math.nan, seconds=math.nan, best=False))
+        return pd.DataFrame(rows)
+
+    @property
+    def breaks(self) -> pd.DataFrame:
+        """One row per jump or kink found: its line, its place in standard deviations, and its size."""
+        import pandas as pd
+
+        rows = [
+            dict(line=index + 1, kind=found.kind, at=found.at, size=found.size)
+            for index, line in enumerate(self.lines)
+            for found in line.breaks
+        ]
+        return pd.DataFrame(rows, columns=["line", "kind", "at", "size"])
+
+    # ------------------------------------------------------------------------------------------------ text
+
+    def __str__(self) -> str:
+        parts = [self._head(), self._components(), self._breaks(), self._sigmas(), self._end()]
+        return "\n\n".join("\n".join(part) for part in parts if part)
+
+    def _head(self) -> list[str]:
+        shown = ", ".join(f"{name}={value:g}" for name, value in list(zip(self.names, self.theta, strict=True))[:6])
+        shown += f", ... ({self.theta.size} numbers)" if self.theta.size > 6 else ""
+        repeats = "repeats exactly" if self.repeats else f"DOES NOT REPEAT: calls differ by {number(self.spread)}"
+        if self.repeats and self.check is not None and self.check.noise > 0:
+            repeats += f", rough by {number(self.check.noise)}"
+        lines = [
+            f"{self.name}: cost {self.cost:.6g} at {shown}",
+            f"{self.precision}, {repeats}; gradient: {self.gradient or 'none, differences alone'}; batch: {self.batch}",
+        ]
+        spent = f"spent: {counted(self.costs, 'cost')}"
+        if self.gradient:
+            spent += f" and {counted(self.gradients, 'gradient')}"
+        spent += f" in {duration(self.seconds)} of {duration(self.budget)}; a cost takes {duration(self.cost_s)}"
+        if math.isfinite(self.gradient_s):
+            spent += f", a gradient {duration(self.gradient_s)}"
+        return [*lines, spent, *(f"note: {note}" for note in self.notes)]
+
+    def _components(self) -> list[str]:
+        if self.check is None:
+            return []
+        check = self.check
+        head = ["", "program", "differences", "step", "ratio", "verdict"]
+        rows = [head]
+        whole = [part for part in check.parts if part.component is None]
+        for part in (*check.components, *whole):
+            rows.append(
+                [
+                    self.called(part),
+                    number(part.program, 6) if self.gradient else "-",
+                    f"{number(part.difference, 6)} +- {number(part.uncertainty, 1)}",
+                    number(part.step, 1),
+                    number(part.ratio, 5) if self.gradient else "-",
+                    part.verdict,
+                ]
+            )
+        title = "Is the gradient right?" if self.gradient else "The derivative by differences:"
+        lines = [title, *_table(rows)]
+        if check.draws:
+            wrong = [part for part in check.draws if part.verdict in FAULTS]
+            lines.append(
+                f"  elsewhere: {counted(len(check.draws), 'direction')} at other thetas around this one, "
+                + (f"{len(wrong)} wrong: {wrong[0].verdict}" if wrong else "none wrong")
+            )
+        if self.gradient and math.isfinite(check.order):
+            lines.append(
+                f"  Taylor remainder |f(x + h d) - f(x) - h g.d|: order {check.order:.2f} in h (2 right, 1 wrong)"
+            )
+        return lines
+
+    def _breaks(self) -> list[str]:
+        if not self.lines:
+            return []
+        unit = "of each input's scale" if self.relative else "on theta"
+        count = counted(len(self.lines), "line")
+        lines = [f"Jumps and kinks on {count} through theta, +-3 sigma (sigma = {number(self.reach)} {unit}):"]
+        for index, line in enumerate(self.lines):
+            said = []
+            for kind, found in (("jump", line.jumps), ("kink", line.kinks)):
+                if found:
+                    first = ", ".join(f"{b.at:+.3f} ({number(b.size)})" for b in found[:4])
+                    size = "height" if kind == "jump" else "change of slope"
+                    said.append(
+                        f"{counted(len(found), kind)} at t = {first}{' ...' if len(found) > 4 else ''} [{size}]"
+                    )
+            bad = int((~np.isfinite(line.costs)).sum())
+            if bad:
+                said.append(f"{bad} of {line.costs.size} costs are no numbers")
+            if line.steps:
+                said.append("constant between jumps: a staircase")
+            lines.append(f"  line {index + 1}: {'; '.join(said) or 'none found'}")
+        if any(len(line.breaks) > 5 for line in self.lines):
+            lines.append("  at most six places are looked at on a line: there may be more")
+        return lines
+
+    def _sigmas(self) -> list[str]:
+        if not self.smoothed:
+            return self._plain()
+        unit = ", relative to each input's scale" if self.relative else ""
+        rows = [["sigma", "|grad J|", "bias of the gradient", "smoothing moves it by", "use", "10% error costs"]]
+        remarks = []
+        for one in self.smoothed:
+            rows.append(
+                [
+                    number(one.sigma),
+                    f"{number(one.norm, 3)} +- {number(one.error, 1)}",
+                    self._bias(one),
+                    f"{number(100 * one.moved / one.norm)}%" if math.isfinite(one.moved) and one.known else "-",
+                    *self._use(one),
+                ]
+            )
+            if one.remark:
+                remarks.append(f"  sigma {number(one.sigma)}: {one.remark}")
+        return [f"With noise of sigma on theta{unit}, J = E cost:", *_table(rows), *remarks]
+
+    def _bias(self, one: Smoothed) -> str:
+        if not math.isfinite(one.bias):
+            return "-"
+        if not one.known:
+            return "cannot tell"
+        low, high = 100 * one.bias_low / one.norm, 100 * one.bias_high / one.norm
+        if low <= 0:
+            return f"none seen, below {number(high)}%"
+        return f"{number(100 * one.bias / one.norm)}% [{number(low)}, {number(high)}]"
+
+    def _use(self, one: Smoothed) -> tuple[str, str]:
+        best = one.best
+        if best is None:
+            return "cannot tell", "-"
+        if self.problems and self.cause in (*FAULTS, "raised") and best.name == "gradient":
+            best = next((m for m in one.methods if m.name == "smoothing" and math.isfinite(m.seconds)), None)
+            if best is None:
+                return "cannot tell", "-"
+        kind = "gradient" if best.name == "gradient" else "cost"
+        return f"{best.name}, N = {int(best.samples):,}", f"{counted(int(best.calls), kind)}, {duration(best.seconds)}"
+
+    def _plain(self) -> list[str]:
+        """Say what to use without noise."""
+        if self.check is None or self.status:
+            return []
+        dim = self.theta.size
+        lines = [f"Without noise: central differences take {2 * dim} costs, {duration(2 * dim * self.cost_s)}"]
+        if self.gradient and math.isfinite(self.gradient_s):
+            fewer = "use the gradient" if self.gradient_s < 2 * dim * self.cost_s else "differences are no slower"
+            lines[0] += f"; the gradient {duration(self.gradient_s)}: {fewer}"
+        return lines
+
+    def _end(self) -> list[str]:
+        lines = [f"warning: {text}" for text in self.warnings]
+        if self.problems:
+            return [*lines, *(f"CANNOT BE TRUSTED: {text}" for text in self.problems)]
+        what = "the gradient is the derivative of its cost" if self.gradient else "the cost has a derivative here"
+        return [*lines, f"RIGHT: {what} ({self.cause})"]
+
+
+def _table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows with aligned columns."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [
+        "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]

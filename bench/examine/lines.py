@@ -1,0 +1,146 @@
+"""Jumps and kinks of a cost on a line, found by halving intervals about the places where its slope changes most.
+
+Where the slope changes by D over a width h, D falls like h for a smooth cost, stays for a kink and grows like 1/h for a
+jump. The order is read over the halvings, so that no threshold on the size of a change is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+POINTS = 97
+"""Points of a scan. No power of 2 and one, so that round numbers seldom fall on them."""
+HALVINGS = 14
+"""Halvings of an interval."""
+PLACES = 6
+"""Places that are looked at on a line, those where the slope changes most."""
+GUARD = 64.0
+"""Rounding errors of a cost that a change of slope has to exceed."""
+
+
+@dataclass(frozen=True)
+class Break:
+    """A place where a cost has no derivative."""
+
+    kind: str
+    """``jump`` or ``kink``."""
+    at: float
+    """Where it is on the line, in units of the line's direction."""
+    size: float
+    """The height of a jump, or the change of slope at a kink, per unit of the line's direction."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A cost along ``theta + t * direction``."""
+
+    direction: np.ndarray
+    """``(d,)``."""
+    at: np.ndarray
+    """Values of t, ``(n,)``."""
+    costs: np.ndarray
+    """``(n,)``."""
+    breaks: tuple[Break, ...]
+    steps: bool
+    """Whether the cost is constant between jumps everywhere: a staircase."""
+
+    @property
+    def jumps(self) -> tuple[Break, ...]:
+        """The jumps."""
+        return tuple(found for found in self.breaks if found.kind == "jump")
+
+    @property
+    def kinks(self) -> tuple[Break, ...]:
+        """The kinks."""
+        return tuple(found for found in self.breaks if found.kind == "kink")
+
+
+def scan(
+    cost: Callable[[np.ndarray], np.ndarray],
+    theta: np.ndarray,
+    direction: np.ndarray,
+    noise: float,
+    reach: float = 3.0,
+    points: int = POINTS,
+    halvings: int = HALVINGS,
+) -> Line:
+    """Scan ``cost((d, B)) -> (B,)`` on a line from -reach to +reach times ``direction (d,)`` about ``theta (d,)``.
+
+    ``noise`` is the size of what the cost's rounding changes.
+    """
+
+    def along(t: np.ndarray) -> np.ndarray:
+        return cost(theta[:, None] + direction[:, None] * t.ravel()).reshape(t.shape)
+
+    t = np.linspace(-reach, reach, points)
+    f = along(t)
+    turns = np.abs(np.diff(f, 2))
+    order = np.argsort(np.nan_to_num(turns, nan=-1.0, posinf=-1.0))[::-1]
+    places: list[int] = []
+    for index in order:
+        if len(places) < PLACES and turns[index] > GUARD * noise and all(abs(index - p) > 1 for p in places):
+            places.append(int(index))
+    found = _narrowed(along, t, f, places, halvings, noise) if places else []
+    level = np.diff(f)
+    steps = bool(level.any() and (np.abs(level) <= noise).mean() > 0.5 and any(b.kind == "jump" for b in found))
+    return Line(direction, t, f, tuple(sorted(found, key=lambda b: b.at)), steps)
+
+
+def _narrowed(
+    along: Callable[[np.ndarray], np.ndarray],
+    t: np.ndarray,
+    f: np.ndarray,
+    places: list[int],
+    halvings: int,
+    noise: float,
+) -> list[Break]:
+    """Halve the intervals about each place, all places at once, and return the breaks."""
+    count = len(places)
+    centre = np.array([t[i + 1] for i in places])
+    width = float(t[1] - t[0])
+    # three points: left, middle, right
+    values = np.stack([[f[i], f[i + 1], f[i + 2]] for i in places])
+    turns, widths = [_turn(values)], [width]
+    for _ in range(halvings):
+        between = along(np.stack([centre - width / 2, centre + width / 2], axis=1))
+        five = np.stack([values[:, 0], between[:, 0], values[:, 1], between[:, 1], values[:, 2]], axis=1)
+        changes = np.abs(five[:, :-2] - 2 * five[:, 1:-1] + five[:, 2:])
+        best = np.argmax(np.nan_to_num(changes, nan=-1.0), axis=1)
+        width /= 2
+        centre = centre + (best - 1) * width
+        values = np.stack([five[np.arange(count), best + k] for k in range(3)], axis=1)
+        turns.append(_turn(values))
+        widths.append(width)
+    change = np.array(
+        turns
+    )  # (halvings + 1, places): second differences, of order 2 in the width, 1 for a kink, 0 for a jump
+    found = []
+    for k in range(count):
+        clear = np.flatnonzero(change[:, k] > GUARD * noise)
+        clear = clear[clear == np.arange(clear.size)]
+        if clear.size < 5:
+            continue
+        last = clear[-min(6, clear.size) :]
+        order = float(np.polyfit(np.log2(np.array(widths)[last]), np.log2(change[last, k]), 1)[0])
+        at, end = float(centre[k]), int(last[-1])
+        if order < 0.5:
+            found.append(Break("jump", at, float(change[end, k])))
+        elif order < 1.5:
+            found.append(Break("kink", at, float(change[end, k] / widths[end])))
+    return _apart(found, 4 * (t[1] - t[0]) / 2**halvings)
+
+
+def _turn(values: np.ndarray) -> np.ndarray:
+    return np.abs(values[:, 0] - 2 * values[:, 1] + values[:, 2])
+
+
+def _apart(found: list[Break], near: float) -> list[Break]:
+    """Return breaks without those found twice, jumps before kinks."""
+    kept: list[Break] = []
+    for one in sorted(found, key=lambda b: b.kind):
+        if all(abs(one.at - other.at) > near for other in kept):
+            kept.append(one)
+    return kept

@@ -1,0 +1,189 @@
+"""An examination as files: text, tables, charts, and one page that holds them all and needs no network."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.examine.findings import Findings
+from bench.report.figures import save, styled
+from bench.report.style import GREY, MARKERS, PALETTE
+from bench.report.text import number
+from bench.sweep.files import make_directory, write_all, write_whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+WIDTH = 7.16
+"""Inches of two columns of a paper."""
+SHOWN = 8
+"""Components drawn: those with the largest error."""
+PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<style>
+body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }}
+h1 {{ font-size: 1.4rem; margin-bottom: .3rem; }} h2 {{ font-size: 1.1rem; margin-top: 2rem; }}
+.verdict {{ padding: .6rem .9rem; border-left: 5px solid {colour}; background: #f6f6f6; }}
+pre {{ overflow-x: auto; background: #f6f6f6; padding: .8rem; font-size: 12.5px; }}
+img {{ max-width: 100%; }}
+table {{ border-collapse: collapse; font-size: 13px; }} .wide {{ overflow-x: auto; }}
+th, td {{ padding: .2rem .6rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap; }}
+th:first-child, td:first-child {{ text-align: left; }}
+</style></head><body>
+<h1>{title}</h1>
+<p class="verdict">{verdict}</p>
+{charts}
+<h2>All numbers</h2>
+<pre>{text}</pre>
+<h2>Every derivative checked</h2>
+<div class="wide">{table}</div>
+</body></html>
+"""
+
+
+def write(report: Findings, directory: Path) -> list[Path]:
+    """Write ``report.txt``, ``derivatives.csv``, ``sigmas.csv``, ``breaks.csv``, the charts and ``report.html``."""
+    make_directory(directory)
+    tables = {"derivatives": report.frame, "sigmas": report.sigmas, "breaks": report.breaks}
+    texts = {f"{name}.csv": table.to_csv(index=False, lineterminator="\n") for name, table in tables.items()}
+    paths = write_all(directory, {"report.txt": f"{report}\n", **texts})
+    pictures = []
+    with styled():
+        for name, (title, figure) in charts(report).items():
+            saved = save(figure, directory / name)
+            paths += saved
+            data = base64.b64encode(saved[0].read_bytes()).decode()
+            pictures.append(f'<h2>{escape(title)}</h2><img alt="{escape(title)}" src="data:image/png;base64,{data}">')
+    page = PAGE.format(
+        title=escape(f"{report.name}, examined"),
+        colour="#D55E00" if report.status else "#009E73",
+        verdict=escape(" ".join(report.problems) or str(report).rpartition("\n")[2]),
+        charts="\n".join(pictures),
+        text=escape(str(report)),
+        table=report.frame.to_html(index=False, float_format=lambda x: number(x, 5), border=0),
+    )
+    write_whole(directory / "report.html", page.encode())
+    return [*paths, directory / "report.html"]
+
+
+def charts(report: Findings) -> dict[str, tuple[str, Figure]]:
+    """Return a title and a figure for each chart that the report has numbers for."""
+    drawn = {}
+    if report.check is not None and report.gradient:
+        drawn["steps"] = ("The gradient against differences of the cost", _steps(report))
+    if report.lines:
+        drawn["lines"] = ("The cost on lines through theta", _lines(report))
+    if len(report.smoothed) > 1:
+        drawn["sigmas"] = ("Errors under noise on theta", _sigmas(report))
+    return drawn
+
+
+def _figure(panels: int, height: float = 2.6) -> tuple[Figure, list]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, list(figure.subplots(1, panels, squeeze=False)[0])
+
+
+def _steps(report: Findings) -> Figure:
+    """Draw the error of each derivative, and the remainder of each random direction, against the step."""
+    assert report.check is not None
+    figure, (left, right) = _figure(2, 2.9)
+    components = sorted(report.check.components, key=lambda p: -np.nan_to_num(p.error, nan=np.inf))[:SHOWN]
+    for index, part in enumerate(components):
+        sample = part.sample
+        size = max(abs(part.difference), abs(part.program)) or 1.0
+        error = np.abs(sample.differences - part.program) / size
+        left.loglog(
+            sample.step, np.where(error > 0, error, np.nan), color=PALETTE[index % 8], marker=MARKERS[index % 8],
+            markersize=3, label=report.called(part),
+        )  # fmt: skip
+    left.set_xlabel("step, in units of the input")
+    left.set_ylabel("relative error of the gradient")
+    left.set_title("A right gradient: falls with the step squared,\nuntil rounding takes over", fontsize=8)
+    if components:
+        left.legend(fontsize=7, loc="upper left")
+    whole = [part for part in report.check.parts if part.component is None]
+    for index, part in enumerate(whole):
+        sample = part.sample
+        with np.errstate(all="ignore"):
+            rest = np.abs(sample.plus - sample.centre - sample.step * part.program)
+        right.loglog(
+            sample.step, np.where(rest > 0, rest, np.nan), color=PALETTE[index % 8], marker=MARKERS[index % 8],
+            markersize=3, label=part.name,
+        )  # fmt: skip
+        steps = np.array([sample.step[0], sample.step[-1]])
+        for power, style in ((1, ":"), (2, "--")):
+            top = rest[0] if rest[0] > 0 else 1.0
+            name = f"order {power}: {'right' if power == 2 else 'wrong'}" if index == 0 else None
+            right.loglog(
+                steps, top * (steps / steps[0]) ** power, color=GREY, linestyle=style, linewidth=0.8, label=name
+            )
+    floor = np.nanmin(
+        [np.nanmin(np.where(p.sample.uncertainty > 0, p.sample.uncertainty, np.nan)) for p in whole] or [1e-16]
+    )
+    right.set_ylim(bottom=max(1e-3 * floor * 1e-10, 1e-20))
+    right.set_xlabel("step h along a random direction d")
+    right.set_ylabel("|f(x + h d) − f(x) − h g·d|")
+    right.set_title("The Taylor remainder: order 2 for a right gradient,\n1 for a wrong one", fontsize=8)
+    right.legend(fontsize=7, loc="upper left")
+    return figure
+
+
+def _lines(report: Findings) -> Figure:
+    """Draw the cost on each line, with its jumps and kinks."""
+    figure, panels = _figure(len(report.lines))
+    for index, (panel, line) in enumerate(zip(panels, report.lines, strict=True)):
+        panel.plot(line.at, line.costs, color=PALETTE[0], marker=".", markersize=2.5, linewidth=0.9)
+        for kind, colour, style in (("jump", PALETTE[2], "-"), ("kink", PALETTE[3], "--")):
+            for count, found in enumerate(b for b in line.breaks if b.kind == kind):
+                panel.axvline(
+                    found.at, color=colour, linestyle=style, linewidth=0.9, label=kind if count == 0 else None
+                )
+        panel.set_xlabel(f"t, in sigma = {number(report.reach)}{' of the scale' if report.relative else ''}")
+        panel.set_title(
+            f"line {index + 1}: {'no break found' if not line.breaks else f'{len(line.breaks)} breaks found'}"
+        )
+        if line.breaks:
+            panel.legend(fontsize=7)
+    panels[0].set_ylabel("cost")
+    return figure
+
+
+def _sigmas(report: Findings) -> Figure:
+    """Draw bias of the gradient and what smoothing moves, against sigma."""
+    figure, (panel,) = _figure(1)
+    shown = [one for one in report.smoothed if one.known]
+    sigma = np.array([one.sigma for one in shown])
+    if shown and np.isfinite([one.bias for one in shown]).all():
+        bias = np.array([[one.bias, one.bias_low, one.bias_high] for one in shown]) / np.array(
+            [[o.norm] for o in shown]
+        )
+        clear = bias[:, 1] > 0
+        panel.vlines(sigma[clear], bias[clear, 1], bias[clear, 2], color=PALETTE[2])
+        panel.plot(sigma[clear], bias[clear, 0], "o", color=PALETTE[2], label="bias of the gradient, with 95% interval")
+        panel.plot(
+            sigma[~clear],
+            bias[~clear, 2],
+            "v",
+            mfc="none",
+            color=PALETTE[2],
+            label="none seen: upper end of its interval",
+        )
+    moved = np.array([one.moved / one.norm for one in shown])
+    if np.isfinite(moved).any():
+        panel.plot(sigma, moved, "s-", color=PALETTE[0], label="what smoothing moves the gradient by")
+    panel.axhline(0.1, color=GREY, linewidth=0.8, linestyle=":", label="10%")
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    panel.set_xlabel("sigma, noise on theta")
+    panel.set_ylabel("relative to |∇J|")
+    panel.legend(fontsize=7)
+    return figure

@@ -1,0 +1,211 @@
+"""What noise of size sigma on theta does to the gradient: bias of the program's gradient, and what each method costs.
+
+The truth is grad J, J(theta) = E cost(theta + sigma u) with u ~ N(0, I), from costs alone, so that it is right across
+jumps, which a mean of gradients does not see. Costs are taken in pairs at +u and -u, with the same noise w of the
+simulator's own: d = (cost(theta + sigma u) - cost(theta - sigma u)) / 2 sigma. Then E[d u] = grad J (Nesterov and
+Spokoiny 2017, Found. Comput. Math. 17, section 2), and subtracting a fitted straight line d = b . u, whose mean is known,
+removes most of its variance. The line is fitted to the other half of the pairs, so that the mean stays exact.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.examine.clock import Clock, OutOfTime
+from bench.examine.simulator import Simulator
+
+PAIRS = 4096
+"""Pairs of costs for one sigma, where the time allows."""
+FEWEST = 64
+"""Pairs without which nothing is said."""
+FIRM = 1024
+"""Pairs before which drawing does not stop early, however small the spread: a jump may be rare."""
+GROUPS = 32
+"""Independent means that intervals are computed from."""
+ENOUGH = 0.03
+"""Standard error of grad J, relative to it, from which no more pairs are drawn once the bias is decided."""
+WANTED = 0.1
+"""Relative error that the costs are stated for."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to estimate grad J, and what a relative error of 10% costs with it."""
+
+    name: str
+    """``gradient``: mean of the program's gradients; ``smoothing``: pairs of costs along random directions."""
+    bias: float
+    """Relative to |grad J|: the upper end of its 95% interval."""
+    samples: float
+    """Samples for a relative root-mean-square error of 10%; infinity where its bias alone is more."""
+    calls: float
+    """Calls of cost or gradient that these take."""
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """The findings at one sigma."""
+
+    sigma: float
+    gradient: np.ndarray
+    """grad J, from costs, ``(d,)``."""
+    error: float
+    """Standard error of its norm."""
+    norm: float
+    """|grad J|, with the share of noise removed."""
+    pairs: int
+    bias: float
+    """|E program's gradient - grad J|, its size with the share of noise removed; NaN without a gradient."""
+    bias_low: float
+    bias_high: float
+    """95% interval of it."""
+    moved: float
+    """|grad J - grad cost| at theta: what smoothing itself changes; NaN without a gradient that is right."""
+    remark: str
+    """Why the intervals may be too narrow; empty if there is no reason."""
+    methods: tuple[Method, ...]
+
+    @property
+    def known(self) -> bool:
+        """Whether grad J stands clear of its own error."""
+        return self.norm > 4.0 * self.error
+
+    @property
+    def decided(self) -> bool:
+        """Whether the bias is surely above or surely below 10% of |grad J|."""
+        edge = WANTED * self.norm
+        return not self.bias_low <= edge <= self.bias_high
+
+    @property
+    def biased(self) -> bool:
+        """Whether the program's gradient is off by more than 10% at this sigma, beyond doubt."""
+        return self.known and bool(self.bias_low > WANTED * self.norm)
+
+    @property
+    def best(self) -> Method | None:
+        """The method that reaches 10% first; None where none does."""
+        usable = [m for m in self.methods if math.isfinite(m.seconds)]
+        return min(usable, key=lambda m: m.seconds) if usable and self.known else None
+
+
+def smoothed(
+    simulator: Simulator,
+    theta: np.ndarray,
+    sigma: float,
+    scale: np.ndarray,
+    plain: np.ndarray | None,
+    clock: Clock,
+    seed: int = 0,
+    pairs: int = PAIRS,
+) -> Smoothed | None:
+    """Measure the gradient under noise ``sigma * scale * u`` on theta; None where the time allows too few pairs.
+
+    ``plain (d,)`` is the gradient at theta without noise, if it is known to be right.
+    """
+    random = np.random.default_rng([seed, 0x736D6F6F])
+    drawn: list[np.ndarray] = []
+    size, found = FEWEST, None
+    try:
+        while size <= pairs:
+            drawn.append(_draw(simulator, theta, sigma * scale, random, size if found is None else size // 2))
+            found = _summary(sigma, scale, np.concatenate(drawn, axis=1), plain, simulator, clock)
+            if size >= FIRM and found.error <= ENOUGH * found.norm and found.decided:
+                break
+            size *= 2
+    except OutOfTime:
+        pass
+    return found
+
+
+def _draw(
+    simulator: Simulator, theta: np.ndarray, spread: np.ndarray, random: np.random.Generator, size: int
+) -> np.ndarray:
+    """Return n pairs, ``(3 d + 1, n)``: directions u, half differences per unit of u, gradients at +u and at -u."""
+    u = random.standard_normal((theta.size, size))
+    w = random.standard_normal((simulator.noise, size)) if simulator.noise else None
+    up, down = theta[:, None] + spread[:, None] * u, theta[:, None] - spread[:, None] * u
+    d = (simulator.costs(up, w) - simulator.costs(down, w)) / 2.0
+    if not simulator.has_gradient:
+        return np.concatenate([u, d[None], np.full((2 * theta.size, size), np.nan)])
+    return np.concatenate([u, d[None], simulator.gradients(up, w), simulator.gradients(down, w)])
+
+
+def _summary(
+    sigma: float,
+    scale: np.ndarray,
+    drawn: np.ndarray,
+    plain: np.ndarray | None,
+    simulator: Simulator,
+    clock: Clock,
+) -> Smoothed:
+    # SciPy's distributions take long to import, and only this needs them
+    from bench.measure.statistics import Truth, summarise
+
+    dim, pairs = scale.size, drawn.shape[1]
+    spread = sigma * scale
+    u, d, up, down = drawn[:dim], drawn[dim], drawn[dim + 1 : 2 * dim + 1], drawn[2 * dim + 1 :]
+    if not np.isfinite(d).all():
+        share = f"{int((~np.isfinite(d)).sum())} of {pairs} pairs have a cost that is no number"
+        nothing = np.full(dim, np.nan)
+        return Smoothed(sigma, nothing, math.inf, math.nan, pairs, math.nan, math.nan, math.nan, math.nan, share, ())
+    groups = _means(_terms(u, d) / spread[:, None])
+    truth = groups.mean(axis=0)
+    error = float(np.sqrt(groups.var(axis=0, ddof=1).sum() / GROUPS))
+    norm = math.sqrt(max(float(truth @ truth) - error**2, 0.0))
+    bias = low = high = moved = math.nan
+    remark = ""
+    slopes = (up + down) / 2.0
+    if np.isfinite(slopes).all():
+        judged = summarise(_means(slopes) - groups, Truth.exact(np.zeros(dim)), pairs // GROUPS)
+        bias, low, high, remark = judged.bias, judged.bias_low, judged.bias_high, judged.note
+    elif simulator.has_gradient:
+        remark = f"{int((~np.isfinite(slopes).all(axis=0)).sum())} of {pairs} pairs have a gradient that is no number"
+    if plain is not None:
+        moved = float(np.linalg.norm(truth - plain))
+    methods = _methods(norm, high, d * u / spread[:, None], up, clock) if norm > 4.0 * error else ()
+    return Smoothed(sigma, truth, error, norm, pairs, bias, low, high, moved, remark, methods)
+
+
+def _terms(u: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return terms ``(d, n)`` whose mean is E[d u], with a straight line fitted to the other half taken out."""
+    dim, count = u.shape
+    halves = np.arange(count) % 2 == 0
+    out = np.empty_like(u)
+    for half in (halves, ~halves):
+        slope = np.zeros(dim)
+        if half.sum() > 3 * dim:
+            slope = np.linalg.lstsq(u[:, ~half].T, d[~half], rcond=None)[0]
+        out[:, half] = (d[half] - slope @ u[:, half]) * u[:, half] + slope[:, None]
+    return out
+
+
+def _means(terms: np.ndarray) -> np.ndarray:
+    """Return independent means of ``terms (d, n)``, ``(GROUPS, d)``; each takes as many of both halves as any other."""
+    return terms.reshape(terms.shape[0], GROUPS, -1).mean(axis=2).T
+
+
+def _methods(norm: float, bias: float, terms: np.ndarray, slopes: np.ndarray, clock: Clock) -> tuple[Method, ...]:
+    """Return what a relative error of 10% costs with each method, from its single samples ``(d, n)``."""
+    found = [_method("smoothing", 0.0, terms, norm, 2, clock.per_cost())]
+    if np.isfinite(slopes).all():
+        found.append(_method("gradient", bias / norm, slopes, norm, 1, clock.per_gradient()))
+    return tuple(sorted(found, key=lambda m: m.seconds))
+
+
+def _method(name: str, bias: float, terms: np.ndarray, norm: float, calls: int, seconds: float) -> Method:
+    variance = float(terms.var(axis=1, ddof=1).sum())
+    room = WANTED**2 - bias**2
+    samples = max(1.0, math.ceil(variance / norm**2 / room)) if room > 0 else math.inf
+    return Method(name, bias, samples, calls * samples, calls * samples * seconds)
+
+
+def directions(count: int, scale: np.ndarray, seed: int) -> np.ndarray:
+    """Return random directions of one standard deviation each, ``(count, d)``; one of them where d is 1."""
+    if scale.size == 1:
+        return scale[None, :]
+    drawn = np.random.default_rng([seed, 0x6C696E65]).standard_normal((count, scale.size))
+    return np.asarray(scale * drawn / np.linalg.norm(drawn, axis=1, keepdims=True))

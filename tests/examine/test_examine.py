@@ -1,0 +1,306 @@
+"""`bench.examine`: right gradients pass, wrong ones are named, jumps are found, and the budget holds."""
+
+import dataclasses
+import math
+import time
+from collections import namedtuple
+
+import numpy as np
+import pytest
+
+import bench
+from bench import cli
+from bench.errors import UserError
+from bench.examine.clock import seconds
+from bench.examine.layout import Layout
+from bench.examine.lines import scan
+from bench.examine.smoothing import Smoothed
+
+QUICK = {"progress": False, "budget": 20}
+
+
+def bowl(x):
+    return float(np.sin(x[0]) * x[1] + x[1] ** 3)
+
+
+def slope(x):
+    return [math.cos(x[0]) * x[1], math.sin(x[0]) + 3 * x[1] ** 2]
+
+
+# ------------------------------------------------------------------------------------------------ theta
+
+
+@dataclasses.dataclass
+class Body:
+    mass: float
+    gains: np.ndarray
+
+
+Pair = namedtuple("Pair", "left right")
+
+
+@pytest.mark.parametrize(
+    ("theta", "names"),
+    [
+        ([1.0, 2.0], ["theta[0]", "theta[1]"]),
+        (2.0, ["theta"]),
+        ({"mass": 1.0, "gains": np.arange(2.0)}, ["mass", "gains[0]", "gains[1]"]),
+        ({"legs": [{"k": 1.0}, {"k": 2.0}]}, ["legs[0].k", "legs[1].k"]),
+        (Body(1.0, np.ones((1, 2))), ["mass", "gains[0,0]", "gains[0,1]"]),
+        (Pair(1.0, (2.0, 3.0)), ["left", "right[0]", "right[1]"]),
+    ],
+)
+def test_theta_is_taken_apart_and_put_together(theta, names):
+    layout = Layout(theta)
+    assert layout.names == names
+    built = layout.build(layout.vector + 1)
+    assert type(built) is type(theta) or isinstance(theta, list)
+    np.testing.assert_array_equal(layout.take(built), layout.vector + 1)
+
+
+@pytest.mark.parametrize(
+    ("theta", "match"),
+    [({}, "no numbers"), ("mass", "real numbers"), ([math.nan], "not finite"), ({"a": 1j}, "real numbers")],
+)
+def test_theta_without_real_numbers_is_bad_input(theta, match):
+    with pytest.raises(UserError, match=match):
+        Layout(theta)
+
+
+def test_scale_of_zero_is_that_of_its_array():
+    np.testing.assert_allclose(Layout({"drag": 2e4, "x": [0.0, 3.0], "y": 0.0}).scales(), [2e4, 3.0, 3.0, 1.0])
+
+
+# -------------------------------------------------------------------------------------------- gradients
+
+
+def test_right_gradient_passes_with_every_digit():
+    report = bench.examine(bowl, [1.0, 0.5], grad=slope, sigma=[0.003], **QUICK)
+    assert (report.status, report.cause) == (0, "smooth")
+    report.assert_right()
+    np.testing.assert_allclose(report.frame["difference"][:2], slope([1.0, 0.5]), rtol=1e-7)
+    assert report.check.order == pytest.approx(2.0, abs=0.1)
+
+
+def test_missing_term_is_named_with_its_component_and_raises():
+    report = bench.examine(bowl, [1.0, 0.5], grad=lambda x: [slope(x)[0], 3 * x[1] ** 2], **QUICK)
+    assert (report.status, report.cause) == (1, "missing_term")
+    with pytest.raises(AssertionError, match=r"missing_term: ratio not constant.*theta\[1\]"):
+        report.assert_right()
+    assert report.check.order == pytest.approx(1.0, abs=0.1)
+
+
+def test_inputs_of_very_different_size_are_no_false_alarm():
+    """A drag of 2e4 beside a temperature of 1: an absolute step would be wrong for one of them."""
+    theta = {"drag": 2e4, "temperature": 1.0}
+    report = bench.examine(
+        lambda p: math.exp(-p["drag"] / 2e4) * p["temperature"] ** 2,
+        theta,
+        grad=lambda p: {
+            "drag": -math.exp(-p["drag"] / 2e4) * p["temperature"] ** 2 / 2e4,
+            "temperature": 2 * math.exp(-p["drag"] / 2e4) * p["temperature"],
+        },
+        **QUICK,
+    )
+    assert report.status == 0
+    assert list(report.frame["name"][:2]) == ["drag", "temperature"]
+
+
+def test_cost_that_does_not_repeat_is_named():
+    random = np.random.default_rng(0)
+    report = bench.examine(lambda x: bowl(x) + 1e-6 * random.standard_normal(), [1.0, 0.5], grad=slope, **QUICK)
+    assert (report.status, report.cause) == (1, "nondeterministic")
+    assert 1e-8 < report.spread < 1e-5
+
+
+def test_gradient_that_raises_is_a_finding():
+    def broken(x):
+        raise FloatingPointError("no tape")
+
+    report = bench.examine(bowl, [1.0, 0.5], grad=broken, **QUICK)
+    assert (report.status, report.cause) == (1, "raised")
+    assert "no tape" in str(report)
+
+
+def test_input_without_effect_warns_and_passes():
+    report = bench.examine(lambda x: x[0] ** 2, [1.0, 2.0], grad=lambda x: [2 * x[0], 0.0], **QUICK)
+    assert report.status == 0
+    assert "zero: theta[1]" in str(report)
+
+
+# -------------------------------------------------------------------------------------- jumps and noise
+
+
+def test_lines_find_jump_and_kink_where_they_are():
+    def cost(x):
+        return (x[0] > 0.37) * 0.2 + abs(x[0] + 0.81) + np.sin(3 * x[0])
+
+    line = scan(cost, np.zeros(1), np.ones(1), noise=1e-15)
+    assert [(b.kind, round(b.at, 3)) for b in line.breaks] == [("kink", -0.81), ("jump", 0.37)]
+    assert line.jumps[0].size == pytest.approx(0.2, rel=1e-3)
+
+
+def test_smooth_line_has_no_breaks():
+    assert not scan(lambda x: np.tanh(30 * x[0]) + x[0] ** 3, np.zeros(1), np.ones(1), noise=1e-16).breaks
+
+
+def test_bias_at_a_jump_is_that_of_the_closed_form():
+    """f = x^2 + 1[x > 0]: grad J = 2 theta + pdf(theta / sigma) / sigma, of which each gradient sees 2 theta."""
+    theta, sigma = 0.1, 0.2
+    missed = math.exp(-0.5 * (theta / sigma) ** 2) / math.sqrt(2 * math.pi) / sigma
+    report = bench.examine(
+        lambda x: x[0] ** 2 + (x[0] > 0), [theta], grad=lambda x: 2 * x, sigma=sigma, batch="columns", **QUICK
+    )
+    (found,) = report.smoothed
+    assert abs(found.norm - (2 * theta + missed)) < 4 * found.error
+    assert found.bias_low <= missed <= found.bias_high
+    assert report.status == 1
+    assert "does not see the jumps" in str(report)
+    assert found.best.name == "smoothing"
+
+
+def test_own_noise_is_the_same_in_costs_that_are_compared():
+    """f = (x + w)^2: without common random numbers no difference would settle."""
+    report = bench.examine(
+        lambda x, w: float((x[0] + w[0]) ** 2), [1.0], grad=lambda x, w: 2 * (x + w[:1]), noise=3, **QUICK
+    )
+    assert report.status == 0
+    (found,) = report.smoothed
+    assert found.norm == pytest.approx(2.0, abs=0.2)  # E 2 (x + w) = 2, from at least 1,024 pairs
+
+
+def test_gradient_under_other_noise_is_caught():
+    """A gradient that draws noise of its own is right about no cost."""
+    report = bench.examine(
+        lambda x, w: float((x[0] + w[0]) ** 2), [1.0], grad=lambda x, w: 2 * (x + w[1:2]), noise=2, **QUICK
+    )
+    assert report.status == 1
+
+
+# ------------------------------------------------------------------------------------- how it is called
+
+
+def test_batches_are_told_from_the_result():
+    def columns(x):
+        assert x.shape == (2, x.shape[1])
+        return (x**2).sum(axis=0)
+
+    report = bench.examine(columns, [1.0, 2.0], **QUICK)
+    assert (report.status, report.batch) == (0, "columns")
+
+    def rows(x):
+        assert x.shape[1] == 2
+        return (x**2).sum(axis=1)
+
+    assert bench.examine(rows, [1.0, 2.0], **QUICK).batch == "rows"
+    assert bench.examine(bowl, [1.0, 2.0], **QUICK).batch == "loop"
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        ({"grad": "tensorflow"}, "unknown grad"),
+        ({"batch": "column"}, "did you mean 'columns'"),
+        ({"sigma": -1.0}, "above 0"),
+        ({"budget": "soon"}, "is no time"),
+        ({"noise": -1}, "whole number"),
+    ],
+)
+def test_bad_settings_say_what_is_allowed(settings, match):
+    with pytest.raises(UserError, match=match):
+        bench.examine(bowl, [1.0, 0.5], **{**QUICK, **settings})
+
+
+def test_cost_that_cannot_be_called_is_bad_input():
+    with pytest.raises(UserError, match="cannot be called at theta: KeyError"):
+        bench.examine(lambda p: p["mass"], {"weight": 1.0}, **QUICK)
+
+
+def test_budget_bounds_everything():
+    def slow(x):
+        time.sleep(0.02)
+        return bowl(x)
+
+    began = time.perf_counter()
+    report = bench.examine(slow, [1.0, 0.5], grad=slope, sigma=[0.01, 0.1], progress=False, budget="1s")
+    assert time.perf_counter() - began < 2.0  # a second, and room for a busy machine
+    assert "not done, for the budget" in str(report)
+
+
+def test_budget_is_read_with_its_unit():
+    assert (seconds("500ms"), seconds("2m"), seconds(3)) == (0.5, 120.0, 3.0)
+
+
+# ----------------------------------------------------------------------------------- files, command, pytest
+
+
+def test_page_has_text_tables_and_charts(tmp_path):
+    report = bench.examine(bowl, [1.0, 0.5], grad=slope, sigma=[0.003, 0.1], **QUICK)
+    names = {path.name for path in report.save(tmp_path / "out")}
+    assert {"report.html", "report.txt", "derivatives.csv", "steps.png", "lines.png", "sigmas.png"} <= names
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("data:image/png;base64") == 3
+    assert "RIGHT: the gradient is the derivative of its cost" in page
+
+
+@pytest.fixture
+def mysim(tmp_path):
+    path = tmp_path / "mysim.py"
+    path.write_text(
+        "theta = [1.0, 0.5]\n"
+        "def cost(x): return x[0] ** 2 * x[1]\n"
+        "def named(p): return p['mass'] ** 2\n"
+        "def right(x): return [2 * x[0] * x[1], x[0] ** 2]\n"
+        "def wrong(x): return [2 * x[0] * x[1], -x[0] ** 2]\n"
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["grad=right", "sigma=0.01"], 0, "RIGHT"),
+        (["grad=wrong", "theta=1,2"], 1, "wrong_factor"),
+        ([], 0, "differences alone"),
+    ],
+)
+def test_command_gives_text_and_status(mysim, capsys, words, status, said):
+    assert cli.main(["examine", f"{mysim}:cost", "--quiet", *words]) == status
+    assert said in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["{}:cots"], "did you mean 'cost'"),
+        (["nothing.py:cost"], "there is no file"),
+        (["{}:cost", "grad=jaxx"], "did you mean 'jax'"),
+        (["{}:cost", "thta=1"], "did you mean 'theta'"),
+        (["{}:cost", "theta=1,x"], "has to be numbers"),
+        ([], "name one cost"),
+    ],
+)
+def test_command_says_what_is_wrong_with_its_words(mysim, capsys, words, said):
+    assert cli.main(["examine", *(word.format(mysim) for word in words)]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_command_takes_named_numbers(mysim, capsys):
+    assert cli.main(["examine", f"{mysim}:named", "theta=mass:2", "--quiet"]) == 0
+    assert "mass=2" in capsys.readouterr().out
+
+
+pytest_plugins = ["bench.examine.fixture"]
+
+
+def test_fixture_fails_on_a_wrong_gradient(examine):
+    examine(bowl, [1.0, 0.5], grad=slope)
+    with pytest.raises(AssertionError, match="wrong_factor"):
+        examine(bowl, [1.0, 0.5], grad=lambda x: [2 * part for part in slope(x)])
+
+
+def test_methods_cost_what_their_variance_says():
+    """A Smoothed with no clear gradient recommends nothing."""
+    unclear = Smoothed(0.1, np.zeros(2), 1.0, 0.5, 64, math.nan, math.nan, math.nan, math.nan, "", ())
+    assert unclear.best is None
+    assert not unclear.biased
