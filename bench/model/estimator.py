@@ -55,7 +55,8 @@ class Estimator(Plugin):
 
     def declares_unbiased(self, program: Program) -> bool:
         """Whether its expectation is grad J_sigma of the program, by what it declares."""
-        return self.unbiased and self.target == "smoothed" and (program.continuous or self.across_jumps)
+        derivative = program.continuous and not program.surrogate
+        return self.unbiased and self.target == "smoothed" and (derivative or self.across_jumps)
 
     def refuses(self, program: Program) -> str | None:
         """Return why this estimator cannot be used on the program, or None."""

@@ -20,6 +20,9 @@ from bench.model.ops import Array, Ops, State
 from bench.model.parameters import Plugin, traced
 from bench.model.scene import EngineScene, FunctionScene, MechanicalScene, Scene
 
+SURROGATE = "the gradient is a surrogate, not the derivative of the program"
+"""What rows, tables and charts say where :attr:`Program.surrogate` holds."""
+
 
 @dataclass(frozen=True)
 class Decision:

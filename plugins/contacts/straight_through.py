@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bench.model import Array, ForceLaw, param, stopped
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.contacts.softplus import Softplus
+
+from bench.model import Array, ForceLaw, param, stopped
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,9 @@ class StraightThrough(ForceLaw):
     backward: str = param("softplus", "law of the gradient", choices=("softplus", "penalty", "none"))
     stiffness: float = param(1e3, "k, force per penetration, of both laws", "N/m", positive=True)
     damping: float = param(0.0, "c, force per penetration rate, of both laws", "N s/m", low=0.0)
-    beta: float = param(1e2, "sharpness of a softplus, which smooths the gap: its reach is some 1/beta", "1/m", positive=True)
+    beta: float = param(
+        1e2, "sharpness of a softplus, which smooths the gap: its reach is some 1/beta", "1/m", positive=True
+    )
 
     @property
     def continuous(self) -> bool:

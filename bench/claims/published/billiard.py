@@ -26,7 +26,9 @@ class Missed(Claim):
         "(contacts from distance), it is 0 nowhere."
     )
     source = "Paulus et al. 2025, arXiv 2506.14186; shares from the geometry"
-    learned = "A surrogate gradient sees what was missed and keeps the motion, but it is not the derivative of the program."
+    learned = (
+        "A surrogate gradient sees what was missed and keeps the motion, but it is not the derivative of the program."
+    )
     labels = ("force across u0 [N]", "df / du0")
 
     def measure(self) -> Outcome:
@@ -60,7 +62,9 @@ class Missed(Claim):
             Figure("share of exact zeros", "0.562", float(np.mean(plain == 0)), spread=5e-4),
             Figure("widest hit", "2.189", float(hits), spread=0.01),
             Figure("share of exact zeros with contacts from distance", "0.0", float(np.mean(surrogate == 0))),
-            Figure("largest difference of the costs", "0.0", float(np.abs(found["plain"][2] - found["surrogate"][2]).max())),
+            Figure(
+                "largest difference of the costs", "0.0", float(np.abs(found["plain"][2] - found["surrogate"][2]).max())
+            ),
         ]
         return Outcome(
             figures,

@@ -12,7 +12,7 @@ import numpy as np
 
 from bench.measure import gradcheck, noise
 from bench.measure.contacts import acting
-from bench.model import LoopOps, Problem, Rollout, Unsupported
+from bench.model import SURROGATE, LoopOps, Problem, Rollout, Unsupported
 from bench.report.reproduce import check_of
 from bench.sweep.cell import Cell
 from bench.sweep.session import Session
@@ -59,7 +59,7 @@ def measure(cell: Cell, session: Session, search: Search) -> dict[str, Any]:
     lost = all(verdict == "nonfinite" for verdict in verdicts)
     return {
         "status": "nonfinite" if lost else "ok",
-        "reason": "no cost is finite" if lost else "",
+        "reason": "no cost is finite" if lost else SURROGATE if problem.program.surrogate else "",
         "verdict": verdicts[worst],
         "best_error": errors[worst],
         "best_eps": float(gradcheck.EPS[best[worst]]),

@@ -139,12 +139,19 @@ def markdown(shown: Arranged) -> str:
         out += ["", "Not checked:", ""]
         for reason, part in lost.groupby("reason", sort=False):
             out.append(f"- {len(part)} {part['status'].iloc[0]}: {escape_markdown(str(reason))}")
+    out += [f"\n{escape_markdown(f'{contact}: {reason}')}" for (contact, reason), _ in said(rows)]
     faults = summary[summary["verdict"].isin(FAULTS)]
     if not faults.empty:
         out += ["", "Faults, and the command that repeats each:", ""]
         for (verdict, line), _ in faults.groupby(["verdict", "command"], sort=False):
             out += [f"- {verdict}", "", f"      {line}", ""]
     return "\n".join(out).rstrip("\n") + "\n"
+
+
+def said(rows: pd.DataFrame) -> Any:
+    """Return what has to be said of checked rows, by contact law and reason: that a gradient is a surrogate."""
+    noted = rows[(rows["status"] == "ok") & (rows["reason"] != "")]
+    return noted.groupby(["contact", "reason"], sort=False)
 
 
 def aside(rows: pd.DataFrame) -> str:
@@ -174,6 +181,8 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
             if tally:
                 parts.append(f"{point} " + ", ".join(f"{tally[v]} {v}" for v in VERDICTS if v in tally))
         print(f"  {name}: " + "; ".join(parts))
+    for (contact, reason), _ in said(rows):
+        print(f"  {contact}: {reason}")
     faults = summary[summary["verdict"].isin(FAULTS)]
     for (verdict, line), part in faults.groupby(["verdict", "command"], sort=False):
         print(f"\n{verdict} ({', '.join(dict.fromkeys(part['point']))}); repeat with\n  {line}")
