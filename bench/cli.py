@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import shlex
 import signal
 import sys
@@ -331,6 +332,11 @@ def _scenes_first(words: Sequence[str], verb: str) -> tuple[list[str], list[str]
     return scenes, rest
 
 
+def _sets_a_horizon(word: str) -> bool:
+    """Return whether a word of the command line sets the horizon of a scene, as a setting or in brackets."""
+    return re.match(r"scene\.\w+\.horizon=|[^=]*\[(.*,)?horizon=|\+?scenes=.*[\[,]horizon=", word) is not None
+
+
 def _gradcheck(words: list[str]) -> int:
     """Run ``gradient_check`` on the scenes named first, with the overrides that follow; a fault too gives status 1."""
     from dataclasses import replace
@@ -342,7 +348,12 @@ def _gradcheck(words: list[str]) -> int:
     settings_ = [f"scenes=[{','.join(scenes)}]", "name=gradcheck"] if scenes else ["name=gradcheck"]
     experiment = _loaded(["experiment=gradient_check", *settings_, *rest])
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
-    if not any(plugin and "horizon" in parameters(plugin) for plugin in plugins):
+    own = [word for word in words if _sets_a_horizon(word)]
+    swept = any(word.startswith("sweep.horizon=") for word in rest)
+    if own:
+        told = f"sweep.horizon overrules {own[0]}" if swept else f"{own[0]} replaces the sweep over horizons"
+        print(f"bench: {told}", file=sys.stderr)
+    if (own and not swept) or not any(plugin and "horizon" in parameters(plugin) for plugin in plugins):
         experiment = replace(experiment, sweep={k: v for k, v in experiment.sweep.items() if k != "horizon"})
     finished = _executed(experiment, words)
     if isinstance(finished, int):

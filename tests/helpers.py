@@ -21,7 +21,7 @@ from bench.studies.bias_variance.columns import COLUMNS
 from bench.sweep import config
 from bench.sweep.cell import Cell
 from bench.sweep.columns import IDENTITY
-from bench.sweep.experiment import Experiment
+from bench.sweep.experiment import Experiment, Layout
 from bench.sweep.grid import cells
 from bench.sweep.runner import blank
 
@@ -189,6 +189,7 @@ def experiment(
     marks: Mapping[str, Mapping[str, float]] | None = None,
     name: str = "made_up",
     formats: tuple[str, ...] = ("png",),
+    table: Layout | None = None,
 ) -> Experiment:
     """An experiment to show made-up rows of: a sweep and nothing that could be run."""
     return Experiment(
@@ -201,6 +202,7 @@ def experiment(
         question="As contact stiffens, which gradient stays right?",
         marks={"stiffness": {"step size limit": 6400}} if marks is None else marks,
         formats=formats,
+        table=table or Layout(),
     )
 
 

@@ -25,12 +25,12 @@ from bench.model.estimator import (
 )
 from bench.model.integrator import Integrator
 from bench.model.known import KnownOptimum, KnownValue
-from bench.model.ops import Array, LoopOps, Ops, State
+from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
-from bench.model.program import Decision, FunctionProgram, Program, Rollout, compose, rollout
+from bench.model.program import SURROGATE, Decision, FunctionProgram, Program, Rollout, compose, rollout
 from bench.model.scene import (
     ContactScene,
     DampedScene,
@@ -44,6 +44,7 @@ from bench.model.scene import (
 )
 
 __all__ = [
+    "SURROGATE",
     "Answer",
     "Array",
     "Auxiliaries",
@@ -92,5 +93,6 @@ __all__ = [
     "param",
     "per_repeat",
     "rollout",
+    "stopped",
     "zeroth_order",
 ]

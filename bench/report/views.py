@@ -251,6 +251,18 @@ def relative(row: Any, column: str) -> float:
     return float(row[column] / norm) if norm > 0 else math.nan
 
 
+def rmse_interval(row: Any) -> tuple[float, float]:
+    """Return the 95% interval of a relative RMSE; NaN where the variance has none.
+
+    It goes from the lower to the upper ends of bias and variance, RMSE^2 = bias^2 + variance.
+    """
+    low, high = (
+        math.hypot(row[f"bias_{end}"], math.sqrt(row.get(f"variance_{end}", math.nan))) for end in ("low", "high")
+    )
+    norm = row["reference_norm"]
+    return (low / norm, high / norm) if norm > 0 else (math.nan, math.nan)
+
+
 def bias_text(row: Any, norm: float = 1.0, interval: bool = True) -> str:
     """Write a bias over a norm: ``0.500 [0.400, 0.600]``, or ``0 (< 0.124)`` if it cannot be distinguished from 0."""
     value, low, high = (row[c] / norm if norm > 0 else math.nan for c in ("bias", "bias_low", "bias_high"))

@@ -13,7 +13,8 @@ from bench.errors import STATUSES, UserError, unknown
 from bench.model import Decision, registry
 from bench.model.identity import parse_identity
 from bench.model.parameters import build, coerce, remember, singular
-from bench.sweep.experiment import Budget, Choice, Execution, Experiment
+from bench.sweep.experiment import Budget, Choice, Execution, Experiment, Layout
+from bench.sweep.grid import swept
 from bench.sweep.study import Study
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -119,7 +120,7 @@ def _prepared(override: str, config_dirs: Sequence[Path]) -> str:
         return f"study={_quoted(value)[1:-1]}"
     if head in map(singular, kinds) or head in ("sweep", "marks"):
         return f"++{bare}={value}"
-    if bare != head and head != "reference":
+    if bare != head and head not in ("reference", "table"):
         raise UserError(f"'{bare}' is not a setting: '{head}' has no parts")
     return f"{bare}={value}"
 
@@ -207,6 +208,7 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         marks=_table(config, "marks"),
         compile_time=coerce(bool, config["compile_time"], "compile_time"),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _listed_or_none(config["formats"])),
+        table=_layout(_table(config, "table"), _table(config, "sweep")),
         reference=_budget(_table(config, "reference")),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
@@ -231,6 +233,23 @@ def _budget(settings: Mapping[str, Any]) -> Budget:
     if samples < 256 or not tolerance > 0:
         raise UserError("reference.samples must be at least 256 and reference.tolerance greater than 0")
     return Budget(samples, tolerance)
+
+
+ROWS = ("estimator", "backend")
+
+
+def _layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> Layout:
+    for key in settings:
+        if key not in ("columns", "rows"):
+            raise unknown("setting of table", key, ("columns", "rows"))
+    columns = "" if settings["columns"] is None else str(settings["columns"])
+    names = {part for name in swept(sweep) for part in (name, name.rpartition(".")[2])}
+    if columns and columns not in names:
+        raise unknown("axis for table.columns:", columns, names)
+    rows = tuple(_one_of("table.rows", row, ROWS) for row in _listed_or_none(settings["rows"]))
+    if "estimator" not in rows:
+        raise UserError(f"table.rows={list(rows)} must hold estimator; [estimator,backend] gives each backend a row")
+    return Layout(columns, rows)
 
 
 def _decision(config: Mapping[str, Any]) -> Decision:

@@ -56,6 +56,16 @@ class Budget:
 
 
 @dataclass(frozen=True)
+class Layout:
+    """How the table of a paper is laid out; it decides no number."""
+
+    columns: str = ""
+    """The swept axis across; empty for the longest."""
+    rows: tuple[str, ...] = ("estimator",)
+    """What gets a row of its own: estimators, with those backends on one row that agree, or also each backend."""
+
+
+@dataclass(frozen=True)
 class Experiment:
     """A named sweep: which plugins, which parameters, how many samples, and what is measured."""
 
@@ -82,6 +92,7 @@ class Experiment:
     """Whether charts of error against time add compilation to it."""
     formats: tuple[str, ...] = ("png",)
     """File formats of the charts."""
+    table: Layout = Layout()
     reference: Budget = Budget()
     compile_cache: Path | None = None
     """Folder of compiled programs kept between runs."""
@@ -114,6 +125,7 @@ class Experiment:
             "theta0": None if self.decision.at is None else list(self.decision.at),
             **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks", "compile_time")},
             "formats": list(self.formats),
+            "table": dataclasses.asdict(self.table),
             "reference": dataclasses.asdict(self.reference),
             "results_dir": str(self.results_dir),
             "compile_cache": None if self.compile_cache is None else str(self.compile_cache),

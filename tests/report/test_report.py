@@ -34,10 +34,10 @@ from bench.report import views
 from bench.report.figures import save, styled
 from bench.report.plotted import plotted
 from bench.report.style import PALETTE, Look, axis_name, colour
-from bench.report.tables import number_format
 from bench.report.text import number
-from bench.studies.bias_variance import charts, findings, tables, terminal
+from bench.studies.bias_variance import charts, findings, pivot, tables, terminal
 from bench.studies.bias_variance.columns import TABLE
+from bench.sweep.experiment import Layout
 from bench.sweep.store import Store
 
 
@@ -90,22 +90,25 @@ def test_pareto_is_what_brute_force_finds(made):
 def test_bias_within_its_noise_is_told_apart(made):
     rows = table([row(bias_low=0.0, bias_high=0.124, bias=0.05), row(seed=1, bias=0.5, bias_low=0.4, bias_high=0.6)])
     tables.write(made, rows)
-    for name in ("bias_variance.md", "bias_variance.tex"):
-        text = (made.directory / name).read_text().replace("$<$", "<").replace("{[}", "[").replace("{]}", "]")
-        assert "0 (< 0.124)" in text
-        assert "0.500 [0.400, 0.600]" in text
-        assert "not distinguishable from 0" in text
+    text = (made.directory / "bias_variance.md").read_text()
+    assert "0 (< 0.124)" in text
+    assert "0.500 [0.400, 0.600]" in text
+    assert "not distinguishable from 0" in text
 
 
 def test_failed_cells_are_rows_with_their_reason(made):
     rows = stiffness_rows()
     tables.write(made, rows)
     text = (made.directory / "bias_variance.md").read_text()
-    lines = [line for line in text.splitlines() if line.startswith("|")]
+    lines = [line for line in text.partition("## Every cell")[2].splitlines() if line.startswith("|")]
     assert len(lines) == 2 + len(rows)
     assert sum("| nonfinite (" in line for line in lines) == (rows["status"] == "nonfinite").sum() > 0
     assert "3 of 32 estimates are not finite, first repeat 4 of seed 0" in text
-    assert (made.directory / "bias_variance.tex").read_text().count(r"\\") == 1 + len(rows)
+    failed = sum(cell.failure == "nonfinite" for cell in paper(rows).cells())
+    assert failed > 0
+    assert text.count("∞") == failed + 1, "a sign in each cell of the pivot, and what it means"
+    latex = (made.directory / "bias_variance.tex").read_text()
+    assert latex.count(r"$\infty$") == failed + latex.count(r"\begin{table*}")
 
 
 EVIL = "<script>alert(1)</script>|[x](http://y)*a*_b_`c`$d$\\input{e}%f&g#h~i^j\nnext \x1b[31mline"
@@ -117,11 +120,12 @@ def test_text_is_escaped_in_every_format(made):
     markdown = (made.directory / "bias_variance.md").read_text()
     assert "<script>" not in markdown
     assert "](http" not in markdown
-    body = [line for line in markdown.splitlines() if line.startswith("|")]
+    body = [line for line in markdown.partition("## Every cell")[2].splitlines() if line.startswith("|")]
     assert len(body) == 5
     assert len({len(re.findall(r"(?<!\\)\|", line)) for line in body}) == 1
     latex = (made.directory / "bias_variance.tex").read_text()
     plain = re.sub(r"\\[a-zA-Z]+(\{\})?|\\[&%$#_{}]|\$[<>|]\$", "", "\n".join(latex.splitlines()[4:]))
+    plain = plain.replace("$$", "")  # what is left of a sign such as $\infty$
     plain = plain.replace(r"\\", "")
     assert not set(plain) & set("$#_%~^<>|")
     assert r"\input" not in latex
@@ -275,14 +279,14 @@ def test_nothing_swept_gives_an_overview():
 
 def test_a_parameter_in_an_identity_string_is_an_axis():
     """The default value is left out of identity strings, and so is the one value that no string has."""
-    sweep = {"gamma": [0.1, 1.0, 10.0]}
-    rows = table([row(estimator="alpha_order", estimator_params=p) for p in ("", "gamma=0.1", "delta=0.3,gamma=10")])
+    sweep = {"ratio": [3.0, 1.5, 10.0]}
+    rows = table([row(estimator="alpha_order", estimator_params=p) for p in ("", "ratio=3", "delta=0.3,ratio=10")])
     rows = pd.concat([rows, table([row()])], ignore_index=True)
     shown = views.arranged(experiment(sweep=sweep), rows)
-    found = views.along(shown, named(shown, "gamma"))
-    assert list(found["x"]) == [1.0, 0.1, 10.0]
+    found = views.along(shown, named(shown, "ratio"))
+    assert list(found["x"]) == [1.5, 3.0, 10.0]
     assert list(found["estimator_params"]) == ["", "", "delta=0.3"]
-    assert "bias_variance_gamma" in drawn(rows, ["gamma"], sweep=sweep)
+    assert "bias_variance_ratio" in drawn(rows, ["ratio"], sweep=sweep)
 
 
 def test_the_parameter_behind_smoothing_is_an_axis():
@@ -395,19 +399,67 @@ def test_best_is_told_only_where_its_interval_is_apart_from_every_other_estimato
             known[f"variance_{end}"] = [ends[name][place] for name in known["estimator"]]
         return known.assign(rmse=[1.2 if name == "fobg" else 2.0 for name in known["estimator"]])
 
-    assert tables.best(rows((2.5, 4.0))).tolist() == [True, True, False, False]
-    assert not tables.best(rows((1.9, 4.0))).any()
-    assert not tables.best(rows((2.5, 4.0)).assign(variance_low=math.nan)).any()
-    assert tables.latex(tables.readable(experiment(), rows((2.5, 4.0)))).count(r"\bfseries") == 2
-    assert r"\bfseries" not in tables.latex(tables.readable(experiment(), rows((1.9, 4.0))))
+    def bold(made, **more):
+        return [cell.best for cell in paper(made, **more).cells()]
+
+    by_backend = {"table": Layout(rows=("estimator", "backend"))}
+    assert bold(rows((2.5, 4.0)), **by_backend) == [True, True, False, False]
+    assert not any(bold(rows((1.9, 4.0)), **by_backend))
+    assert not any(bold(rows((2.5, 4.0)).assign(variance_low=math.nan), **by_backend))
+    assert not any(bold(rows((2.5, 4.0)).assign(rmse_rel=1.5), **by_backend)), "nothing that is no better than zero"
+    assert bold(rows((2.5, 4.0))) == [True, False]
+    made = paper(rows((2.5, 4.0)))
+    assert (pivot.latex(made).count(r"\textbf"), pivot.markdown(made).count("**0.")) == (1, 1)
+
+
+def paper(rows, **settings):
+    """The table of a paper from rows."""
+    found = experiment(**settings)
+    return pivot.pivot(found, views.arranged(found, rows))
+
+
+def fitted(made):
+    return [part for block in made.blocks for part in pivot._fitting(block)]
+
+
+def test_no_part_of_the_papers_table_is_wider_than_a_page_of_two_columns():
+    """Fifty values of an axis stand below each other, and a name that is too long is broken; nothing is lost."""
+    rows = table([row(estimator=name, stiffness=float(k + 1)) for name in ("fobg", "x" * 80) for k in range(50)])
+    made = paper(rows, sweep={"stiffness": [float(k + 1) for k in range(50)]})
+    parts = fitted(made)
+    assert len(parts) > 2
+    assert all(pivot.width(part) <= pivot.WIDTH for part in parts)
+    assert [value for part in parts for value in part.values] == list(made.blocks[0].values)
+    assert len(made.blocks[0].values) == 50
+    assert "p{150pt}" in pivot.latex(made)
 
 
 @pytest.mark.parametrize(
-    ("texts", "form"),
-    [(["0.10", "12", "-"], "2.2"), (["1.2e5", "-3"], "-1.1e1"), (["2.0e-7"], "1.1e-1"), (["0 (< 0.1)", "-"], "1.0")],
+    ("text", "size", "points"), [("0.151", 8.0, 19.37), ("[0.14, 0.16]", 5.0, 32.5), ("estimator", 8.0, 34.95)]
 )
-def test_column_format_holds_every_number(texts, form):
-    assert number_format(texts) == form
+def test_widths_are_those_of_tex_or_a_little_more(text, size, points):
+    """``points`` are sums of the widths in the metric files of cmr8 and cmr5."""
+    assert points <= pivot._set(text, size) <= 1.2 * points
+
+
+def test_columns_and_rows_of_the_papers_table_can_be_chosen(tmp_path, capsys):
+    words = ["sweep.sigma=[0.1,0.3]", "sweep.stiffness=[10,100,1000]", "estimators=[fobg]", "backends=[jax,torch]"]
+    for more, across, names in (
+        ([], ("10", "100", "1000"), 1),
+        (["table.columns=sigma"], ("0.1", "0.3"), 1),
+        (["table.rows=[estimator,backend]"], ("10", "100", "1000"), 2),
+    ):
+        given, cells = loaded(*words, *more)
+        made = pivot.pivot(given, views.arranged(given, rows_of(given, cells)))
+        assert {block.values for block in made.blocks} == {across}
+        assert {len(block.rows) for block in made.blocks} == {names}
+    for word, said in (
+        ("table.columns=sigmas", "did you mean 'sigma'"),
+        ("table.rows=[backend]", "must hold estimator"),
+        ("table.row=[estimator]", "table.row"),
+    ):
+        assert main(["plan", *words, word]) == 2
+        assert said in capsys.readouterr().err
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex: apt-get install texlive-science")
@@ -419,11 +471,13 @@ def test_table_compiles_in_latex(count, made):
     rows.loc[2, ["bias", "bias_low"]] = 0.0
     tables.write(made, rows)
     packages = re.search(r"usepackage\{(.*)\}", (made.directory / "bias_variance.tex").read_text())[1]
-    text = rf"\documentclass{{article}}\usepackage{{{packages}}}\begin{{document}}\input{{bias_variance.tex}}\end{{document}}"
+    page = r"\documentclass[twocolumn]{article}\setlength{\textwidth}{504pt}"
+    text = rf"{page}\usepackage{{{packages}}}\begin{{document}}\input{{bias_variance.tex}}\end{{document}}"
     (made.directory / "paper.tex").write_text(text)
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
     done = subprocess.run(command, cwd=made.directory, capture_output=True, text=True, errors="replace", timeout=120)
     assert done.returncode == 0, done.stdout[-2000:]
+    assert "Overfull" not in done.stdout
 
 
 # ------------------------------------------------------------------------------------------------------ swept axes

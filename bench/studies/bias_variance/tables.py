@@ -1,9 +1,8 @@
-"""Writes the main table: CSV with every digit, Markdown and LaTeX to read."""
+"""Writes the main table: CSV with every digit, Markdown to read, and the pivot of a paper in Markdown and LaTeX."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,18 +11,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.report.tables import csv, escape_latex, escape_markdown, latex_number, number_format
+from bench.measure.statistics import UNEXPLAINED, unexplained
+from bench.report.tables import csv, escape_markdown
 from bench.report.text import axis_value, number
-from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, bias_text, pareto, unsteady
+from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, arranged, bias_text, pareto, unsteady
+from bench.studies.bias_variance import pivot
 from bench.sweep import axes
 from bench.sweep.columns import IDENTITY
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import write_all
 
-PAGE_ROWS = 40
-"""Most rows of a LaTeX table that fit a page."""
+DOUBTED = " ?"
 FOOTNOTES = [
-    "0 (< u): the bias is not distinguishable from 0, its 95% interval reaches up to u.",
+    "0 (< u): the bias is not distinguishable from 0, its 95% interval reaches up to u. "
+    f"{DOUBTED.strip()}: the estimator declares to be unbiased and the interval excludes 0, so {UNEXPLAINED}.",
     "relative bias and rel. RMSE: divided by the norm of the reference gradient. A relative RMSE above 1 is worse "
     "than answering zero.",
     "variance: trace of the covariance of one estimate. time: one estimate, steady state, without compilation. "
@@ -33,13 +34,13 @@ FOOTNOTES = [
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``bias_variance`` (.csv, .md, .tex) and ``speed_accuracy.csv``; returns their paths."""
-    table = readable(experiment, rows)
+    paper = pivot.pivot(experiment, arranged(experiment, rows))
     return write_all(
         experiment.directory,
         {
             "bias_variance.csv": csv(axes.table(experiment, rows)),
-            "bias_variance.md": markdown(table),
-            "bias_variance.tex": latex(table),
+            "bias_variance.md": f"{pivot.markdown(paper)}\n{markdown(readable(experiment, rows))}",
+            "bias_variance.tex": pivot.latex(paper),
             "speed_accuracy.csv": csv(speed_accuracy(rows)),
         },
     )
@@ -75,8 +76,6 @@ class Readable:
     """Per column, whether it holds numbers."""
     body: list[list[str]]
     reasons: list[str]
-    best: list[bool]
-    """Per row, whether its error is the lowest of its problem, beyond the intervals."""
 
 
 def readable(experiment: Experiment, rows: pd.DataFrame) -> Readable:
@@ -94,7 +93,7 @@ def readable(experiment: Experiment, rows: pd.DataFrame) -> Readable:
         note = f" ({reasons[row['reason']]})" if row["reason"] else ""
         body.append(cells + [row["status"] + note for _ in status])
     return Readable(
-        title=f"{rows['experiment'].iloc[0]}: bias and variance",
+        title="Every cell",
         shared=shared,
         headers=[*varying, *results, *status],
         numeric=[
@@ -104,27 +103,7 @@ def readable(experiment: Experiment, rows: pd.DataFrame) -> Readable:
         ],
         body=body,
         reasons=[f"({i}) {text}" for text, i in reasons.items()],
-        best=best(rows).tolist(),
     )
-
-
-def best(rows: pd.DataFrame) -> pd.Series:
-    """Return, per row, whether its RMSE is its problem's lowest, with an interval apart from every other estimator's.
-
-    The interval of an RMSE goes from the lower to the upper ends of bias and variance, RMSE^2 = bias^2 + variance.
-    """
-    low, high = (np.sqrt(rows[f"bias_{end}"] ** 2 + rows.get(f"variance_{end}", math.nan)) for end in ("low", "high"))
-    estimator = rows["estimator"] + "[" + rows["estimator_params"] + "]"
-    ends = pd.DataFrame({"low": low, "high": high, "estimator": estimator, "rmse": rows["rmse"]})
-    result = pd.Series(False, index=rows.index)
-    for _, part in ends[rows["status"] == "ok"].groupby([problem(rows), rows["samples"]]):
-        first = part.loc[part["rmse"].idxmin()] if part["rmse"].notna().any() else None
-        if first is not None:
-            others = part[part["estimator"] != first["estimator"]]
-            mine = part[part["estimator"] == first["estimator"]]
-            if len(others) and mine["high"].max() < others["low"].min() and others["low"].notna().all():
-                result[mine.index] = True
-    return result
 
 
 def _varying(rows: pd.DataFrame, swept: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -161,7 +140,8 @@ def _results(row: Any) -> list[str]:
     if row["status"] != "ok":
         return ["-"] * 6
     return [
-        bias_text(row), bias_text(row, row["reference_norm"], interval=False),
+        bias_text(row) + DOUBTED * unexplained(row["reason"]),
+        bias_text(row, row["reference_norm"], interval=False),
         number(row["variance"], 3), number(row["rmse_rel"], 3), number(row["cosine"], 3),
         number(row["time_s"] * 1e3, 3) + UNSTEADY * bool(unsteady(row)),
     ]  # fmt: skip
@@ -170,7 +150,7 @@ def _results(row: Any) -> list[str]:
 def markdown(table: Readable) -> str:
     """Write the main table in Markdown."""
     e = escape_markdown
-    out = [f"# {e(table.title)}", ""]
+    out = [f"## {e(table.title)}", ""]
     for text in table.shared:
         out += [e(text), ""]
     out.append("| " + " | ".join(map(e, table.headers)) + " |")
@@ -180,36 +160,3 @@ def markdown(table: Readable) -> str:
     if table.reasons:
         out += ["", "Notes on the status:", "", *(f"- {e(reason)}" for reason in table.reasons)]
     return "\n".join(out) + "\n"
-
-
-def latex(table: Readable) -> str:
-    """Write the main table in LaTeX: booktabs, numbers aligned by siunitx; a ``longtable`` if it does not fit a page.
-
-    The RMSE of a row that is best of its problem beyond the intervals is bold.
-    """
-    e = escape_latex
-    texts = [[row[i] for row in table.body] for i in range(len(table.headers))]
-    formats = [number_format(column) if right else "" for column, right in zip(texts, table.numeric, strict=True)]
-    spec = "".join(f"S[table-format={form}]" if form else "l" for form in formats)
-    heads = [f"{{{e(text)}}}" if form else e(text) for text, form in zip(table.headers, formats, strict=True)]
-    error = table.headers.index("rel. RMSE")
-    body = []
-    for row, first in zip(table.body, table.best, strict=True):
-        cells = [latex_number(text) if form else e(text) for text, form in zip(row, formats, strict=True)]
-        if first:
-            cells[error] = rf"\bfseries {cells[error]}"
-        body.append(" & ".join(cells) + r" \\")
-    head = [r"\toprule", " & ".join(heads) + r" \\", r"\midrule"]
-    if len(table.body) > PAGE_ROWS:
-        kind, packages = "longtable", "booktabs,longtable,siunitx"
-        body = [*head, r"\endhead", r"\bottomrule", r"\endfoot", *body, r"\end{longtable}"]
-    else:
-        kind, packages = "tabular", "booktabs,siunitx"
-        body = [*head, *body, r"\bottomrule", r"\end{tabular}", ""]
-    setup = [r"\begingroup\footnotesize\setlength{\tabcolsep}{3pt}", r"\sisetup{detect-weight=true,mode=text}"]
-    out = [rf"% needs \usepackage{{{packages}}}", *setup, rf"\begin{{{kind}}}{{{spec}}}", *body]
-    bold = ["Bold: lowest error of its problem, its interval apart from that of every other estimator."] * any(
-        table.best
-    )
-    notes = (table.title + ".", *table.shared, *FOOTNOTES, *bold, *table.reasons)
-    return "\n".join([*out, *(rf"\noindent {e(note)}\par" for note in notes), r"\endgroup"]) + "\n"
