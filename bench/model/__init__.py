@@ -27,12 +27,12 @@ from bench.model.estimator import (
 )
 from bench.model.integrator import Integrator
 from bench.model.known import Identified, KnownOptimum, KnownValue
-from bench.model.ops import Array, LoopOps, Ops, State
+from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
-from bench.model.program import Decision, FunctionProgram, Program, Rollout, compose, rollout
+from bench.model.program import SURROGATE, Decision, FunctionProgram, Program, Rollout, compose, rollout
 from bench.model.scene import (
     ContactScene,
     DampedScene,
@@ -46,6 +46,7 @@ from bench.model.scene import (
 )
 
 __all__ = [
+    "SURROGATE",
     "Answer",
     "Array",
     "Auxiliaries",
@@ -98,5 +99,6 @@ __all__ = [
     "per_repeat",
     "rollout",
     "slopes",
+    "stopped",
     "zeroth_order",
 ]
