@@ -23,10 +23,12 @@ MADE = re.compile(r"_[0-9a-f]{8}$")
 """What a module's name gets when it is loaded from a file."""
 RELATIVE = 0.01
 """Sigma of the lines, and of a cost with noise of its own, in units of each input's scale, where none is given."""
-SHARES = {"check": 0.6, "again": 0.5, "lines": 0.3}
+SHARES = {"check": 0.75, "again": 0.5, "lines": 0.3}
 """Most of the time left that a part may take; what it does not use is there for the next one."""
 POINTS_EACH = 2 * (2 * EPS.size + 17)
 """Costs of a direction that is checked, about."""
+SCANS = 4 * 7 * 65
+"""Costs that a check spends on looking for staircases, where a direction is not plainly right."""
 EFFORTS = (
     Options(),
     Options(draws=2),
@@ -35,6 +37,10 @@ EFFORTS = (
     Options(components=0, draws=0, directions=1, eps=EPS[::2]),
 )
 """What a check looks at, from the whole to the least, for simulators that are slow."""
+PANELS = (7, 12)
+"""Panels of 4 Gauss-Legendre points of the two integrals of the gradient along a line."""
+LEAST_MISSED = 0.002
+"""Share of a cost's change that the integral of its gradient may miss by itself."""
 OTHER_NOISE = 2
 """Draws of the simulator's own noise, besides the first, under which the gradient is checked along random directions."""
 
@@ -137,13 +143,13 @@ class _Examination:
     def run(self, gradient: str) -> Report:
         """Ask everything that the time allows, the gradient first."""
         value, spread = self._repeated()
+        simulator, clock = self.simulator, self.clock
         checked, more = None, []
-        if spread == 0:
+        if spread == 0 and self._gradient_comes():
             checked = self._checked()
             more = self._under_other_noise(checked)
-        lines = self._lines(checked)
-        found = self._smoothed(checked, spread == 0) if not self.simulator.gradient_error else []
-        simulator, clock = self.simulator, self.clock
+        lines = self._lines(checked) if not simulator.gradient_error else []
+        found = self._smoothed(checked, spread == 0) if not simulator.gradient_error else []
         notes = list(simulator.notes)
         notes += [f"the cost raised {count} times: {text}" for text, count in list(simulator.raised.items())[:3]]
         relative = not self.levels
@@ -194,14 +200,27 @@ class _Examination:
         pairs = [same, np.array(values[1::2])]
         return values[0], max(0.0 if np.isnan(one).all() else float(np.ptp(one)) for one in pairs)
 
-    def _options(self, least: int = 0) -> Options:
+    def _gradient_comes(self) -> bool:
+        """Ask for the gradient twice, the second time to see how long it takes; return whether it came."""
+        if self.simulator.has_gradient:
+            self.clock.stage("first gradient")
+            try:
+                for _ in range(2):
+                    self.simulator.gradients(self.theta[:, None], self.w)
+            except OutOfTime:
+                return True
+        return not self.simulator.gradient_error
+
+    def _options(self) -> Options:
         """Return what can be looked at in the time that is left."""
         each, slope = self.clock.per_cost(), self.clock.per_gradient()
         each = 0.0 if math.isnan(each) else each
         slope = 4 * each if math.isnan(slope) else slope
-        for effort in EFFORTS[least:-1]:
+        for effort in EFFORTS[:-1]:
             chosen = min(effort.components, self.theta.size) + effort.directions
             calls = chosen * POINTS_EACH + effort.draws * effort.directions * POINTS_EACH // 2
+            # what a wrong gradient asks for besides: scans, and ratios at other thetas
+            calls += SCANS + min(effort.draws, 4) * min(effort.components, self.theta.size) * POINTS_EACH // 2
             if calls * each + (effort.draws + 3) * slope < SHARES["check"] * self.clock.left:
                 break
         else:
@@ -268,11 +287,36 @@ class _Examination:
             for direction in along:
                 size = float(np.abs(self._costs(self.theta[:, None])).max())
                 rounding = max(measured, self.simulator.unit * (size if math.isfinite(size) else 0.0))
-                found.append(scan(self._costs, self.theta, direction, rounding, points=points))
+                line = scan(self._costs, self.theta, direction, rounding, points=points)
+                found.append(replace(line, missed=self._missed(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
         self.clock.allow(1.0)
         return found
+
+    def _missed(self, line: Line, checked: Check | None) -> float:
+        """Return the share of the cost's change along a line that its gradient does not explain.
+
+        The integral of a right gradient along a line is the difference of the costs at its ends, except for jumps. It needs
+        no step. NaN where the integral itself is not certain to a tenth of what is missed, or without a gradient.
+        """
+        if checked is None or not checked.trusted or not self.simulator.has_gradient:
+            return math.nan
+        changes = np.abs(np.diff(line.costs)).sum()
+        if not (np.isfinite(changes) and changes > 0):
+            return math.nan
+        integrals = []
+        for panels in PANELS:
+            x, weight = np.polynomial.legendre.leggauss(4)
+            edges = np.linspace(line.at[0], line.at[-1], panels + 1)
+            half = np.diff(edges)[:, None] / 2
+            t, weights = ((edges[:-1, None] + half) + half * x).ravel(), (half * weight).ravel()
+            at = self.theta[:, None] + line.direction[:, None] * t
+            w = None if self.w is None else np.repeat(self.w, t.size, axis=1)
+            integrals.append(float(weights @ (line.direction @ self.simulator.gradients(at, w))))
+        missed = abs(line.costs[-1] - line.costs[0] - integrals[-1]) / changes
+        doubt = abs(integrals[-1] - integrals[0]) / changes
+        return float(missed) if doubt < max(0.1 * missed, LEAST_MISSED) else math.nan
 
     def _smoothed(self, checked: Check | None, repeats: bool) -> list[Smoothed]:
         """Measure the gradient under noise on theta, an equal share of the time for each sigma."""

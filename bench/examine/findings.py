@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.examine.lines import Line
-from bench.examine.smoothing import Smoothed
+from bench.examine.smoothing import WANTED, Smoothed
 from bench.measure.gradcheck import FAULTS, Check, Part
 from bench.report.text import counted, duration, number
 
@@ -24,7 +24,7 @@ WORDS = {
     "pass the noise in as w, or fix its seed",
     "stale_gradient": "the gradient stays that of another theta: a cache that is never emptied, or a copy made too early",
     "staircase": "the cost is constant between steps: a cast to int, rounding, or a comparison inside",
-    "precision": "the cost has fewer digits than its type: a shorter float inside",
+    "precision": "the cost has fewer digits than its type: a shorter float inside, or a solver that stops early",
     "disconnected": "the gradient is exactly 0 where the cost has a slope: detached, or an operation that cuts gradients",
     "wrong_factor": "the ratio is constant: a factor or a sign is wrong",
     "missing_term": "ratio not constant: a term is missing or detached",
@@ -37,6 +37,8 @@ WORDS = {
     "zero": "the gradient and all differences are exactly 0: does this input do anything?",
 }
 """What a cause means to the owner of the simulator."""
+SEEN = 0.01
+"""Share of a cost's change that a gradient may miss on a line without a word."""
 WARNED = ("zero", "saturated")
 """Right, and yet worth a look."""
 
@@ -92,7 +94,8 @@ class Findings:
     def cause(self) -> str:
         """The cause of what is wrong, or how it is right: a verdict of the gradient check.
 
-        ``raised`` where the gradient could not be computed, ``undecided`` where the budget ended before the check.
+        ``raised`` where the gradient could not be computed, ``undecided`` where the budget ended before the check,
+        ``jumps`` or ``biased`` where the gradient is right at theta and misses jumps around it.
         """
         if self.error:
             return "raised"
@@ -101,6 +104,10 @@ class Findings:
         if self.check is None:
             return "undecided"
         bad = [one.cause for one in (self.check, *self.more) if not one.trusted]
+        if not bad and self.missed > WANTED:
+            return "jumps"
+        if not bad and any(one.biased for one in self.smoothed):
+            return "biased"
         return bad[0] if bad else self.check.cause
 
     @property
@@ -116,6 +123,12 @@ class Findings:
         else:
             found += [self.sentence(one) for one in (self.check, *self.more) if not one.trusted][:1]
         if not found:
+            missed = self.missed
+            if missed > WANTED:
+                found.append(
+                    f"jumps: along a line the integral of the gradient misses {number(100 * missed)}% of the cost's change: "
+                    "jumps, which no gradient sees, make the rest"
+                )
             for one in self.smoothed:
                 if one.biased:
                     low, high = one.bias_low / one.norm, one.bias_high / one.norm
@@ -138,8 +151,17 @@ class Findings:
                     )
         if self.precision != "float64":
             found.append(f"{self.precision}: a check in {self.precision} sees errors above about {self.resolution}")
+        if not self.status and self.missed > SEEN:
+            found.append(
+                f"jumps: along a line the integral of the gradient misses {number(100 * self.missed)}% of the cost's change"
+            )
         found += [f"not done, for the budget: {what}" for what in self.left_out]
         return found
+
+    @property
+    def missed(self) -> float:
+        """Largest share of the cost's change along a line that the integral of the gradient misses, 0 where unknown."""
+        return max((line.missed for line in self.lines if math.isfinite(line.missed)), default=0.0)
 
     @property
     def resolution(self) -> str:
@@ -307,9 +329,15 @@ class Findings:
             bad = int((~np.isfinite(line.costs)).sum())
             if bad:
                 said.append(f"{bad} of {line.costs.size} costs are no numbers")
+            if math.isfinite(line.missed):
+                said.append(
+                    f"the gradient's integral explains {number(100 * (1 - line.missed), 4)}% of the cost's change"
+                )
             if line.steps:
                 said.append("constant between jumps: a staircase")
-            lines.append(f"  line {index + 1}: {'; '.join(said) or 'none found'}")
+            if not line.breaks:
+                said.insert(0, "none found")
+            lines.append(f"  line {index + 1}: {'; '.join(said)}")
         if any(len(line.breaks) > 5 for line in self.lines):
             lines.append("  at most six places are looked at on a line: there may be more")
         return lines

@@ -46,6 +46,8 @@ class Line:
     breaks: tuple[Break, ...]
     steps: bool
     """Whether the cost is constant between jumps everywhere: a staircase."""
+    missed: float = float("nan")
+    """Share of the cost's change from end to end that the integral of the gradient misses; NaN where it is not known."""
 
     @property
     def jumps(self) -> tuple[Break, ...]:

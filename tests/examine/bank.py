@@ -1,0 +1,423 @@
+"""Planted faults and right gradients in NumPy, torch and JAX simulators, and the table of what each checker finds.
+
+    python tests/examine/bank.py [numpy] [torch] [jax]
+
+prints a line per case: the cause that `bench.examine` names, its exit status, calls and seconds, and beside it whether
+`torch.autograd.gradcheck` or `jax.test_util.check_grads` complains, at their own default steps and tolerances.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Case:
+    """A cost with a gradient, and what there is to find."""
+
+    name: str
+    library: str
+    cost: Callable[..., Any]
+    theta: Any
+    grad: Any
+    causes: tuple[str, ...] = ()
+    """Causes that name it; none for a right gradient."""
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+# ------------------------------------------------------------------------------------------------ NumPy
+
+
+def complex_step(cost, *extra):
+    """The gradient of an analytic cost to every digit (Squire and Trapp 1998)."""
+
+    def gradient(x, *w):
+        steps = np.array(x, dtype=complex)[None] + 1e-30j * np.eye(len(x))
+        return np.array([cost(row, *w).imag for row in steps]) / 1e-30
+
+    return gradient
+
+
+def swing(x, steps=100, dt=0.02):
+    """A damped pendulum: theta is first angle, first speed and damping; the cost its squared last angle."""
+    q, v = x[0], x[1]
+    for _ in range(steps):
+        v = v + dt * (-9.81 * np.sin(q) - x[2] * v)
+        q = q + dt * v
+    return q * q + 0.1 * v * v
+
+
+def landing(x, damper=True, contact=True, steps=150, dt=2e-3, slope=False):
+    """A ball on a spring floor, and its derivative by height and speed; the damper acts on the way in and out."""
+    q, v, dq, dv = x[0], x[1], np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    for _ in range(steps):
+        depth = max(-q, 0.0)
+        inside = float(q < 0)
+        force = -9.81 + 2e3 * depth - 50.0 * depth * v
+        dforce = inside * contact * (-2e3 * dq + 50.0 * v * dq - damper * 50.0 * depth * dv)
+        v, dv = v + dt * force, dv + dt * dforce
+        q, dq = q + dt * v, dq + dt * dv
+    return 2 * (q - 0.2) * dq if slope else (q - 0.2) ** 2
+
+
+def bisected(x, tolerance, slope=False):
+    """The root of z + z^3 = x0 x1 by bisection down to a tolerance, and its derivative by the implicit function."""
+    low, high = -10.0, 10.0
+    while high - low > tolerance:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if middle + middle**3 < x[0] * x[1] else (low, middle)
+    z = 0.5 * (low + high)
+    return np.array([x[1], x[0]]) / (1 + 3 * z * z) * 2 * z if slope else z * z
+
+
+def fixed_point(x, tolerance=1e-7, slope=False):
+    """z = cos(z) x0 x1 / 3 iterated until it moves less than a tolerance, and its derivative by the implicit function."""
+    z, before, c = 0.0, 1.0, x[0] * x[1] / 3
+    while abs(z - before) > tolerance:
+        z, before = np.cos(z) * c, z
+    return 2 * z * np.cos(z) / 3 * np.array([x[1], x[0]]) / (1 + np.sin(z) * c) if slope else z * z
+
+
+MIX = np.array([[2.0, 1.0, 0.3], [0.2, 1.5, -0.4], [0.1, 0.7, 1.2]])
+START = [0.4, 0.3, 0.5]
+
+
+def mixed(x):
+    return np.sum(np.tanh(MIX @ x) ** 2)
+
+
+def transposed(x):
+    y = np.tanh(MIX @ x)
+    return MIX @ (2 * y * (1 - y * y))
+
+
+def numpy_cases():
+    right = complex_step(swing)
+    first = {}
+
+    def stale(x):
+        return first.setdefault("gradient", right(x))
+
+    calls = {"count": 0}
+
+    def counting(x):
+        calls["count"] += 1
+        return swing(x) + 1e-5 * calls["count"]
+
+    fresh = np.random.default_rng(0)
+
+    def driven(x, w):
+        q, v = x[0], x[1]
+        for push in w:
+            v = v + 0.05 * (-9.81 * np.sin(q) - x[2] * v + push)
+            q = q + 0.05 * v
+        return q * q
+
+    yield Case("factor 2", "numpy", swing, START, lambda x: 2 * right(x), ("wrong_factor",))
+    yield Case("sign", "numpy", swing, START, lambda x: -right(x), ("wrong_factor",))
+    yield Case("3% off", "numpy", swing, START, lambda x: 1.03 * right(x), ("wrong_factor",))
+    yield Case("sign of one component", "numpy", swing, START, lambda x: right(x) * [1, 1, -1], ("wrong_factor",))
+    yield Case("transposed matrix", "numpy", mixed, START, transposed, ("missing_term",))
+    yield Case("components exchanged", "numpy", swing, START, lambda x: right(x)[[1, 0, 2]], ("missing_term",))
+    yield Case(
+        "missing contact term", "numpy", landing, [0.1, -0.5], lambda x: landing(x, contact=False, slope=True),
+        ("missing_term",),
+    )  # fmt: skip
+    yield Case(
+        "missing damper",
+        "numpy",
+        landing,
+        [0.1, -0.5],
+        lambda x: landing(x, damper=False, slope=True),
+        ("missing_term",),
+    )
+    yield Case("last step forgotten", "numpy", swing, START, complex_step(lambda x: swing(x, 99)), ("missing_term",))
+    yield Case("stale cache", "numpy", swing, START, stale, ("stale_gradient",))
+    yield Case(
+        "float32 inside", "numpy", lambda x: swing(np.asarray(x, np.float32)).item(), START, right, ("precision",)
+    )
+    yield Case(
+        "cast to int",
+        "numpy",
+        lambda x: swing(np.floor(np.array(x) * 1e4) / 1e4),
+        START,
+        right,
+        ("staircase", "precision"),
+    )
+    yield Case("state outlasts a call", "numpy", counting, START, right, ("nondeterministic",))
+    yield Case(
+        "noise drawn anew",
+        "numpy",
+        lambda x: swing(x) + 1e-7 * fresh.standard_normal(),
+        START,
+        right,
+        ("nondeterministic",),
+    )
+    yield Case(
+        "noise reused shifted", "numpy", driven, START, lambda x, w: complex_step(driven)(x, w[::-1]),
+        ("missing_term",), {"noise": 20},
+    )  # fmt: skip
+    yield Case("gradient elsewhere", "numpy", swing, START, lambda x: right(np.array(x) + 0.01), ("missing_term",))
+    yield Case("jump at theta", "numpy", lambda x: swing(x) + (x[0] > 0.4 - 1e-12) * 1.0, START, right, ("jump",))
+
+    yield Case(
+        "bisection to 1e-7", "numpy", lambda x: bisected(x, 1e-7), [1.0, 2.0], lambda x: bisected(x, 1e-7, slope=True),
+        ("precision",),
+    )  # fmt: skip
+    yield Case("pendulum", "numpy", swing, START, right)
+    yield Case("contact", "numpy", landing, [0.1, -0.5], lambda x: landing(x, slope=True))
+    yield Case(
+        "drag 2e4 beside 1", "numpy", lambda x: swing([x[0], x[1], x[2] / 4e4]), [0.4, 0.3, 2e4],
+        complex_step(lambda x: swing([x[0], x[1], x[2] / 4e4])),
+    )  # fmt: skip
+    yield Case("cost of 1e-12", "numpy", lambda x: 1e-12 * swing(x), START, lambda x: 1e-12 * right(x))
+    yield Case("cost beside 1e6", "numpy", lambda x: 1e6 + swing(x), START, right)
+    yield Case("solver to 1e-7", "numpy", lambda x: fixed_point(x), [1.0, 2.0], lambda x: fixed_point(x, slope=True))
+    yield Case(
+        "solver to 1e-13", "numpy", lambda x: bisected(x, 1e-13), [1.0, 2.0], lambda x: bisected(x, 1e-13, slope=True)
+    )
+    yield Case("chaotic", "numpy", logistic, [0.3, 3.9], complex_step(logistic))
+    yield Case("own noise", "numpy", driven, START, complex_step(driven), settings={"noise": 20})
+
+
+def logistic(x, steps=25):
+    """The chaotic logistic map: the derivative grows to some 1e5."""
+    y = x[0]
+    for _ in range(steps):
+        y = x[1] * y * (1 - y)
+    return y
+
+
+# ------------------------------------------------------------------------------------------------ torch
+
+
+def torch_cases():
+    import torch
+
+    def fall(x, cut=lambda f: f, state=lambda q: q, steps=60):
+        q, v = x[0], x[1]
+        for _ in range(steps):
+            force = -9.81 + cut(200.0 * torch.relu(-q) - 3.0 * torch.relu(-q) * v)
+            v = v + 0.01 * force
+            q = state(q + 0.01 * v)
+        return (q - 0.2) ** 2 + 0.1 * v * v
+
+    def no_grad(force):
+        with torch.no_grad():
+            return force.clone()
+
+    def clamped(q):
+        q = q.clone()
+        q.data.clamp_(max=0.03)
+        return q
+
+    class Halved(torch.autograd.Function):
+        @staticmethod
+        def forward(context, x):
+            context.save_for_backward(x)
+            return x.sin()
+
+        @staticmethod
+        def backward(context, slope):
+            return 0.5 * slope * context.saved_tensors[0].cos()
+
+    at = [0.05, -0.4]
+    cut = ("missing_term",)
+    yield Case("detach on the force", "torch", lambda x: fall(x, lambda f: f.detach()), at, "torch", cut)
+    yield Case("no_grad on the force", "torch", lambda x: fall(x, no_grad), at, "torch", cut)
+    yield Case(
+        "item() in the loop",
+        "torch",
+        lambda x: fall(x, state=lambda q: q * 0 + q.item()),
+        at,
+        "torch",
+        ("disconnected",),
+    )
+    yield Case("in-place clamp of data", "torch", lambda x: fall(x, state=clamped), at, "torch", cut)
+    yield Case("detached altogether", "torch", lambda x: fall(x.detach()), at, "torch", ("disconnected",))
+    yield Case("rounded", "torch", lambda x: fall((x * 1e5).long() / 1e5), at, "torch", ("staircase",))
+    yield Case("half precision inside", "torch", lambda x: fall(x.float()).double(), at, "torch", ("precision",))
+    yield Case(
+        "NaN behind where", "torch",
+        lambda x: fall(x) + torch.where(x[0] > 0.1, torch.sqrt(x[0] - 0.1), torch.zeros_like(x[0])),
+        at, "torch", ("nan_gradient",),
+    )  # fmt: skip
+    yield Case(
+        "norm at 0, squared",
+        "torch",
+        lambda x: x[1:].pow(2).sum().sqrt() ** 2 + x[0] ** 2,
+        [0.3, 0.0],
+        "torch",
+        ("nan_gradient",),
+    )
+    yield Case(
+        "argmin of a grid",
+        "torch",
+        lambda x: fall(x) + 0.1 * torch.argmin((torch.linspace(-1, 1, 20001) - x[0]).abs()) / 20000,
+        at,
+        "torch",
+        ("staircase",),
+    )
+    yield Case(
+        "rank by sorting",
+        "torch",
+        lambda x: (x * torch.argsort(x).double()).sum() + torch.sort(x).indices.double()[0],
+        [0.3, 0.3],
+        "torch",
+        ("jump",),
+    )
+    yield Case("wrong backward", "torch", lambda x: Halved.apply(x).sum(), [0.3, 0.7], "torch", ("wrong_factor",))
+
+    yield Case("ball on a floor", "torch", fall, at, "torch")
+    yield Case("small network", "torch", lambda x: torch.tanh(torch.outer(x, x) @ x).sum(), [0.3, -0.7, 0.2], "torch")
+    yield Case(
+        "sorted values", "torch", lambda x: (torch.sort(x).values * torch.arange(3)).sum(), [0.3, -0.7, 0.2], "torch"
+    )
+
+
+# -------------------------------------------------------------------------------------------------- JAX
+
+
+def jax_cases():
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+
+    def push(x, cut=lambda f: f, steps=80):
+        def step(carry, _):
+            q, v = carry
+            gap = q[1] - q[0]
+            force = cut(100.0 * jax.nn.softplus(-20.0 * gap) / 20.0)
+            v = v + 0.02 * jnp.stack([-force, force])
+            return (q + 0.02 * v, v), None
+
+        (q, v), _ = jax.lax.scan(step, (jnp.array([0.0, 0.2]), x), None, length=steps)
+        return (q[1] - 1.0) ** 2 + 0.1 * v @ v
+
+    @jax.custom_vjp
+    def wrong(x):
+        return jnp.sin(x)
+
+    wrong.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (-g * jnp.cos(x),))
+
+    at = [1.0, 0.1]
+    cut = ("missing_term",)
+    yield Case("stop_gradient on contact", "jax", lambda x: push(x, jax.lax.stop_gradient), at, "jax", cut)
+    yield Case("stop_gradient on theta", "jax", lambda x: push(jax.lax.stop_gradient(x)), at, "jax", ("disconnected",))
+    yield Case("cast to int", "jax", lambda x: push((x * 1e5).astype(int) / 1e5), at, "jax", ("staircase",))
+    yield Case("wrong custom_vjp", "jax", lambda x: wrong(x).sum(), at, "jax", ("wrong_factor",))
+    yield Case(
+        "norm at 0, squared",
+        "jax",
+        lambda x: jnp.linalg.norm(x[1:]) ** 2 + x[0] ** 2,
+        [0.3, 0.0],
+        "jax",
+        ("nan_gradient",),
+    )
+    yield Case("float(x) in the loop", "jax", lambda x: push(x) + float(x[0]), at, "jax", ("raised",))
+
+    yield Case("pushing", "jax", push, at, "jax")
+    yield Case("stiff, implicit", "jax", lambda x: jnp.sum((x / (1.0 + 1e6 * 1e-3)) ** 2) * 1e6 + jnp.sum(x), at, "jax")
+    yield Case("kink beside theta", "jax", lambda x: jnp.sum(jnp.abs(x - 0.1003) * x), [1.0, 0.1], "jax")
+
+
+CASES = {"numpy": numpy_cases, "torch": torch_cases, "jax": jax_cases}
+
+
+# ------------------------------------------------------------------------------------------ other checkers
+
+
+def by_torch(case):
+    """Whether `torch.autograd.gradcheck` complains; None where it cannot be asked."""
+    import torch
+
+    if case.library == "jax" or case.settings:
+        return None
+    function = case.cost
+    if case.library == "numpy":
+
+        class Wrapped(torch.autograd.Function):
+            @staticmethod
+            def forward(context, x):
+                context.save_for_backward(x)
+                return x.new_tensor(float(case.cost(x.detach().numpy())))
+
+            @staticmethod
+            def backward(context, slope):
+                return slope * torch.as_tensor(np.array(case.grad(context.saved_tensors[0].detach().numpy())))
+
+        function = Wrapped.apply
+    x = torch.tensor(case.theta, dtype=torch.float64, requires_grad=True)
+    return not torch.autograd.gradcheck(function, (x,), raise_exception=False)
+
+
+def by_jax(case):
+    """Whether `jax.test_util.check_grads` complains; None where it cannot be asked."""
+    if case.library != "jax":
+        return None
+    import jax.numpy as jnp
+    from jax.test_util import check_grads
+
+    try:
+        check_grads(case.cost, (jnp.array(case.theta),), order=1, modes=["rev"])
+    except Exception:
+        return True
+    return False
+
+
+def examined(case):
+    from bench.examine import examine
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return examine(case.cost, case.theta, grad=case.grad, progress=False, budget=60, **case.settings)
+
+
+def main(libraries):
+    print("| library | case | cause named | as planted | exit | costs | gradients | seconds | other checker |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    caught = named = faults = right = alarms = other_caught = other_asked = other_alarms = other_right = 0
+    for library in libraries or CASES:
+        for case in CASES[library]():
+            report = examined(case)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                try:
+                    other = by_jax(case) if case.library == "jax" else by_torch(case)
+                except Exception:
+                    other = True
+            fits = report.cause in case.causes if case.causes else report.status == 0
+            if case.causes:
+                faults, caught, named = faults + 1, caught + report.status, named + fits
+                other_asked, other_caught = other_asked + (other is not None), other_caught + bool(other)
+            else:
+                right, alarms = right + 1, alarms + report.status
+                other_right, other_alarms = other_right + (other is not None), other_alarms + bool(other)
+            said = {None: "-", True: "complains", False: "passes"}[other]
+            print(
+                f"| {library} | {case.name} | {report.cause} | {'yes' if fits else 'NO'} | {report.status} "
+                f"| {report.costs} | {report.gradients} | {report.seconds:.2f} | {said} |",
+                flush=True,
+            )
+    print(
+        f"\nbench.examine: {caught} of {faults} faults caught, {named} named as planted, {alarms} false alarms of {right}"
+    )
+    print(
+        f"torch gradcheck, jax check_grads: {other_caught} of {other_asked} caught, {other_alarms} false alarms of {other_right}"
+    )
+    return 0 if named == faults and not alarms else 1
+
+
+if __name__ == "__main__":
+    started = time.perf_counter()
+    status = main(sys.argv[1:])
+    print(f"{time.perf_counter() - started:.0f} s in all")
+    sys.exit(status)

@@ -1,0 +1,34 @@
+"""Planted faults are caught, and right gradients pass; `python tests/examine/bank.py` prints the whole table."""
+
+import bank
+import pytest
+
+SLOW = ("contact", "missing contact term", "missing damper")
+"""Cases whose rollouts take long in Python; the quick tests have others of their kind."""
+UNNAMED = ("missing contact term", "last step forgotten", "noise reused shifted", "in-place clamp of data")
+"""Faults that are caught and called by a wider or another name: `wrong_adjoint` or `wrong_factor`."""
+
+
+def judge(case):
+    report = bank.examined(case)
+    assert report.status == bool(case.causes), f"{case.name}: {report.cause}\n{report}"
+    if case.causes and case.name not in UNNAMED:
+        assert report.cause in case.causes, case.name
+
+
+@pytest.mark.parametrize("case", [c for c in bank.numpy_cases() if c.name not in SLOW], ids=lambda c: c.name)
+def test_numpy_simulators_are_judged_rightly(case):
+    judge(case)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [c for c in bank.numpy_cases() if c.name in SLOW], ids=lambda c: c.name)
+def test_longer_numpy_simulators_are_judged_rightly(case):
+    judge(case)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("library", ["torch", "jax"])
+def test_simulators_with_tapes_are_judged_rightly(library):
+    for case in bank.CASES[library]():
+        judge(case)
