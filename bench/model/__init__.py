@@ -13,6 +13,7 @@ from bench.errors import Unsupported
 from bench.model.adjoint import Slopes, slopes
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
+from bench.model.blocks import cores
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
 from bench.model.estimator import (
@@ -93,6 +94,7 @@ __all__ = [
     "adjoint_gradient",
     "columns",
     "compose",
+    "cores",
     "first_order",
     "halves",
     "param",
