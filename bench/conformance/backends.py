@@ -205,7 +205,7 @@ def single_precision_is_finite(backend: Backend) -> str:
 @verifies(Backend)
 def provides_is_truthful(backend: Backend) -> str:
     """Verify that declared capabilities are known and present, and that equations are refused without ``root``."""
-    capabilities = {"value", "grad", "score", "root", "physics"}
+    capabilities = {"value", "grad", "score", "root", "physics", "simulator"}
     strange = sorted(set(backend.provides) - capabilities)
     require(not strange, f"{', '.join(strange)} are none of {', '.join(sorted(capabilities))}")
     require("value" in backend.provides, "gives no costs")

@@ -10,7 +10,9 @@ so never branch on it in Python; every other type is static.
 """
 
 from bench.errors import Unsupported
+from bench.model import loaded
 from bench.model.backend import Backend
+from bench.model.callables import CallableScene
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
 from bench.model.estimator import (
@@ -30,7 +32,7 @@ from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
-from bench.model.program import Decision, FunctionProgram, Program, Rollout, compose, rollout
+from bench.model.program import CallableProgram, Decision, FunctionProgram, Program, Rollout, compose, rollout
 from bench.model.scene import (
     ContactScene,
     DampedScene,
@@ -48,6 +50,8 @@ __all__ = [
     "Array",
     "Auxiliaries",
     "Backend",
+    "CallableProgram",
+    "CallableScene",
     "Compilations",
     "Contact",
     "ContactLaw",
@@ -89,6 +93,7 @@ __all__ = [
     "compose",
     "first_order",
     "halves",
+    "loaded",
     "param",
     "per_repeat",
     "rollout",
