@@ -10,6 +10,9 @@ from bench.model.parameters import Plugin, param
 from bench.model.problem import Problem
 from bench.model.program import Program
 
+CAPABILITIES = frozenset({"value", "grad", "score", "explicit", "surrogate", "root", "physics"})
+"""What a backend may provide."""
+
 
 @dataclass(frozen=True)
 class Backend(Plugin):
@@ -17,8 +20,7 @@ class Backend(Plugin):
 
     kind: ClassVar[str] = "backends"
     provides: ClassVar[frozenset[str]] = frozenset({"value", "grad", "score"})
-    """Capabilities, out of ``value``, ``grad``, ``score``, ``explicit``, ``surrogate``, ``root`` and
-    ``physics``.
+    """Capabilities, out of :data:`CAPABILITIES`.
 
     With ``explicit`` it differentiates the cost by theta under given actions, see :meth:`Problem.explicit`. With
     ``surrogate`` it gives the gradients that a contact law declares in place of the derivative.
