@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import shlex
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,7 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        return _dispatch(words)
+        with _stopped_by_signals():
+            return _dispatch(words)
     except UserError as error:
         print("bench:", printable(error), file=sys.stderr)
         return 2
@@ -75,6 +80,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\nbench: stopped", file=sys.stderr)
         return 130
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    """Have SIGTERM and SIGHUP stop a command like Ctrl-C, and a second one of the three end it at once and in silence.
+
+    Nothing is lost then: finished rows are on disk, and workers end with their run.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    names = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
+    def stop(*_: object) -> None:
+        for name in names:
+            signal.signal(name, signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    before = {name: signal.getsignal(name) for name in names}
+    for name in names:
+        if before[name] not in (signal.SIG_IGN, None):  # as under nohup
+            signal.signal(name, stop)
+    try:
+        yield
+    finally:
+        for name, handler in before.items():
+            if signal.getsignal(name) is stop:
+                signal.signal(name, handler)
 
 
 def _dispatch(words: list[str]) -> int:
@@ -299,6 +332,11 @@ def _scenes_first(words: Sequence[str], verb: str) -> tuple[list[str], list[str]
     return scenes, rest
 
 
+def _sets_a_horizon(word: str) -> bool:
+    """Return whether a word of the command line sets the horizon of a scene, as a setting or in brackets."""
+    return re.match(r"scene\.\w+\.horizon=|[^=]*\[(.*,)?horizon=|\+?scenes=.*[\[,]horizon=", word) is not None
+
+
 def _gradcheck(words: list[str]) -> int:
     """Run ``gradient_check`` on the scenes named first, with the overrides that follow; a fault too gives status 1."""
     from dataclasses import replace
@@ -310,7 +348,12 @@ def _gradcheck(words: list[str]) -> int:
     settings_ = [f"scenes=[{','.join(scenes)}]", "name=gradcheck"] if scenes else ["name=gradcheck"]
     experiment = _loaded(["experiment=gradient_check", *settings_, *rest])
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
-    if not any(plugin and "horizon" in parameters(plugin) for plugin in plugins):
+    own = [word for word in words if _sets_a_horizon(word)]
+    swept = any(word.startswith("sweep.horizon=") for word in rest)
+    if own:
+        told = f"sweep.horizon overrules {own[0]}" if swept else f"{own[0]} replaces the sweep over horizons"
+        print(f"bench: {told}", file=sys.stderr)
+    if (own and not swept) or not any(plugin and "horizon" in parameters(plugin) for plugin in plugins):
         experiment = replace(experiment, sweep={k: v for k, v in experiment.sweep.items() if k != "horizon"})
     finished = _executed(experiment, words)
     if isinstance(finished, int):

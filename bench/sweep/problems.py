@@ -24,7 +24,7 @@ class Problems:
         problem = self._kept.pop(key, None)
         if problem is None:
             problem = backend.compile(cell.program())
-            problem.compilations = self.compilations
+            problem.compilations, problem.provides = self.compilations, backend.provides
         self._kept[key] = problem
         if len(self._kept) > self.KEPT:
             del self._kept[next(iter(self._kept))]

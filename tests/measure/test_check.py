@@ -147,6 +147,17 @@ def test_inputs_of_very_different_size_have_steps_of_their_own():
     assert np.array_equal(found.scale, [1e6, 1e-6, 1.0])
 
 
+def test_rounding_of_a_large_component_is_no_fault_of_a_small_one_but_an_exact_0_is():
+    theta = np.ones(2)
+
+    def uneven(x):
+        return x[0] ** 2 + 1e-6 * x[1] ** 2
+
+    assert check(uneven, lambda x: np.array([2.0 * x[0], 2e-6 * x[1] + 1e-11]), theta).trusted
+    assert not check(uneven, lambda x: np.array([2.0 * x[0], 2e-6 * x[1] + 1e-6]), theta).trusted
+    assert check(uneven, lambda x: np.array([2.0 * x[0], 0.0]), theta).cause == "disconnected"
+
+
 def test_noise_of_the_cost_is_measured():
     rough = check(lambda x: cost(x) + 1e-7 * np.sin(1e13 * x).sum(axis=0), gradient, THETA)
     assert rough.cause == "rounding"
@@ -179,8 +190,8 @@ def test_cost_is_judged_without_a_gradient():
 def test_every_verdict_is_trusted_or_not():
     assert set(TRUSTED) | set(UNTRUSTED) == set(VERDICTS)
     assert not set(TRUSTED) & set(UNTRUSTED)
+    assert worst(["zero", "smooth", "kink"]) == "kink"
     assert worst(["zero", "smooth"]) == "smooth"
-    assert worst(["zero"]) == "zero"
 
 
 # -------------------------------------------------------------------------------------------- amplifying rollouts

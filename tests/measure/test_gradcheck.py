@@ -7,11 +7,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bench import run
 from bench.cli import main
 from bench.measure import noise
 from bench.measure.gradcheck import EPS, FAULTS, VERDICTS, Sample, diagnose
 from bench.model import Problem, compose, registry
 from bench.studies.gradient_check import GradientCheck, measure, report
+from bench.studies.gradient_check.places import trusted
 from bench.sweep.columns import IDENTITY
 
 FLOAT64, FLOAT32 = (float(np.finfo(dtype).eps) for dtype in (np.float64, np.float32))
@@ -292,7 +294,8 @@ def test_fault_is_exit_status_1_and_its_line_repeats_it(tmp_path, monkeypatch, c
     words = ["gradcheck", "pushing[mass=0.2]", "contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[2]"]
     assert main([*words, "scene.pushing.sigma=0.05", "seed=3", "workers=0", f"results_dir={tmp_path / 'a'}"]) == 1
     printed = capsys.readouterr().out
-    assert "wrong_adjoint (start" in printed
+    assert "wrong_factor (start" in printed
+    assert "ratio -1" in printed
     lines = (tmp_path / "a" / "gradcheck" / "gradient_check.md").read_text().splitlines()
     (line,) = [text.strip() for text in lines if "python -m bench gradcheck" in text]
     again = shlex.split(line)[3:]
@@ -308,6 +311,63 @@ def test_unsupported_cells_are_rows(tmp_path):
     assert list(table["status"]) == ["unsupported"]
     assert "root finder" in table["reason"][0]
     assert "Not checked" in (tmp_path / "gradcheck" / "gradient_check.md").read_text()
+
+
+def test_contacts_of_an_engine_are_asked_from_the_engine(monkeypatch):
+    """An engine's steps cannot be taken in NumPy, and some of its contacts are known to nobody else."""
+    scene = plugin("scenes", "bounce_once", horizon=10, height=0.1 + 5.3 * 2.0 / 480.0)
+    problem = compiled(scene, plugin("contacts", "penalty", stiffness=1e4), "mujoco")
+    problem.provides = problem.provides | {"physics"}
+    modes = measure.contact_modes(problem)
+    assert modes(problem.program.theta0[:, None], np.zeros((3, 1))) == ["6-9"]
+    box = compiled(plugin("scenes", "tossed_box", horizon=2), plugin("contacts", "penalty"), "mujoco")
+    box.provides = box.provides | {"physics"}
+    assert measure.contact_modes(box) is None
+
+
+def test_horizon_set_for_a_scene_is_checked_and_said(tmp_path, capsys):
+    words = ["backends=[numpy]", f"results_dir={tmp_path}", "formats=[]", "workers=0"]
+    assert main(["gradcheck", "pendulum", "scene.pendulum.horizon=3", *words]) == 0
+    assert set(pd.read_csv(tmp_path / "gradcheck" / "gradient_check.csv")["horizon"]) == {3}
+    assert "scene.pendulum.horizon=3 replaces the sweep" in capsys.readouterr().err
+    assert main(["gradcheck", "pendulum[horizon=3]", "sweep.horizon=[2]", *words]) == 0
+    assert "sweep.horizon overrules pendulum[horizon=3]" in capsys.readouterr().err
+
+
+def test_step_beyond_the_stability_limit_is_said(tmp_path, capsys):
+    words = ["contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[2]", "workers=0", "formats=[]"]
+    main(["gradcheck", "pushing", *words, "contact.penalty.stiffness=1e4", f"results_dir={tmp_path}"])
+    assert "beyond the stability limit" in capsys.readouterr().out
+    main(["gradcheck", "pushing", *words, "contact.penalty.stiffness=10", f"results_dir={tmp_path}"])
+    assert "beyond the stability limit" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("verdict", ["unsettled", "jump", "kink", "nan_gradient", "wrong_factor", "staircase"])
+def test_what_cannot_be_trusted_counts_except_what_was_sought_on_a_switch(verdict):
+    assert not trusted("start", verdict)
+    assert trusted("at", verdict) == (verdict in ("jump", "kink"))
+
+
+def test_gradient_that_is_right_for_the_first_column_alone_is_seen(pendulum):
+    def later(g, _):
+        return np.concatenate([g[:, :1], 1.1 * g[:, 1:]], axis=1)
+
+    found = measure.start(Planted(pendulum, grad=later), pendulum.program.theta0, FLOAT64, SEARCH, 0)
+    assert found.cause == "wrong_factor"
+
+
+def test_components_are_columns_of_the_row(tmp_path):
+    words = ["study=gradient_check", "scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "formats=[]"]
+    rows = run([*words, "workers=0", "name=one", f"results_dir={tmp_path}"])
+    (row,) = rows.to_dict("records")
+    assert list(row["component"]) == list(range(int(row["dim"])))
+    np.testing.assert_allclose(row["component_ratio"], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(row["component_program"], row["component_difference"], rtol=1e-6)
+    assert set(row["component_verdict"]) == {"smooth"}
+    assert row["untrusted"] == 0
+    table = pd.read_csv(tmp_path / "one" / "gradient_components.csv")
+    assert list(table["component"]) == list(row["component"])
+    np.testing.assert_allclose(table["component_program"], row["component_program"])
 
 
 def test_worst_check_decides_the_line_of_a_point():

@@ -107,7 +107,7 @@ def checked(*words):
         "point": ["start"], "sample": [0], "direction": [0], "derivative_program": [1.0], "check_verdict": ["smooth"],
         "check_error": [1e-9], "check_eps": [1e-4], "eps": list(eps), "derivative_differences": [1.0, 1.0],
         "relative_error": [1e-9, 1e-8], "mode_minus": ["", ""], "mode_plus": ["", ""],
-    }  # fmt: skip
+    } | {name: [0] for name in gradient_check.PART}  # fmt: skip
     return given, rows.assign(verdict="smooth", **{name: [value] * len(rows) for name, value in values.items()})
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from . import roughness
 from .causes import of_ratios
 from .direction import EPS, GUARD, Finding, Sample, judge
-from .sampling import order, points, samples, shifts
-from .verdicts import FAULTS, MEANING, TRUSTED, UNTRUSTED, VERDICTS, worst
+from .sampling import order, points, samples
+from .verdicts import FAULTS, MEANING, TRUSTED, worst
 
 Cost = Callable[[np.ndarray], np.ndarray]
 """Costs of columns: ``(d, B)`` to ``(B,)``."""
@@ -24,6 +24,8 @@ Modes = Callable[[np.ndarray], Sequence[str]]
 """Names of the contact modes of columns: ``(d, B)`` to ``B`` strings."""
 SUSPICIOUS = 4
 """Directions at most that are scanned for a staircase."""
+ELSEWHERE = 4
+"""Other thetas at which a wrong component's ratio is taken."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ class Part:
     """Order of the Taylor remainder: 2 for a right gradient, 1 for a wrong one, NaN where noise or nothing is left."""
     verdict: str
     sample: Sample
+    modes: tuple[Sequence[str], Sequence[str]] = ((), ())
+    """Contact modes at each step, on the minus and on the plus side; empty without any."""
 
     @property
     def ratio(self) -> float:
@@ -90,7 +94,7 @@ class Check:
     """The outcome of a check."""
 
     cause: str
-    """The worst verdict, one of :data:`VERDICTS`."""
+    """The worst verdict, one of :data:`.verdicts.VERDICTS`."""
     theta: np.ndarray
     gradient: np.ndarray
     scale: np.ndarray
@@ -213,14 +217,19 @@ class _Checker:
             doubt = np.abs(self.gradient(theta + 4.0 * self.unit * self.scale) - first)
         at_draws = [self.gradient(other) for other in around.T]
         again = self.gradient(theta)
-        names = [f"component {i}" for i in chosen] + [f"direction {i}" for i in range(options.directions)]
-        vectors, rates = self._directions(chosen)
-        parts = self._parts(theta, vectors, rates, first, names, [*chosen, *[None] * options.directions], doubt)
+        count = options.directions
+        names = [f"component {i}" for i in chosen] + [f"direction {i}" for i in range(count)]
+        vectors, lengths = self._directions(chosen)
+        every = np.repeat(theta[:, None], len(names), axis=1), np.repeat(first[:, None], len(names), axis=1)
+        parts = self._parts(*every, vectors, lengths, names, [*chosen, *[None] * count], doubt)
+        names = [f"draw {k} direction {i}" for k in range(options.draws) for i in range(count)]
         draws: list[Part] = []
-        for k, (other, found) in enumerate(zip(around.T, at_draws, strict=True)):
-            vectors, rates = self._directions([])
-            drawn = [f"draw {k} direction {i}" for i in range(options.directions)]
-            draws += self._parts(other, vectors, rates, found, drawn, [None] * options.directions, doubt, twice=False)
+        if names:
+            vectors = np.concatenate([self._directions([])[0] for _ in range(options.draws)], axis=1)
+            found = np.repeat(np.stack(at_draws, axis=1), count, axis=1)
+            none: list[int | None] = [None] * len(names)
+            starts = np.repeat(around, count, axis=1)
+            draws = self._parts(starts, found, vectors, np.ones(len(names)), names, none, doubt, twice=False)
         parts, draws = self._explained(parts, draws, around, at_draws)
         causes = [part.verdict for part in parts]
         # elsewhere, only what is certain counts: theta itself is on no kink of another theta
@@ -268,59 +277,65 @@ class _Checker:
 
     def _parts(
         self,
-        theta: np.ndarray,
+        thetas: np.ndarray,
+        gradients: np.ndarray,
         vectors: np.ndarray,
         lengths: np.ndarray,
-        gradient: np.ndarray,
         names: list[str],
         components: Sequence[int | None],
         doubt: np.ndarray,
         twice: bool = True,
     ) -> list[Part]:
-        """Check the derivatives along ``vectors (d, M)`` at one theta."""
+        """Check derivatives along ``vectors (d, M)`` at ``thetas (d, M)``, in one batch of costs."""
         eps, count = self.options.eps, vectors.shape[1]
         if not count:
             return []
-        at = points(theta, vectors, self.unit, eps)
+        at = points(thetas, vectors, self.unit, eps)
         values = self.cost(at).reshape(count, -1)
         repeatable = np.ones(count, bool)
         if twice:
             # in another order, so that no column depends on its neighbours
-            same = self._same(values, self.cost(at[:, ::-1])[::-1].reshape(count, -1))
-            repeatable = np.asarray(same.all(axis=1))
-        crossing = None
-        if self._modes is not None:
-            names_ = np.array(self._modes(at), dtype=object).reshape(count, -1)
-            crossing = np.asarray(names_[:, : eps.size] != names_[:, eps.size : 2 * eps.size])
+            again = self.cost(at[:, ::-1])[::-1].reshape(count, -1)
+            repeatable = np.asarray(((values == again) | (np.isnan(values) & np.isnan(again))).all(axis=1))
+        minus, plus = self._sides(at, count)
         with np.errstate(invalid="ignore"):
-            program = np.where(vectors != 0.0, vectors * gradient[:, None], 0.0).sum(axis=0) / lengths
+            program = np.where(vectors != 0.0, vectors * gradients, 0.0).sum(axis=0) / lengths
         if self._gradient is None:
             program = np.zeros(count)
         doubts = np.abs(vectors).T @ np.nan_to_num(doubt, nan=0.0, posinf=0.0) / lengths
-        found = samples(values, lengths, program, self.unit, eps, crossing, repeatable, doubts)
+        # what is this little beside the other components may come from their rounding; an exact 0 does not
+        whole = np.abs(np.nan_to_num(gradients, posinf=0.0, neginf=0.0)) * self.scale[:, None]
+        doubts += np.where(program != 0.0, np.sqrt(self.unit) * whole.max(axis=0) / lengths, 0.0)
+        found = samples(values, lengths, program, self.unit, eps, minus != plus, repeatable, doubts)
         if self._gradient is None:
             found = [replace(s, derivative=judge(s).difference) for s in found]
         judged = [judge(sample) for sample in found]
         if twice:
-            judged = self._scanned(theta, vectors, found, judged)
+            judged = self._scanned(thetas, vectors, found, judged)
+        modes = [(tuple(a), tuple(b)) for a, b in zip(minus, plus, strict=True)]
         return [
-            _part(names[m], components[m], sample, finding)
+            _part(names[m], components[m], sample, finding, modes[m])
             for m, (sample, finding) in enumerate(zip(found, judged, strict=True))
         ]
 
-    def _same(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return where two calls agree."""
-        return (a == b) | (np.isnan(a) & np.isnan(b))
+    def _sides(self, at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the contact modes at the steps of each direction, on the minus and on the plus side, ``(M, K)``."""
+        eps = self.options.eps.size
+        if self._modes is None:
+            return np.full((count, eps), ""), np.full((count, eps), "")
+        columns = at.reshape(at.shape[0], count, -1)[:, :, : 2 * eps].reshape(at.shape[0], -1)
+        names = np.array(self._modes(columns), dtype=object).reshape(count, 2 * eps)
+        return names[:, :eps], names[:, eps:]
 
     def _scanned(
-        self, theta: np.ndarray, vectors: np.ndarray, found: list[Sample], judged: list[Finding]
+        self, thetas: np.ndarray, vectors: np.ndarray, found: list[Sample], judged: list[Finding]
     ) -> list[Finding]:
         """Look for staircases in the cost along the directions that are not plainly right."""
         plain = ("smooth", "nonlinear", "mode_crossing", "zero", "nonfinite", "nondeterministic")
         asked = [m for m, finding in enumerate(judged) if finding.verdict not in plain][:SUSPICIOUS]
         along = roughness.scans(1.0, self.unit)
         for m in asked:
-            at = theta[:, None] + vectors[:, m : m + 1] * along.reshape(1, -1)
+            at = thetas[:, m : m + 1] + vectors[:, m : m + 1] * along.reshape(1, -1)
             values = self.cost(at).reshape(along.shape)
             for spacing, row in zip(along, values, strict=True):
                 if roughness.treads(row, 8.0 * self.unit * float(np.abs(row).max())):
@@ -351,16 +366,22 @@ class _Checker:
         here = [part for part in parts if part.verdict in FAULTS]
         if still and at_draws[0].any() and not here:
             return parts, [_named(part, "stale_gradient", ("wrong_adjoint",)) for part in draws]
-        guilty = [part.component for part in wrong if part.component is not None]
+        guilty = [part.component for part in parts if any(part is one for one in wrong) and part.component is not None]
         ratios = {i: [part.ratio for part in parts if part.component == i] for i in guilty}
-        for other, found in list(zip(around.T, at_draws, strict=True))[:4]:
-            vectors = np.diag(self.scale)[:, guilty]
-            again = self._parts(
-                other, vectors, self.scale[guilty], found, [""] * len(guilty), guilty, np.zeros(other.size), twice=False
-            )
-            for i, part in zip(guilty, again, strict=True):
-                if part.verdict == "wrong_adjoint" or part.verdict in TRUSTED:
-                    ratios[i].append(part.ratio)
+        count, few = len(guilty), min(len(at_draws), ELSEWHERE)
+        again = self._parts(
+            np.repeat(around[:, :few], count, axis=1),
+            np.repeat(np.stack(at_draws[:few], axis=1), count, axis=1) if few else np.zeros((around.shape[0], 0)),
+            np.tile(np.diag(self.scale)[:, guilty], few),
+            np.tile(self.scale[guilty], few),
+            [""] * (count * few),
+            guilty * few,
+            np.zeros(self.theta.size),
+            twice=False,
+        )
+        for part in again:
+            if part.component is not None and part.verdict in ("wrong_adjoint", *TRUSTED):
+                ratios[part.component].append(part.ratio)
         whole = [part for part in (*parts, *draws) if part.component is None and part.verdict == "wrong_adjoint"]
         right = any(part.verdict in TRUSTED and part.verdict != "zero" for part in parts if part.component is not None)
         cause = of_ratios(ratios, [part.ratio for part in whole], right)
@@ -368,7 +389,9 @@ class _Checker:
         return renamed, [_named(part, cause[None], ("wrong_adjoint",)) for part in draws]
 
 
-def _part(name: str, component: int | None, sample: Sample, finding: Finding) -> Part:
+def _part(
+    name: str, component: int | None, sample: Sample, finding: Finding, modes: tuple[Sequence[str], Sequence[str]]
+) -> Part:
     return Part(
         name=name,
         component=component,
@@ -381,11 +404,9 @@ def _part(name: str, component: int | None, sample: Sample, finding: Finding) ->
         order=order(sample),
         verdict=finding.verdict,
         sample=sample,
+        modes=modes,
     )
 
 
 def _named(part: Part, verdict: str, instead: Sequence[str]) -> Part:
     return replace(part, verdict=verdict) if part.verdict in instead else part
-
-
-__all__ = ["UNTRUSTED", "VERDICTS", "Check", "Options", "Part", "check", "scales", "shifts"]

@@ -16,9 +16,13 @@ def shifts(unit: float, eps: np.ndarray = EPS) -> np.ndarray:
 
 
 def points(theta: np.ndarray, vectors: np.ndarray, unit: float, eps: np.ndarray = EPS) -> np.ndarray:
-    """Return theta moved along each column of ``vectors (d, M)`` by each of the :func:`shifts`, ``(d, M * S)``."""
-    moved = theta[:, None, None] + vectors[:, :, None] * shifts(unit, eps)
-    return np.asarray(moved.reshape(theta.size, -1))
+    """Return theta moved along each column of ``vectors (d, M)`` by each of the :func:`shifts`, ``(d, M * S)``.
+
+    ``theta`` is ``(d,)``, or ``(d, M)`` for directions that start at different points.
+    """
+    start = theta.reshape(theta.shape[0], -1)
+    moved = start[:, :, None] + vectors[:, :, None] * shifts(unit, eps)
+    return np.asarray(moved.reshape(theta.shape[0], -1))
 
 
 def samples(

@@ -13,7 +13,7 @@ UNDECIDED = ("nonfinite", "unsettled")
 """Nothing was shown."""
 BROKEN = ("jump", "kink")
 """The cost has no derivative at this point."""
-TRUSTED = ("saturated", "rounding", "mode_crossing", "nonlinear", "zero", "smooth")
+TRUSTED = ("saturated", "rounding", "mode_crossing", "nonlinear", "smooth", "zero")
 """The gradient is the derivative."""
 UNTRUSTED = (*FAULTS, *UNDECIDED, *BROKEN)
 """Verdicts that end a check with exit status 1."""
@@ -37,13 +37,12 @@ MEANING = {
     "rounding": "right; small steps err by more than the arithmetic explains, as with a loose solver",
     "mode_crossing": "right; the two sides of wide differences meet different contacts",
     "nonlinear": "right; wide differences see the curvature of the cost",
-    "zero": "gradient and differences are exactly zero",
     "smooth": "right at every useful step",
+    "zero": "gradient and differences are exactly zero",
 }
 """What each verdict says."""
 
 
 def worst(verdicts: Iterable[str]) -> str:
-    """Return the worst of some verdicts; ``zero`` only where all are."""
-    found = set(verdicts)
-    return min(found - {"zero"} or found, key=VERDICTS.index)
+    """Return the worst of some verdicts."""
+    return min(verdicts, key=VERDICTS.index)

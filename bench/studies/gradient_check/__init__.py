@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from bench.measure.gradcheck import FAULTS, VERDICTS
+from bench.measure.gradcheck import VERDICTS
 from bench.model import param
 from bench.sweep.cell import Cell
 from bench.sweep.columns import Column, Columns, Judged, numbers, text
@@ -24,15 +24,29 @@ class GradientCheck(Study):
 
     name = "gradient_check"
     columns: ClassVar[Columns] = Columns.of(
+        Column("untrusted", "number of checks that show a gradient not to be trusted"),
         Column("best_error", "smallest relative error over all steps, of the worst check"),
         Column("best_eps", "step of that error, in units of the natural scale"),
         Column("scale", "natural scale of displacements of theta: its norm, at least 1"),
+        Column(
+            "taylor_order", "order of the Taylor remainder along random directions: 2 for a right gradient, 1 if wrong"
+        ),
+        Column("cost_noise", "measured standard deviation of the cost's own noise"),
         text("verdict", "the worst verdict of the checks", judged=Judged("verdict", "verdict", order=VERDICTS)),
         text("command", "a line for the shell that repeats the checks"),
         text("device", "what the program ran on"),
+        numbers("component", "components of theta that were checked one by one"),
+        numbers("component_program", "of each component, the program's number"),
+        numbers("component_difference", "of each component, what the differences settle on"),
+        numbers("component_uncertainty", "of each component, the error of that"),
+        numbers("component_step", "of each component, the step it was taken at, in units of the component"),
+        numbers("component_ratio", "of each component, the program's number over the difference"),
+        numbers("component_left", "of each component, the one-sided slope towards smaller values"),
+        numbers("component_right", "of each component, the one-sided slope towards larger values"),
+        numbers("component_verdict", "of each component, its verdict"),
         numbers("point", "where each check was made: start, or before, at or after a contact switch"),
         numbers("sample", "of each check, 0 without noise, 1 with it"),
-        numbers("direction", "of each check, the number of its direction"),
+        numbers("direction", "of each check, the number of its direction; -1 - i for component i"),
         numbers("derivative_program", "of each check, the program's directional derivative"),
         numbers("check_verdict", "of each check, its verdict"),
         numbers("check_error", "of each check, the smallest relative error over all steps"),
@@ -53,11 +67,13 @@ class GradientCheck(Study):
         1e-4, "how far before and after a switch gradients are checked, in the same units", positive=True
     )
 
+    around: int = param(8, "other thetas around the start at which gradients are checked", low=1)
+
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Make all checks of one cell."""
         from bench.studies.gradient_check.measure import Search, measure
 
-        return measure(cell, session, Search(self.directions, self.drawn, self.reach, self.aside))
+        return measure(cell, session, Search(self.directions, self.drawn, self.reach, self.aside, self.around))
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         """Write the tables and charts."""
@@ -78,5 +94,5 @@ class GradientCheck(Study):
         return content(experiment, rows)
 
     def faults(self, rows: pd.DataFrame) -> int:
-        """Count rows on which a check found a gradient that must not be used."""
-        return int(rows["verdict"].isin(FAULTS).sum())
+        """Count rows on which a check found a gradient that cannot be trusted, or no finite cost."""
+        return int(((rows["untrusted"] > 0) | (rows["status"] == "nonfinite")).sum())

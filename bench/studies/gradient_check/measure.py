@@ -5,20 +5,23 @@ from __future__ import annotations
 import itertools
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from bench.measure import gradcheck, noise
 from bench.measure.contacts import acting
-from bench.model import LoopOps, Problem, Rollout, Unsupported
+from bench.model import SURROGATE, ContactScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
 from bench.report.reproduce import check_of
+from bench.studies.gradient_check.places import trusted
 from bench.sweep.cell import Cell
 from bench.sweep.session import Session
 
 COLUMNS_AT_ONCE = 128
-"""Rollouts per evaluation of contact modes, always the same number so that a compiling backend compiles once."""
+"""Rollouts per evaluation, always the same number so that a compiling backend compiles once."""
+NEUTRAL = 1e-9
+"""Growth per step that rounding explains."""
 
 
 @dataclass(frozen=True)
@@ -43,42 +46,144 @@ class Search:
     drawn: int
     reach: float
     aside: float
+    around: int = 8
 
 
 def measure(cell: Cell, session: Session, search: Search) -> dict[str, Any]:
     """Make all checks of one cell."""
     problem = session.problem(cell)
     theta = problem.program.theta0
+    unit = float(np.finfo(cell.backend.dtype).eps)
     drawn = noise.draw(cell.seed, cell.scene.name, 1, 1, problem.program.n_noise, "gradient check")[0, 0]
     directions = noise.draw(cell.seed, cell.scene.name, 1, search.drawn, theta.size, "directions")[0]
-    places, found = examine(problem, theta, drawn, directions, float(np.finfo(cell.backend.dtype).eps), search)
-    verdicts = [gradcheck.diagnose(sample) for sample, _ in found]
-    best = [gradcheck.best(sample) for sample, _ in found]
-    errors = [float(sample.errors[i]) for (sample, _), i in zip(found, best, strict=True)]
-    worst = min(range(len(found)), key=lambda i: (gradcheck.VERDICTS.index(verdicts[i]), -errors[i]))
+    whole = start(problem, theta, unit, search, cell.seed)
+    places, found = examine(problem, theta, drawn, directions, unit, search)
+    points = [*at_start(whole), *(_checked(place, *both) for place, both in zip(places, found, strict=True))]
+    verdicts = [point.verdict for point in points]
+    best = [gradcheck.best(point.sample) for point in points]
+    errors = [float(point.sample.errors[i]) for point, i in zip(points, best, strict=True)]
+    severest = min(range(len(points)), key=lambda i: (gradcheck.VERDICTS.index(verdicts[i]), -errors[i]))
     lost = all(verdict == "nonfinite" for verdict in verdicts)
+    parts = whole.components
+    said = [SURROGATE] if problem.program.surrogate else []
+    said += [] if whole.cause in PLAIN else [whole.sentence()]
     return {
         "status": "nonfinite" if lost else "ok",
-        "reason": "no cost is finite" if lost else "",
-        "verdict": verdicts[worst],
-        "best_error": errors[worst],
-        "best_eps": float(gradcheck.EPS[best[worst]]),
+        "reason": "no cost is finite" if lost else "; ".join([*said, *beyond_stability(cell)]),
+        "verdict": gradcheck.worst(verdicts),
+        "untrusted": sum(not trusted(point.point, point.verdict) for point in points),
+        "best_error": errors[severest],
+        "best_eps": float(gradcheck.EPS[best[severest]]),
         "scale": scale_of(theta),
+        "taylor_order": whole.order,
+        "cost_noise": whole.noise,
         "command": check_of(cell),
         "device": problem.device,
-        "point": [place.point for place in places],
-        "sample": [place.sample for place in places],
-        "direction": [place.number for place in places],
-        "derivative_program": [sample.derivative for sample, _ in found],
+        "component": [part.component for part in parts],
+        "component_program": [part.program for part in parts],
+        "component_difference": [part.difference for part in parts],
+        "component_uncertainty": [part.uncertainty for part in parts],
+        "component_step": [part.step for part in parts],
+        "component_ratio": [part.ratio for part in parts],
+        "component_left": [part.left for part in parts],
+        "component_right": [part.right for part in parts],
+        "component_verdict": [part.verdict for part in parts],
+        "point": [point.point for point in points],
+        "sample": [point.noise for point in points],
+        "direction": [point.number for point in points],
+        "derivative_program": [point.sample.derivative for point in points],
         "check_verdict": verdicts,
         "check_error": errors,
         "check_eps": [float(gradcheck.EPS[i]) for i in best],
         "eps": gradcheck.EPS.tolist(),
-        "derivative_differences": _joined(sample.differences for sample, _ in found),
-        "relative_error": _joined(sample.errors for sample, _ in found),
-        "mode_minus": [modes[0] for _, both in found for modes in both],
-        "mode_plus": [modes[1] for _, both in found for modes in both],
+        "derivative_differences": _joined(point.sample.differences for point in points),
+        "relative_error": _joined(point.sample.errors for point in points),
+        "mode_minus": [mode for point in points for mode in point.minus],
+        "mode_plus": [mode for point in points for mode in point.plus],
     }
+
+
+PLAIN = ("smooth", "nonlinear", "zero", "mode_crossing")
+"""Verdicts on theta that need no sentence."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One derivative checked, wherever."""
+
+    point: str
+    noise: int
+    number: int
+    """Number of the direction; -1 - i for component i."""
+    verdict: str
+    sample: gradcheck.Sample
+    minus: Sequence[str]
+    """Contact modes on the minus side, by step."""
+    plus: Sequence[str]
+
+
+def start(problem: Problem, theta: np.ndarray, unit: float, search: Search, seed: int) -> gradcheck.Check:
+    """Check every component at theta without noise, random directions there and around it.
+
+    Costs come in batches of one width, so that a compiling backend compiles once. A gradient is the last column of a
+    batch that begins with another theta, as a backend may be right for one column alone.
+    """
+    still = np.zeros((problem.program.n_noise, COLUMNS_AT_ONCE))
+
+    def cost(thetas: np.ndarray) -> np.ndarray:
+        count = thetas.shape[1]
+        index = np.arange(-(-count // COLUMNS_AT_ONCE) * COLUMNS_AT_ONCE).clip(max=count - 1)
+        parts = [problem.value(thetas[:, part], still) for part in index.reshape(-1, COLUMNS_AT_ONCE)]
+        return np.concatenate(parts)[:count]
+
+    def gradient(at: np.ndarray) -> np.ndarray:
+        return problem.grad(np.stack([theta, at], axis=1), still[:, :2])[:, -1]
+
+    modes = contact_modes(problem)
+    named = None if modes is None else lambda thetas: modes(thetas, np.zeros((still.shape[0], thetas.shape[1])))
+    options = gradcheck.Options(directions=search.directions, draws=search.around, unit=unit, seed=seed)
+    return gradcheck.check(cost, gradient, theta, options, named)
+
+
+def at_start(whole: gradcheck.Check) -> list[Point]:
+    """Return the components, and of random directions and other thetas those that show more than they do."""
+    parts = list(whole.components)
+    seen = {part.verdict for part in parts}
+    parts += [
+        part for part in whole.parts if part.component is None and part.verdict not in (*gradcheck.TRUSTED, *seen)
+    ]
+    if whole.cause not in (*seen, *(part.verdict for part in parts)):
+        # found at other thetas only, or by asking twice
+        parts += [replace(part, verdict=whole.cause) for part in (*whole.guilty, *whole.parts)[:1]]
+    return [Point("start", 0, _number(part), part.verdict, part.sample, *part.modes) for part in parts]
+
+
+def _number(part: gradcheck.Part) -> int:
+    return -1 - part.component if part.component is not None else int(part.name.rpartition(" ")[2])
+
+
+def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, str]]) -> Point:
+    minus, plus = zip(*sides, strict=True)
+    return Point(place.point, place.sample, place.number, gradcheck.diagnose(sample), sample, minus, plus)
+
+
+def beyond_stability(cell: Cell) -> list[str]:
+    """Return a remark if a step in contact multiplies the state, by the integrator's own matrix on the law's spring."""
+    scene, law, integrator = cell.scene, cell.contact, cell.integrator
+    spring = law.spring() if isinstance(law, ForceLaw) else None
+    if not isinstance(scene, ContactScene) or spring is None or integrator is None:
+        return []
+    first = scene.initial_state(np, scene.theta0()[:, None])
+    response = float(scene.contact(np).response(np, first.q).max())
+    factor = float(getattr(scene, "velocity_factor", 1.0))
+    matrix = integrator.transition(float(scene.dt), spring[0] * response, spring[1] * response, factor)
+    growth = float(np.abs(np.linalg.eigvals(matrix)).max())
+    if growth <= 1.0 + NEUTRAL:
+        return []
+    return [
+        f"the step is beyond the stability limit of the contact: each step in contact multiplies the state by up to "
+        f"{growth:.3g}; take a smaller dt"
+    ]
 
 
 def _joined(parts: Iterator[np.ndarray]) -> list[float]:
@@ -192,9 +297,10 @@ def contact_modes(problem: Problem) -> Modes | None:
     program = problem.program
     if not isinstance(program, Rollout) or not program.scene.n_contacts:
         return None
-    rollout = _followed if not program.needs_root else _asked
+    # an engine and a solver step by themselves; anything else is quicker in NumPy
+    rollout = _asked if program.needs_root or "physics" in problem.provides else _followed
     try:
-        rollout(problem, program.theta0[:, None], np.zeros((program.n_noise, COLUMNS_AT_ONCE)))
+        acting(program, *rollout(problem, program.theta0[:, None], np.zeros((program.n_noise, COLUMNS_AT_ONCE))))
     except Unsupported:
         return None
 

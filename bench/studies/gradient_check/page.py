@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from bench.measure.gradcheck import FAULTS, VERDICTS
+from bench.measure.gradcheck import TRUSTED, UNTRUSTED, VERDICTS
 from bench.report.style import PALETTE
 from bench.report.text import counted, number
 from bench.report.views import Arranged, arranged
@@ -20,7 +20,7 @@ from bench.report.web.content import (
     titled,
     together,
 )
-from bench.studies.gradient_check.report import PROBLEM, by_point, long_table
+from bench.studies.gradient_check.report import PROBLEM, by_point, doubtful, long_table
 from bench.sweep.experiment import Experiment
 
 POINTS = {"start": 0, "before": 5, "at": 2, "after": 3}
@@ -87,19 +87,21 @@ def checks(shown: Arranged) -> pd.DataFrame:
 def finding(rows: pd.DataFrame) -> str:
     """Write how many checks found a fault, and where."""
     points = by_point(rows)
-    faults = points[points["verdict"].isin(FAULTS)]
+    faults = doubtful(points)
     if points.empty:
         return "No gradient could be checked: the table has the reason of each cell."
     if faults.empty:
-        return f"None of {counted(len(points), 'checked point')} shows a wrong gradient{_errors(points)}."
+        return (
+            f"None of {counted(len(points), 'checked point')} shows a gradient that cannot be trusted{_errors(points)}."
+        )
     named = ", ".join(dict.fromkeys(titled(faults, ["scene", "contact", "backend"])))
     kinds, show = ", ".join(faults["verdict"].unique()), "shows" if len(faults) == 1 else "show"
-    return f"{len(faults)} of {counted(len(points), 'checked point')} {show} a fault: {kinds}; on {named}."
+    return f"{len(faults)} of {counted(len(points), 'checked point')} {show} a gradient that cannot be trusted: {kinds}; on {named}."
 
 
 def _errors(points: pd.DataFrame) -> str:
     """Write the largest error where there is a derivative, and how many points have none."""
-    broken = points["verdict"].isin(("kink", "jump", "unsettled"))
+    broken = points["verdict"].isin(UNTRUSTED)
     errors = points.loc[~broken, "error"].dropna()
     text = (
         f"; the largest error is {number(errors.max())} ({points.loc[errors.idxmax(), 'scene']})" if len(errors) else ""
@@ -120,10 +122,10 @@ def answers(rows: pd.DataFrame) -> pd.DataFrame:
     for verdict in VERDICTS:
         part = points[points["verdict"] == verdict]
         if len(part):
-            fault = "yes" if verdict in FAULTS else "no"
+            fault = "yes" if verdict in TRUSTED else "no"
             scenes = ", ".join(dict.fromkeys(part["scene"]))
             largest = number(part["error"].max())
             lines.append(
-                {"verdict": verdict, "fault": fault, "points": len(part), "largest error": largest, "scenes": scenes}
+                {"verdict": verdict, "trusted": fault, "points": len(part), "largest error": largest, "scenes": scenes}
             )
     return pd.DataFrame(lines)

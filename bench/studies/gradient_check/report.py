@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
-from bench.measure.gradcheck import FAULTS, VERDICTS
+from bench.measure.gradcheck import VERDICTS
 from bench.report.figures import save, styled
 from bench.report.style import GREY, STYLE, colour, plain
 from bench.report.tables import escape_markdown
@@ -24,6 +24,7 @@ from bench.report.text import counted, number
 from bench.report.views import Arranged, arranged
 from bench.report.web.content import columns_of, grouped, problems, shown_as, telling, together
 from bench.studies.gradient_check import GradientCheck
+from bench.studies.gradient_check.places import trusted
 from bench.sweep.axes import parsed, with_axes
 from bench.sweep.columns import IDENTITY
 from bench.sweep.experiment import Experiment
@@ -41,12 +42,13 @@ PROBLEM = ("scene", "contact", "integrator")
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``gradient_check`` (.csv, .md) and the chart; returns the files' paths."""
+    """Write ``gradient_check`` (.csv, .md), ``gradient_components.csv`` and the chart; returns the files' paths."""
     shown = arranged(experiment, rows)
     table = long_table(with_axes(experiment, rows))
     contents = {
         "gradient_check.csv": table.to_csv(index=False, lineterminator="\n"),
         "gradient_check.md": markdown(shown),
+        "gradient_components.csv": component_table(rows).to_csv(index=False, lineterminator="\n"),
     }
     paths = write_all(experiment.directory, contents)
     if (table["eps"].notna() & np.isfinite(table["relative_error"])).any():
@@ -87,6 +89,24 @@ def long_table(rows: pd.DataFrame) -> pd.DataFrame:
     table = pd.DataFrame(lines, columns=[*whole, *ORDER, *last])
     counts = ["horizon", "samples", "repeats", "dim", "seed", "sample", "direction"]
     return table.astype(dict.fromkeys(counts, "Int64"))
+
+
+PART = (
+    "component", "component_program", "component_difference", "component_uncertainty", "component_step",
+    "component_ratio", "component_left", "component_right", "component_verdict",
+)  # fmt: skip
+"""Columns that hold a value per component."""
+
+
+def component_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one line per cell and component of theta, with a column for each of :data:`PART`."""
+    names = ["experiment", *IDENTITY, "dim"]
+    lines = [
+        {name: row[name] for name in names} | dict(zip(PART, values, strict=True)) | {"key": row["key"]}
+        for row in rows.to_dict("records")
+        for values in zip(*(row[name] for name in PART), strict=True)
+    ]
+    return pd.DataFrame(lines, columns=[*names, *PART, "key"])
 
 
 def by_point(rows: pd.DataFrame) -> pd.DataFrame:
@@ -139,11 +159,14 @@ def markdown(shown: Arranged) -> str:
         out += ["", "Not checked:", ""]
         for reason, part in lost.groupby("reason", sort=False):
             out.append(f"- {len(part)} {part['status'].iloc[0]}: {escape_markdown(str(reason))}")
-    faults = summary[summary["verdict"].isin(FAULTS)]
+    faults = doubtful(summary)
     if not faults.empty:
-        out += ["", "Faults, and the command that repeats each:", ""]
-        for (verdict, line), _ in faults.groupby(["verdict", "command"], sort=False):
-            out += [f"- {verdict}", "", f"      {line}", ""]
+        out += ["", "Gradients that cannot be trusted, and the command that repeats each:", ""]
+        for line, part in faults.groupby("command", sort=False):
+            out += [f"- {', '.join(dict.fromkeys(part['verdict']))}", "", f"      {line}", ""]
+    said = remarks(rows[rows["status"] == "ok"])
+    if said:
+        out += ["", "Remarks:", "", *(f"- {escape_markdown(text)} ({counted(count, 'cell')})" for text, count in said)]
     return "\n".join(out).rstrip("\n") + "\n"
 
 
@@ -174,9 +197,26 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
             if tally:
                 parts.append(f"{point} " + ", ".join(f"{tally[v]} {v}" for v in VERDICTS if v in tally))
         print(f"  {name}: " + "; ".join(parts))
-    faults = summary[summary["verdict"].isin(FAULTS)]
-    for (verdict, line), part in faults.groupby(["verdict", "command"], sort=False):
-        print(f"\n{verdict} ({', '.join(dict.fromkeys(part['point']))}); repeat with\n  {line}")
+    faults = doubtful(summary)
+    for line, lines in faults.groupby("command", sort=False):
+        parts = lines.groupby("verdict", sort=False)["point"]
+        named = [f"{verdict} ({', '.join(dict.fromkeys(points))})" for verdict, points in parts]
+        print(f"\n{', '.join(named)}; repeat with\n  {line}")
+    for text, count in remarks(rows):
+        print(f"\n{counted(count, 'cell')}: {text}")
+
+
+def doubtful(summary: pd.DataFrame) -> pd.DataFrame:
+    """Return the lines of :func:`by_point` on which a gradient cannot be trusted."""
+    pairs = zip(summary["point"], summary["verdict"], strict=True)
+    return summary[np.array([not trusted(point, verdict) for point, verdict in pairs], dtype=bool)]
+
+
+def remarks(rows: pd.DataFrame) -> list[tuple[str, int]]:
+    """Return the reasons of cells, those of failed ones with their status, and how many have each."""
+    told = rows[rows["reason"].fillna("") != ""]
+    texts = told["reason"].where(told["status"] == "ok", told["status"] + ": " + told["reason"])
+    return [(str(text), int(count)) for text, count in texts.value_counts(sort=False).items()]
 
 
 def problem_of(shown: Arranged) -> pd.Series:
