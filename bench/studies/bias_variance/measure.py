@@ -35,7 +35,8 @@ def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> 
     # usage covers the timed calls only: the reference may have used the same problem
     problem.reset_usage()
     started = time.perf_counter()
-    parts, clock = [], None
+    parts: list[np.ndarray] = []
+    clock: timing.Timing | None = None
     if calls:
         parts, clock = timing.timed(lambda r: made.of(r, r + 1), calls, settle_s=settle_s, pause=made.pause)
     # a copy, since the remaining estimates count on
