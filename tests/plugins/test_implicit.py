@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from bench.plugins.backends.implicit import Implicit
 from bench.plugins.contacts.complementarity import Complementarity
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.integrators.implicit_euler import ImplicitEuler
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.ground_wall import GroundWall
 from bench.plugins.scenes.pushing import Pushing
 
@@ -42,3 +45,40 @@ def test_columns_of_any_scale_are_differentiated_alike(unknowns):
         return jnp.sum(ops.root(lambda z, a: a * z - 1.0, guess, a))
 
     assert np.asarray(jax.grad(total)(a)) == pytest.approx(-unknowns / np.asarray(a) ** 2, rel=SOLVED)
+
+
+def stiff(stiffness, **values):
+    """A ball on a spring so stiff that dt^2 k / m is ``stiffness``, all along the 10 steps before, at and after touch."""
+    scene = BounceOnce(horizon=10, height=0.1 + 5.3 * 2.0 / 480.0, **values)
+    return Implicit().compile(compose(scene, Penalty(stiffness=stiffness / scene.dt**2), ImplicitEuler()))
+
+
+@pytest.mark.parametrize("stiffness", [1e2, 1e8, 1e11])
+def test_stiff_equations_are_solved_whatever_the_size_of_their_residual(stiffness):
+    """A residual that multiplies the gap by 1e11 rounds to 1e-5, which is no failure."""
+    problem = stiff(stiffness)
+    w = 0.1 * np.random.default_rng(0).standard_normal((problem.program.n_noise, 64))
+    theta = problem.program.theta0
+    assert np.isfinite(problem.value(theta, w)).all()
+    assert np.isfinite(problem.grad(theta, w)).all()
+
+
+@pytest.mark.parametrize("mode", ["reverse", "forward"])
+def test_a_solve_that_fails_has_no_gradient(mode, monkeypatch):
+    """z^2 + 1 = 0 has no root; what the last iteration left has a derivative all the same, of nothing."""
+    import jax
+    import jax.numpy as jnp
+
+    ops = Implicit().ops()
+    a = jnp.asarray([[-1.0, 1.0]])
+
+    def root(a):
+        return ops.root(lambda z, a: z * z + a, 2.0 + 0.0 * a, a)
+
+    assert np.isnan(np.asarray(root(a))).tolist() == [[False, True]]
+    if mode == "reverse":
+        slope = jax.grad(lambda a: root(a).sum())(a)
+    else:
+        slope = jax.jvp(root, (a,), (jnp.ones_like(a),))[1]
+    assert np.isnan(np.asarray(slope)).tolist() == [[False, True]]
+    assert slope[0, 0] == pytest.approx(-0.5, rel=SOLVED)
