@@ -21,7 +21,12 @@ def pytest_configure(config):
     )
 
 
-@pytest.fixture(params=list(registry.entries()["backends"]))
+LONG = {"fused"}
+"""Backends that compile each program for seconds, whatever its size."""
+BACKENDS = [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in registry.entries()["backends"]]
+
+
+@pytest.fixture(params=BACKENDS)
 def backend(request):
     """Each registered backend that can run a scene's own program, with its default parameters.
 

@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.measure.statistics import UNEXPLAINED, unexplained
 from bench.report.text import number
 from bench.sweep.columns import Column, Columns, Judged
 
@@ -68,9 +69,10 @@ def judge(column: Column, columns: Columns, old: Row, new: Row) -> Change | None
         return None
     if column.judged.neutral:
         change = change._replace(outcome="changed")
-    doubtful = any(isinstance(row.get("reason"), str) and row["reason"] for row in (old, new))
-    if doubtful and column.judged.by in ("interval", "spread"):
-        return Change("changed", f"{change.text}, intervals doubtful")
+    remarks = [str(row["reason"]) for row in (old, new) if isinstance(row.get("reason"), str) and row["reason"]]
+    if remarks and column.judged.by in ("interval", "spread"):
+        doubt = UNEXPLAINED if any(map(unexplained, remarks)) else "intervals doubtful"
+        return Change("changed", f"{change.text}, {doubt}")
     return change
 
 

@@ -10,6 +10,8 @@ so never branch on it in Python; every other type is static.
 """
 
 from bench.errors import Unsupported
+from bench.model.adjoint import Slopes, slopes
+from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
@@ -24,13 +26,13 @@ from bench.model.estimator import (
     zeroth_order,
 )
 from bench.model.integrator import Integrator
-from bench.model.known import KnownOptimum, KnownValue
-from bench.model.ops import Array, LoopOps, Ops, State
+from bench.model.known import Identified, KnownOptimum, KnownValue
+from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
-from bench.model.program import Decision, FunctionProgram, Program, Rollout, compose, rollout
+from bench.model.program import SURROGATE, Decision, FunctionProgram, Program, Rollout, compose, rollout
 from bench.model.scene import (
     ContactScene,
     DampedScene,
@@ -44,6 +46,7 @@ from bench.model.scene import (
 )
 
 __all__ = [
+    "SURROGATE",
     "Answer",
     "Array",
     "Auxiliaries",
@@ -63,6 +66,7 @@ __all__ = [
     "FrictionScene",
     "FunctionProgram",
     "FunctionScene",
+    "Identified",
     "ImpulseLaw",
     "Integrator",
     "Jacobians",
@@ -81,10 +85,12 @@ __all__ = [
     "Rollout",
     "SampleMean",
     "Scene",
+    "Slopes",
     "State",
     "Trajectory",
     "Unsupported",
     "Usage",
+    "adjoint_gradient",
     "columns",
     "compose",
     "first_order",
@@ -92,5 +98,7 @@ __all__ = [
     "param",
     "per_repeat",
     "rollout",
+    "slopes",
+    "stopped",
     "zeroth_order",
 ]

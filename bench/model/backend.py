@@ -17,9 +17,11 @@ class Backend(Plugin):
 
     kind: ClassVar[str] = "backends"
     provides: ClassVar[frozenset[str]] = frozenset({"value", "grad", "score"})
-    """Capabilities, out of ``value``, ``grad``, ``score``, ``explicit``, ``root`` and ``physics``.
+    """Capabilities, out of ``value``, ``grad``, ``score``, ``explicit``, ``surrogate``, ``root`` and
+    ``physics``.
 
-    With ``explicit`` it differentiates the cost by theta under given actions, see :meth:`Problem.explicit`.
+    With ``explicit`` it differentiates the cost by theta under given actions, see :meth:`Problem.explicit`. With
+    ``surrogate`` it gives the gradients that a contact law declares in place of the derivative.
 
     With ``physics`` the backend steps a scene's :meth:`~EngineTwin.mjcf` twin by an integrator and a contact solver of
     its own, so its programs differ from those of other backends and need reference gradients of their own.

@@ -18,6 +18,8 @@ class ContactLaw(Plugin):
     kind: ClassVar[str] = "contacts"
     smoothing: ClassVar[str] = ""
     """Name of the parameter that smooths the law, if it has one (``beta``, ``kappa``)."""
+    surrogate: ClassVar[bool] = False
+    """Whether automatic differentiation of a step gives, on purpose, another gradient than the step's derivative."""
     needs_root: ClassVar[bool] = False
     """Whether the law solves an equation each step, so that only backends with ``root`` can run it."""
 

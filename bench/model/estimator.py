@@ -55,7 +55,8 @@ class Estimator(Plugin):
 
     def declares_unbiased(self, program: Program) -> bool:
         """Whether its expectation is grad J_sigma of the program, by what it declares."""
-        return self.unbiased and self.target == "smoothed" and (program.continuous or self.across_jumps)
+        derivative = program.continuous and not program.surrogate
+        return self.unbiased and self.target == "smoothed" and (derivative or self.across_jumps)
 
     def refuses(self, program: Program) -> str | None:
         """Return why this estimator cannot be used on the program, or None."""
@@ -66,6 +67,9 @@ class Estimator(Plugin):
         missing = self.needs - provides
         if missing:
             return f"{self.name} needs {', '.join(sorted(missing))}, which {backend} lacks"
+        if "grad" in self.needs and program.surrogate and "surrogate" not in provides:
+            law = program.contact.name if program.contact else ""
+            return f"{self.name} needs the surrogate gradient of contact law {law}, and {backend} takes differences of costs"
         if "score" in self.needs and program.explicit:
             start = f"theta sets the initial state of {program.scene.name} while noise is on the actions, so "
             if not self.adds_explicit:

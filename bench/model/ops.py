@@ -53,6 +53,17 @@ class LoopOps:
 NO_ROOT = "a step solves an equation, and this backend has no root finder: use one that provides root (see `python -m bench list backends`)"
 
 
+def stopped(array: Array) -> Array:
+    """Return the array as automatic differentiation sees a constant; NumPy arrays as they are."""
+    if hasattr(array, "detach"):
+        return array.detach()
+    if type(array).__module__.partition(".")[0] in ("jax", "jaxlib"):
+        import jax
+
+        return jax.lax.stop_gradient(array)
+    return array
+
+
 class State(NamedTuple):
     """Generalised positions ``q (n_q, B)`` and velocities ``v (n_v, B)``."""
 

@@ -20,6 +20,9 @@ from bench.model.ops import Array, Ops, State
 from bench.model.parameters import Plugin, traced
 from bench.model.scene import EngineScene, FunctionScene, MechanicalScene, Scene
 
+SURROGATE = "the gradient is a surrogate, not the derivative of the program"
+"""What rows, tables and charts say where :attr:`Program.surrogate` holds."""
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -99,6 +102,11 @@ class Program(ABC):
     def continuous(self) -> bool:
         """Whether the cost is continuous in theta."""
         return self.scene.continuous and (self.contact is None or self.contact.continuous)
+
+    @property
+    def surrogate(self) -> bool:
+        """Whether its gradient is, by its contact law's design, not the derivative of the program."""
+        return self.contact is not None and self.contact.surrogate
 
     @cached_property
     def theta0(self) -> np.ndarray:

@@ -40,16 +40,18 @@ def ranked_backends(cell: Cell) -> list[Backend]:
     if cell.program_key not in _ranked:
         candidates = []
         with suppress(Unsupported):
-            candidates = [b for b in able_backends(cell.program()) if b.reference_rank is not None]
+            candidates = able_backends(cell.program(), ranked=True)
         _ranked[cell.program_key] = sorted(candidates, key=lambda b: b.reference_rank or 0)
     return _ranked[cell.program_key]
 
 
-def able_backends(program: Program) -> list[Backend]:
-    """Return the available backends, with default parameters, that can run a program."""
+def able_backends(program: Program, ranked: bool = False) -> list[Backend]:
+    """Return the available backends, with default parameters, that can run a program; or those that give references."""
     backends = []
     for entry in registry.entries()["backends"].values():
         if entry.plugin is None or not entry.available or not issubclass(entry.plugin, Backend):
+            continue
+        if ranked and entry.plugin.reference_rank is None:  # not asked, since a backend may have to trace the program
             continue
         with suppress(Exception):  # a backend that fails at this question cannot run the program
             backend = _default(entry.plugin)

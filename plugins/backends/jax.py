@@ -33,7 +33,7 @@ class Jax(Backend):
 
     name = "jax"
     requires: ClassVar[tuple[str, ...]] = ("jax",)
-    provides = Backend.provides | {"explicit"}
+    provides = Backend.provides | {"explicit", "surrogate"}
     compiles = True
     reference_rank: ClassVar[int | None] = 0
 

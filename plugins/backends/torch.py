@@ -17,7 +17,7 @@ class Torch(Backend):
 
     name = "torch"
     requires: ClassVar[tuple[str, ...]] = ("torch",)
-    provides = Backend.provides | {"explicit"}
+    provides = Backend.provides | {"explicit", "surrogate"}
     reference_rank: ClassVar[int | None] = 2
 
     def compile(self, program: Program) -> Problem:

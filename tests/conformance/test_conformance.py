@@ -48,7 +48,9 @@ PLUGINS = [entry.plugin for entry in ENTRIES if entry.plugin is not None]
 
 def _is_long(plugin: type[Plugin]) -> bool:
     """Whether its checks take a minute or many: backends that compile each program for seconds, or run it eagerly."""
-    return bool({"physics", "root"} & set(getattr(plugin, "provides", ()))) or plugin.requires == ("torch",)
+    return bool({"physics", "root"} & set(getattr(plugin, "provides", ()))) or bool(
+        {"torch", "numba"} & set(plugin.requires)
+    )
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry.kind}-{entry.name}")

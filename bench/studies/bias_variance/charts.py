@@ -17,9 +17,9 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.model import registry
+from bench.model import SURROGATE, registry
 from bench.report.figures import save, styled
-from bench.report.style import Look, symbol
+from bench.report.style import Look, plain, symbol
 from bench.report.views import CATEGORIES, Family, along, arranged, families, ran
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost
 from bench.studies.bias_variance.panels import bias_variance, overview, speed_accuracy
@@ -60,6 +60,8 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
     look = Look(rows, sorted(registry.entries()["estimators"]))
     seeds = rows["seed"].nunique()
     merged = [f"medians over {seeds} seeds"] if seeds > 1 else []
+    for law in rows.loc[rows["reason"].str.contains(SURROGATE, regex=False), "contact"].unique():
+        merged.append(f"{plain(law)}: {SURROGATE}")
     drawings: dict[str, Figure] = {}
 
     def problems(axis: Axis | None, drawable: Callable[[pd.DataFrame], bool]) -> list[Family]:

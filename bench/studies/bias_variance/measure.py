@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bench.measure import noise, statistics, timing
-from bench.model import Auxiliaries, Problem
+from bench.model import SURROGATE, Auxiliaries, Problem
 from bench.sweep.cell import Cell
 from bench.sweep.session import Session
 
@@ -72,7 +72,8 @@ def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
         return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}
     unbiased = cell.estimator.declares_unbiased(program)
     summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples, unbiased=unbiased))
-    result |= {"reason": "; ".join(part for part in (summary.pop("note"), truth.note) if part), **summary}
+    surrogate = SURROGATE if program.surrogate and "grad" in cell.estimator.needs else ""
+    result |= {"reason": "; ".join(part for part in (surrogate, summary.pop("note"), truth.note) if part), **summary}
     bad = ~np.isfinite(estimates).all(axis=1)
     if bad.any():
         result["status"] = "nonfinite"

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.measure.statistics import UNEXPLAINED, unexplained
 from bench.report.tables import csv, escape_markdown
 from bench.report.text import axis_value, number
 from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, arranged, bias_text, pareto, unsteady
@@ -20,8 +21,10 @@ from bench.sweep.columns import IDENTITY
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import write_all
 
+DOUBTED = " ?"
 FOOTNOTES = [
-    "0 (< u): the bias is not distinguishable from 0, its 95% interval reaches up to u.",
+    "0 (< u): the bias is not distinguishable from 0, its 95% interval reaches up to u. "
+    f"{DOUBTED.strip()}: the estimator declares to be unbiased and the interval excludes 0, so {UNEXPLAINED}.",
     "relative bias and rel. RMSE: divided by the norm of the reference gradient. A relative RMSE above 1 is worse "
     "than answering zero.",
     "variance: trace of the covariance of one estimate. time: one estimate, steady state, without compilation. "
@@ -137,7 +140,8 @@ def _results(row: Any) -> list[str]:
     if row["status"] != "ok":
         return ["-"] * 6
     return [
-        bias_text(row), bias_text(row, row["reference_norm"], interval=False),
+        bias_text(row) + DOUBTED * unexplained(row["reason"]),
+        bias_text(row, row["reference_norm"], interval=False),
         number(row["variance"], 3), number(row["rmse_rel"], 3), number(row["cosine"], 3),
         number(row["time_s"] * 1e3, 3) + UNSTEADY * bool(unsteady(row)),
     ]  # fmt: skip

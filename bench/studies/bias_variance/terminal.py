@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from bench.measure.statistics import UNEXPLAINED, unexplained
 from bench.report.text import axis_value, duration, number, one_line
 from bench.report.views import (
     UNSTEADY,
@@ -190,7 +191,11 @@ def _show_verdict(console: Console, group: Family, axis: Axis | None) -> None:
     console.print(f"  {group.title()}" + (f", by {axis.title}" if axis else ""), style="bold")
     curves = lines(group.rows)
     _print_wrapped(console, f"lowest error: {_winners(curves)}", 4)
-    for text, test in (("mostly bias, more samples do not help", _biased), ("no better than answering zero", _useless)):
+    for text, test in (
+        ("mostly bias, more samples do not help", _biased),
+        (f"a bias where none is declared, {UNEXPLAINED}", _unexplained),
+        ("no better than answering zero", _useless),
+    ):
         where: dict[str, dict[float, bool]] = {}
         for line in curves:
             there = where.setdefault(line.label, {})
@@ -215,7 +220,12 @@ def _winners(curves: Sequence[Line]) -> str:
 
 
 def _biased(row: Any) -> bool:
-    return bool(resolved(row) and row["bias_rel"] > NEGLIGIBLE and row["bias"] ** 2 > row["rmse"] ** 2 / 2)
+    found = resolved(row) and row["bias_rel"] > NEGLIGIBLE and row["bias"] ** 2 > row["rmse"] ** 2 / 2
+    return bool(found and not _unexplained(row))
+
+
+def _unexplained(row: Any) -> bool:
+    return unexplained(row["reason"])
 
 
 def _useless(row: Any) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 
 from bench.measure import gradcheck, noise
 from bench.measure.contacts import acting
-from bench.model import ContactScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
+from bench.model import SURROGATE, ContactScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
 from bench.report.reproduce import check_of
 from bench.studies.gradient_check.places import trusted
 from bench.sweep.cell import Cell
@@ -65,7 +65,8 @@ def measure(cell: Cell, session: Session, search: Search) -> dict[str, Any]:
     severest = min(range(len(points)), key=lambda i: (gradcheck.VERDICTS.index(verdicts[i]), -errors[i]))
     lost = all(verdict == "nonfinite" for verdict in verdicts)
     parts = whole.components
-    said = [] if whole.cause in PLAIN else [whole.sentence()]
+    said = [SURROGATE] if problem.program.surrogate else []
+    said += [] if whole.cause in PLAIN else [whole.sentence()]
     return {
         "status": "nonfinite" if lost else "ok",
         "reason": "no cost is finite" if lost else "; ".join([*said, *beyond_stability(cell)]),

@@ -1,0 +1,170 @@
+"""Fused: a rollout and its adjoint as one native loop, compiled by Numba."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.model import Array, Backend, LoopOps, Problem, Program
+
+from ..fused import emit, kernels, trace
+from ..fused.graph import Refused
+from .jax import Jax, JaxOps, JaxProblem
+
+
+@dataclass(frozen=True)
+class Fused(Backend):
+    """Gradients: exact derivative of the program by JAX's rules for single operations; float64 or float32; no roots.
+
+    JAX traces the program once for one rollout. Its step and the step's adjoint become scalar code, the loop over time
+    lies inside, and rollouts are the lanes of vector instructions, so that states stay near the core. Equal to ``jax``
+    up to rounding, ties included; trajectories, step Jacobians and explicit derivatives come from ``jax`` itself. A
+    program with an operation that has no scalar form is refused by the operation's name.
+    """
+
+    name = "fused"
+    requires: ClassVar[tuple[str, ...]] = ("jax", "numba")
+    provides = Jax.provides
+
+    def compile(self, program: Program) -> Problem:
+        """Return the program, whose kernels are compiled at the first call of each function, for any batch."""
+        _use_double()
+        return FusedProblem(program, JaxOps(), self.dtype, "reverse")
+
+    def refuses(self, program: Program) -> str | None:
+        """Return the operation that has no form as scalar code, or None."""
+        if program.needs - self.provides:
+            return None
+        _use_double()
+        try:
+            for function in ("value", "grad"):
+                _source(_Structure(program), function, self.dtype)
+        except Refused as error:
+            return f"backend {self.name} has no scalar code for {error}"
+        return None
+
+
+def _use_double() -> None:
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+
+
+class _PlainOps(LoopOps):
+    """jax.numpy and lax.scan as it is."""
+
+    def __init__(self) -> None:
+        import jax.numpy
+
+        super().__init__(jax.numpy)
+
+    def scan(self, step: Any, carry: Any, xs: Any, length: int) -> Any:
+        """Run lax.scan."""
+        import jax
+
+        return jax.lax.scan(lambda state, x: (step(state, x), None), carry, xs, length)[0]
+
+
+class _Structure:
+    """A program, equal to others of the same structure."""
+
+    def __init__(self, program: Program) -> None:
+        self.program, self.key = program, program.structure
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Structure) and self.key == other.key
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The source of a kernel and the tables that it reads."""
+
+    text: str
+    length: int
+    constants: np.ndarray
+    indices: np.ndarray
+
+
+@cache
+def _source(structure: _Structure, function: str, dtype: str) -> _Source:
+    program = structure.program
+
+    def cost(parameter: Array, theta: Array, noise: Array) -> Array:
+        return program.bind(parameter).cost(_PlainOps(), theta, noise)
+
+    def log_probability(parameter: Array, theta: Array, noise: Array, scored: Array) -> Array:
+        return program.bind(parameter).log_probability(_PlainOps(), theta, scored, noise)
+
+    shapes = {"parameter": len(program.parameters()), "theta": program.dim, "noise": program.n_noise}
+    wrt = {"value": None, "grad": "theta", "score": "scored"}[function]
+    loop = (
+        trace.traced(log_probability, shapes | {"scored": program.dim})
+        if wrt == "scored"
+        else trace.traced(cost, shapes)
+    )
+    text = emit.source(loop, dtype, wrt, program.dim, f"{function} of {program.scene.name}", cache=False)
+    flat = [np.concatenate(part) if part else np.zeros(1) for part in (loop.constants, loop.indices)]
+    return _Source(text, loop.length, flat[0].astype(dtype), flat[1].astype(np.int64))
+
+
+class FusedProblem(JaxProblem):
+    """A program as compiled kernels; they take any batch and horizon, and float parameters as arguments."""
+
+    grain = emit.LANES
+
+    def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._kernel("value", theta, w, 1)[0]
+
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._kernel("grad", theta, w, self.dim)
+
+    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._kernel("score", theta, w, self.dim)
+
+    def _kernel(self, function: str, theta: np.ndarray, w: np.ndarray, rows: int) -> np.ndarray:
+        """Return ``(rows, B)`` of a kernel, for a batch that is a multiple of the lanes."""
+        batch = w.shape[1]
+        if batch % self.grain:
+            # a batch below one block comes as it is
+            short = -batch % self.grain
+            wide = [np.pad(x, ((0, 0), (0, short)), mode="edge") if x.shape[1] == batch else x for x in (theta, w)]
+            return self._kernel(function, wide[0], wide[1], rows)[:, :batch] if batch else np.empty((rows, 0))
+        source = _source(_Structure(self.program), function, self._dtype.name)
+        w, noise_row = self._flat(w)
+        if theta.shape[1] == 1:
+            theta = np.repeat(theta, self.grain, axis=1)
+            column = 0
+        else:
+            column = 1
+        flat, row = self._flat(theta)
+        out = np.empty((rows, batch), self._dtype)
+        arguments = (
+            self._parameters, source.constants, source.indices, source.length, flat, row, column, flat, row, column,
+            w, noise_row, out.reshape(-1), batch, rows, 0, batch,
+        )  # fmt: skip
+        if not self._compiled(source.text)(*arguments):
+            self._compiled(kernels.exact(source.text))(*arguments)
+        return out.astype(np.float64, copy=False)
+
+    def _flat(self, array: np.ndarray) -> tuple[np.ndarray, int]:
+        """Return a view that begins at the first entry, and the distance of its rows."""
+        array = np.asarray(array, dtype=self._dtype)
+        size = array.itemsize
+        if array.strides[1] != size or array.strides[0] % size or array.strides[0] < 0:
+            array = np.ascontiguousarray(array)
+        row = array.strides[0] // size
+        length = (array.shape[0] - 1) * row + array.shape[1] if array.shape[0] else 0
+        return np.lib.stride_tricks.as_strided(array, (length,), (size,)), row
+
+    def _compiled(self, text: str) -> Any:
+        kernel = kernels.compiled(text, self._dtype.name, self._measured, self.compilations)
+        if kernel.name not in self._charged:
+            self._charged.add(kernel.name)
+            self.usage.compile_s += kernel.seconds
+        return kernel.call

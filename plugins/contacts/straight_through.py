@@ -1,0 +1,54 @@
+"""One law in the forward pass, another in the backward one."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.contacts.softplus import Softplus
+
+from bench.model import Array, ForceLaw, param, stopped
+
+
+@dataclass(frozen=True)
+class StraightThrough(ForceLaw):
+    """The forces of ``forward``; automatic differentiation sees those of ``backward`` at the same states.
+
+    Its gradient is a surrogate, not the derivative of the program: each step is differentiated as if ``backward`` had
+    acted there. With a hard forward law and a softplus behind it, bodies that miss each other still feel in the
+    gradient where they would have met (contacts from distance), and the motion is not smoothed. ``none`` differentiates
+    contact forces as constants. Source: Paulus et al. 2025; straight-through estimators, Bengio et al. 2013.
+    """
+
+    name = "straight_through"
+    smoothing: ClassVar[str] = "beta"
+    surrogate: ClassVar[bool] = True
+
+    forward: str = param("penalty", "law of the motion", choices=("penalty", "softplus"))
+    backward: str = param("softplus", "law of the gradient", choices=("softplus", "penalty", "none"))
+    stiffness: float = param(1e3, "k, force per penetration, of both laws", "N/m", positive=True)
+    damping: float = param(0.0, "c, force per penetration rate, of both laws", "N s/m", low=0.0)
+    beta: float = param(
+        1e2, "sharpness of a softplus, which smooths the gap: its reach is some 1/beta", "1/m", positive=True
+    )
+
+    @property
+    def continuous(self) -> bool:
+        """True except for a penalty with damping in the forward pass."""
+        return self.forward == "softplus" or self.damping == 0.0
+
+    def spring(self) -> tuple[float, float]:
+        """Return (k, c) of the forward law."""
+        return self.stiffness, self.damping
+
+    def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
+        """Return the forward law's force, with the backward law's derivative."""
+        ahead = stopped(self._law(self.forward).force(xp, gap, gap_rate))
+        if self.backward == "none":
+            return ahead
+        behind = self._law(self.backward).force(xp, gap, gap_rate)
+        return ahead + (behind - stopped(behind))
+
+    def _law(self, name: str) -> ForceLaw:
+        if name == "penalty":
+            return Penalty(stiffness=self.stiffness, damping=self.damping)
+        return Softplus(stiffness=self.stiffness, damping=self.damping, beta=self.beta)

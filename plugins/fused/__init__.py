@@ -1,0 +1,1 @@
+"""Rollouts as one native loop: scalar code from a traced step, its adjoint, and the loops around both."""

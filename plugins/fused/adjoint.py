@@ -1,0 +1,125 @@
+"""Reverse mode on scalar expressions, each operation by JAX's own rule, so that ties and kinks are treated alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+from .graph import Graph, Node, Refused, reached
+
+
+@cache
+def _rule(op: str, data: Any, count: int, which: int) -> Any:
+    """Return JAX's pullback of an operation to one of its arguments, as a jaxpr of (arguments, cotangent)."""
+    import jax
+    from jax import lax
+
+    def function(*args: Any) -> Any:
+        if op == "integer_pow":
+            return lax.integer_pow(args[0], data)
+        if op == "select_n":
+            return lax.select_n(args[0] > 0.5, *args[1:])
+        if op not in SMOOTH:
+            raise Refused(f"the derivative of {op}")
+        return getattr(lax, op)(*args)
+
+    def pulled(*args: Any) -> Any:
+        rest = list(args[:-1])
+
+        def of_one(x: Any) -> Any:
+            return function(*rest[:which], x, *rest[which + 1 :])
+
+        return jax.vjp(of_one, rest[which])[1](args[-1])[0]
+
+    shape = jax.ShapeDtypeStruct((), "float64")
+    return jax.make_jaxpr(pulled)(*[shape] * (count + 1))
+
+
+SMOOTH = frozenset({
+    "abs", "acos", "acosh", "add", "asin", "asinh", "atan", "atan2", "atanh", "cos", "cosh", "div", "erf", "exp",
+    "expm1", "log", "log1p", "logistic", "max", "min", "mul", "neg", "pow", "rem", "rsqrt", "sin", "sinh", "sqrt",
+    "stop_gradient", "sub", "tan", "tanh",
+})  # fmt: skip
+"""Operations whose derivative JAX gives under their own name in jax.lax."""
+FLAT = frozenset({
+    "and", "ceil", "eq", "floor", "ge", "gt", "is_finite", "le", "lt", "ne", "not", "or", "sign", "stop_gradient", "xor",
+})  # fmt: skip
+"""Operations whose derivative is 0 everywhere."""
+
+
+def active(nodes: list[Node], wanted: Callable[[Node], bool]) -> set[int]:
+    """Return the numbers of the nodes that depend on a wanted one, through operations that have a derivative."""
+    found: set[int] = set()
+    for node in nodes:
+        if wanted(node) or (node.op not in FLAT and any(arg.number in found for arg in _differentiable(node))):
+            found.add(node.number)
+    return found
+
+
+def _differentiable(node: Node) -> tuple[Node, ...]:
+    return node.args[1:] if node.op == "select_n" else node.args
+
+
+def pullback(graph: Graph, seeds: list[tuple[Node, Node]], wanted: Callable[[Node], bool]) -> dict[Node, Node]:
+    """Return the derivative by each wanted node of sum over seeds of (node * cotangent); those that are 0 are missing.
+
+    What lies behind a wanted node is not followed.
+    """
+    nodes = reached([node for node, _ in seeds], wanted)
+    live = active(nodes, wanted)
+    cotangents: dict[int, Node] = {}
+
+    def add(node: Node, cotangent: Node) -> None:
+        if node.number in live:
+            known = cotangents.get(node.number)
+            cotangents[node.number] = cotangent if known is None else graph.apply("add", known, cotangent)
+
+    for node, cotangent in seeds:
+        add(node, cotangent)
+    found: dict[Node, Node] = {}
+    for node in reversed(nodes):
+        if node.number not in cotangents:
+            continue
+        cotangent = cotangents[node.number]
+        if wanted(node):
+            found[node] = cotangent
+            continue
+        for which, arg in enumerate(node.args):
+            if arg.number in live and not (node.op == "select_n" and which == 0):
+                add(arg, _pulled(graph, node, which, cotangent))
+    return found
+
+
+def _pulled(graph: Graph, node: Node, which: int, cotangent: Node) -> Node:
+    """Return the cotangent of one argument of a node."""
+    jaxpr = _rule(node.op, node.data, len(node.args), which).jaxpr
+    known: dict[Any, Node] = dict(zip(jaxpr.invars, [*node.args, cotangent], strict=True))
+
+    def read(atom: Any) -> Node:
+        return graph.literal(atom.val) if hasattr(atom, "val") else known[atom]
+
+    _evaluate(graph, jaxpr, known, read, node)
+    return read(jaxpr.outvars[0])
+
+
+def _evaluate(graph: Graph, jaxpr: Any, known: dict[Any, Node], read: Callable[[Any], Node], node: Node) -> None:
+    for equation in jaxpr.eqns:
+        name, args = equation.primitive.name, [read(atom) for atom in equation.invars]
+        if name in ("jit", "pjit"):
+            inner = equation.params["jaxpr"].jaxpr
+            known.update(zip(inner.invars, args, strict=True))
+            _evaluate(graph, inner, known, read, node)
+            results = [read(atom) for atom in inner.outvars]
+        elif name == "convert_element_type":
+            boolean = str(equation.invars[0].aval.dtype) == "bool"
+            one, zero = graph.literal(1.0), graph.literal(0.0)
+            results = [graph.apply("select_n", args[0], zero, one) if boolean else args[0]]
+        elif name in ("copy", "broadcast_in_dim", "reshape"):
+            results = [args[0]]
+        elif node.op == "select_n" and name == "gt" and args[0] is node.args[0]:
+            results = [args[0]]  # the condition is true or false already
+        else:
+            name = "add" if name == "add_any" else name
+            results = [graph.apply(name, *args, data=equation.params.get("y"))]
+        known.update(zip(equation.outvars, results, strict=True))

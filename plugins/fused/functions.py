@@ -1,0 +1,122 @@
+"""Functions that kernels call: those of which Python has none, and sine and cosine that compute in lanes.
+
+Sine and cosine reduce the angle by multiples of pi/2 in three parts (Cody, Waite 1980) and sum Taylor series to the
+order at which the next term is below 1e-18. The first two parts have 33 bits, so that their products with a multiple
+below 2^20 are exact; beyond that angle a kernel reports it and is run again with the C library's functions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from decimal import Decimal, localcontext
+from fractions import Fraction
+
+LIMIT = 1.6e6
+"""Largest angle [rad] of the fast sine and cosine."""
+
+
+def _half_pi() -> Fraction:
+    """Return pi / 2 to 60 digits, by Machin's formula pi / 4 = 4 atan(1/5) - atan(1/239)."""
+    with localcontext() as context:
+        context.prec = 70
+
+        def atan(n: int) -> Decimal:
+            power, total, k = Decimal(1) / n, Decimal(0), 0
+            while abs(power) > Decimal(10) ** -68:
+                total += (-power if k % 2 else power) / (2 * k + 1)
+                power, k = power / (n * n), k + 1
+            return total
+
+        return Fraction(2 * (4 * atan(5) - atan(239)))
+
+
+def _parts() -> list[float]:
+    """Return three numbers that add up to pi / 2, the first two with 33 bits."""
+    left, parts = _half_pi(), []
+    for bits in (33, 33, 53):
+        exponent = math.frexp(float(left))[1] - bits
+        part = float(round(left / Fraction(2) ** exponent) * Fraction(2) ** exponent)
+        parts.append(part)
+        left -= Fraction(part)
+    return parts
+
+
+def _series(first: int, last: int) -> str:
+    """Return the Taylor series in z = r^2 from 1/first!, with alternating signs, in Horner's form."""
+    orders = list(range(first, last + 1, 2))
+    text = ""
+    for i, order in reversed(list(enumerate(orders))):
+        term = f"F({(-1) ** i / math.factorial(order)!r})"
+        text = f"({term} + z * {text})" if text else term
+    return text
+
+
+def _trigonometry() -> str:
+    p1, p2, p3 = _parts()
+    return f"""
+LIMIT = {LIMIT!r}
+
+
+@njit(error_model="numpy")
+def turned_(x, shift):
+    k = np.rint(x * F({2 / math.pi!r}))
+    r = ((x - k * F({p1!r})) - k * F({p2!r})) - k * F({p3!r})
+    z = r * r
+    sine = r * {_series(1, 19)}
+    cosine = {_series(0, 20)}
+    # of the quadrant: 0 to 3
+    turn = k + shift
+    turn = turn - F(4.0) * np.floor(turn * F(0.25))
+    odd = (turn == F(1.0)) | (turn == F(3.0))
+    result = cosine if odd else sine
+    return -result if turn >= F(2.0) else result
+
+
+@njit(error_model="numpy")
+def sin_(x):
+    return turned_(x, F(0.0))
+
+
+@njit(error_model="numpy")
+def cos_(x):
+    return turned_(x, F(1.0))
+"""
+
+
+SIMPLE = {
+    "max_": "(a, b):\n    return a if (a > b) | (a != a) else b",
+    "min_": "(a, b):\n    return a if (a < b) | (a != a) else b",
+    "sign_": "(x):\n    return F(1.0) if x > F(0.0) else (F(-1.0) if x < F(0.0) else x)",
+    "rsqrt_": "(x):\n    return F(1.0) / math.sqrt(x)",
+    "logistic_": "(x):\n    return F(1.0) / (F(1.0) + math.exp(-x))",
+}
+SLOW = """
+LIMIT = math.inf
+
+
+@njit(error_model="numpy")
+def sin_(x):
+    return math.sin(x)
+
+
+@njit(error_model="numpy")
+def cos_(x):
+    return math.cos(x)
+"""
+"""Sine and cosine of the C library, for any angle."""
+FAST = _trigonometry()
+
+
+class HELPERS:
+    """The text of helper functions."""
+
+    @staticmethod
+    def text(used: Iterable[str]) -> str:
+        """Return the definitions of the functions used."""
+        used = set(used)
+        angles = used & {"sin_", "cos_"}
+        if angles:
+            used.add("max_")
+        parts = [f'\n@njit(error_model="numpy")\ndef {name}{SIMPLE[name]}\n' for name in sorted(used & set(SIMPLE))]
+        return "\n".join([*parts, FAST] if angles else parts)

@@ -1,0 +1,149 @@
+"""Scalar expressions as a graph in which equal ones exist once, folded and simplified without changing a number."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+MOST = 20_000
+"""Most nodes of a graph: beyond it, code without loops would be too long to compile."""
+
+
+class Refused(Exception):
+    """Raised where a program has no form as a loop of scalar code; the message names the primitive."""
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """A number: a leaf, or an operation on other nodes. Arguments have smaller numbers than their users."""
+
+    number: int
+    op: str
+    args: tuple[Node, ...] = ()
+    data: Any = None
+    """Of a leaf its index or value, of an operation its parameters."""
+
+    @property
+    def value(self) -> Any:
+        """The value of a literal, else None."""
+        return self.data if self.op == "literal" else None
+
+
+FOLD: dict[str, Callable[..., Any]] = {
+    "abs": np.abs, "acos": np.arccos, "acosh": np.arccosh, "add": np.add, "and": np.logical_and, "asin": np.arcsin,
+    "asinh": np.arcsinh, "atan": np.arctan, "atan2": np.arctan2, "atanh": np.arctanh, "ceil": np.ceil, "cos": np.cos,
+    "cosh": np.cosh, "div": np.divide, "eq": np.equal, "erf": np.vectorize(math.erf), "exp": np.exp,
+    "expm1": np.expm1, "floor": np.floor, "ge": np.greater_equal, "gt": np.greater, "is_finite": np.isfinite,
+    "le": np.less_equal, "log": np.log, "log1p": np.log1p, "logistic": lambda x: 1.0 / (1.0 + np.exp(-x)),
+    "lt": np.less, "max": np.maximum, "min": np.minimum, "mul": np.multiply, "ne": np.not_equal, "neg": np.negative,
+    "not": np.logical_not, "or": np.logical_or, "pow": np.power, "rem": np.fmod, "rsqrt": lambda x: 1.0 / np.sqrt(x),
+    "select_n": lambda which, no, yes: np.where(which, yes, no), "sign": np.sign, "sin": np.sin, "sinh": np.sinh,
+    "sqrt": np.sqrt, "square": np.square, "stop_gradient": lambda x: x, "sub": np.subtract, "tan": np.tan,
+    "tanh": np.tanh, "xor": np.logical_xor,
+}  # fmt: skip
+"""Operations on single numbers, as NumPy computes them."""
+
+
+@dataclass
+class Graph:
+    """Nodes; equal ones are the same object."""
+
+    nodes: list[Node] = field(default_factory=list)
+    _known: dict[Any, Node] = field(default_factory=dict)
+
+    def leaf(self, op: str, data: Any = None) -> Node:
+        """Return a leaf."""
+        return self._node(op, (), data)
+
+    def literal(self, value: Any) -> Node:
+        """Return a constant; -0.0 and 0.0, True and 1.0 are different constants."""
+        value = bool(value) if isinstance(value, bool | np.bool_) else float(value)
+        return self._node("literal", (), value)
+
+    def apply(self, op: str, *args: Node, data: Any = None) -> Node:
+        """Return an operation on nodes, simplified where that changes no number (the sign of a zero may change)."""
+        if op == "integer_pow":
+            return self._power(args[0], data)
+        if op not in FOLD:
+            raise Refused(op)
+        values = [arg.value for arg in args]
+        if all(value is not None for value in values):
+            with np.errstate(all="ignore"):
+                return self.literal(FOLD[op](*values))
+        return self._simpler(op, args, values) or self._node(op, args, data)
+
+    def _simpler(self, op: str, args: tuple[Node, ...], values: list[Any]) -> Node | None:
+        if op == "stop_gradient":
+            # kept as an operation of its own, since its derivative is 0
+            return None
+        if op in ("add", "mul"):
+            neutral = 0.0 if op == "add" else 1.0
+            for value, other in zip(values, reversed(args), strict=True):
+                if value == neutral:
+                    return other
+            # constants last, so that formulas of different steps have the same form; else as written the first time
+            if args[0].op == "literal" or (op, (args[1].number, args[0].number), None) in self._known:
+                return self._node(op, (args[1], args[0]), None)
+        if op in ("sub", "div") and values[1] == (0.0 if op == "sub" else 1.0):
+            return args[0]
+        if op == "sub" and values[0] == 0.0:
+            return self.apply("neg", args[1])
+        if op == "mul" and -1.0 in values:
+            return self.apply("neg", args[values.index(-1.0) - 1])
+        if op == "neg" and args[0].op == "neg":
+            return args[0].args[0]
+        if op == "square":
+            return self.apply("mul", args[0], args[0])
+        if op == "select_n":
+            if values[0] is not None:
+                return args[2] if values[0] else args[1]
+            if args[1] is args[2]:
+                return args[1]
+        return None
+
+    def _power(self, base: Node, exponent: int) -> Node:
+        """Return an integer power by repeated squaring, as XLA computes it."""
+        if exponent < 0:
+            return self.apply("div", self.literal(1.0), self._power(base, -exponent))
+        result, square = self.literal(1.0), base
+        while exponent:
+            if exponent & 1:
+                result = self.apply("mul", result, square)
+            exponent >>= 1
+            if exponent:
+                square = self.apply("mul", square, square)
+        return result
+
+    def sum(self, terms: Iterable[Node]) -> Node:
+        """Return the sum of nodes, from left to right."""
+        total = self.literal(0.0)
+        for term in terms:
+            total = self.apply("add", total, term)
+        return total
+
+    def _node(self, op: str, args: tuple[Node, ...], data: Any) -> Node:
+        key = (op, tuple(arg.number for arg in args), repr(data) if op == "literal" else data)
+        found = self._known.get(key)
+        if found is None:
+            if len(self.nodes) >= MOST * (10 if not args else 1):
+                raise Refused(f"code of more than {MOST} operations without a loop")
+            found = self._known[key] = Node(len(self.nodes), op, args, data)
+            self.nodes.append(found)
+        return found
+
+
+def reached(roots: Iterable[Node], stop: Callable[[Node], bool] = lambda node: False) -> list[Node]:
+    """Return the nodes that roots are computed from, arguments first; what lies behind a node to stop at is left out."""
+    seen: dict[int, Node] = {}
+    waiting = list(roots)
+    while waiting:
+        node = waiting.pop()
+        if node.number not in seen:
+            seen[node.number] = node
+            if not stop(node):
+                waiting.extend(node.args)
+    return [seen[number] for number in sorted(seen)]

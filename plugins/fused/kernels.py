@@ -1,0 +1,111 @@
+"""Compiled kernels: their source is kept in a folder by its text, and Numba keeps the machine code beside it."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from bench.model import Compilations
+
+from .functions import FAST, SLOW
+
+_known: dict[str, Kernel] = {}
+_busy = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A compiled kernel, the seconds that compiling took, and whether it was loaded from a folder."""
+
+    name: str
+    call: Callable[..., bool]
+    seconds: float
+    loaded: bool
+
+
+def compiled(text: str, dtype: str, fresh: bool, count: Compilations) -> Kernel:
+    """Return the kernel of a source, compiled once per process; with ``fresh`` its seconds are those of a compilation.
+
+    Compilations and requests are added to ``count``.
+    """
+    name = hashlib.sha256(text.encode()).hexdigest()[:16]
+    # one at a time: Numba's compiler holds a lock of its own
+    with _busy:
+        found = _known.get(name)
+        if found is None or (fresh and found.loaded):
+            folder = None if fresh or count.folder is None else Path(count.folder) / "fused"
+            found = _known[name] = _compile(name, text, dtype, folder)
+            count.made += not found.loaded
+        count.shapes.add(name)
+        return found
+
+
+def exact(text: str) -> str:
+    """Return the source with the C library's sine and cosine, for angles beyond the range of the fast ones."""
+    return text.replace(FAST, SLOW)
+
+
+def _compile(name: str, text: str, dtype: str, folder: Path | None) -> Kernel:
+    from numba import types
+
+    started = time.perf_counter()
+    real: Any = {"float64": types.float64, "float32": types.float32}[dtype]
+    module = _module(name, text, folder)
+    kernel = module.kernel
+    vector, whole = types.Array(real, 1, "C"), types.Array(types.int64, 1, "C")
+    size = types.int64
+    kernel.compile(
+        (
+            vector,
+            vector,
+            whole,
+            size,
+            vector,
+            size,
+            size,
+            vector,
+            size,
+            size,
+            vector,
+            size,
+            vector,
+            size,
+            size,
+            size,
+            size,
+        )
+    )
+    loaded = bool(kernel.stats.cache_hits) if folder is not None else False
+    return Kernel(name, kernel, time.perf_counter() - started, loaded)
+
+
+def _module(name: str, text: str, folder: Path | None) -> ModuleType:
+    """Return the module of a source: from a file that Numba can keep machine code for, or from memory."""
+    full = f"_bench_fused_{name}"
+    if folder is None:
+        module = ModuleType(full)
+        exec(compile(text, f"<{full}>", "exec"), vars(module))
+        return module
+    path = folder / f"{name}.py"
+    # Numba asks whether the source is older than the machine code: an existing file stays as it is
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, draft = tempfile.mkstemp(dir=folder, suffix=".draft")
+        with os.fdopen(handle, "w") as file:
+            file.write(text.replace("cache=False", "cache=True"))
+        os.replace(draft, path)
+    spec: Any = importlib.util.spec_from_file_location(full, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[full] = module
+    spec.loader.exec_module(module)
+    return module

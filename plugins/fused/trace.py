@@ -1,0 +1,279 @@
+"""JAX code as scalar expressions: a program is traced for one column, and each array becomes its numbers one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .graph import FOLD, Graph, Node, Refused
+
+BRANCHES = 4
+"""Most different formulas that one input of a step may have along the horizon."""
+
+
+@dataclass
+class Loop:
+    """A function of one rollout: numbers before the loop, one step, and the result after it.
+
+    Without steps (``length`` 0, no carries) the result follows from the inputs directly. Leaves: ``parameter``,
+    ``theta``, ``scored``, ``noise`` (an index each), ``carry`` and ``final`` (number of the carry, in a step and after
+    the last one), ``table`` (number of a table with one constant per step), and ``theta@``, ``scored@``, ``noise@``
+    (number of a table with one index per step).
+    """
+
+    graph: Graph
+    length: int = 0
+    first: list[Node] = field(default_factory=list)
+    """The carries before the first step."""
+    step: list[Node] = field(default_factory=list)
+    """The carries after a step, from the ``carry`` leaves."""
+    result: Node | None = None
+    constants: list[np.ndarray] = field(default_factory=list)
+    """Tables ``(length,)`` of constants."""
+    indices: list[np.ndarray] = field(default_factory=list)
+    """Tables ``(length,)`` of indices."""
+
+
+def traced(function: Callable[..., Any], shapes: dict[str, int]) -> Loop:
+    """Return the scalar form of ``function(**columns)``, which returns one number per column.
+
+    ``shapes`` gives the length of each argument, all of them ``(n, 1)`` except ``parameter``, which is ``(n,)``. The
+    function may contain one scan. Raises :class:`Refused` with the name of a primitive without a scalar form.
+    """
+    import jax
+
+    arguments = [
+        jax.ShapeDtypeStruct((n,) if name == "parameter" else (n, 1), np.float64) for name, n in shapes.items()
+    ]
+    closed = jax.make_jaxpr(lambda *columns: function(**dict(zip(shapes, columns, strict=True))))(*arguments)
+    tracer = _Tracer()
+    inputs = [_leaves(tracer.loop.graph, name, n) for name, n in shapes.items()]
+    (cost,) = tracer.run(closed.jaxpr, closed.consts, inputs)
+    tracer.loop.result = tracer.nodes(cost)[0]
+    return tracer.loop
+
+
+def _leaves(graph: Graph, name: str, count: int) -> np.ndarray:
+    leaves = _objects([graph.leaf(name, i) for i in range(count)], (count,))
+    return leaves if name == "parameter" else leaves[:, None]
+
+
+def _objects(items: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
+    array = np.empty(len(items), dtype=object)
+    array[:] = items
+    return array.reshape(shape)
+
+
+class _Tracer:
+    """Evaluates jaxprs on arrays of nodes; arrays without any are plain NumPy arrays."""
+
+    def __init__(self) -> None:
+        self.loop = Loop(Graph())
+
+    def nodes(self, array: np.ndarray) -> list[Node]:
+        """Return the entries of an array as nodes."""
+        graph = self.loop.graph
+        return [x if isinstance(x, Node) else graph.literal(x) for x in np.asarray(array).ravel()]
+
+    def run(self, jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return the outputs of a jaxpr."""
+        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(np.asarray, consts), *arguments], strict=True))
+
+        def read(atom: Any) -> np.ndarray:
+            return np.asarray(atom.val) if hasattr(atom, "val") else known[atom]
+
+        for equation in jaxpr.eqns:
+            values = [read(atom) for atom in equation.invars]
+            outputs = self._apply(equation, values)
+            known.update(zip(equation.outvars, outputs, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def _apply(self, equation: Any, values: list[np.ndarray]) -> list[np.ndarray]:
+        name, parameters = equation.primitive.name, equation.params
+        if name in ("jit", "pjit"):
+            return self.run(parameters["jaxpr"].jaxpr, parameters["jaxpr"].consts, values)
+        if name == "scan":
+            return self._scan(parameters, values)
+        if name in MOVES:
+            return [MOVES[name](parameters, equation.outvars[0].aval, *values)]
+        if name in REDUCTIONS:
+            return [self._reduce(REDUCTIONS[name], values[0], parameters["axes"])]
+        if name == "dot_general":
+            return [self._dot(parameters["dimension_numbers"], *values)]
+        return [self._elementwise(name, parameters, values, equation.outvars[0].aval)]
+
+    def _elementwise(self, name: str, parameters: Any, values: list[np.ndarray], out: Any) -> np.ndarray:
+        if name == "convert_element_type":
+            return self._convert(values[0], out.dtype)
+        if name == "copy":
+            return values[0]
+        if name == "clamp":
+            low, x, high = values
+            return self._elementwise("min", {}, [self._elementwise("max", {}, [x, low], out), high], out)
+        if name not in FOLD and name != "integer_pow":
+            raise Refused(name)
+        if all(value.dtype != object for value in values):
+            with np.errstate(all="ignore"):
+                if name == "integer_pow":
+                    return np.asarray(values[0] ** float(parameters["y"]), dtype=out.dtype)
+                return np.asarray(FOLD[name](*values), dtype=out.dtype)
+        if len(values) > 3:
+            raise Refused(f"{name} of more than two cases")
+        rows = [self.nodes(np.broadcast_to(value, out.shape)) for value in values]
+        data = parameters.get("y") if name == "integer_pow" else None
+        graph = self.loop.graph
+        return _objects([graph.apply(name, *row, data=data) for row in zip(*rows, strict=True)], out.shape)
+
+    def _convert(self, value: np.ndarray, dtype: Any) -> np.ndarray:
+        if value.dtype != object:
+            return value.astype(dtype)
+        if np.issubdtype(dtype, np.floating):
+            graph, one, zero = self.loop.graph, self.loop.graph.literal(1.0), self.loop.graph.literal(0.0)
+            items = [graph.apply("select_n", x, zero, one) if x.op in LOGICAL else x for x in self.nodes(value)]
+            return _objects(items, value.shape)
+        raise Refused(f"convert_element_type to {dtype}")
+
+    def _reduce(self, op: str, value: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+        moved = np.moveaxis(value, axes, range(len(axes)))
+        rows = moved.reshape(-1, *moved.shape[len(axes) :])
+        total = rows[0]
+        for row in rows[1:]:
+            pairs = zip(self.nodes(total), self.nodes(row), strict=True)
+            total = _objects([self.loop.graph.apply(op, a, b) for a, b in pairs], row.shape)
+        return total
+
+    def _dot(self, dimensions: Any, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        (over_left, over_right), (batch, _) = dimensions
+        if batch:
+            raise Refused("dot_general with batch dimensions")
+        a = np.moveaxis(left, over_left, range(left.ndim - len(over_left), left.ndim))
+        b = np.moveaxis(right, over_right, range(len(over_right)))
+        kept = a.shape[: a.ndim - len(over_left)] + b.shape[len(over_right) :]
+        a, b = (
+            a.reshape(-1, int(np.prod(a.shape[a.ndim - len(over_left) :]))),
+            b.reshape(-1, int(np.prod(b.shape[len(over_right) :]))),
+        )
+        graph = self.loop.graph
+        entries = []
+        for row in a:
+            for column in b.T:
+                pairs = zip(self.nodes(row), self.nodes(column), strict=True)
+                entries.append(graph.sum(graph.apply("mul", x, y) for x, y in pairs))
+        return _objects(entries, kept)
+
+    def _scan(self, parameters: Any, values: list[np.ndarray]) -> list[np.ndarray]:
+        loop, closed = self.loop, parameters["jaxpr"]
+        if loop.step:
+            raise Refused("scan in a program that has one already")
+        if parameters["reverse"]:
+            raise Refused("scan backwards")
+        loop.length = parameters["length"]
+        n_consts, n_carry = parameters["num_consts"], parameters["num_carry"]
+        consts, first, xs = values[:n_consts], values[n_consts : n_consts + n_carry], values[n_consts + n_carry :]
+        if len(closed.jaxpr.outvars) != n_carry:
+            raise Refused("scan that returns a value of each step")
+        loop.first = [node for part in first for node in self.nodes(part)]
+        symbols = [loop.graph.leaf("carry", i) for i in range(len(loop.first))]
+        carry, at = [], 0
+        for part in first:
+            carry.append(_objects(symbols[at : at + part.size], part.shape))
+            at += part.size
+        slices = [self._slice(x) for x in xs]
+        after = self.run(closed.jaxpr, closed.consts, [*consts, *carry, *slices])
+        loop.step = [node for part in after for node in self.nodes(part)]
+        finals, at, result = [loop.graph.leaf("final", i) for i in range(len(symbols))], 0, []
+        for part in first:
+            result.append(_objects(finals[at : at + part.size], part.shape))
+            at += part.size
+        return result
+
+    def _slice(self, x: np.ndarray) -> np.ndarray:
+        """Return one step's slice of an array ``(length, ...)``: formulas that hold for every step."""
+        steps = [self.nodes(row) for row in x]
+        return _objects([self._along([row[i] for row in steps]) for i in range(len(steps[0]))], x.shape[1:])
+
+    def _along(self, nodes: list[Node]) -> Node:
+        """Return one node that stands for a number's value at every step."""
+        first, graph = nodes[0], self.loop.graph
+        if all(node is first for node in nodes):
+            return first
+        kinds = {(node.op, node.data if node.args else None, len(node.args)) for node in nodes}
+        if len(kinds) > 1:
+            return self._branches(nodes)
+        if first.op == "literal":
+            return graph.leaf("table", self._table(self.loop.constants, np.array([n.data for n in nodes], float)))
+        if first.op in ("theta", "scored", "noise"):
+            return graph.leaf(f"{first.op}@", self._table(self.loop.indices, np.array([n.data for n in nodes])))
+        if not first.args:
+            raise Refused(f"{first.op} that differs between steps")
+        return graph.apply(
+            first.op, *(self._along([n.args[i] for n in nodes]) for i in range(len(first.args))), data=first.data
+        )
+
+    def _branches(self, nodes: list[Node]) -> Node:
+        """Return a choice by step between formulas of different form."""
+        kinds = [(node.op, node.data if node.args else None) for node in nodes]
+        distinct = list(dict.fromkeys(kinds))
+        if len(distinct) > BRANCHES:
+            raise Refused("scan over inputs of too many different forms")
+        graph, result = self.loop.graph, None
+        for kind in distinct:
+            mask = np.array([other == kind for other in kinds])
+            sample = nodes[int(np.argmax(mask))]
+            formula = self._along([node if here else sample for node, here in zip(nodes, mask, strict=True)])
+            if result is None:
+                result = formula
+                continue
+            table = graph.leaf("table", self._table(self.loop.constants, mask.astype(float)))
+            result = graph.apply("select_n", graph.apply("gt", table, graph.literal(0.5)), result, formula)
+        assert result is not None
+        return result
+
+    def _table(self, tables: list[np.ndarray], values: np.ndarray) -> int:
+        for i, table in enumerate(tables):
+            if np.array_equal(table, values):
+                return i
+        tables.append(values)
+        return len(tables) - 1
+
+
+LOGICAL = frozenset({"and", "eq", "ge", "gt", "is_finite", "le", "lt", "ne", "not", "or", "xor"})
+"""Operations that give true or false."""
+REDUCTIONS = {
+    "reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_or": "or",
+    "reduce_and": "and",
+}  # fmt: skip
+
+
+def _broadcast(parameters: Any, out: Any, value: np.ndarray, *_: Any) -> np.ndarray:
+    shape = [1] * out.ndim
+    for axis, target in enumerate(parameters["broadcast_dimensions"]):
+        shape[target] = value.shape[axis]
+    return np.broadcast_to(value.reshape(shape), out.shape)
+
+
+def _sliced(parameters: Any, out: Any, value: np.ndarray) -> np.ndarray:
+    strides = parameters["strides"] or (1,) * value.ndim
+    bounds = zip(parameters["start_indices"], parameters["limit_indices"], strides, strict=True)
+    return value[tuple(slice(*each) for each in bounds)]
+
+
+MOVES: dict[str, Callable[..., np.ndarray]] = {
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda p, out, *values: np.concatenate(values, axis=p["dimension"]),
+    "expand_dims": lambda p, out, value: value.reshape(out.shape),
+    "iota": lambda p, out: np.broadcast_to(
+        np.arange(out.shape[p["dimension"]]).reshape([-1 if a == p["dimension"] else 1 for a in range(out.ndim)]),
+        out.shape,
+    ).astype(out.dtype),
+    "reshape": lambda p, out, value: value.reshape(out.shape),
+    "rev": lambda p, out, value: np.flip(value, p["dimensions"]),
+    "slice": _sliced,
+    "squeeze": lambda p, out, value: value.reshape(out.shape),
+    "stack": lambda p, out, *values: np.stack(values, axis=p["axis"]),
+    "transpose": lambda p, out, value: np.transpose(value, p["permutation"]),
+}
+"""Operations that move numbers and compute none."""

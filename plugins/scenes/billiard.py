@@ -1,0 +1,77 @@
+"""One ball is pushed at another: where it misses, the gradient is exactly zero."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.model import Array, ContactScene, State, param
+
+
+@dataclass(frozen=True)
+class Billiard(ContactScene):
+    """Two equal balls on a frictionless table; a force (4, u0) acts on the first during the first step.
+
+    q = (x1, y1, x2, y2); theta = u0 (d = 1), with parameter noise; f = squared distance of the second ball from the
+    origin at T. Straight at the other ball it hits while |u0| < 4 tan(asin(2 radius / distance)), 2.189 N; beyond that
+    it misses, f does not depend on u0, and the derivative is exactly 0. Source: Paulus et al. 2025.
+    """
+
+    name = "billiard"
+    leaves_out: ClassVar[str] = "spin, friction, cushions, the third dimension"
+    n_q: ClassVar[int] = 4
+    n_u: ClassVar[int] = 2
+    n_contacts: ClassVar[int] = 1
+    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e3, "beta": 50.0}
+
+    sigma: float = param(0.3, "standard deviation of the noise on u0", "N", positive=True)
+    horizon: int = param(300, "number of time steps", "steps", positive=True)
+    dt: float = param(0.01, "length of a time step", "s", positive=True)
+    mass: float = param(0.17, "mass of each ball", "kg", positive=True)
+    radius: float = param(0.042, "radius of each ball", "m", positive=True)
+    push: float = param(4.0, "force along x in the first step", "N")
+    start: float = param(1.0, "u0 at theta, the force across in the first step", "N")
+
+    def theta0(self) -> np.ndarray:
+        """Return (u0,)."""
+        return np.array([self.start])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Place the balls at rest on the x axis, 0.175 m apart."""
+        zero = 0.0 * theta[0]
+        return State(xp.stack([zero - 0.375, zero, zero - 0.2, zero]), xp.stack([zero, zero, zero, zero]))
+
+    def planned_controls(self, xp: Any, theta: Array) -> Array:
+        """Return (push, u0) in the first step, nothing after it."""
+        first = xp.stack([0.0 * theta[0] + self.push, theta[0]])[None]
+        later = xp.zeros((self.horizon - 1, 2, theta.shape[1]), dtype=theta.dtype)
+        return xp.concat([first, later], axis=0)
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return the force on the first ball per mass."""
+        return xp.concat([u / self.mass, 0.0 * u], axis=0)
+
+    def gap(self, xp: Any, q: Array) -> Array:
+        """Return the distance between the surfaces."""
+        return _distance(xp, q)[None] - 2.0 * self.radius
+
+    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return the relative velocity along the line of centres."""
+        apart, relative = q[2:4] - q[0:2], v[2:4] - v[0:2]
+        return (xp.sum(apart * relative, axis=0) / _distance(xp, q))[None]
+
+    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+        """Push both balls apart along the line of centres."""
+        normal = (q[2:4] - q[0:2]) / _distance(xp, q)
+        pushed = normal * force / self.mass
+        return xp.concat([-pushed, pushed], axis=0)
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return the squared distance of the second ball from the origin."""
+        return q[2] ** 2 + q[3] ** 2
+
+
+def _distance(xp: Any, q: Array) -> Array:
+    """Return the distance between the centres, ``(B,)``."""
+    return xp.sqrt((q[2] - q[0]) ** 2 + (q[3] - q[1]) ** 2)

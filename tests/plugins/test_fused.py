@@ -1,0 +1,172 @@
+"""The fused backend: the same numbers as JAX, ties and NaN included, from code that is compiled once per structure."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from bench.model import Array, Compilations, FunctionScene, compose, param, registry
+
+pytest.importorskip("numba")
+
+from bench.plugins.fused import functions, kernels, trace
+from bench.plugins.fused.graph import Graph, Refused
+
+SAME = 1e-12
+"""Relative difference allowed from JAX, which adds the same terms in another order."""
+
+
+@dataclass(frozen=True)
+class Kinks(FunctionScene):
+    """Operations with ties, each on a coordinate of its own, and an angle."""
+
+    name = "fused_kinks"
+    leaves_out: ClassVar[str] = "everything but kinks"
+    sigma: float = param(1e-3, "noise", positive=True)
+    scale: float = param(2.0, "a parameter")
+
+    def theta0(self) -> np.ndarray:
+        """Return the kinks themselves, and an angle of 1."""
+        return np.array([0.0, 0.0, 0.0, 1.0])
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """Return |x0| + max(x1, 0) + (x2 where positive) + scale sin x3, and 0 times 1 / x0."""
+        kept = xp.where(x[2] > 0, x[2], 0.0 * x[2])
+        return xp.abs(x[0]) + xp.maximum(x[1], 0.0 * x[1]) + kept + self.scale * xp.sin(x[3]) + 0.0 / x[0]
+
+
+@dataclass(frozen=True)
+class Sorted(Kinks):
+    """A cost that has no form as scalar code."""
+
+    name = "fused_sorted"
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """Return the largest coordinate, found by sorting."""
+        return xp.sort(x, axis=0)[-1]
+
+
+def both(program):
+    """The program on the fused backend and on JAX."""
+    return (registry.make("backends", name).compile(program) for name in ("fused", "jax"))
+
+
+def relative(a, b):
+    assert np.array_equal(np.isnan(a), np.isnan(b))
+    return np.nanmax(np.abs(a - b)) / np.nanmax(np.abs(b))
+
+
+@pytest.fixture(scope="module")
+def kinks():
+    return both(compose(Kinks()))
+
+
+@pytest.fixture(scope="module")
+def pushing():
+    scene = registry.make("scenes", "pushing", {"horizon": 3})
+    law, integrator = registry.make("contacts", "penalty"), registry.make("integrators", "semi_implicit_euler")
+    return list(both(compose(scene, law, integrator)))
+
+
+def test_ties_and_nan_are_those_of_jax(kinks):
+    fused, jax = kinks
+    theta = np.array([[0.0, 0.5, 0.25], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, -2.0, 40.0]])
+    w = np.zeros((4, 3))
+    assert relative(fused.grad(theta, w), jax.grad(theta, w)) < SAME
+    assert np.isnan(fused.value(theta, w)).tolist() == [True, False, False]
+    # an angle beyond the range of the fast sine is computed by the C library
+    theta = np.array([[1.0], [1.0], [1.0], [1e9 + 0.5]])
+    assert fused.value(theta, np.zeros((4, 1)))[0] == pytest.approx(3.0 + 2.0 * math.sin(1e9 + 0.5), rel=SAME)
+
+
+def test_rollouts_are_those_of_jax_for_every_batch_and_thread(pushing):
+    fused, jax = pushing
+    rng = np.random.default_rng(0)
+    w = rng.standard_normal((3, 1100))
+    theta = jax.program.theta0[:, None] + 0.1 * rng.standard_normal((3, 1100))
+    whole = fused.grad(theta, w)
+    assert relative(whole, jax.grad(theta, w)) < SAME
+    fused.block, fused.threads = 96, 1
+    one = fused.grad(theta, w)
+    fused.threads = 2
+    two = fused.grad(theta, w)
+    assert np.array_equal(one, whole)
+    assert np.array_equal(two, whole)
+    shared = fused.grad(jax.program.theta0, w)
+    assert np.array_equal(fused.grad(jax.program.theta0, w[:, :1]), shared[:, :1])
+    assert np.array_equal(fused.grad(jax.program.theta0, w[:, 7:40]), shared[:, 7:40])
+
+
+def test_parameters_and_horizon_compile_nothing_again(pushing):
+    fused, _ = pushing
+    w = np.zeros((3, 32))
+    fused.grad(fused.program.theta0, w)
+    scene = registry.make("scenes", "pushing", {"horizon": 5, "mass": 0.3})
+    law = registry.make("contacts", "penalty", {"stiffness": 77.0})
+    other = compose(scene, law, registry.make("integrators", "semi_implicit_euler"))
+    changed, jax = both(other)
+    w = np.random.default_rng(1).standard_normal((5, 40))
+    changed.compilations = Compilations()
+    assert relative(changed.grad(other.theta0, w), jax.grad(other.theta0, w)) < SAME
+    assert changed.compilations.made == 0
+
+
+def test_machine_code_is_kept_on_disk(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernels, "_known", {})
+    fused = registry.make("backends", "fused").compile(compose(registry.make("scenes", "linear", {"dimension": 2})))
+    fused.compilations = Compilations(tmp_path)
+    first = fused.value(np.ones(2), np.zeros((2, 1)))
+    assert fused.compilations.made == 1
+    monkeypatch.setattr(kernels, "_known", {})
+    assert fused.value(np.ones(2), np.zeros((2, 1))) == first
+    assert fused.compilations.made == 1, "loaded, not compiled"
+
+
+def test_an_operation_without_scalar_form_is_refused_by_name():
+    backend = registry.make("backends", "fused")
+    assert "no scalar code for sort" in str(backend.refuses(compose(Sorted())))
+    pushed = compose(
+        registry.make("scenes", "pushing"),
+        registry.make("contacts", "complementarity"),
+        registry.make("integrators", "semi_implicit_euler"),
+    )
+    assert "no root finder" in str(backend.lacks(pushed))
+
+
+def test_formulas_of_a_step_are_found_along_the_horizon():
+    """A force in the first step only becomes one formula with a table, not one per step."""
+    tracer = trace._Tracer()
+    graph = tracer.loop.graph
+    early, late = graph.leaf("theta", 2), graph.literal(0.0)
+    node = tracer._along([early, late, late, late])
+    assert node.op == "select_n"
+    assert [table.tolist() for table in tracer.loop.constants] == [[0.0, 1.0, 1.0, 1.0]]
+    many = [graph.apply(op, early) for op in ("sin", "cos", "tan", "exp", "log")]
+    with pytest.raises(Refused, match="too many different forms"):
+        tracer._along(many)
+
+
+def test_equal_expressions_exist_once_and_nan_is_not_simplified_away():
+    graph = Graph()
+    x, y = graph.leaf("theta", 0), graph.leaf("theta", 1)
+    assert graph.apply("mul", x, y) is graph.apply("mul", y, x)
+    assert graph.apply("add", x, graph.literal(0.0)) is x
+    assert graph.apply("mul", graph.literal(0.0), x).op == "mul"
+    assert graph.apply("integer_pow", x, data=2) is graph.apply("mul", x, x)
+
+
+def test_sine_and_cosine_are_accurate_in_the_whole_range():
+    """The text of the fast functions, run by Python, against the C library: within 2 units in the last place of 1."""
+    scope: dict[str, Any] = {"np": np, "math": math, "F": float, "njit": lambda **options: lambda function: function}
+    exec(functions.FAST, scope)
+    rng = np.random.default_rng(0)
+    angles = np.concatenate([rng.uniform(-s, s, 300) for s in (1e-3, 1.0, 30.0, 1e4, functions.LIMIT)])
+    angles = np.concatenate([angles, np.arange(-40, 40) * math.pi / 2, [0.0]])
+    for name in ("sin", "cos"):
+        off = [abs(scope[f"{name}_"](float(x)) - getattr(math, name)(x)) for x in angles]
+        assert max(off) < 2 * np.finfo(float).eps
+    with np.errstate(invalid="ignore"):
+        assert math.isnan(scope["sin_"](math.nan))
+        assert math.isnan(scope["cos_"](math.inf))

@@ -1,0 +1,101 @@
+"""straight_through: the motion of one law, the gradient of another, and words for it wherever it is shown."""
+
+import numpy as np
+import pytest
+from bench.plugins.backends.jax import Jax
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.backends.torch import Torch
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.contacts.softplus import Softplus
+from bench.plugins.contacts.straight_through import StraightThrough
+from bench.plugins.estimators.fobg import Fobg
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.billiard import Billiard
+
+import bench
+from bench.measure.reference import certify
+from bench.model import SURROGATE, compose
+
+U = np.linspace(-50, 50, 100)[None]
+STILL = np.zeros_like(U)
+
+
+@pytest.fixture(scope="module")
+def problems():
+    laws = {"hard": Penalty(), "surrogate": StraightThrough(beta=50.0), "none": StraightThrough(backward="none")}
+    laws["same"] = StraightThrough(backward="penalty")
+    # ten times faster than the source's shot, so that a dozen steps are enough
+    scene = Billiard(horizon=12, push=40.0, start=10.0)
+    return {name: Torch().compile(compose(scene, law, SemiImplicitEuler())) for name, law in laws.items()}
+
+
+def test_the_motion_is_the_forward_laws(problems):
+    hard = problems["hard"].value(U, STILL)
+    for name in ("surrogate", "none", "same"):
+        np.testing.assert_array_equal(problems[name].value(U, STILL), hard)
+
+
+def test_missed_balls_have_no_gradient_except_with_contacts_from_distance(problems):
+    hard, distant = (problems[name].grad(U, STILL)[0] for name in ("hard", "surrogate"))
+    missed = np.abs(U[0]) > 22.5
+    assert (hard[missed] == 0).all()
+    assert (distant != 0).all()
+
+
+def test_the_same_law_behind_gives_the_derivative(problems):
+    np.testing.assert_allclose(problems["same"].grad(U, STILL), problems["hard"].grad(U, STILL), rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("gap", [-0.01, 0.0, 0.02])
+def test_one_force_has_the_forward_value_and_the_backward_slope(gap):
+    import jax
+    import jax.numpy as jnp
+
+    law = StraightThrough(beta=50.0)
+    at = jnp.array([[gap]])
+    force, slope = jax.value_and_grad(lambda x: law.force(jnp, x, 0.0 * x).sum())(at)
+    assert force == Penalty().force(np, np.array([[gap]]), np.zeros((1, 1))).sum()
+    behind = jax.grad(lambda x: Softplus(beta=50.0).force(jnp, x, 0.0 * x).sum())(at)
+    assert slope[0, 0] == behind[0, 0]
+    assert slope[0, 0] < 0
+
+
+def test_a_surrogate_gradient_certifies_nothing_and_is_never_declared_unbiased(problems):
+    program = problems["surrogate"].program
+    assert program.surrogate
+    assert not Fobg().declares_unbiased(program)
+    reference = certify(problems["surrogate"], Torch().provides, 16, 0.05)
+    assert "first_order" not in reference.method
+
+
+def test_differences_cannot_give_a_surrogate():
+    program = compose(Billiard(horizon=5), StraightThrough(), SemiImplicitEuler())
+    assert "surrogate" in Fobg().lacks(program, Numpy().provides, "numpy")
+    assert Fobg().lacks(program, Jax().provides, "jax") is None
+
+
+def test_rows_tables_and_charts_say_it_in_words(tmp_path):
+    rows = bench.run(
+        scenes=["billiard"], contacts=["penalty", "straight_through"], backends=["torch"], estimators=["fobg", "reinforce"],
+        sweep={"sigma": [0.1, 0.3]}, samples=8, repeats=8, timing=False, workers=0, results_dir=tmp_path,
+        scene={"billiard": {"horizon": 12, "push": 40.0, "start": 10.0}}, reference={"samples": 256}, formats=["svg"],
+    )  # fmt: skip
+    said = rows["reason"].str.contains(SURROGATE)
+    assert (said == ((rows["contact"] == "straight_through") & (rows["estimator"] == "fobg"))).all()
+    folder = tmp_path / "custom"
+    assert SURROGATE in (folder / "bias_variance.md").read_text()
+    from bench.studies.bias_variance import charts
+    from bench.sweep import config
+
+    figures = charts.figures(config.load([f"results_dir={tmp_path}", "sweep.sigma=[0.1,0.3]"]), rows)
+    words = " ".join(text.get_text() for figure in figures.values() for sub in figure.subfigs for text in sub.texts)
+    assert SURROGATE in " ".join(words.split())
+
+
+@pytest.mark.slow
+def test_gradcheck_says_it_in_words(tmp_path, capsys):
+    words = ["gradcheck", "billiard", "contacts=[straight_through]", "backends=[jax]", "sweep.horizon=[60]"]
+    from bench import cli
+
+    assert cli.main([*words, f"results_dir={tmp_path}"]) == 1
+    assert SURROGATE in capsys.readouterr().out
