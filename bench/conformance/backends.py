@@ -49,6 +49,8 @@ SCORE = 1e-5
 SINGLE = 1e-2
 """Relative error allowed in single precision: rollouts round hundreds of times by 6e-8, and central differences in it
 keep two or three digits."""
+FAR = 1e200
+"""Size of a theta whose square is not finite."""
 SOLVED = 1e-9
 """Relative error allowed where equations are solved to 1e-12 in the unknown, through a condition number below 100."""
 
@@ -187,6 +189,26 @@ def shared_theta_is_spread(backend: Backend) -> str:
             require(off < DIFFERENCED, f"{capability} of {title(program)}: a single column differs by {off:.1e}")
             worst = max(worst, off)
     return f"to {worst:.0e}"
+
+
+@verifies(Backend)
+def failed_rollouts_have_no_gradient(backend: Backend) -> str:
+    """Verify that a gradient is not finite where its cost is not: theta far out, in one column of a batch."""
+    if "grad" not in backend.provides:
+        raise Skipped("gives no gradients")
+    lost = []
+    for program in programs_for(backend, telling):
+        theta, w = samples(program)
+        far = np.where(np.arange(COLUMNS) == 1, FAR * (1.0 + np.abs(theta)), theta)
+        problem = backend.compile(program)
+        with np.errstate(all="ignore"):
+            failed = ~np.isfinite(problem.value(far, w))
+            gone = ~np.isfinite(problem.grad(far, w)).all(axis=0)
+        require(gone[failed].all(), f"{title(program)}: a cost that is not finite has a finite gradient")
+        lost.append(failed.any())
+    if not any(lost):
+        raise Skipped(f"no rollout fails {FAR:g} away")
+    return f"{sum(lost)} programs"
 
 
 @verifies(Backend)
