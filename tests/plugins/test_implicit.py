@@ -1,8 +1,13 @@
 """The implicit backend's root finder: the columns of a batch are solved independently."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from bench.plugins.backends.implicit import Implicit
+from bench.plugins.backends.jax import Jax
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.backends.torch import Torch
 from bench.plugins.contacts.complementarity import Complementarity
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.integrators.implicit_euler import ImplicitEuler
@@ -11,7 +16,7 @@ from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.ground_wall import GroundWall
 from bench.plugins.scenes.pushing import Pushing
 
-from bench.model import compose
+from bench.model import FunctionScene, compose
 
 SOLVED = 1e-12
 """The root finder stops at a relative change of 1e-12, and Newton's last step on a linear equation is exact."""
@@ -64,7 +69,7 @@ def test_stiff_equations_are_solved_whatever_the_size_of_their_residual(stiffnes
 
 
 @pytest.mark.parametrize("mode", ["reverse", "forward"])
-def test_a_solve_that_fails_has_no_gradient(mode, monkeypatch):
+def test_a_solve_that_fails_has_no_gradient(mode):
     """z^2 + 1 = 0 has no root; what the last iteration left has a derivative all the same, of nothing."""
     import jax
     import jax.numpy as jnp
@@ -76,9 +81,37 @@ def test_a_solve_that_fails_has_no_gradient(mode, monkeypatch):
         return ops.root(lambda z, a: z * z + a, 2.0 + 0.0 * a, a)
 
     assert np.isnan(np.asarray(root(a))).tolist() == [[False, True]]
-    if mode == "reverse":
-        slope = jax.grad(lambda a: root(a).sum())(a)
-    else:
-        slope = jax.jvp(root, (a,), (jnp.ones_like(a),))[1]
+    reverse = mode == "reverse"
+    slope = jax.grad(lambda a: root(a).sum())(a) if reverse else jax.jvp(root, (a,), (jnp.ones_like(a),))[1]
     assert np.isnan(np.asarray(slope)).tolist() == [[False, True]]
     assert slope[0, 0] == pytest.approx(-0.5, rel=SOLVED)
+
+
+@dataclass(frozen=True)
+class Hidden(FunctionScene):
+    """theta^2 where theta is positive, else no number: chosen after the fact, as by a solver that looks whether it failed."""
+
+    name = "hidden"
+
+    def theta0(self):
+        return np.array([1.0])
+
+    def cost(self, xp, x):
+        return xp.where(x[0] > 0, x[0] * x[0], xp.nan * xp.ones_like(x[0]))
+
+
+@pytest.mark.parametrize("backend", [Jax(), Jax(mode="forward"), Torch(), Numpy()], ids=str)
+def test_a_cost_that_is_no_number_has_no_gradient(backend):
+    problem = backend.compile(compose(Hidden()))
+    gradient = problem.grad(np.array([[2.0, -2.0]]), np.zeros((1, 2)))
+    assert gradient[0, 0] == pytest.approx(4.0, rel=1e-6)
+    assert np.isnan(gradient[0, 1])
+
+
+def test_complex_numbers_are_an_error(monkeypatch):
+    from bench.plugins.backends.numpy import NumpyProblem
+
+    problem = Numpy().compile(compose(Hidden()))
+    monkeypatch.setattr(NumpyProblem, "_grad", lambda self, theta, w: np.ones((1, w.shape[1])) + 1j)
+    with pytest.raises(TypeError, match="complex"):
+        problem.grad(np.array([1.0]), np.zeros((1, 2)))
