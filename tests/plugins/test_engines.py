@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins import mjcf
 from bench.plugins.backends import compiling
 from bench.plugins.backends.jax import Jax
 from bench.plugins.backends.mjx import Mjx
@@ -33,6 +32,7 @@ from bench.conformance import backends
 from bench.conformance.kit import Failed
 from bench.conformance.subjects import distance, law_for, samples
 from bench.model import EngineScene, EngineTwin, compose, registry
+from bench.plugins import mjcf
 from bench.studies.bias_variance import BiasVariance
 from bench.sweep.cell import Cell
 from bench.sweep.experiment import Budget
