@@ -41,6 +41,10 @@ PANELS = (7, 12)
 """Panels of 4 Gauss-Legendre points of the two integrals of the gradient along a line."""
 LEAST_MISSED = 0.002
 """Share of a cost's change that the integral of its gradient may miss by itself."""
+LOOKS = ((PLACES, HALVINGS), (3, 10), (1, 10))
+"""Places looked at on a line and halvings of each, from the whole to the least."""
+FEWEST_POINTS = 17
+"""Points without which a line is not scanned."""
 OTHER_NOISE = 2
 """Draws of the simulator's own noise, besides the first, under which the gradient is checked along random directions."""
 
@@ -274,12 +278,15 @@ class _Examination:
         along = directions(2, spread, self.seed)
         each = self.clock.per_cost()
         room = SHARES["lines"] * self.clock.left / len(along) / each if each > 0 else math.inf
-        points = int(min(POINTS, room - 2 * PLACES * HALVINGS))
-        if points < 17:
+        for most, halvings in LOOKS:
+            points = int(min(POINTS, room - 2 * most * halvings))
+            if points >= FEWEST_POINTS:
+                break
+        else:
             self.left_out.append("jumps and kinks on lines")
             return []
         if points < POINTS:
-            self.left_out.append(f"fine lines: {points} points instead of {POINTS}")
+            self.left_out.append(f"fine lines: {points} points instead of {POINTS}, and {most} places looked at")
         found = []
         measured = checked.noise if checked is not None and math.isfinite(checked.noise) else 0.0
         self.clock.allow(2 * SHARES["lines"])
@@ -287,7 +294,7 @@ class _Examination:
             for direction in along:
                 size = float(np.abs(self._costs(self.theta[:, None])).max())
                 rounding = max(measured, self.simulator.unit * (size if math.isfinite(size) else 0.0))
-                line = scan(self._costs, self.theta, direction, rounding, points=points)
+                line = scan(self._costs, self.theta, direction, rounding, 3.0, points, halvings, most)
                 found.append(replace(line, missed=self._missed(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
