@@ -8,6 +8,8 @@ theta = {"speed": jnp.array([1.0, 0.1]), "stiffness": jnp.array(100.0)}
 
 
 def rollout(theta, cut):
+    """Return the squared distance of the second body to 1 m; `cut` is between the contact force and its use."""
+
     def step(carry, _):
         q, v = carry
         force = cut(theta["stiffness"] * jax.nn.relu(q[0] - q[1] + 0.1))

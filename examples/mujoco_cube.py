@@ -36,4 +36,4 @@ def cost(model, data):
 if __name__ == "__main__":
     for engine in sys.argv[1:] or ["mujoco", "mjx"]:
         toss = bench.Mjcf(CUBE, start, cost, steps=120, engine=engine)
-        print(bench.examine(toss, theta, grad=toss.gradient, sigma=[0.01, 0.1], budget="90s"), end="\n\n")
+        print(bench.examine(toss, theta, grad=toss.gradient, sigma=[0.01, 0.1], budget="180s"), end="\n\n")

@@ -11,6 +11,7 @@ class Block(torch.nn.Module):
         self.in_place = in_place
 
     def forward(self, push):
+        """Return the squared distance to 0.5 m for a push that grows with time."""
         x = v = torch.zeros((), dtype=push.dtype)
         for t in range(60):
             force = push[0] + push[1] * t / 60 if t < 30 else torch.zeros((), dtype=push.dtype)

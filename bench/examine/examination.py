@@ -27,14 +27,14 @@ SHARES = {"check": 0.75, "again": 0.5, "lines": 0.3}
 """Most of the time left that a part may take; what it does not use is there for the next one."""
 POINTS_EACH = 2 * (2 * EPS.size + 17)
 """Costs of a direction that is checked, about."""
-SCANS = 4 * 7 * 65
-"""Costs that a check spends on looking for staircases, where a direction is not plainly right."""
+SCAN = 7 * 65
+"""Costs of looking for a staircase along one direction, which a check does where it is not plainly right."""
 EFFORTS = (
     Options(),
-    Options(draws=2),
-    Options(draws=1, directions=1),
-    Options(components=4, draws=0),
-    Options(components=0, draws=0, directions=1, eps=EPS[::2]),
+    Options(draws=2, scanned=1),
+    Options(draws=2, directions=1, scanned=0),
+    Options(components=4, draws=2, directions=1, scanned=0),
+    Options(components=0, draws=0, directions=1, eps=EPS[::2], scanned=0),
 )
 """What a check looks at, from the whole to the least, for simulators that are slow."""
 PANELS = (7, 12)
@@ -224,7 +224,10 @@ class _Examination:
             chosen = min(effort.components, self.theta.size) + effort.directions
             calls = chosen * POINTS_EACH + effort.draws * effort.directions * POINTS_EACH // 2
             # what a wrong gradient asks for besides: scans, and ratios at other thetas
-            calls += SCANS + min(effort.draws, 4) * min(effort.components, self.theta.size) * POINTS_EACH // 2
+            calls += (
+                effort.scanned * SCAN
+                + min(effort.draws, 4) * min(effort.components, self.theta.size) * POINTS_EACH // 2
+            )
             if calls * each + (effort.draws + 3) * slope < SHARES["check"] * self.clock.left:
                 break
         else:
@@ -237,7 +240,7 @@ class _Examination:
     def _checked(self) -> Check | None:
         self.clock.stage("checking the gradient")
         options = self._options()
-        for attempt in (options, replace(options, components=0, draws=0, directions=1, eps=EPS[::2])):
+        for attempt in (options, replace(options, components=0, draws=0, directions=1, eps=EPS[::2], scanned=0)):
             self.clock.allow(SHARES["check"] if attempt is options else 1.0)
             try:
                 return self._one_check(attempt)

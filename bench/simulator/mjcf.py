@@ -57,7 +57,9 @@ class Mjcf:
         self._start, self._cost, self._control, self.steps = start, cost, control, steps
         self._mujoco, self._data, self._probe = mujoco, mujoco.MjData(self.model), mujoco.MjData(self.model)
         self._engine = _Mjx(self) if engine == "mjx" else None
-        self.__name__ = self.__qualname__ = f"{engine} model, nq={self.model.nq}, nv={self.model.nv}, nu={self.model.nu}"
+        self.__name__ = self.__qualname__ = (
+            f"{engine} model, nq={self.model.nq}, nv={self.model.nv}, nu={self.model.nu}"
+        )
         self.__module__ = ""
 
     def __call__(self, theta: Any) -> float:
