@@ -27,7 +27,9 @@ class TimeOfImpact(Claim):
         "sign is wrong at every step size."
     )
     source = SOURCE
-    learned = "A motion that is right to first order can have a derivative of the wrong sign, and refining does not help."
+    learned = (
+        "A motion that is right to first order can have a derivative of the wrong sign, and refining does not help."
+    )
     labels = ("initial height [m]", "final height [m]")
 
     def measure(self) -> Outcome:

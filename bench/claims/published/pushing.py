@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from bench.model import Problem
 
 
-def sampled(at: Problem, count: int, seed: int, zeroth: str = "reinforce") -> tuple[tuple[float, float], tuple[float, float]]:
+def sampled(
+    at: Problem, count: int, seed: int, zeroth: str = "reinforce"
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the variances of first- and zeroth-order terms, each with its standard error."""
     w = np.random.default_rng(seed).standard_normal((at.program.n_noise, count))
     first, other = (terms(at, estimator(name), w) for name in ("fobg", zeroth))
@@ -42,7 +44,8 @@ class SmoothedPush(Claim):
         """Sample both orders at the published sharpnesses."""
         first = {"1e2": "10.82", "1.27e4": "10.77", "2.8e4": "15.99", "6.4e4": "3.9e5"}
         zeroth = {"1e2": "2970", "1.27e4": "2959", "2.8e4": "2967", "6.4e4": "2368"}
-        figures, series = [], {"beta": [], "first": [], "zeroth": []}
+        figures: list[Figure] = []
+        series: dict[str, list[float]] = {"beta": [], "first": [], "zeroth": []}
         seeds = []
         for beta in first:
             at = problem("pushing[sigma=0.3]", f"softplus[stiffness=1e5,beta={float(beta)!r}]")
@@ -50,12 +53,23 @@ class SmoothedPush(Claim):
             series["beta"].append(float(beta))
             series["first"].append(v1)
             series["zeroth"].append(v0)
-            figures.append(Figure(f"zeroth order, beta = {beta}", zeroth[beta], v0, e0, spread=0.1 * float(zeroth[beta])))
+            figures.append(
+                Figure(f"zeroth order, beta = {beta}", zeroth[beta], v0, e0, spread=0.1 * float(zeroth[beta]))
+            )
             if beta == "6.4e4":
                 seeds = [sampled(at, 1000, seed)[0][0] for seed in range(12)]
-                figures.append(Figure("first order, beta = 6.4e4, median of 12 seeds of 1,000", first[beta], float(np.median(seeds)), factor=30.0))
+                figures.append(
+                    Figure(
+                        "first order, beta = 6.4e4, median of 12 seeds of 1,000",
+                        first[beta],
+                        float(np.median(seeds)),
+                        factor=30.0,
+                    )
+                )
             else:
-                figures.append(Figure(f"first order, beta = {beta}", first[beta], v1, e1, spread=0.03 * float(first[beta])))
+                figures.append(
+                    Figure(f"first order, beta = {beta}", first[beta], v1, e1, spread=0.03 * float(first[beta]))
+                )
         low, high = min(seeds), max(seeds)
         return Outcome(
             figures,
@@ -91,7 +105,8 @@ class StiffPush(Claim):
         values = "velocity_factor=0.998,push=0.1,sigma=0.1"
         coarse = {10.0: "46", 100.0: "7e2", 300.0: "4e4", 1000.0: "1e10"}
         fine = {10.0: "44", 100.0: "6e2", 300.0: "1e4", 1000.0: "2e7"}
-        figures, series = [], {"k": list(coarse), "coarse": [], "fine": [], "zeroth": []}
+        figures: list[Figure] = []
+        series: dict[str, list[float]] = {"k": list(coarse), "coarse": [], "fine": [], "zeroth": []}
         for k, text in coarse.items():
             at = problem(f"pushing[{values},horizon=200,dt=0.005]", f"penalty[stiffness={k!r}]")
             (v1, e1), (v0, e0) = sampled(at, 4000, 17)

@@ -22,7 +22,9 @@ class SoftWall(Claim):
 
     name = "C14"
     lesson = "Stiffness or step size"
-    statement = "A penalty wall's gradient is wrong by more than its own size at coarse steps, and right as the step falls."
+    statement = (
+        "A penalty wall's gradient is wrong by more than its own size at coarse steps, and right as the step falls."
+    )
     source = "Paulus et al. 2025, arXiv 2506.14186, toy example"
     learned = "Before blaming contact, halve the time step and look again."
     labels = ("time step [s]", "mean error of df/dq0")

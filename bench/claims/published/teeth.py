@@ -30,14 +30,23 @@ class Teeth(Claim):
         theta = np.stack([0.5 + shift, np.full_like(shift, -2.0), np.zeros_like(shift)])
         still = np.zeros((3, shift.size))
         figures, series = [], {"shift": shift.tolist()}
-        for name, law, slope in (("with", "impulse", "-1.0000"), ("without", "impulse[time_of_impact=false]", "1.0000")):
+        for name, law, slope in (
+            ("with", "impulse", "-1.0000"),
+            ("without", "impulse[time_of_impact=false]", "1.0000"),
+        ):
             # 204 states are 203 steps
             at = problem("bounce_once[horizon=203,dt=0.002,radius=0.1,height=0.5]", law)
             slopes = at.grad(theta, still)[0]
             height = at.value(theta, still)
             series[name] = height.tolist()
             figures.append(Figure(f"mean slope, {name}", slope, float(slopes.mean())))
-            figures.append(Figure(f"share of slopes that are {slope}, {name}", "1.0000", float(np.mean(np.abs(slopes - float(slope)) < 1e-9))))
+            figures.append(
+                Figure(
+                    f"share of slopes that are {slope}, {name}",
+                    "1.0000",
+                    float(np.mean(np.abs(slopes - float(slope)) < 1e-9)),
+                )
+            )
             if name == "with":
                 figures.append(Figure("y_T + y0", "1.012", float(np.mean(height + theta[0]))))
             else:
