@@ -6,8 +6,11 @@ import itertools
 import os
 import re
 import shlex
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -62,7 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        return _dispatch(words)
+        with _stopped_by_signals():
+            return _dispatch(words)
     except UserError as error:
         print("bench:", printable(error), file=sys.stderr)
         return 2
@@ -76,6 +80,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\nbench: stopped", file=sys.stderr)
         return 130
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    """Have SIGTERM and SIGHUP stop a command like Ctrl-C, and a second one of the three end it at once and in silence.
+
+    Nothing is lost then: finished rows are on disk, and workers end with their run.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    names = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
+    def stop(*_: object) -> None:
+        for name in names:
+            signal.signal(name, signal.SIG_DFL)
+        raise KeyboardInterrupt
+
+    before = {name: signal.getsignal(name) for name in names}
+    for name in names:
+        if before[name] not in (signal.SIG_IGN, None):  # as under nohup
+            signal.signal(name, stop)
+    try:
+        yield
+    finally:
+        for name, handler in before.items():
+            if signal.getsignal(name) is stop:
+                signal.signal(name, handler)
 
 
 def _dispatch(words: list[str]) -> int:

@@ -14,7 +14,10 @@ import importlib.machinery
 import importlib.util
 import inspect
 import pkgutil
+import re
 import sys
+import types
+import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -22,13 +25,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from bench.errors import UserError, unknown
-from bench.model.parameters import Plugin, build, remember, singular
+from bench.errors import UserError, printable, unknown
+from bench.model.parameters import Plugin, build, parameters, remember, singular
 
 BUILT_IN = ("bench.plugins", "bench.studies")
 KINDS = ("scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "studies")
 """The kinds that come with the package, in the order in which they are listed; a plugin may declare another."""
 ENTRY_POINT_GROUP = "bench.plugins"
+NAME = re.compile(r"\w[\w.-]*")
+"""Names of plugins: they stand in identity strings, where brackets, commas and spaces have a meaning."""
+LONGEST = 1000
+"""Letters of a reason that are kept."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +93,9 @@ def entries() -> Table:
             plugin = point.load()
             if not (isinstance(plugin, type) and issubclass(plugin, Plugin) and plugin.kind):
                 raise TypeError(f"{point.value} is not a plugin class")
-        except Exception as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # a plugin that exits at import, too, must not end the command
             _fail(table, _guessed_kind(point.name), point.name, error)
         else:
             _add(table, plugin)
@@ -118,13 +127,20 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
 def _load_module(found: Table, kind: str, path: str) -> None:
     try:
         module = importlib.import_module(path)
-    except Exception as error:
-        # one broken plugin must not hide the others: it is listed with its error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        # one broken plugin must not hide the others, nor end the command by sys.exit(): it is listed with its error
         _fail(found, kind if kind in found else "estimators", path.rpartition(".")[2], error)
         return
-    for plugin in vars(module).values():
-        own = isinstance(plugin, type) and plugin.__module__.startswith(module.__name__)
-        if own and issubclass(plugin, Plugin) and plugin.kind and plugin.name:
+    for name, plugin in list(vars(module).items()):
+        try:
+            own = isinstance(plugin, type) and str(plugin.__module__).startswith(module.__name__)
+            concrete = own and issubclass(plugin, Plugin) and plugin.kind and plugin.name
+        except Exception as error:
+            _fail(found, kind if kind in found else "estimators", name, error, "cannot be used")
+            continue
+        if concrete:
             _add(found, plugin)
 
 
@@ -132,23 +148,52 @@ def _guessed_kind(name: str) -> str:
     return next((kind for kind in KINDS if name.startswith(kind)), "estimators")
 
 
-def _fail(found: Table, kind: str, name: str, error: Exception) -> None:
-    found[kind][name] = Entry(kind, name, None, f"import failed: {type(error).__name__}: {error}")
+def _fail(found: Table, kind: str, name: str, error: BaseException, what: str = "import failed") -> None:
+    try:
+        said = printable(error)[:LONGEST]
+    except Exception:
+        said = "(a message that cannot be printed)"
+    while name in found[kind]:  # a sound plugin keeps its name
+        name += " (another)"
+    found[kind][name] = Entry(kind, name, None, f"{what}: {type(error).__name__}: {said}")
 
 
 def _add(found: Table, plugin: type[Plugin]) -> None:
-    table = found.setdefault(plugin.kind, {})
+    where = printable(f"{plugin.__module__}.{plugin.__qualname__}")
+    kind = plugin.kind if isinstance(plugin.kind, str) and plugin.kind.isidentifier() else "estimators"
+    table = found.setdefault(kind, {})
+    try:
+        faults = _faults(plugin)
+    except Exception as error:
+        _fail(found, kind, where.rpartition(".")[2], error, "cannot be used")
+        return
+    if faults:
+        table[where.rpartition(".")[2]] = Entry(kind, where, None, f"cannot be used: {faults}")
+        return
     taken = table.get(plugin.name)
     if taken is not None and taken.plugin is not plugin:
-        where = f"{plugin.__module__}.{plugin.__qualname__}"
-        table[f"{plugin.name} of {where}"] = Entry(
-            plugin.kind, plugin.name, None, f"the name is taken by {taken.plugin}"
-        )
+        by = taken.plugin and f"{taken.plugin.__module__}.{taken.plugin.__qualname__}"
+        table[f"{plugin.name} of {where}"] = Entry(kind, plugin.name, None, f"the name is taken by {by or taken.name}")
     elif inspect.isabstract(plugin):
         missing = ", ".join(sorted(plugin.__abstractmethods__))
-        table[plugin.name] = Entry(plugin.kind, plugin.name, None, f"{plugin.__qualname__} does not define {missing}")
+        table[plugin.name] = Entry(kind, plugin.name, None, f"{plugin.__qualname__} does not define {missing}")
     else:
-        table[plugin.name] = Entry(plugin.kind, plugin.name, plugin, _missing(plugin))
+        table[plugin.name] = Entry(kind, plugin.name, plugin, _missing(plugin))
+
+
+def _faults(plugin: type[Plugin]) -> str:
+    """Return what makes a class unusable as a plugin before it is used; its parameters are read, and may raise."""
+    if not (isinstance(plugin.kind, str) and plugin.kind.isidentifier()):
+        return f"kind={printable(repr(plugin.kind))[:LONGEST]} must be a name"
+    if not (isinstance(plugin.name, str) and NAME.fullmatch(plugin.name)):
+        return f"name={printable(repr(plugin.name))[:LONGEST]} must be letters, digits, '_', '-' and '.'"
+    if not (isinstance(plugin.requires, tuple | list) and all(isinstance(r, str) and r for r in plugin.requires)):
+        return f"requires={printable(repr(plugin.requires))[:LONGEST]} must be a tuple of modules"
+    for parameter in parameters(plugin).values():
+        kinds = typing.get_args(parameter.type) if isinstance(parameter.type, types.UnionType) else (parameter.type,)
+        if not kinds or not set(kinds) <= {bool, int, float, str, type(None)} or kinds == (type(None),):
+            return f"parameter {parameter.name} must be annotated as bool, int, float or str"
+    return ""
 
 
 def _missing(plugin: type[Plugin]) -> str:

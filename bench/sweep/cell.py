@@ -163,7 +163,9 @@ class Cell:
     def _dim(self) -> float:
         try:
             return len(self.decision.names) or int(self.scene.theta0().size)
-        except Exception:  # the error shows up in the cell's own row
+        except KeyboardInterrupt:
+            raise
+        except BaseException:  # the error shows up in the cell's own row
             return math.nan
 
     # ----------------------------------------------------------------------------------------------- program
@@ -176,7 +178,9 @@ class Cell:
         """Return status and reason if this cell cannot run, or None."""
         try:
             return self._refusal()
-        except Exception as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
             row = failure(error)
             return row["status"], row["reason"]
 

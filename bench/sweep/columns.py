@@ -97,6 +97,12 @@ HIDDEN = (
     ),
     Column("wall_s", "seconds that the cell took in all", "s", table=False),
     Column("stored_at", "when the row was stored, since 1970", "s", table=False),
+    Column(
+        "sequence",
+        "a count that grows with every storing; the row of a key with the largest is its newest",
+        table=False,
+    ),
+    text("machine", "processor, cores and system of the machine that made the row", table=False),
 )
 COMMON = {column.name: column for column in (*FIRST, DIM, *STATUS, *LAST, *HIDDEN)}
 

@@ -11,6 +11,7 @@ from bench.errors import StorageError
 from bench.measure import timing
 from bench.sweep import progress, runner
 from bench.sweep.experiment import Experiment
+from bench.sweep.files import tidy
 from bench.sweep.plan import Planned, plan
 from bench.sweep.store import Store
 
@@ -32,7 +33,7 @@ class Finished:
 
 def store_of(experiment: Experiment) -> Store:
     """Return the store of an experiment's rows."""
-    return Store(experiment.directory, experiment.columns)
+    return Store(experiment.directory, experiment.columns, experiment.study.name)
 
 
 def execute(experiment: Experiment, quiet: bool = True) -> Finished:
@@ -48,6 +49,8 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     planned = plan(experiment, store)
     progress.print_versions(planned, experiment.execution.versions)
     store.prepare()
+    for folder in (experiment.directory, experiment.directory / "pending", experiment.results_dir / "references"):
+        tidy(folder)
     with progress.of(experiment.name, planned, quiet) as shown:
         try:
             runner.run(experiment, planned, store, shown.finished, shown.working)

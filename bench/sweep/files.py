@@ -2,11 +2,53 @@
 
 from __future__ import annotations
 
+import fcntl
+import hashlib
 import os
+import platform
+import re
+import time
 import uuid
+from contextlib import suppress
 from pathlib import Path
 
+import psutil
+
 from bench.errors import StorageError
+from bench.model.parameters import remember
+
+STALE_S = 3600.0
+"""Age at which a half-written file of another machine belongs to no run."""
+TEMPORARY = re.compile(r"\..+-bench-([0-9a-f]{8})-(\d+)-[0-9a-f]{32}")
+"""Names of files that are being written: the machine, the process, and a number of their own."""
+
+
+def temporary(path: Path) -> Path:
+    """Return a hidden name beside a path under which it can be written; it says whose it is, for :func:`tidy`."""
+    return path.with_name(f".{path.name[:100]}-bench-{_machine()}-{os.getpid()}-{uuid.uuid4().hex}")
+
+
+@remember
+def _machine() -> str:
+    """Return a name for what process numbers mean something on: one start of a machine, or one container."""
+    try:
+        where = Path("/proc/sys/kernel/random/boot_id").read_text() + os.readlink("/proc/self/ns/pid")
+    except OSError:
+        where = platform.node()
+    return hashlib.sha256(where.encode()).hexdigest()[:8]
+
+
+def tidy(directory: Path) -> None:
+    """Remove half-written files that killed runs have left in a directory, itself and not below it."""
+    with suppress(OSError):
+        for path in directory.iterdir():
+            match = TEMPORARY.fullmatch(path.name)
+            if match is None:
+                continue
+            with suppress(OSError):
+                gone = match[1] == _machine() and not psutil.pid_exists(int(match[2]))
+                if gone or time.time() - path.stat().st_mtime > STALE_S:
+                    path.unlink()
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -34,19 +76,19 @@ def make_directory(path: Path) -> None:
 
 def replace_file(path: Path, content: bytes) -> None:
     """Write like :func:`write_whole`, but let FileNotFoundError pass: the directory may have been removed meanwhile."""
-    temporary = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
+    part = temporary(path)
     try:
-        with open(temporary, "wb") as file:
+        with open(part, "wb") as file:
             file.write(content)
             file.flush()
             # the content must be on disk before the name points to it, or a power cut leaves an empty file
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+            flush(file.fileno())
+        os.replace(part, path)
         sync(path.parent)
     except FileNotFoundError:
         raise
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
         raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
 
 
@@ -54,6 +96,16 @@ def sync(directory: Path) -> None:
     """Make renames in a directory outlast a power cut."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        flush(descriptor)
     finally:
         os.close(descriptor)
+
+
+def flush(descriptor: int) -> None:
+    """Have the disk write what it was given: on macOS ``fsync`` stops at the drive's cache, and F_FULLFSYNC does not."""
+    whole = getattr(fcntl, "F_FULLFSYNC", None)
+    if whole is not None:
+        with suppress(OSError):  # a network drive may not know it
+            fcntl.fcntl(descriptor, whole)
+            return
+    os.fsync(descriptor)

@@ -7,7 +7,6 @@ import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -57,8 +56,12 @@ class Measure:
 
     def prepare(self, item: Task) -> None:
         """Have the backend import its libraries, as it does when it gets a program."""
-        with suppress(Exception):  # an error here will come again while the cell is measured, and is reported then
+        try:
             self._session.problems.of(item.backend, item.cell)
+        except KeyboardInterrupt:
+            raise
+        except BaseException:  # it will come again while the cell is measured, and is reported then
+            return
 
     def __call__(self, item: Task) -> dict[str, Any]:
         """Return the results of the cell, or the status and reason of its failure."""
@@ -66,9 +69,9 @@ class Measure:
             return outcome(item.cell, self._session, self._study)
         try:
             self._session.references.of(item.cell)
-        except StorageError:
+        except (StorageError, KeyboardInterrupt):
             raise
-        except Exception as error:
+        except BaseException as error:
             return failure(error)
         return {"status": "ok"}
 
@@ -77,9 +80,9 @@ def outcome(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
     """Return the results of a cell, or the status and reason of its failure; never raises for a plugin's error."""
     try:
         result = study.measure(cell, session)
-    except StorageError:
+    except (StorageError, KeyboardInterrupt):
         raise
-    except Exception as error:
+    except BaseException as error:  # a plugin that exits must not end a run in this process
         return dict(failure(error))
     if cell.timing:
         return result
@@ -226,7 +229,9 @@ def _grouped(tasks: list[Task]) -> list[list[Task]]:
 def _has_closed_form(cell: Cell) -> bool:
     try:
         return cell.program().closed_form_gradient() is not None
-    except Exception:  # its own worker reports the error
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # its own worker reports the error
         return True
 
 

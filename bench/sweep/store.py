@@ -4,6 +4,8 @@ Rows that finish together are one small JSON file under ``pending/``; at the end
 into ``rows.parquet``. Every file is written whole under a name of its own and renamed into place, and is deleted only
 by a run that has read it and written its rows into another file. So nothing is locked, a run can be killed at any
 moment, and several can write to one directory: what is stored is the union of all files, the newest row of each key.
+The newest is the one with the largest ``sequence``, a count that only grows: clocks may be wrong, on one of several
+machines or for an hour.
 """
 
 from __future__ import annotations
@@ -18,25 +20,30 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.errors import StorageError
+from bench.errors import StorageError, UserError, printable
 from bench.sweep.columns import Columns
-from bench.sweep.files import replace_file, sync
+from bench.sweep.files import replace_file, sync, temporary, tidy
 
 if TYPE_CHECKING:
     import pandas as pd
 
 ATTEMPTS = 100
 """Times that a directory is read again while other runs change it."""
-STALE_S = 3600.0
-"""Age at which a half-written file belongs to no run."""
+LARGEST = 2.0**53
+"""Larger counts than this are not kept exactly as float64, so no run has written them."""
 
 
 class Store:
-    """The rows of one experiment. Raises :class:`StorageError` when its directory cannot be written or read."""
+    """The rows of one experiment. Raises :class:`StorageError` when its directory cannot be written or read.
 
-    def __init__(self, directory: Path, columns: Columns) -> None:
+    With ``study``, a directory that holds rows of another one is refused: two studies under one name would mix.
+    """
+
+    def __init__(self, directory: Path, columns: Columns, study: str = "") -> None:
         self.directory = directory
         self._columns = columns
+        self._study = study
+        self._last: int | None = None
         self._table = directory / "rows.parquet"
         self._pending = directory / "pending"
 
@@ -44,7 +51,7 @@ class Store:
         """Make the directory, and make sure that it can be written."""
         try:
             self._pending.mkdir(parents=True, exist_ok=True)
-            probe = self._pending / f".probe-{uuid.uuid4().hex}"
+            probe = temporary(self._pending / "probe")
             probe.write_text("")
             probe.unlink()
         except OSError as error:
@@ -52,7 +59,11 @@ class Store:
 
     def append(self, *rows: dict[str, Any]) -> None:
         """Store finished cells: when this returns, they outlast a power cut."""
-        stamped = [row | {"stored_at": time.time()} for row in rows]
+        if self._last is None:
+            self.load()
+        assert self._last is not None
+        self._last += 1
+        stamped = [row | {"stored_at": time.time(), "sequence": self._last} for row in rows]
         self._add("json", json.dumps(stamped).encode())
 
     def load(self) -> pd.DataFrame:
@@ -84,7 +95,7 @@ class Store:
         for _ in range(ATTEMPTS):
             files = self._files()
             try:
-                frames = [self._columns.typed(frame) for frame in _frames(files)]
+                frames = [_typed(self._columns, frame, path) for path, frame in _frames(files)]
             except FileNotFoundError:
                 continue
             # a file folded while others were read may have been missed in both places
@@ -96,10 +107,22 @@ class Store:
         import pandas as pd
 
         if not frames:
+            self._last = self._last or 0
             return pd.DataFrame(columns=self._columns.stored)
         table = pd.concat(frames, ignore_index=True)
-        newest = table.sort_values("stored_at", kind="stable", na_position="first").drop_duplicates("key", keep="last")
-        return newest.sort_index().reset_index(drop=True)
+        others = sorted(set(table["study"]) - {"", self._study}) if self._study else []
+        if others:
+            raise UserError(
+                f"'{self.directory}' holds rows of study {', '.join(map(printable, others))}, and this is study {self._study}: "
+                "choose another folder with name=..."
+            )
+        count = table["sequence"].where(table["sequence"].between(0, LARGEST), 0.0)
+        self._last = max(self._last or 0, int(count.max()))
+        # rows of older versions have no count: among them the clock decides, and any counted row is newer
+        place = table.assign(sequence=count)[["sequence", "stored_at"]]
+        newest = place.sort_values(["sequence", "stored_at"], kind="stable", na_position="first").index
+        table = table.loc[newest].drop_duplicates("key", keep="last")
+        return table.sort_index().reset_index(drop=True)
 
     # ------------------------------------------------------------------------------------------- writing
 
@@ -150,10 +173,8 @@ class Store:
 
     def _tidy(self) -> None:
         """Remove half-written files of killed runs, and the directory of small files when it is empty."""
+        tidy(self._pending)
         with suppress(OSError):
-            for path in self._pending.glob(".*"):
-                if time.time() - path.stat().st_mtime > STALE_S:
-                    path.unlink()
             self._pending.rmdir()
 
 
@@ -179,7 +200,29 @@ def _mark(path: Path) -> tuple[int, int]:
     return status.st_ino, status.st_mtime_ns
 
 
-def _frames(paths: Iterable[Path]) -> Iterator[pd.DataFrame]:
+def _typed(columns: Columns, frame: pd.DataFrame, path: Path) -> pd.DataFrame:
+    """Return the frame with its columns typed; raises :class:`StorageError` where it is no table of rows.
+
+    A number that cannot be read would become a missing one, and be written back as that.
+    """
+    if "key" not in frame or not frame["key"].map(lambda key: isinstance(key, str) and bool(key)).all():
+        raise StorageError(f"'{path}' has no keys, so its rows belong to no cell; move it away to start afresh")
+    if not frame.columns.is_unique:
+        raise StorageError(f"'{path}' has two columns of one name; move it away to start afresh")
+    typed = columns.typed(frame)
+    for name in columns.named("number"):
+        numeric = name in frame and frame[name].dtype.kind in "fiub"
+        if (
+            name in frame
+            and not numeric
+            and typed[name].isna().sum() > (frame[name].isna() | (frame[name].astype(str) == "")).sum()
+        ):
+            raise StorageError(f"'{path}' has values in its column '{name}' that are no numbers; move it away")
+    return typed
+
+
+def _frames(paths: Iterable[Path]) -> Iterator[tuple[Path, pd.DataFrame]]:
+    """Yield each table with its path; the rows of small files come last, as one table."""
     import pandas as pd
 
     rows: list[dict[str, Any]] = []
@@ -187,15 +230,24 @@ def _frames(paths: Iterable[Path]) -> Iterator[pd.DataFrame]:
         try:
             if path.suffix == ".parquet":
                 # opened once: a path is opened for the schema and again for the pages, and may be replaced in between
-                yield pd.read_parquet(io.BytesIO(path.read_bytes()))
+                yield path, pd.read_parquet(io.BytesIO(path.read_bytes()))
             else:
                 read = json.loads(path.read_text())
-                rows.extend(read if isinstance(read, list) else [read])
+                rows.extend(_rows(read if isinstance(read, list) else [read]))
+                small = path
         except FileNotFoundError:
             raise
         except Exception as error:
-            said = " ".join(str(error).split())
-            what = "Parquet" if path.suffix == ".parquet" else "JSON"
+            said = printable(error)[:300]
+            what = "Parquet" if path.suffix == ".parquet" else "JSON rows"
             raise StorageError(f"'{path}' cannot be read as {what} ({said}); move it away to start afresh") from None
     if rows:
-        yield pd.DataFrame(rows)
+        yield small, pd.DataFrame(rows)
+
+
+def _rows(read: list[Any]) -> list[dict[str, Any]]:
+    """Return what a small file holds; raises ValueError where that is not rows, each with its key."""
+    for row in read:
+        if not isinstance(row, dict) or not isinstance(row.get("key"), str) or not row["key"]:
+            raise ValueError("a row is an object with a key")
+    return read

@@ -1,36 +1,36 @@
 """Runs work in processes that can be killed: one item at a time, with limits on its time and memory.
 
-A worker is a spawned process in a session of its own. It builds a handler once, then handles items as they come, so
-that imports and compilations are paid once. It answers in JSON, and what it prints comes back through a pipe: nothing
-that a worker sends is executed here. (Pools of the standard library lose all their items when one worker dies.)
+A worker is a process in a session of its own. It builds a handler once, then handles items as they come, so that imports
+and compilations are paid once. It answers in JSON, and what it prints comes back through a pipe: nothing that a worker
+sends is executed here. (Pools of the standard library lose all their items when one worker dies.)
 """
 
 from __future__ import annotations
 
-import faulthandler
 import json
-import multiprocessing
 import os
 import pickle
+import secrets
+import select
 import signal
-import sys
-import threading
+import socket
+import subprocess
 import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
-from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import psutil
 
 from bench.errors import StorageError, UserError, failure
-from bench.model import registry
+from bench.sweep import worker as process
+from bench.sweep.channel import BOUND, TOKEN, Broken, Channel
+from bench.sweep.guardian import MARK, Guardian, kill_marked
+from bench.sweep.worker import READY, Handler
 
 TICK = 0.05
 """Seconds between looks at the time and memory that items take."""
@@ -44,10 +44,10 @@ START_S = 60.0
 """Seconds granted to a worker for starting, and for importing what an item needs, beyond the item's own time."""
 TAIL = 16000
 """Bytes of a worker's output that are kept."""
-READY = b"ready"
-"""The message of a worker that can take items."""
-MARK = "BENCH_WORKER"
-"""Environment variable that marks all processes started by a worker, wherever they have gone."""
+GONE_S = 5.0
+"""Seconds granted to a process for ending once it has closed its connection."""
+STARTS = 3
+"""Workers in a row that may be killed while they start; more is no accident."""
 SINGLE = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -55,16 +55,6 @@ SINGLE = {
     "NPROC": "1",
 }
 """Settings that keep numerical libraries to one thread, if set before these are imported."""
-
-
-class Handler(Protocol):
-    """Handles items in a worker."""
-
-    def prepare(self, item: Any) -> None:
-        """Import what the item needs; the time is not counted as the item's."""
-
-    def __call__(self, item: Any) -> dict[str, Any]:
-        """Return the item's result, to be sent as JSON."""
 
 
 @dataclass(frozen=True)
@@ -89,104 +79,16 @@ class Answer:
     """The last lines printed while the item was handled."""
 
 
-# ------------------------------------------------------------------------------------------------ in a worker
-
-
-def _serve(
-    connection: Connection, output: Connection, make: Callable[[Any], Handler], argument: bytes, folders: Sequence[Path]
-) -> None:
-    """Answer items until there are none; ``argument`` is pickled, as its classes may come from plugin ``folders``."""
-    # a process group of its own, so that all it starts can be killed with it
-    os.setsid()
-    # Ctrl-C reaches the parent, which ends its workers
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.dup2(output.fileno(), 1)
-    os.dup2(output.fileno(), 2)
-    faulthandler.enable(all_threads=False)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    for folder in folders:
-        registry.add_folder(folder)
-    own, handle = os.getpid(), make(pickle.loads(argument))
-    connection.send_bytes(READY)
-    while True:
-        try:
-            message = connection.recv_bytes()
-        except EOFError:
-            return
-        answer = _answered(connection, handle, message)
-        if os.getpid() != own:
-            os._exit(0)  # a child that a plugin forked, which must not answer for its parent
-        _end_children()
-        with suppress(Exception):
-            sys.stdout.flush()
-        connection.send_bytes(answer)
-
-
-def _answered(connection: Connection, handle: Handler, message: bytes) -> bytes:
-    own, started = os.getpid(), time.perf_counter()
-    try:
-        item = pickle.loads(message)
-        handle.prepare(item)
-        # an empty message: the imports are done and the item's own time begins
-        connection.send_bytes(b"")
-        started = time.perf_counter()
-        text = json.dumps({"result": handle(item), "seconds": time.perf_counter() - started})
-    except StorageError as error:
-        text = json.dumps({"storage": str(error)})
-    except BaseException as error:
-        if os.getpid() != own:
-            os._exit(0)
-        text = json.dumps({"result": failure(error), "seconds": time.perf_counter() - started})
-    return text.encode()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    _kill(_marked(os.environ[MARK]))
-    os.killpg(0, signal.SIGKILL)
-
-
-def _end_children() -> None:
-    """Kill the processes that a plugin has started and left running."""
-    try:
-        # raises without children, which spares the search through all processes
-        os.waitpid(-1, os.WNOHANG)
-    except ChildProcessError:
-        return
-    children = psutil.Process().children(recursive=True)
-    _kill(children)
-    for child in children:
-        with suppress(ChildProcessError):
-            os.waitpid(child.pid, 0)
-
-
-def _marked(mark: str) -> list[psutil.Process]:
-    """Return the other processes that have this mark in their environment."""
-    processes = []
-    for process in psutil.process_iter():
-        with suppress(psutil.Error):
-            if process.pid != os.getpid() and process.environ().get(MARK) == mark:
-                processes.append(process)
-    return processes
-
-
-def _kill(processes: Sequence[psutil.Process]) -> None:
-    for process in processes:
-        with suppress(psutil.Error):
-            process.kill()
-
-
 # ------------------------------------------------------------------------------------------------ the pool
 
 
 @dataclass(eq=False)
 class _Worker:
-    process: BaseProcess
-    connection: Connection
-    output: Connection
-    memory: psutil.Process
+    process: subprocess.Popen[bytes]
+    channel: Channel
+    output: int
+    """Descriptor of what it prints."""
+    facts: psutil.Process
     mark: str
     group: deque[Any] = field(default_factory=deque)
     """Items it will get next."""
@@ -200,16 +102,22 @@ class _Worker:
     pace: float = 1.0
     """Seconds the last item took."""
     tail: bytes = b""
+    handled: int = 0
+    """Items it has answered."""
+    broken: str = ""
+    """Why nothing more is expected of it."""
 
     @property
     def room(self) -> int:
         """How many more items it should get."""
+        if self.given and self.channel.waiting > BOUND:
+            return 0
         return 1 + min(AHEAD, int(AHEAD_S / max(self.pace, 1e-6))) - len(self.given)
 
     def listen(self) -> None:
         """Keep the end of the printed output."""
         with suppress(OSError):
-            while chunk := os.read(self.output.fileno(), 1 << 16):
+            while chunk := os.read(self.output, 1 << 16):
                 self.tail = (self.tail + chunk)[-TAIL:]
                 if len(chunk) < 1 << 16:
                     return
@@ -243,14 +151,23 @@ class Pool:
         self._argument, self._folders = pickle.dumps(argument), tuple(folders)
         self._workers: list[_Worker] = []
         self._unsent: list[Answer] = []
-        self._context = multiprocessing.get_context("spawn")
+        self._again: deque[deque[Any]] = deque()
+        self._crashed: set[int] = set()
+        self._unready = 0
+        self._mark = uuid.uuid4().hex
+        self._guardian: Guardian | None = None
 
     def __enter__(self) -> Pool:
         return self
 
     def __exit__(self, *_: object) -> None:
         while self._workers:
-            _end(self._workers.pop())
+            worker = self._workers.pop()
+            _end(worker)
+            _close(worker)
+        if self._guardian is not None:
+            self._guardian.dismiss()
+            self._guardian = None
 
     def run(self, groups: Sequence[Sequence[Any]]) -> Iterator[list[Answer]]:
         """Yield answers as they come, each item once, and an empty list now and then.
@@ -263,7 +180,7 @@ class Pool:
             busy = [worker for worker in self._workers if worker.given]
             if not busy and not self._unsent:
                 return
-            wait([end for worker in busy for end in (worker.connection, worker.output)], 0 if self._unsent else TICK)
+            _wait(busy, 0 if self._unsent else TICK)
             answers, self._unsent = self._unsent, []
             yield answers + [answer for worker in busy for answer in self._look_after(worker, waiting)]
 
@@ -277,10 +194,12 @@ class Pool:
         for worker in self._workers:
             if not worker.group and not worker.given:
                 worker.group = waiting.popleft() if waiting else self._half()
-        while waiting and len(self._workers) < self._count:
-            worker = self._start()
-            worker.group = waiting.popleft()
-            self._workers.append(worker)
+        # what a worker died of may be what it did before: the item at work then gets a worker of its own
+        for groups in (self._again, waiting):
+            while groups and len(self._workers) < self._count:
+                worker = self._start()
+                worker.group = groups.popleft()
+                self._workers.append(worker)
         for worker in self._workers:
             while worker.group and worker.room > 0:
                 self._give(worker)
@@ -304,39 +223,51 @@ class Pool:
         if not worker.given:
             worker.since, worker.begun = time.monotonic(), False
         worker.given.append(item)
-        with suppress(OSError):  # _look_after finds a worker that has died
-            worker.connection.send_bytes(message)
+        with suppress(Broken):  # _look_after finds a worker that has died
+            worker.channel.send(message)
 
     def _start(self) -> _Worker:
-        connection, theirs = self._context.Pipe()
-        output, printed = self._context.Pipe(duplex=False)
+        if self._guardian is None:
+            self._guardian = Guardian(self._mark)
+        ours, theirs = socket.socketpair()
+        output, printed = os.pipe()
         # listen() reads what there is and never waits
-        os.set_blocking(output.fileno(), False)
-        process = self._context.Process(
-            target=_serve, args=(theirs, printed, self._make, self._argument, self._folders)
-        )
-        resource_tracker.ensure_running()  # otherwise it would start with the worker's mark and be killed with it
-        mark = uuid.uuid4().hex
-        with _environment({MARK: mark} | (SINGLE if self._single else {})):
-            process.start()
-        # a pipe reports its end only when every copy of the other side is closed, this one too
+        os.set_blocking(output, False)
+        token, mark = secrets.token_bytes(TOKEN), f"{self._mark}-{uuid.uuid4().hex}"
+        started = subprocess.Popen(
+            process.command(theirs.fileno(), token), pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
+            stdout=printed, stderr=printed, start_new_session=True,
+            env=os.environ | {MARK: mark} | (SINGLE if self._single else {}),
+        )  # fmt: skip
+        # a socket reports its end only when every copy of the other side is closed, this one too
         theirs.close()
-        printed.close()
-        return _Worker(process, connection, output, psutil.Process(process.pid), mark)
+        os.close(printed)
+        worker = _Worker(started, Channel(ours, token), output, psutil.Process(started.pid), mark)
+        with suppress(Broken):
+            worker.channel.send(process.first(self._make, self._argument, self._folders))
+        return worker
 
     def _look_after(self, worker: _Worker, waiting: deque[deque[Any]]) -> list[Answer]:
         answers = _received(worker)
         verdict = self._verdict(worker)
         if verdict is None:
             return answers
+        by_signal = verdict[0] == "stopped" or (worker.process.returncode or 0) < 0
         _end(worker)
         answers += _received(worker)  # answers sent before it died still count
+        _close(worker)
         self._workers.remove(worker)
-        if not worker.ready:
+        self._unready = 0 if worker.ready else self._unready + 1
+        if not worker.ready and (self._unready == STARTS or not by_signal):
             raise UserError(f"a worker cannot start: {verdict[1]}; last output: {worker.take_output() or 'none'}")
-        if worker.given:
+        if worker.given and worker.ready:
             guilty, seconds = worker.given.popleft(), time.monotonic() - worker.since
-            result = {"status": verdict[0], "reason": verdict[1]}
+            if self._once_more(worker, guilty, verdict[0]):
+                self._again.append(deque([guilty, *worker.given, *worker.group]))
+                return answers
+            twice = ", in two workers" if id(guilty) in self._crashed else ""
+            status = "timeout" if verdict[0] == "timeout" else "crashed"
+            result = {"status": status, "reason": verdict[1] + twice}
             answers.append(Answer(guilty, result, seconds, worker.take_output()))
         # the items behind the guilty one did nothing wrong
         left = deque([*worker.given, *worker.group])
@@ -344,20 +275,37 @@ class Pool:
             waiting.appendleft(left)
         return answers
 
+    def _once_more(self, worker: _Worker, item: Any, status: str) -> bool:
+        """Return whether an item should have another worker before it is blamed.
+
+        What the worker did before may have killed it, or someone from outside; too much memory may be that of items
+        before.
+        """
+        if id(item) in self._crashed or status == "timeout" or (status == "memory" and not worker.handled):
+            return False
+        self._crashed.add(id(item))
+        return True
+
     def _verdict(self, worker: _Worker) -> tuple[str, str] | None:
-        """Return status and reason if a worker has to be given up, or None."""
-        code = worker.process.exitcode
+        """Return what ended a worker (``crashed``, ``stopped``, ``timeout``, ``memory``) and the reason, or None."""
+        code = worker.process.poll()
+        if code is None and worker.broken:
+            with suppress(subprocess.TimeoutExpired):
+                code = worker.process.wait(0 if "descriptors" in worker.broken else GONE_S)
         if code is not None:
             return "crashed", died(code)
+        if worker.broken:
+            return "crashed", worker.broken
         if not worker.given:
             return None
         timeout, memory = self._limits.timeout, self._limits.memory
         if timeout is not None and time.monotonic() - worker.since > timeout + (0 if worker.begun else START_S):
             return "timeout", f"no result within {timeout:g} s"
-        if memory is not None:
-            with suppress(psutil.Error):
-                if worker.memory.memory_info().rss > memory:
-                    return "crashed", f"stopped for using more than {memory / 2**30:.3g} GiB of memory"
+        with suppress(psutil.Error):
+            if memory is not None and worker.facts.memory_info().rss > memory:
+                return "memory", f"stopped for using more than {memory / 2**30:.3g} GiB of memory"
+            if worker.facts.status() == psutil.STATUS_STOPPED:
+                return "stopped", "stopped by a signal"
         return None
 
 
@@ -369,48 +317,65 @@ def died(code: int) -> str:
     return f"killed by {name}" + (" (out of memory?)" if name == "SIGKILL" else "")
 
 
+def _wait(workers: Sequence[_Worker], seconds: float) -> None:
+    """Wait until a worker sends or prints something, or can take more of what waits for it."""
+    poll = select.poll()
+    for worker in workers:
+        poll.register(worker.channel, select.POLLIN | (select.POLLOUT if worker.channel.waiting else 0))
+        poll.register(worker.output, select.POLLIN)
+    poll.poll(1000 * seconds)
+    for worker in workers:
+        with suppress(Broken):
+            worker.channel.flush()
+        worker.listen()
+
+
 def _received(worker: _Worker) -> list[Answer]:
     answers: list[Answer] = []
-    with suppress(EOFError, OSError):
-        while worker.given and worker.connection.poll():
-            message = worker.connection.recv_bytes()
-            if message == READY:
-                worker.ready = True
-                continue
-            if not message:
-                worker.since, worker.begun = time.monotonic(), True
-                continue
-            content = json.loads(message)
-            if "storage" in content:
-                raise StorageError(content["storage"])
-            worker.listen()
-            worker.pace, item = content["seconds"], worker.given.popleft()
-            answers.append(Answer(item, content["result"], worker.pace, worker.take_output()))
-            worker.since, worker.begun = time.monotonic(), False
+    while not worker.broken and worker.given:
+        try:
+            messages = worker.channel.receive()
+        except Broken as error:
+            worker.broken = str(error)
+            break
+        if not messages:
+            break
+        for message in messages:
+            answers += _answer(worker, message)
     worker.listen()
     return answers
 
 
+def _answer(worker: _Worker, message: bytes) -> list[Answer]:
+    if message == READY:
+        worker.ready = True
+        return []
+    if not message:
+        worker.since, worker.begun = time.monotonic(), True
+        return []
+    content = json.loads(message)
+    if "storage" in content:
+        raise StorageError(content["storage"])
+    worker.listen()
+    worker.pace, item = content["seconds"], worker.given.popleft()
+    answer = Answer(item, content["result"], worker.pace, worker.take_output())
+    worker.since, worker.begun = time.monotonic(), False
+    worker.handled += 1
+    return [answer]
+
+
 def _end(worker: _Worker) -> None:
     """Kill a worker and everything it has started."""
-    with suppress(ProcessLookupError):
-        os.killpg(worker.memory.pid, signal.SIGKILL)
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(worker.process.pid, signal.SIGKILL)
     worker.process.kill()
-    worker.process.join()
-    _kill(_marked(worker.mark))
+    worker.process.wait()
+    kill_marked(worker.mark)
     worker.listen()
 
 
-@contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Set environment variables for processes started meanwhile."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def _close(worker: _Worker) -> None:
+    """Close the descriptors of a worker that has ended."""
+    worker.channel.close()
+    with suppress(OSError):
+        os.close(worker.output)

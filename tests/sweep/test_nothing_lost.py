@@ -1,0 +1,290 @@
+"""Rows that must not be lost, changed or blamed: studies under one name, wrong clocks, full pipes, late deaths."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import pandas as pd
+import psutil
+import pytest
+
+from bench.cli import main
+from bench.errors import StorageError, UserError
+from bench.studies.bias_variance.columns import COLUMNS
+from bench.sweep import files
+from bench.sweep.channel import Broken, Channel
+from bench.sweep.files import TEMPORARY, temporary, tidy
+from bench.sweep.store import Store
+from bench.sweep.workers import Limits, Pool
+
+TINY = ["scenes=[heaviside]", "backends=[numpy]", "samples=8", "repeats=4", "timing=false", "workers=0", "--quiet"]
+FOBG = [*TINY, "estimators=[fobg]"]
+
+
+def row(key="a", **values) -> dict:
+    return COLUMNS.blank() | {"key": key, "status": "ok", "study": "bias_variance", **values}
+
+
+# ---------------------------------------------------------------------------------------------------- one directory
+
+
+@pytest.mark.parametrize("verb", ["run", "plan", "report"])
+def test_a_directory_of_another_study_is_refused_and_left_alone(tmp_path, capsys, verb):
+    store = Store(tmp_path / "custom", COLUMNS)
+    store.prepare()
+    store.append(row(study="growth", rate_max=2.0))
+    held = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert main([verb, *FOBG, f"results_dir={tmp_path}"]) == 2
+    said = capsys.readouterr().err
+    assert "holds rows of study growth, and this is study bias_variance" in said
+    assert "name=" in said
+    assert held == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+def test_a_file_without_keys_is_unreadable_and_never_overwritten(tmp_path):
+    table = tmp_path / "rows.parquet"
+    pd.DataFrame([{"bias": 1.0}]).to_parquet(table)
+    before, store = table.read_bytes(), Store(tmp_path, COLUMNS)
+    for act in (store.load, store.compact, lambda: store.append(row())):
+        with pytest.raises(StorageError, match="has no keys"):
+            act()
+    assert table.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [[1], ["a"], {"a": 1}, [{"key": None}], [{"key": ""}], 7, None])
+def test_a_small_file_that_holds_no_rows_is_unreadable(tmp_path, content):
+    path = tmp_path / "pending" / "x.json"
+    path.parent.mkdir()
+    path.write_text(json.dumps(content))
+    with pytest.raises(StorageError, match="cannot be read as JSON rows"):
+        Store(tmp_path, COLUMNS).compact()
+    assert json.loads(path.read_text()) == content
+
+
+def test_a_number_that_is_none_does_not_turn_into_a_missing_one(tmp_path):
+    pd.DataFrame([row() | {"bias": "large"}]).to_parquet(tmp_path / "rows.parquet")
+    with pytest.raises(StorageError, match="'bias' that are no numbers"):
+        Store(tmp_path, COLUMNS).compact()
+
+
+def test_a_row_dated_in_the_future_is_replaced_by_the_next_one(tmp_path, monkeypatch):
+    store = Store(tmp_path, COLUMNS)
+    monkeypatch.setattr("bench.sweep.store.time.time", lambda: 4e9)
+    store.append(row(bias=1.0))
+    monkeypatch.undo()
+    Store(tmp_path, COLUMNS).append(row(bias=2.0))
+    assert list(Store(tmp_path, COLUMNS).load()["bias"]) == [2.0]
+    Store(tmp_path, COLUMNS).compact()
+    Store(tmp_path, COLUMNS).append(row(bias=3.0))
+    assert list(Store(tmp_path, COLUMNS).load()["bias"]) == [3.0]
+
+
+@pytest.mark.parametrize("count", [float("inf"), 1e300, -5.0, float("nan")])
+def test_a_count_that_no_run_has_written_wins_nothing(tmp_path, count):
+    (tmp_path / "pending").mkdir()
+    (tmp_path / "pending" / "x.json").write_text(json.dumps([row(bias=1.0, sequence=count, stored_at=4e9)]))
+    Store(tmp_path, COLUMNS).append(row(bias=2.0))
+    assert list(Store(tmp_path, COLUMNS).load()["bias"]) == [2.0]
+
+
+# ------------------------------------------------------------------------------------------------------------- files
+
+
+def test_half_written_files_of_dead_processes_go_and_those_of_living_ones_stay(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    mine, other = temporary(tmp_path / "a.png"), tmp_path / ".mine"
+    dead = mine.with_name(mine.name.replace(f"-{os.getpid()}-", f"-{gone.pid}-"))
+    far = mine.with_name(mine.name.replace("-bench-", "-bench-").replace(files._machine(), "0" * 8))
+    for path in (mine, dead, far, other):
+        assert path is other or TEMPORARY.fullmatch(path.name)
+        path.write_text("")
+    tidy(tmp_path)
+    assert set(tmp_path.iterdir()) == {mine, far, other}
+    os.utime(far, (0, 0))
+    tidy(tmp_path)
+    assert set(tmp_path.iterdir()) == {mine, other}
+
+
+def test_a_run_tidies_every_folder_that_it_writes_to(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    for place in ("custom", "custom/pending", "references"):
+        (tmp_path / place).mkdir(parents=True, exist_ok=True)
+        left = temporary(tmp_path / place / "x")
+        left.with_name(left.name.replace(f"-{os.getpid()}-", f"-{gone.pid}-")).write_text("half")
+    assert main([*FOBG, f"results_dir={tmp_path}"]) == 0
+    assert not [path for path in tmp_path.rglob(".*")]
+
+
+def test_the_disk_is_told_to_empty_its_cache_where_fsync_does_not(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(files.fcntl, "F_FULLFSYNC", 51, raising=False)
+    monkeypatch.setattr(files.fcntl, "fcntl", lambda descriptor, what: asked.append(what))
+    files.write_whole(tmp_path / "x", b"1")
+    assert asked == [51, 51]  # the file and its folder
+
+
+# ----------------------------------------------------------------------------------------------------------- workers
+
+
+class Handler:
+    """Does what an item says, in the worker."""
+
+    def __init__(self, argument):
+        pass
+
+    def prepare(self, item):
+        pass
+
+    def __call__(self, item):
+        what = item[0]
+        if what == "dies late":
+            import threading
+
+            threading.Timer(0.15, os._exit, [3]).start()
+        elif what == "dies":
+            os._exit(4)
+        elif what == "hangs":
+            time.sleep(1000)
+        elif what == "writes":
+            for descriptor in range(3, 30):
+                try:
+                    os.write(descriptor, b"garbage" * 10)
+                except OSError:
+                    continue
+        elif what == "slow":
+            time.sleep(0.4)
+        return {"status": "ok"}
+
+
+def answers(items, limits=None, **more):
+    with Pool(1, Handler, None, limits or Limits(), folders=(), **more) as pool:
+        found = [answer for some in pool.run([items]) for answer in some]
+    return {str(answer.item[0]): answer.result for answer in found}, found
+
+
+def test_a_late_death_is_not_blamed_on_the_next_cell():
+    results, found = answers([("dies late",), ("slow",), ("sound",)])
+    assert len(found) == 3
+    assert {result["status"] for result in results.values()} == {"ok"}
+
+
+def test_a_cell_that_dies_twice_is_blamed_and_its_neighbours_are_not():
+    results, _ = answers([("sound",), ("dies",), ("other",)])
+    assert results["dies"]["status"] == "crashed"
+    assert "exit status 4, in two workers" in results["dies"]["reason"]
+    assert results["sound"]["status"] == results["other"]["status"] == "ok"
+
+
+def test_large_items_behind_a_hanging_one_do_not_hold_up_the_clock():
+    big = "x" * 600_000
+    started = time.monotonic()
+    results, found = answers([("sound", big), ("hangs", big), *((f"more{i}", big) for i in range(6))], Limits(1.0))
+    assert time.monotonic() - started < 30
+    assert results["hangs"]["status"] == "timeout"
+    assert len(found) == 8
+
+
+def test_a_plugin_that_writes_into_descriptors_costs_its_own_cell():
+    results, _ = answers([("sound",), ("writes",), ("other",)])
+    assert results["writes"]["status"] == "crashed"
+    assert "wrote into the descriptors" in results["writes"]["reason"]
+    assert results["sound"]["status"] == results["other"]["status"] == "ok"
+
+
+@pytest.mark.parametrize("sent", [b"garbage", b"\0" * 40])
+def test_bytes_that_are_no_message_are_noticed(sent):
+    import socket
+
+    one, two = socket.socketpair()
+    with one, two:
+        two.send(sent)
+        with pytest.raises(Broken, match="descriptors"):
+            Channel(one, b"t" * 16).receive()
+
+
+HELD = """
+import ctypes, os, subprocess, sys
+from bench.sweep.workers import Limits, Pool
+
+class Holds:
+    def __init__(self, argument):
+        pass
+    def prepare(self, item):
+        pass
+    def __call__(self, item):
+        subprocess.Popen(["sleep", "600"], start_new_session=True)
+        print("at work", file=open(item, "w"))
+        ctypes.PyDLL(None).sleep(600)  # in C, with the interpreter lock
+        return {"status": "ok"}
+
+if __name__ == "__main__":
+    import held
+    with Pool(1, held.Holds, None, Limits()) as pool:
+        list(pool.run([[sys.argv[1]]]))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="finds processes by /proc")
+def test_workers_that_hold_the_interpreter_lock_end_with_their_run(tmp_path):
+    (tmp_path / "held.py").write_text(HELD)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    run = subprocess.Popen([sys.executable, str(tmp_path / "held.py"), "begun"], cwd=tmp_path, env=environment)
+
+    def left() -> list[psutil.Process]:
+        found = []
+        for process in psutil.process_iter():
+            try:
+                if process.cwd() == str(tmp_path) and process.status() != psutil.STATUS_ZOMBIE:
+                    found.append(process)
+            except psutil.Error:
+                continue
+        return found
+
+    for _ in range(600):
+        if (tmp_path / "begun").exists():
+            break
+        time.sleep(0.05)
+    assert len(left()) >= 4  # the run, its guardian, the worker and what it started
+    run.kill()
+    run.wait()
+    for _ in range(100):  # within 5 s
+        if not left():
+            return
+        time.sleep(0.05)
+    assert not left()
+
+
+def test_workers_that_cannot_be_made_say_why():
+    with Pool(1, _no_handler, None, Limits()) as pool, pytest.raises(UserError, match="no handler today"):
+        list(pool.run([[1]]))
+
+
+def _no_handler(argument):
+    raise RuntimeError("no handler today")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("times", [1, 2])
+def test_signals_stop_a_run_in_peace(tmp_path, sent, times):
+    import signal
+
+    seeds = ",".join(map(str, range(400)))
+    words = [*FOBG[:-1], f"sweep.seed=[{seeds}]", "samples=20000", f"results_dir={tmp_path}"]
+    run = subprocess.Popen([sys.executable, "-m", "bench", *words], stderr=subprocess.PIPE, text=True)
+    for _ in range(600):
+        if list(tmp_path.glob("custom/pending/*.json")):
+            break
+        time.sleep(0.05)
+    for _ in range(times):
+        run.send_signal(getattr(signal, sent))
+        time.sleep(0.005)
+    said = run.communicate(timeout=30)[1]
+    assert run.returncode in ((130,) if times == 1 else (130, -getattr(signal, sent)))
+    assert "Traceback" not in said
+    assert "KeyboardInterrupt" not in said
+    assert not Store(tmp_path / "custom", COLUMNS).load().empty
