@@ -41,6 +41,7 @@ from bench.model import (
     compose,
     param,
 )
+from bench.model.backend import CAPABILITIES
 
 GRADIENT = 1e-4
 """Relative error allowed against central differences of step 1e-6, on columns where two steps agree to 2e-5."""
@@ -208,9 +209,8 @@ def single_precision_is_finite(backend: Backend) -> str:
 @verifies(Backend)
 def provides_is_truthful(backend: Backend) -> str:
     """Verify that declared capabilities are known and present, and that equations are refused without ``root``."""
-    capabilities = {"value", "grad", "score", "root", "physics"}
-    strange = sorted(set(backend.provides) - capabilities)
-    require(not strange, f"{', '.join(strange)} are none of {', '.join(sorted(capabilities))}")
+    strange = sorted(set(backend.provides) - CAPABILITIES)
+    require(not strange, f"{', '.join(strange)} are none of {', '.join(sorted(CAPABILITIES))}")
     require("value" in backend.provides, "gives no costs")
     for program in programs_for(backend, telling):
         problem, (theta, w) = backend.compile(program), samples(program)

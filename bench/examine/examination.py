@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from bench.errors import UserError
-from bench.examine.clock import Clock, OutOfTime, seconds
-from bench.examine.layout import Layout
 from bench.examine.lines import HALVINGS, PLACES, POINTS, Line, scan
 from bench.examine.report import Report
-from bench.examine.simulator import Simulator
 from bench.examine.smoothing import PAIRS, Smoothed, directions, smoothed
 from bench.measure.gradcheck import EPS, Check, Options, check
+from bench.simulator.clock import Clock, OutOfTime, seconds
+from bench.simulator.columns import Simulator
+from bench.simulator.layout import Layout
 
 MADE = re.compile(r"_[0-9a-f]{8}$")
 """What a module's name gets when it is loaded from a file."""

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.examine.clock import Clock, OutOfTime
-from bench.examine.simulator import Simulator
+from bench.simulator.clock import Clock, OutOfTime
+from bench.simulator.columns import Simulator
 
 PAIRS = 4096
 """Pairs of costs for one sigma, where the time allows."""

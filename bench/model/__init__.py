@@ -10,7 +10,11 @@ so never branch on it in Python; every other type is static.
 """
 
 from bench.errors import Unsupported
+from bench.model import loaded
+from bench.model.adjoint import Slopes, slopes
+from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
+from bench.model.callables import CallableScene
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
 from bench.model.estimator import (
@@ -24,13 +28,22 @@ from bench.model.estimator import (
     zeroth_order,
 )
 from bench.model.integrator import Integrator
-from bench.model.known import KnownOptimum, KnownValue
+from bench.model.known import Identified, KnownOptimum, KnownValue
 from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
-from bench.model.program import SURROGATE, Decision, FunctionProgram, Program, Rollout, compose, rollout
+from bench.model.program import (
+    SURROGATE,
+    CallableProgram,
+    Decision,
+    FunctionProgram,
+    Program,
+    Rollout,
+    compose,
+    rollout,
+)
 from bench.model.scene import (
     ContactScene,
     DampedScene,
@@ -49,6 +62,8 @@ __all__ = [
     "Array",
     "Auxiliaries",
     "Backend",
+    "CallableProgram",
+    "CallableScene",
     "Compilations",
     "Contact",
     "ContactLaw",
@@ -64,6 +79,7 @@ __all__ = [
     "FrictionScene",
     "FunctionProgram",
     "FunctionScene",
+    "Identified",
     "ImpulseLaw",
     "Integrator",
     "Jacobians",
@@ -82,17 +98,21 @@ __all__ = [
     "Rollout",
     "SampleMean",
     "Scene",
+    "Slopes",
     "State",
     "Trajectory",
     "Unsupported",
     "Usage",
+    "adjoint_gradient",
     "columns",
     "compose",
     "first_order",
     "halves",
+    "loaded",
     "param",
     "per_repeat",
     "rollout",
+    "slopes",
     "stopped",
     "zeroth_order",
 ]

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.model import Array, KnownOptimum, KnownValue, MechanicalScene, State, param
+from bench.model import Array, ContactLaw, KnownOptimum, KnownValue, MechanicalScene, Plugin, State, param
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,10 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
         """Return the weighted squares of the end state."""
         return self.end_position * q[0] ** 2 + self.end_speed * v[0] ** 2
 
-    def optimum(self) -> tuple[float, str]:
-        """Return x0'P x0."""
+    def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
+        """Return x0'P x0, for semi-implicit Euler."""
+        if integrator is None or integrator.name != "semi_implicit_euler":
+            return None
         return float(self.start**2 * _values(self)[0][0, 0]), "Riccati recursion"
 
     def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, KnownOptimum, KnownValue, MechanicalScene, State, param
+from bench.model import Array, ContactLaw, KnownOptimum, KnownValue, MechanicalScene, Plugin, State, param
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
         """Return the weighted square of the end state."""
         return self.end * xp.sum(v * v, axis=0)
 
-    def optimum(self) -> tuple[float, str]:
+    def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
         """Return the least cost of a gain k per copy, the minimum of a polynomial of k."""
         cost = self.cost_of(np.linspace(-2.0, 0.0, 201))
         low, high = np.linspace(-2.0, 0.0, 201)[[max(int(cost.argmin()) - 1, 0), min(int(cost.argmin()) + 1, 200)]]

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.model import Array, ContactScene, KnownOptimum, State, param
+from bench.model import Array, ContactLaw, ContactScene, ImpulseLaw, KnownOptimum, Plugin, State, param
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,10 @@ class TwoBalls(KnownOptimum, ContactScene):
         """Return the squared distance of the second ball from the goal."""
         return q[2] ** 2 + q[3] ** 2
 
-    def optimum(self) -> tuple[float, str]:
-        """Return the least f(s, v) over impact times s; that of doing nothing where no blow is worth it."""
+    def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
+        """Return the least f(s, v) over impact times s, for rigid laws; that of doing nothing where no blow is worth it."""
+        if not isinstance(contact, ImpulseLaw) or self.restitution != 1.0:
+            return None
         end, gap, eps = self.horizon * self.dt, 1.0 - math.sqrt(2.0) * self.radius, self.effort
         s = np.linspace(1e-3, 1.0 - 1e-9, 100_001) * end
         for _ in range(6):

@@ -11,10 +11,10 @@ import pytest
 import bench
 from bench import cli
 from bench.errors import UserError
-from bench.examine.clock import seconds
-from bench.examine.layout import Layout
 from bench.examine.lines import scan
 from bench.examine.smoothing import Smoothed
+from bench.simulator.clock import seconds
+from bench.simulator.layout import Layout
 
 QUICK = {"progress": False, "budget": 20}
 

@@ -4,6 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from bench.plugins.contacts.impulse import Impulse
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.integrators.explicit_euler import ExplicitEuler
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.lqr import Lqr
 from bench.plugins.scenes.static_gain import StaticGain
 from bench.plugins.scenes.two_balls import TwoBalls
@@ -47,13 +51,13 @@ def test_checked_optima_of_the_regulator(kind, least):
 
 
 def test_regulator_knows_its_optimum_and_value():
-    least, _ = Lqr().optimum()
+    least, _ = Lqr().optimum(None, SemiImplicitEuler())
     assert least == pytest.approx(lqr_by_hand("semi_implicit"), rel=1e-12)
     problem = bench.problem("lqr[horizon=12]", backend="numpy")
     scene = problem.program.scene
     found = solve(problem)
     assert found.certified
-    assert found.cost == pytest.approx(scene.optimum()[0], rel=CHECKED)
+    assert found.cost == pytest.approx(scene.optimum(None, SemiImplicitEuler())[0], rel=CHECKED)
     path = problem.trajectory(found.theta, np.zeros((12, 1))).states[:, :, 0]
     # what is left to pay on the optimal path is the value of the state reached
     for step in (0, 5, 12):
@@ -71,7 +75,7 @@ def test_scalar_regulator():
     """A = B = Q = 1, R = .1, Q_f = 10, T = 10: J* 1.0916079783, J(0) 20, and 100 copies of it with one constant gain."""
     scene = StaticGain(copies=1)
     assert scene.cost_to_go(np.zeros((1, 1)), np.ones((1, 1)), 0)[0] == pytest.approx(1.0916079783, rel=1e-9)
-    assert StaticGain(copies=100).optimum()[0] == pytest.approx(109.1607978, rel=1e-9)
+    assert StaticGain(copies=100).optimum(None, None)[0] == pytest.approx(109.1607978, rel=1e-9)
     problem = bench.problem("static_gain[copies=3]", backend="numpy")
     costs = problem.value(
         np.stack([np.zeros(9), np.full(9, -0.9160798 / 3), -0.9160798 * np.eye(3).ravel()], axis=1), np.zeros((9, 3))
@@ -80,10 +84,12 @@ def test_scalar_regulator():
 
 
 def test_two_balls():
-    assert TwoBalls().optimum()[0] == pytest.approx(1.39654216, rel=1e-8)
+    assert TwoBalls().optimum(Impulse(), None)[0] == pytest.approx(1.39654216, rel=1e-8)
     problem = bench.problem("two_balls", contact="impulse", backend="numpy")
     assert problem.value(np.zeros(240), np.zeros((240, 1)))[0] == pytest.approx(2.0)
-    assert TwoBalls(effort=10.0).optimum()[0] == 2.0  # no blow is worth it
+    assert TwoBalls(effort=10.0).optimum(Impulse(), None)[0] == 2.0  # no blow is worth it
+    assert TwoBalls().optimum(Penalty(), None) is None
+    assert Lqr().optimum(None, ExplicitEuler()) is None
 
 
 @pytest.mark.parametrize(

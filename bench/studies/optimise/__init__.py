@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -93,7 +94,7 @@ class Optimise(Study):
             source = f"estimator {estimator.name}" if estimator is not None else f"scene {cell.scene.name}"
             return f"optimizer {optimizer.name} needs {' and '.join(lacking)}, which {source} does not give"
         if self.target is not None and isinstance(cell.scene, KnownOptimum) and cell.decision == OWN:
-            least, how = cell.scene.optimum()
+            least, how = cell.scene.optimum(cell.contact, cell.integrator) or (-math.inf, "")
             if self.target < least:
                 return f"target={self.target:g} is below the least cost {least:.10g} of scene {cell.scene.name} ({how})"
         return None

@@ -13,6 +13,9 @@ from bench.studies.optimise.races import Races
 CHANCE = 0.05
 """Chance above which an order may be random."""
 
+FEW_SEEDS = 5
+"""Bootstrap intervals of fewer searches are too narrow: with two, half of the resamples are one search twice."""
+
 
 def sentences(found: Races, default: float) -> list[str]:
     """Return the findings, the answer to the question first."""

@@ -231,7 +231,9 @@ def known_optimum(cell: Cell, problem: Problem, session: Session, settings: Sett
     if settings.scored != "plain":
         return np.nan, "unknown: the objective is smoothed"
     if isinstance(cell.scene, KnownOptimum) and cell.decision == OWN:
-        return cell.scene.optimum()
+        known = cell.scene.optimum(cell.contact, cell.integrator)
+        if known is not None:
+            return known
     if problem.dim > LARGEST or not problem.program.continuous or "grad" not in cell.backend.provides:
         return np.nan, "unknown"
     path = session.experiment.results_dir / "references" / f"optimum_{cell.program_key}.json"
@@ -259,7 +261,7 @@ _classes: dict[str, str] = {}
 def scene_class(cell: Cell, problem: Problem) -> str:
     """Return the class of a problem: what makes its gradients difficult.
 
-    Chaotic is a continuous problem without contact whose gradients vary more than its zeroth-order terms do.
+    Where gradients vary more than zeroth-order terms do, a problem with dynamics is chaotic, a function stiff.
     """
     program = problem.program
     if cell.decision.names:
@@ -274,7 +276,9 @@ def scene_class(cell: Cell, problem: Problem) -> str:
             first = problem.grad(program.theta0, w).var(axis=1).sum()
             cost = problem.value(program.theta0, w) - problem.value(program.theta0, 0.0 * w[:, :1])
             zeroth = (cost * problem.score(program.theta0, w)).var(axis=1).sum()
-        _classes[cell.program_key] = "chaotic" if not first < zeroth else "smooth"
+        _classes[cell.program_key] = (
+            "smooth" if first < zeroth else "chaotic" if isinstance(program, Rollout) else "stiff"
+        )
     return _classes[cell.program_key]
 
 

@@ -1,0 +1,106 @@
+"""Which parameters does a record of the motion tell, how well, and does a fit know it?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from bench.model import Identified, MechanicalScene, Optimizer, param
+from bench.sweep.cell import Cell
+from bench.sweep.columns import Column, Columns, Judged, numbers, text
+from bench.sweep.experiment import Experiment
+from bench.sweep.session import Session
+from bench.sweep.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Identify(Study):
+    """Fits parameters of a scene to noisy records of its motion, and compares the fits with the Cramer-Rao bound."""
+
+    name = "identify"
+    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "optimizer")
+    columns: ClassVar[Columns] = Columns.of(
+        text("optimizer", "identity string of the optimizer"),
+        text("words", "what the record can and cannot tell"),
+        Column("rank", "directions of the parameters that the record sees"),
+        Column("condition", "largest singular value of the information over the smallest that is seen",
+               judged=Judged("exact", "condition number")),
+        Column("fits", "records that were fitted"),
+        Column("step_shift", "largest relative change of an estimate when the model's step is halved, without noise"),
+        text("step_note", "whether the estimate holds for its time step only"),
+        numbers("unknowns", "names of the parameters"),
+        numbers("truth", "their values"),
+        numbers("start", "their values where fits start"),
+        numbers("invariants", "products of powers that the record tells"),
+        numbers("bound", "Cramer-Rao bound of their relative standard deviations"),
+        numbers("fisher", "Fisher information of the logarithms, row by row", table=False),
+        numbers("shooting", "the ways of fitting: single, multiple, windows"),
+        numbers("converged", "by way, share of fits whose residuals are the noise"),
+        numbers("converged_low", "lower end of its 95% interval"),
+        numbers("converged_high", "upper end of its 95% interval"),
+        numbers("error", "by way, root mean square of the errors in units of the bound, of converged fits"),
+        numbers("coverage", "by way, share of 95% intervals that hold the truth, of converged fits"),
+        numbers("coverage_low", "lower end of its 95% interval, records being what is drawn"),
+        numbers("coverage_high", "upper end of its 95% interval"),
+        numbers("hidden", "by way, fits that report more directions than the record sees"),
+        numbers("estimate", "by way and invariant, the median estimate"),
+        numbers("estimate_low", "lower end of the 95% interval of the first fit, by way and invariant"),
+        numbers("estimate_high", "its upper end"),
+    )  # fmt: skip
+
+    measurement: float = param(0.01, "standard deviation of the noise on each measurement", "m", positive=True)
+    start: float = param(1.2, "fits start at this many times the truth, every second one at its inverse", positive=True)
+    windows: int = param(8, "windows of multiple shooting and of windows", low=2)
+    iterations: int = param(40, "steps of the optimizer", positive=True)
+    refine: int = param(1, "the records come from a step this many times shorter", positive=True)
+    data: str | None = param(None, "CSV file with measurements of your own, a line per step; null: made from the truth")
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Fit all records in all ways."""
+        from bench.studies.identify.measure import measure
+
+        return measure(cell, self)
+
+    def refuses(self, cell: Cell) -> str | None:
+        """Refuse scenes without unknowns or steps that NumPy can take, truths that are not positive, data of another length."""
+        from bench.studies.identify.measure import read
+
+        scene, optimizer = cell.scene, cell.parts["optimizer"]
+        assert isinstance(optimizer, Optimizer)
+        if not isinstance(scene, MechanicalScene):
+            return f"scene {scene.name} is a plain function: it has no motion to record"
+        if not cell.decision.names and not isinstance(scene, Identified):
+            return f"scene {scene.name} names no unknowns: name parameters of it, theta=[..]"
+        program = cell.program()
+        if program.needs:
+            return f"{scene.name} with {cell.integrator.name if cell.integrator else 'none'} cannot be stepped in NumPy, where records are fitted"
+        if optimizer.draws(2):
+            return f"optimizer {optimizer.name} samples, and fits are compared along one path: use one that does not"
+        if self.data is not None:
+            try:
+                read(self.data, scene)
+            except (OSError, ValueError) as error:
+                return str(error)
+        return None
+
+    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+        """Write the tables and the chart."""
+        from bench.studies.identify import report
+
+        return report.write(experiment, rows)
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
+        """Print what each record tells, and how the fits did."""
+        from bench.studies.identify import report
+
+        report.show(experiment, rows)
+
+    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
+        """Return the finding, errors and coverage, and the table."""
+        from bench.studies.identify.page import content
+
+        return content(experiment, rows)

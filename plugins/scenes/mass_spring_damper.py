@@ -1,0 +1,59 @@
+"""A mass on a spring and a damper, let go from rest: what its motion can and cannot say about its parameters."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.model import Array, Identified, MechanicalScene, State, param
+
+
+@dataclass(frozen=True)
+class MassSpringDamper(Identified, MechanicalScene):
+    """m x'' = -k x - c x' + ``force`` sin t from rest at ``start``; f = mean of (x - hold)^2 over the steps.
+
+    theta is the position at the start, with parameter noise. Without a force the motion is x = e^(-at) (cos wt + (a/w) sin
+    wt) with a = c / 2m and w^2 = k/m - a^2: it depends on k/m and c/m only, so that no record of it tells m, k and c
+    apart. A known force lifts that.
+    """
+
+    name = "mass_spring_damper"
+    leaves_out = "friction that does not grow with speed, a spring that stiffens"
+    n_q: ClassVar[int] = 1
+    n_u: ClassVar[int] = 1
+    unknowns: ClassVar[tuple[str, ...]] = ("mass", "stiffness", "damping")
+
+    sigma: float = param(0.1, "standard deviation of the noise on theta", "m", positive=True)
+    horizon: int = param(200, "number of time steps", "steps", positive=True)
+    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    mass: float = param(1.0, "m", "kg", positive=True)
+    stiffness: float = param(4.0, "k", "N/m", low=0.0)
+    damping: float = param(0.4, "c", "N s/m", low=0.0)
+    force: float = param(0.0, "amplitude of the force sin t", "N")
+    start: float = param(1.0, "x at the start, at theta", "m")
+    hold: float = param(0.0, "x wanted", "m")
+
+    def theta0(self) -> np.ndarray:
+        """Return the position at the start."""
+        return np.array([self.start])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Start at rest at theta."""
+        return State(theta[:1], 0.0 * theta[:1])
+
+    def planned_controls(self, xp: Any, theta: Array) -> Array:
+        """Return sin t at the middle of each step, whatever theta."""
+        time = self.dt * (xp.astype(xp.arange(self.horizon), theta.dtype)[:, None] + 0.5)
+        return (xp.sin(time) + 0.0 * theta[0])[:, None, :]
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return spring, damper and force over the mass."""
+        return (self.force * u - self.stiffness * q - self.damping * v) / self.mass
+
+    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return the step's share of the mean squared distance."""
+        return (q[0] - self.hold) ** 2 / self.horizon
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return nothing."""
+        return 0.0 * q[0]

@@ -1,0 +1,196 @@
+"""Fits of parameters: what a record tells in closed form, the Cramer-Rao bound, coverage, basins and time steps."""
+
+import math
+
+import numpy as np
+import pytest
+from bench.plugins.optimizers.gauss_newton import GaussNewton
+
+import bench
+from bench.measure.identification import Information, product
+from bench.studies.identify.measure import Fitting, fitted, information, measure, model_of, windows_of
+from bench.sweep import config
+from bench.sweep.execute import store_of
+from bench.sweep.grid import cells
+from bench.sweep.plan import plan
+
+SPRING = ("scenes=[mass_spring_damper]", "integrators=[rk4]")
+STEPPED = 1e-4
+"""Relative error of rk4 at 0.05 s against the closed form of the motion, in what is compared here."""
+
+
+def made(*words):
+    return config.load(["study=identify", "backends=[numpy]", "optimizers=[gauss_newton]", "samples=1", *words])
+
+
+def cell_of(*words):
+    (cell,) = cells(made(*words))
+    return cell
+
+
+def displacement(k, c, t):
+    """x(t) of a unit mass released from rest at 1."""
+    a = c / 2
+    w = np.sqrt(k - a * a)
+    return np.exp(-a * t) * (np.cos(w * t) + a / w * np.sin(w * t))
+
+
+def closed_form_fisher():
+    """Fisher matrix of (k/m, c/m) for 200 samples to T = 10 with noise .01, from the closed form of the motion."""
+    t, h = 0.05 * np.arange(1, 201), 1e-6
+    by_k = (displacement(4 + h, 0.4, t) - displacement(4 - h, 0.4, t)) / (2 * h)
+    by_c = (displacement(4, 0.4 + h, t) - displacement(4, 0.4 - h, t)) / (2 * h)
+    rows = np.stack([by_k, by_c]) / 0.01
+    return rows @ rows.T
+
+
+def test_checked_information_of_the_spring():
+    fisher = closed_form_fisher()
+    assert fisher == pytest.approx(np.array([[153173.26, -65209.88], [-65209.88, 632731.78]]), rel=1e-5)
+    bound = np.linalg.inv(fisher)
+    assert np.sqrt(np.diag(bound)) == pytest.approx([0.00261307, 0.00128568], rel=1e-5)
+    assert bound[0, 1] / math.sqrt(bound[0, 0] * bound[1, 1]) == pytest.approx(0.209465, rel=1e-5)
+
+
+def test_information_is_that_of_the_closed_form():
+    model = model_of(cell_of(*SPRING, "theta=[stiffness,damping]"))
+    found = information(model, model.values, 0.01)
+    scale = np.array([4.0, 0.4])  # logarithms
+    assert found.fisher == pytest.approx(closed_form_fisher() * np.outer(scale, scale), rel=STEPPED)
+
+
+def test_only_ratios_without_a_force():
+    model = model_of(cell_of(*SPRING))
+    found = information(model, model.values, 0.01)
+    assert (
+        found.words == "only stiffness/mass, damping/mass: scaling mass, stiffness and damping together changes nothing"
+    )
+    assert np.abs(found.jacobian @ np.ones(3)).max() < 1e-7 * np.abs(found.jacobian).max()
+    bound = np.sqrt(np.diag(found.covariance()))
+    assert bound == pytest.approx([0.00261307 / 4, 0.00128568 / 0.4], rel=STEPPED)
+
+
+def test_a_known_force_lifts_the_gauge_and_an_unknown_gain_brings_it_back():
+    known = model_of(cell_of("scenes=[mass_spring_damper[force=0.5]]", "integrators=[rk4]"))
+    assert information(known, known.values, 0.01).rank == 3
+    words = ("scenes=[mass_spring_damper[force=0.5]]", "integrators=[rk4]", "theta=[mass,stiffness,damping,force]")
+    unknown = model_of(cell_of(*words))
+    found = information(unknown, unknown.values, 0.01)
+    assert found.rank == 3
+    assert found.labels == ["stiffness/mass", "damping/mass", "force/mass"]
+
+
+def test_words_of_products():
+    names = ("a", "b", "c")
+    assert product(names, np.array([1.0, -0.5, 0.0])) == "a/b^(1/2)"
+    square = Information(names, np.array([[2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))  # a^2 b and c
+    assert square.labels == ["a*b^(1/2)", "c"]
+    assert Information(names, np.zeros((2, 3))).words.startswith("nothing can be told")
+    alone = Information(names, np.diag([1.0, 1.0, 0.0])[:2])
+    assert alone.words == "only a, b: c changes nothing"
+
+
+def test_friction_fitted_with_a_step_holds_for_that_step():
+    """d = v0^2/(2 mu g) = 1.529052, dd/dmu = -5.096840, and mu_hat/mu = 1 - h mu g/v0."""
+    exact, model = 9.0 / (2 * 0.3 * 9.81), model_of(cell_of("scenes=[sliding_block]"))
+    assert exact == pytest.approx(1.529052, rel=1e-6)
+    assert -exact / 0.3 == pytest.approx(-5.096840, rel=1e-6)
+    fitting = Fitting(model, "single", 1, 0.01, np.ones(2))
+    start = np.log(np.array([[0.25]]))
+    found = np.exp(fitted(fitting, GaussNewton(), start, np.array([[exact]]), 40))[0, 0]
+    # the stop within a step leaves a second-order rest
+    assert found / 0.3 == pytest.approx(1 - 0.02 * 0.3 * 9.81 / 3.0, abs=2e-3)
+    fine = model_of(cell_of("scenes=[sliding_block[dt=0.0005,horizon=2400]]"))
+    assert (fine.record(np.array([[0.3 * 1.001, 0.3 * 0.999]])) @ [1, -1]) / 0.0006 == pytest.approx(
+        [-5.09684], rel=0.01
+    )
+
+
+@pytest.mark.parametrize(("bounces", "expected"), [(1, 0.00625), (4, 0.002728)])
+def test_restitution_from_heights(bounces, expected):
+    """h_n = e^(2n) with 1 cm noise at e = .8: sd(e) from the first height, and from four."""
+    n = np.arange(1, bounces + 1)
+    slopes = 2 * n * 0.8 ** (2 * n - 1) / 0.01
+    assert 1 / math.sqrt(slopes @ slopes) == pytest.approx(expected, rel=2e-4)
+
+
+def test_single_shooting_is_lost_beyond_its_basin_and_windows_are_not():
+    """Over T = 10 s single shooting converges from within 4.4934/10 of the frequency, windows of 2 s from within 2.25."""
+    model = model_of(cell_of("scenes=[mass_spring_damper[damping=1e-9]]", "integrators=[rk4]", "theta=[stiffness]"))
+    truth = model.values  # 4: frequency 2
+    data = model.record(truth[:, None])
+    for off, converges in ((0.3, True), (0.8, False)):
+        start = np.full((1, 1), (2.0 + off) ** 2)
+        for way, count in (("single", 1), ("windows", 5)):
+            fitting = Fitting(model, way, count, 0.01, np.array([1.0, 2.0]))
+            found = np.exp(fitted(fitting, GaussNewton(), fitting.start(start, data), data, 20)[0, 0])
+            assert (abs(found - 4.0) < 1e-3) == (converges or way == "windows"), (off, way)
+
+
+def test_a_row_in_all_ways():
+    row = measure(
+        cell_of("scenes=[mass_spring_damper[horizon=80]]", "integrators=[rk4]", "repeats=12"),
+        made("scenes=[mass_spring_damper]").study,
+    )
+    assert row["shooting"] == ["single", "multiple", "windows"]
+    assert row["hidden"] == [0, 0, 0]
+    assert min(row["converged"]) == 1.0
+    assert row["error"][0] == pytest.approx(row["error"][1], rel=0.05)  # windows that meet are one rollout
+    assert row["error"][0] < row["error"][2]  # windows on their own know less
+    assert all(low <= 0.95 <= high for low, high in zip(row["coverage_low"], row["coverage_high"], strict=True))
+    assert "holds for other steps too" in row["step_note"]
+
+
+def test_model_of_a_coarse_step_says_so():
+    row = measure(cell_of("scenes=[sliding_block]", "repeats=16"), made("study=identify[refine=16]").study)
+    assert row["step_note"].startswith("holds for this time step only")
+    assert row["coverage_high"][0] < 0.95
+
+
+@pytest.mark.slow
+def test_cramer_rao_is_reached_over_500_records_and_none_hides_the_gauge():
+    cell = cell_of(*SPRING, "repeats=500")
+    row = measure(cell, made("study=identify[windows=2]").study)
+    assert row["hidden"][0] == 0
+    # the relative error of a standard deviation from 500 draws of two numbers
+    assert abs(row["error"][0] - 1.0) < 4 / math.sqrt(2 * 1000)
+    assert row["coverage_low"][0] < 0.95 < row["coverage_high"][0]
+
+
+def refused(*words):
+    experiment = made(*words)
+    (item,) = plan(experiment, store_of(experiment))
+    return item.refusal[1] if item.refusal else None
+
+
+def test_refusals(tmp_path):
+    assert "names no unknowns: name parameters of it, theta=[..]" in refused("scenes=[pendulum]")
+    assert "is a plain function" in refused("scenes=[quadratic]")
+    assert "samples, and fits are compared" in refused("scenes=[sliding_block]", "optimizers=[cem]")
+    assert refused("scenes=[pendulum]", "theta=[mass]") is None
+    with pytest.raises(
+        bench.UserError, match=r"unknown parameter in theta of scene pendulum: 'mas'; did you mean 'mass'"
+    ):
+        refused("scenes=[pendulum]", "theta=[mas]")
+    path = tmp_path / "short.csv"
+    path.write_text("1.0\n0.9\n")
+    said = refused("scenes=[mass_spring_damper]", f"study=identify[data={path}]")
+    assert f"data={path} has 2 lines of 1 numbers" in said
+    assert "is measured 200 times in 1 positions" in said
+
+
+def test_own_measurements_are_fitted(tmp_path):
+    t = 0.05 * np.arange(1, 201)
+    np.savetxt(tmp_path / "own.csv", displacement(4.4, 0.5, t)[:, None], delimiter=",", header="x", comments="")
+    experiment = made(*SPRING, f"study=identify[data={tmp_path / 'own.csv'},start=1.05,iterations=8]")
+    (cell,) = cells(experiment)
+    row = measure(cell, experiment.study)
+    assert row["fits"] == 1
+    assert math.isnan(row["coverage"][0])  # no truth is known
+    assert row["estimate"][:2] == pytest.approx([4.4, 0.5], rel=STEPPED)
+
+
+def test_number_of_windows():
+    assert windows_of(200, 8) == 8
+    assert windows_of(7, 8) == 1
+    assert windows_of(12, 8) == 6
