@@ -35,7 +35,9 @@ def test_a_file_is_a_problem(file):
     w = np.array([[0.0, 2.0], [0.0, 0.0]])
     np.testing.assert_allclose(problem.value(problem.program.theta0, w), [2.0, 2.2**2 * 0.5 + 1])
     np.testing.assert_allclose(problem.grad(problem.program.theta0, w)[:, 0], [2.0, 4.0])
-    found = bench.estimate(problem, "randomized_smoothing", samples=64, repeats=8, reference_samples=4096, tolerance=0.1)
+    found = bench.estimate(
+        problem, "randomized_smoothing", samples=64, repeats=8, reference_samples=4096, tolerance=0.1
+    )
     assert found.summary.reference_norm > 4.4  # sqrt(2^2 + 4^2), and the jump, which the gradient does not see
 
 

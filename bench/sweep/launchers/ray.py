@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import pickle
 import time
@@ -57,7 +58,7 @@ class RayLauncher:
             address = self._settings["address"] or os.environ.get("RAY_ADDRESS")
             try:
                 self._ray.init(
-                    address=address, log_to_driver=False, logging_level="ERROR",
+                    address=address, log_to_driver=False, logging_level=logging.ERROR,
                     runtime_env={"env_vars": {"PYTHONPATH": jobs.import_path()}},
                 )  # fmt: skip
             except Exception as error:
