@@ -86,6 +86,11 @@ class Smoothed:
         return self.known and bool(self.bias_low > WANTED * self.norm)
 
     @property
+    def unshown(self) -> bool:
+        """Whether the bias may be as large as grad J itself, for all that was seen, though it need not be."""
+        return self.known and not self.biased and bool(self.bias_high > self.norm)
+
+    @property
     def best(self) -> Method | None:
         """The method that reaches 10% first; None where none does."""
         usable = [m for m in self.methods if math.isfinite(m.seconds)]

@@ -14,6 +14,7 @@ from bench.model import loaded
 from bench.model.adjoint import Slopes, slopes
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
+from bench.model.blocks import cores
 from bench.model.callables import CallableScene
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
@@ -106,6 +107,7 @@ __all__ = [
     "adjoint_gradient",
     "columns",
     "compose",
+    "cores",
     "first_order",
     "halves",
     "loaded",
