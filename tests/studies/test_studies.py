@@ -18,6 +18,7 @@ from bench.report import reproduce, web
 from bench.report.views import along, arranged, families
 from bench.report.web.content import Content, grouped, looks, problems
 from bench.report.web.document import data
+from bench.studies.gradient_check import matrix
 from bench.studies.gradient_check import report as gradient_check
 from bench.studies.growth import report as growth
 from bench.studies.stability import page as stability_page
@@ -125,8 +126,10 @@ def test_a_swept_parameter_keeps_lines_of_the_gradient_check_apart():
     found = table_of(gradient_check.markdown(shown))
     assert list(found["damping"]) == ["0", "1", "10"]
     assert set(found["scene"]) == {"mass_spring"}
-    titles = [panel.get_title() for panel in gradient_check.figure(shown).axes]
-    assert titles == ["mass_spring\ndamping=0", "mass_spring\ndamping=1", "mass_spring\ndamping=10"]
+    (panel,) = matrix.figure(shown).axes
+    lines = [label.get_text() for label in reversed(panel.get_yticklabels())]
+    assert lines == ["mass_spring, damping=0", "mass_spring, damping=1", "mass_spring, damping=10"]
+    assert [text.get_text() for text in panel.texts] == ["ok"] * 3 + ["2 steps"]
     assert web.content(given, rows).tables["checks"]["problem"].nunique() == 6
 
 
@@ -475,3 +478,10 @@ def test_the_command_of_a_gradient_check_repeats_its_cell(words):
 def test_the_command_of_a_gradient_check_without_time_steps_has_no_horizon():
     (cell,) = cells(config.load(["study=gradient_check", "scenes=[quadratic]", "estimators=[fobg]"]))
     assert reproduce.check_of(cell) == "python -m bench gradcheck quadratic 'backends=[jax]' seed=0"
+
+
+def test_the_matrix_of_gradient_checks_leads_with_what_is_wrong():
+    table = pd.DataFrame({"name": ["a", "b"], "point": ["start", "before"], "verdict": ["wrong_factor", "kink"]})
+    assert matrix.headline(table) == "Wrong gradients: a; kinks, jumps or no answer beside a switch in 1 of 2 problems"
+    assert matrix.headline(table[1:]).startswith("No gradient is wrong for its own program; kinks, jumps")
+    assert matrix.headline(table.assign(verdict="smooth")).startswith("Every gradient is the derivative")
