@@ -217,7 +217,8 @@ def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -
     ops = TorchOps()
     result = program.log_probability(ops, fixed, free, noise) if scored else program.cost(ops, free, noise)
     (gradient,) = torch.autograd.grad(result.sum(), free, materialize_grads=True)
-    return np.asarray(gradient)
+    # a choice between NaN and a number passes on the number's derivative
+    return np.asarray(gradient.masked_fill(~torch.isfinite(result.detach()), float("nan")))
 
 
 def _is_open_loop(scene: MechanicalScene, dim: int) -> bool:

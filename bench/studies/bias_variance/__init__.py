@@ -43,11 +43,11 @@ class BiasVariance(Study):
         return measure(cell, session, self.timed_calls, self.settle_s)
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the main table, error against time, the charts, and the fastest methods where samples were swept."""
-        from bench.studies.bias_variance import charts, fastest, tables
+        """Write the main table, error against time, the charts, the fastest methods, and who wins where."""
+        from bench.studies.bias_variance import charts, fastest, standing, tables
 
         paths = tables.write(experiment, rows) + charts.write(experiment, rows)
-        return paths + fastest.write(experiment, rows)
+        return paths + fastest.write(experiment, rows) + standing.write(experiment, rows)
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
         """Print the digest: the main table, condensed where it is long, and the findings from it."""
