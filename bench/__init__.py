@@ -8,6 +8,7 @@ from bench.examine import Report, examine
 from bench.face import Estimates, estimate, load, problem, run
 from bench.model import *  # noqa: F403
 from bench.model import __all__ as _contracts
+from bench.simulator.mjcf import Mjcf
 from bench.sweep.cell import Cell
 from bench.sweep.columns import Column, Columns, Judged
 from bench.sweep.experiment import Experiment
@@ -23,6 +24,7 @@ __all__ = [
     "Estimates",
     "Experiment",
     "Judged",
+    "Mjcf",
     "Report",
     "Session",
     "StorageError",

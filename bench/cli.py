@@ -234,6 +234,10 @@ def _plan(words: list[str]) -> int:
     experiment = _loaded(words)
     store = store_of(experiment)
     progress.print_plan(experiment, plan.plan(experiment, store), store.load())
+    if experiment.execution.launcher == "slurm":
+        from bench.sweep.launchers.slurm import script
+
+        print(f"\nthe job script:\n{script(experiment)}")
     return 0
 
 
@@ -406,6 +410,13 @@ def _history(words: list[str]) -> int:
     return history.main(words)
 
 
+def _index(words: list[str]) -> int:
+    """Write the page over all experiments of a folder."""
+    from bench.report import index
+
+    return index.main(words)
+
+
 VERBS = {
     "run": Verb(
         _run, "+experiment=NAME [key=value ...]", "run what is missing, then write tables and charts",
@@ -452,6 +463,10 @@ VERBS = {
         "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
         "times only with --timings, against the spread between runs: again=DIR,DIR names further runs of BEFORE.\n"
         "Written to out=DIR (runs/compare): compare.csv, .md, .json, .xml (JUnit) and .html.\n",
+    ),
+    "index": Verb(
+        _index, "index [DIR]", "a page over all experiments of a results folder, with the state of each",
+        "DIR is results without one. Written to DIR/index.html; nothing is simulated.\n",
     ),
     "history": Verb(
         _history, "history DIR DIR ... [out=DIR]", "errors and failures over versions, as one small chart",

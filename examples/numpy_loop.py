@@ -34,3 +34,10 @@ def forgetful(theta):
     """The same without the damper's share."""
     x, dx = rollout(theta, forget=True)
     return 2 * (x - 0.1) * dx
+
+
+if __name__ == "__main__":
+    import bench
+
+    for function in (gradient, forgetful):
+        print(bench.examine(cost, theta, grad=function, sigma=[0.01, 0.1], budget="60s"), end="\n\n")

@@ -73,8 +73,25 @@ def _set_springs(model: Any, law: Penalty, impedance: float) -> None:
     """
     bodies = model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2])]
     inverse_mass = model.body_invweight0[bodies, 0].sum(axis=0)
+    inverse_mass *= _edges(model)
     model.pair_solref[:] = -np.array([law.stiffness, law.damping]) * inverse_mass[:, None]
     model.pair_solimp[:, :2] = impedance
+
+
+def _edges(model: Any) -> Any:
+    """Return by how much less each pair's spring has to be, as its force is made of several, ``(n_pairs,)``.
+
+    With a pyramidal cone a contact with friction is the sum of four edges (two with one direction of friction), each a
+    spring with the inverse mass A (1 + mu^2) instead of A. The engine takes 2 mu^2 of that for the regularisation of an
+    edge at small impedances, so that the normal force of all is 2 / (mu^2 (1 + mu^2)) times that of one spring
+    (MuJoCo, Computation, "Pyramidal cones": R of all edges is one value, derived from the friction coefficients).
+    """
+    import mujoco
+
+    if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
+        return np.ones(model.npair)
+    friction = np.maximum(model.pair_friction[:, 0], mujoco.mjMINMU)
+    return np.where(model.pair_dim > 1, friction**2 * (1.0 + friction**2) / 2.0, 1.0)
 
 
 def _disabled(bit: Any, model: Any, lean: bool) -> int:

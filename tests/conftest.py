@@ -41,6 +41,8 @@ def backend(request):
     chosen = entry.plugin()
     if "physics" in chosen.provides and "physics" not in needs:
         pytest.skip(f"{chosen.name} steps a model of its own")
+    if "simulator" in chosen.provides:
+        pytest.skip(f"{chosen.name} runs simulators of the user's own")
     if needs - chosen.provides:
         pytest.skip(f"{chosen.name} does not provide {', '.join(sorted(needs - chosen.provides))}")
     return chosen

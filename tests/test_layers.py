@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BENCH = ROOT / "bench"
 LAYERS = [
     ["errors"],
+    ["simulator"],
     ["model"],
     ["measure", "conformance", "plugins"],
     ["sweep"],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -19,19 +19,24 @@ from bench.conformance.subjects import (
     SAME,
     NewtonOps,
     all_programs,
+    available,
     covering,
     distance,
     disturbed,
+    law_for,
     plain_backend,
     rng,
     samples,
+    stepping,
     telling,
     title,
 )
 from bench.model import (
     Array,
     Backend,
+    EngineScene,
     EngineTwin,
+    ForceLaw,
     Integrator,
     MechanicalScene,
     Problem,
@@ -41,6 +46,7 @@ from bench.model import (
     compose,
     param,
 )
+from bench.model.backend import CAPABILITIES
 
 GRADIENT = 1e-4
 """Relative error allowed against central differences of step 1e-6, on columns where two steps agree to 2e-5."""
@@ -49,6 +55,12 @@ SCORE = 1e-5
 SINGLE = 1e-2
 """Relative error allowed in single precision: rollouts round hundreds of times by 6e-8, and central differences in it
 keep two or three digits."""
+FAR = 1e200
+"""Size of a theta whose square is not finite."""
+PRESSED = 1e-3
+"""Penetration [m] at which the force of a contact with friction is compared."""
+PUSHED = 0.02
+"""Relative error allowed to that force: an impedance of 1e-4 hides 5e-4 of it at a friction of 0.5."""
 SOLVED = 1e-9
 """Relative error allowed where equations are solved to 1e-12 in the unknown, through a condition number below 100."""
 
@@ -190,6 +202,26 @@ def shared_theta_is_spread(backend: Backend) -> str:
 
 
 @verifies(Backend)
+def failed_rollouts_have_no_gradient(backend: Backend) -> str:
+    """Verify that a gradient is not finite where its cost is not: theta far out, in one column of a batch."""
+    if "grad" not in backend.provides:
+        raise Skipped("gives no gradients")
+    lost = []
+    for program in programs_for(backend, telling):
+        theta, w = samples(program)
+        far = np.where(np.arange(COLUMNS) == 1, FAR * (1.0 + np.abs(theta)), theta)
+        problem = backend.compile(program)
+        with np.errstate(all="ignore"):
+            failed = ~np.isfinite(problem.value(far, w))
+            gone = ~np.isfinite(problem.grad(far, w)).all(axis=0)
+        require(gone[failed].all(), f"{title(program)}: a cost that is not finite has a finite gradient")
+        lost.append(failed.any())
+    if not any(lost):
+        raise Skipped(f"no rollout fails {FAR:g} away")
+    return f"{sum(lost)} programs"
+
+
+@verifies(Backend)
 def single_precision_is_finite(backend: Backend) -> str:
     """Verify that ``dtype=float32`` gives costs and gradients near those in double precision, on smooth scenes."""
     single = dataclasses.replace(backend, dtype="float32")
@@ -208,9 +240,8 @@ def single_precision_is_finite(backend: Backend) -> str:
 @verifies(Backend)
 def provides_is_truthful(backend: Backend) -> str:
     """Verify that declared capabilities are known and present, and that equations are refused without ``root``."""
-    capabilities = {"value", "grad", "score", "root", "physics"}
-    strange = sorted(set(backend.provides) - capabilities)
-    require(not strange, f"{', '.join(strange)} are none of {', '.join(sorted(capabilities))}")
+    strange = sorted(set(backend.provides) - CAPABILITIES)
+    require(not strange, f"{', '.join(strange)} are none of {', '.join(sorted(CAPABILITIES))}")
     require("value" in backend.provides, "gives no costs")
     for program in programs_for(backend, telling):
         problem, (theta, w) = backend.compile(program), samples(program)
@@ -285,6 +316,76 @@ def _coupled(xp: Any, n: int, z: Array) -> Array:
 
 def _implicit_problem(backend: Backend, unknowns: int) -> Problem:
     return backend.compile(compose(_Initial(unknowns=unknowns), None, _Solving()))
+
+
+@dataclass(frozen=True)
+class _Pressed(EngineScene):
+    """A ball of 1 kg, 1 mm into a plane with friction, at velocity theta (along, away); f is its velocity away a step on."""
+
+    name = "pressed"
+    n_q: ClassVar[int] = 2
+    n_contacts: ClassVar[int] = 1
+    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 50.0, "damping_mode": "clipped"}
+
+    sigma: float = param(0.1, "standard deviation of the noise", positive=True)
+    horizon: int = param(1, "number of time steps", positive=True)
+    dt: float = param(1e-4, "length of a time step", "s", positive=True)
+    friction: float = param(0.5, "Coulomb coefficient", low=0.0)
+
+    def theta0(self) -> np.ndarray:
+        """Rest."""
+        return np.zeros(2)
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Press the ball in."""
+        zero = 0.0 * theta[0]
+        return State(xp.stack([zero, zero + 0.1 - PRESSED]), theta)
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return the velocity away from the plane."""
+        return v[1]
+
+    def mjcf(self) -> str:
+        """Return the ball on its plane."""
+        return f"""
+            <worldbody>
+              <geom name="ground" type="plane" size="1 1 1"/>
+              <body>
+                <joint name="x" type="slide" axis="1 0 0"/>
+                <joint name="z" type="slide" axis="0 0 1"/>
+                <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+                <geom name="ball" type="sphere" size="0.1" mass="0"/>
+              </body>
+            </worldbody>
+            <contact>
+              <pair geom1="ground" geom2="ball" condim="3" friction="{self.friction} {self.friction} 1 1 1"/>
+            </contact>"""
+
+
+@verifies(Backend)
+def frictional_contact_has_the_force_of_its_law(backend: Backend) -> str:
+    """Verify the normal force of a contact with friction at rest, closing, parting and creeping, against the spring law's.
+
+    The same ball sliding at 1 m/s is reported and not judged: an engine's friction adds to the normal force there.
+    """
+    if "physics" not in backend.provides:
+        raise Skipped("has no physics of its own")
+    scene = _Pressed()
+    laws = [law_for(scene, law) for law in available("contacts")]
+    springs = [law for law in laws if isinstance(law, ForceLaw) and law.spring() is not None]
+    runs = [p for p in (compose(scene, law, stepping()) for law in springs) if backend.lacks(p) is None]
+    if not runs:
+        raise Skipped("runs no spring with friction")
+    program = runs[0]
+    along, away = np.array([0.0, 0.0, 0.0, 0.01, 1.0]), np.array([0.0, -0.1, 0.1, 0.0, 0.0])
+    after = backend.compile(program).value(np.stack([along, away]), np.zeros((program.n_noise, along.size)))
+    law = program.contact
+    assert isinstance(law, ForceLaw)
+    force, expected = (after - away) / scene.dt, law.force(np, np.full((1, along.size), -PRESSED), away[None])[0]
+    off = np.abs(force / expected - 1.0)[:-1].max()
+    told = ", ".join(f"{f:.4g} ({e:.4g})" for f, e in zip(force[:-1], expected, strict=False))
+    require(off < PUSHED, f"normal forces, and those of the law, in N: {told}")
+    return f"to {off:.0e}; sliding at 1 m/s it pushes with {force[-1] / expected[-1]:.2g} times the law's force"
 
 
 @verifies(Backend)

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from bench.errors import UserError, unknown
-from bench.examine import source
 from bench.examine.examination import examine
 from bench.examine.report import Report
-from bench.examine.simulator import LIBRARIES
+from bench.simulator import source
+from bench.simulator.columns import LIBRARIES
 
 SETTINGS = ("theta", "grad", "sigma", "noise", "budget", "batch", "scale", "seed", "save")
 QUIET = "--quiet"

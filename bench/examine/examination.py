@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from bench.errors import UserError
-from bench.examine.clock import Clock, OutOfTime, seconds
-from bench.examine.layout import Layout
 from bench.examine.lines import HALVINGS, PLACES, POINTS, Line, scan
 from bench.examine.report import Report
-from bench.examine.simulator import Simulator
 from bench.examine.smoothing import PAIRS, Smoothed, directions, smoothed
 from bench.measure.gradcheck import EPS, Check, Options, check
+from bench.simulator.clock import Clock, OutOfTime, seconds
+from bench.simulator.columns import Simulator
+from bench.simulator.layout import Layout
 
 MADE = re.compile(r"_[0-9a-f]{8}$")
 """What a module's name gets when it is loaded from a file."""
@@ -27,20 +27,24 @@ SHARES = {"check": 0.75, "again": 0.5, "lines": 0.3}
 """Most of the time left that a part may take; what it does not use is there for the next one."""
 POINTS_EACH = 2 * (2 * EPS.size + 17)
 """Costs of a direction that is checked, about."""
-SCANS = 4 * 7 * 65
-"""Costs that a check spends on looking for staircases, where a direction is not plainly right."""
+SCAN = 7 * 65
+"""Costs of looking for a staircase along one direction, which a check does where it is not plainly right."""
 EFFORTS = (
     Options(),
-    Options(draws=2),
-    Options(draws=1, directions=1),
-    Options(components=4, draws=0),
-    Options(components=0, draws=0, directions=1, eps=EPS[::2]),
+    Options(draws=2, scanned=1),
+    Options(draws=2, directions=1, scanned=0),
+    Options(components=4, draws=2, directions=1, scanned=0),
+    Options(components=0, draws=0, directions=1, eps=EPS[::2], scanned=0),
 )
 """What a check looks at, from the whole to the least, for simulators that are slow."""
 PANELS = (7, 12)
 """Panels of 4 Gauss-Legendre points of the two integrals of the gradient along a line."""
 LEAST_MISSED = 0.002
 """Share of a cost's change that the integral of its gradient may miss by itself."""
+LOOKS = ((PLACES, HALVINGS), (3, 10), (1, 10))
+"""Places looked at on a line and halvings of each, from the whole to the least."""
+FEWEST_POINTS = 17
+"""Points without which a line is not scanned."""
 OTHER_NOISE = 2
 """Draws of the simulator's own noise, besides the first, under which the gradient is checked along random directions."""
 
@@ -220,7 +224,10 @@ class _Examination:
             chosen = min(effort.components, self.theta.size) + effort.directions
             calls = chosen * POINTS_EACH + effort.draws * effort.directions * POINTS_EACH // 2
             # what a wrong gradient asks for besides: scans, and ratios at other thetas
-            calls += SCANS + min(effort.draws, 4) * min(effort.components, self.theta.size) * POINTS_EACH // 2
+            calls += (
+                effort.scanned * SCAN
+                + min(effort.draws, 4) * min(effort.components, self.theta.size) * POINTS_EACH // 2
+            )
             if calls * each + (effort.draws + 3) * slope < SHARES["check"] * self.clock.left:
                 break
         else:
@@ -233,7 +240,7 @@ class _Examination:
     def _checked(self) -> Check | None:
         self.clock.stage("checking the gradient")
         options = self._options()
-        for attempt in (options, replace(options, components=0, draws=0, directions=1, eps=EPS[::2])):
+        for attempt in (options, replace(options, components=0, draws=0, directions=1, eps=EPS[::2], scanned=0)):
             self.clock.allow(SHARES["check"] if attempt is options else 1.0)
             try:
                 return self._one_check(attempt)
@@ -274,12 +281,15 @@ class _Examination:
         along = directions(2, spread, self.seed)
         each = self.clock.per_cost()
         room = SHARES["lines"] * self.clock.left / len(along) / each if each > 0 else math.inf
-        points = int(min(POINTS, room - 2 * PLACES * HALVINGS))
-        if points < 17:
+        for most, halvings in LOOKS:
+            points = int(min(POINTS, room - 2 * most * halvings))
+            if points >= FEWEST_POINTS:
+                break
+        else:
             self.left_out.append("jumps and kinks on lines")
             return []
         if points < POINTS:
-            self.left_out.append(f"fine lines: {points} points instead of {POINTS}")
+            self.left_out.append(f"fine lines: {points} points instead of {POINTS}, and {most} places looked at")
         found = []
         measured = checked.noise if checked is not None and math.isfinite(checked.noise) else 0.0
         self.clock.allow(2 * SHARES["lines"])
@@ -287,7 +297,7 @@ class _Examination:
             for direction in along:
                 size = float(np.abs(self._costs(self.theta[:, None])).max())
                 rounding = max(measured, self.simulator.unit * (size if math.isfinite(size) else 0.0))
-                line = scan(self._costs, self.theta, direction, rounding, points=points)
+                line = scan(self._costs, self.theta, direction, rounding, 3.0, points, halvings, most)
                 found.append(replace(line, missed=self._missed(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")

@@ -95,7 +95,8 @@ class Findings:
         """The cause of what is wrong, or how it is right: a verdict of the gradient check.
 
         ``raised`` where the gradient could not be computed, ``undecided`` where the budget ended before the check,
-        ``jumps`` or ``biased`` where the gradient is right at theta and misses jumps around it.
+        ``jumps`` or ``biased`` where the gradient is right at theta and misses jumps around it, ``spread`` where its values
+        around theta vary too widely to say.
         """
         if self.error:
             return "raised"
@@ -104,10 +105,14 @@ class Findings:
         if self.check is None:
             return "undecided"
         bad = [one.cause for one in (self.check, *self.more) if not one.trusted]
+        if not bad and any(line.steps for line in self.lines):
+            return "staircase"
         if not bad and self.missed > WANTED:
             return "jumps"
         if not bad and any(one.biased for one in self.smoothed):
             return "biased"
+        if not bad and any(one.unshown for one in self.smoothed):
+            return "spread"
         return bad[0] if bad else self.check.cause
 
     @property
@@ -122,6 +127,11 @@ class Findings:
             found.append("undecided: the budget ended before the gradient was checked")
         else:
             found += [self.sentence(one) for one in (self.check, *self.more) if not one.trusted][:1]
+        if not found and any(line.steps for line in self.lines):
+            found.append(
+                "staircase: the cost is constant between jumps, here and on a line: its derivative is 0 and says nothing, with "
+                "or without a gradient; smooth it, as sigma= does"
+            )
         if not found:
             missed = self.missed
             if missed > WANTED:
@@ -130,6 +140,11 @@ class Findings:
                     "jumps, which no gradient sees, make the rest"
                 )
             for one in self.smoothed:
+                if one.unshown:
+                    found.append(
+                        f"spread: at sigma {number(one.sigma)} the gradients vary so widely that {one.pairs} pairs do not show "
+                        "whether their mean is grad J: take costs, as the table says"
+                    )
                 if one.biased:
                     low, high = one.bias_low / one.norm, one.bias_high / one.norm
                     found.append(
@@ -368,6 +383,8 @@ class Findings:
         if not one.known:
             return "cannot tell"
         low, high = 100 * one.bias_low / one.norm, 100 * one.bias_high / one.norm
+        if one.unshown:
+            return "cannot tell: they spread too widely"
         if low <= 0:
             return f"none seen, below {number(high)}%"
         return f"{number(100 * one.bias / one.norm)}% [{number(low)}, {number(high)}]"

@@ -68,10 +68,11 @@ def scan(
     reach: float = 3.0,
     points: int = POINTS,
     halvings: int = HALVINGS,
+    most: int = PLACES,
 ) -> Line:
     """Scan ``cost((d, B)) -> (B,)`` on a line from -reach to +reach times ``direction (d,)`` about ``theta (d,)``.
 
-    ``noise`` is the size of what the cost's rounding changes.
+    ``noise`` is the size of what the cost's rounding changes; ``most`` places are looked at.
     """
 
     def along(t: np.ndarray) -> np.ndarray:
@@ -83,7 +84,7 @@ def scan(
     order = np.argsort(np.nan_to_num(turns, nan=-1.0, posinf=-1.0))[::-1]
     places: list[int] = []
     for index in order:
-        if len(places) < PLACES and turns[index] > GUARD * noise and all(abs(index - p) > 1 for p in places):
+        if len(places) < most and turns[index] > GUARD * noise and all(abs(index - p) > 1 for p in places):
             places.append(int(index))
     found = _narrowed(along, t, f, places, halvings, noise) if places else []
     level = np.diff(f)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.examine.clock import Clock, OutOfTime
-from bench.examine.simulator import Simulator
+from bench.simulator.clock import Clock, OutOfTime
+from bench.simulator.columns import Simulator
 
 PAIRS = 4096
 """Pairs of costs for one sigma, where the time allows."""
@@ -84,6 +84,11 @@ class Smoothed:
     def biased(self) -> bool:
         """Whether the program's gradient is off by more than 10% at this sigma, beyond doubt."""
         return self.known and bool(self.bias_low > WANTED * self.norm)
+
+    @property
+    def unshown(self) -> bool:
+        """Whether the bias may be as large as grad J itself, for all that was seen, though it need not be."""
+        return self.known and not self.biased and bool(self.bias_high > self.norm)
 
     @property
     def best(self) -> Method | None:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import time
 import zlib
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
+
+HELD = 1 << 22
+"""Most normal numbers that a cell holds at once (32 MiB); of more, it draws a part, uses it and draws the next."""
 
 
 @lru_cache(maxsize=2)
@@ -22,8 +27,31 @@ def draw(seed: int, scene: str, repeats: int, samples: int, width: int, stream: 
     """
     block = np.empty((width, repeats, samples))
     for r in range(repeats):
-        key = np.random.SeedSequence([seed, zlib.crc32(stream.encode()), zlib.crc32(scene.encode()), r])
-        block[:, r, :] = np.random.Generator(np.random.Philox(key)).standard_normal((samples, width)).T
+        block[:, r, :] = _generator(seed, scene, r, stream).standard_normal((samples, width)).T
     # cells share the array
     block.setflags(write=False)
     return np.moveaxis(block, 0, -1)
+
+
+def parts(seed: int, scene: str, repeat: int, samples: int, width: int, stream: str) -> Iterator[np.ndarray]:
+    """Yield repeat's row of :func:`draw` in parts ``(width, b)`` of at most :data:`HELD` numbers: the same numbers.
+
+    Where the parts end depends on nothing but the width, so sums over parts do not depend on the machine.
+    """
+    generator = _generator(seed, scene, repeat, stream)
+    columns = max(1, HELD // max(width, 1))
+    for start in range(0, samples, columns):
+        yield np.ascontiguousarray(generator.standard_normal((min(columns, samples - start), width)).T)
+
+
+@lru_cache(maxsize=64)
+def seconds(seed: int, scene: str, samples: int, width: int) -> float:
+    """Return the seconds of drawing the noise of one estimate, the first part of it where it comes in parts."""
+    started = time.perf_counter()
+    part = next(parts(seed, scene, 0, samples, width, "cells"))
+    return (time.perf_counter() - started) * samples / part.shape[1]
+
+
+def _generator(seed: int, scene: str, repeat: int, stream: str) -> np.random.Generator:
+    key = np.random.SeedSequence([seed, zlib.crc32(stream.encode()), zlib.crc32(scene.encode()), repeat])
+    return np.random.Generator(np.random.Philox(key))

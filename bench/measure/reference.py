@@ -35,6 +35,8 @@ FAR = 4.5
 """Standard deviations to which jumps are looked for along a direction."""
 ROUNDING = 1e-9
 """Share of a gradient below which first and zeroth order differ by rounding alone."""
+SHARED = 1e-10
+"""Error that the terms of all samples may have in common, relative to their size: rounding, and central differences."""
 WARNED, REFUSED = 0.999, 1.0 - 1e-6
 """Levels at which a difference between first and zeroth order is remarked on, and at which zeroth order is used."""
 
@@ -251,6 +253,8 @@ def _batches(
         note = (
             f"no sample of the reference had a gradient: events rarer than {3.0 / (count * BATCHES):.1g} are not seen"
         )
+    # an error that all samples share, such as that of a backend's differences, shows in no spread
+    unseen = math.hypot(unseen, SHARED * math.sqrt(float(np.square(pilot).sum(axis=0).mean())))
     return Reference(batches, f"sampling[{order},n={count * BATCHES}]", unseen, note=note)
 
 

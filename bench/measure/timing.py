@@ -21,6 +21,8 @@ LEAST_S = 0.005
 """Seconds that the calls of one timing should fill; fast ones are repeated."""
 MOST = 20
 """Most calls made for each call asked for."""
+STEADY = 0.1
+"""Interquartile range over median below which a timing is steady; until then calls are repeated."""
 NOISY = 0.2
 """Interquartile range over median above which a timing is marked in tables."""
 
@@ -45,25 +47,57 @@ class Timing:
         return self.iqr_s / self.median_s
 
 
+class Pause:
+    """Time that belongs to no call: ``with pause:`` around drawing noise, say."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._since = 0.0
+
+    def __enter__(self) -> None:
+        self._since = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds += time.perf_counter() - self._since
+
+
 def timed(
-    call: Callable[[int], np.ndarray], count: int, least_s: float = LEAST_S, most: int = MOST
+    call: Callable[[int], np.ndarray],
+    count: int,
+    least_s: float = LEAST_S,
+    most: int = MOST,
+    settle_s: float = 0.0,
+    pause: Pause | None = None,
 ) -> tuple[list[np.ndarray], Timing]:
     """Return results and seconds of ``call(0) ... call(count - 1)``, after one warm-up call that is thrown away.
 
-    Where these take less than ``least_s`` in all, calls are repeated until they do, ``most`` times each at most. Calls
-    must return finished NumPy arrays, so that no work is left on a device when the clock stops.
+    Where these take less than ``least_s`` in all, calls are repeated until they do, ``most`` times each at most; and
+    until their times are :data:`STEADY`, but not beyond ``settle_s`` seconds in all. What passes within ``pause`` is
+    taken off. Calls must return finished NumPy arrays, so that no work is left on a device when the clock stops.
     """
+    pause = pause or Pause()
     call(0)
     results: list[np.ndarray] = []
     seconds: list[float] = []
-    while len(seconds) < count or (sum(seconds) < least_s and len(seconds) < most * count):
-        start = time.perf_counter()
+    while len(seconds) < count or (len(seconds) < most * count and _goes_on(seconds, least_s, settle_s)):
+        paused, start = pause.seconds, time.perf_counter()
         result = call(len(seconds) % count)
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.perf_counter() - start - (pause.seconds - paused))
         if len(results) < count:
             results.append(result)
     low, median, high = np.percentile(seconds, [25, 50, 75])
     return results, Timing(float(median), float(high - low), tuple(seconds))
+
+
+def _goes_on(seconds: list[float], least_s: float, settle_s: float) -> bool:
+    """Return whether calls have to be repeated: too short in all, or not yet steady and within the time for that."""
+    total = sum(seconds)
+    if total < least_s:
+        return True
+    if total >= settle_s:
+        return False
+    low, median, high = np.percentile(seconds, [25, 50, 75])
+    return bool(high - low > STEADY * median)
 
 
 def conditions() -> dict[str, Any]:

@@ -10,9 +10,12 @@ so never branch on it in Python; every other type is static.
 """
 
 from bench.errors import Unsupported
+from bench.model import loaded
 from bench.model.adjoint import Slopes, slopes
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
+from bench.model.blocks import cores
+from bench.model.callables import CallableScene
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
 from bench.model.estimator import (
@@ -32,7 +35,16 @@ from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
-from bench.model.program import SURROGATE, Decision, FunctionProgram, Program, Rollout, compose, rollout
+from bench.model.program import (
+    SURROGATE,
+    CallableProgram,
+    Decision,
+    FunctionProgram,
+    Program,
+    Rollout,
+    compose,
+    rollout,
+)
 from bench.model.scene import (
     ContactScene,
     DampedScene,
@@ -51,6 +63,8 @@ __all__ = [
     "Array",
     "Auxiliaries",
     "Backend",
+    "CallableProgram",
+    "CallableScene",
     "Compilations",
     "Contact",
     "ContactLaw",
@@ -93,8 +107,10 @@ __all__ = [
     "adjoint_gradient",
     "columns",
     "compose",
+    "cores",
     "first_order",
     "halves",
+    "loaded",
     "param",
     "per_repeat",
     "rollout",

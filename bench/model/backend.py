@@ -10,6 +10,9 @@ from bench.model.parameters import Plugin, param
 from bench.model.problem import Problem
 from bench.model.program import Program
 
+CAPABILITIES = frozenset({"value", "grad", "score", "explicit", "surrogate", "root", "physics", "simulator"})
+"""What a backend may provide."""
+
 
 @dataclass(frozen=True)
 class Backend(Plugin):
@@ -17,11 +20,12 @@ class Backend(Plugin):
 
     kind: ClassVar[str] = "backends"
     provides: ClassVar[frozenset[str]] = frozenset({"value", "grad", "score"})
-    """Capabilities, out of ``value``, ``grad``, ``score``, ``explicit``, ``surrogate``, ``root`` and
-    ``physics``.
+    """Capabilities, out of :data:`CAPABILITIES`.
 
     With ``explicit`` it differentiates the cost by theta under given actions, see :meth:`Problem.explicit`. With
     ``surrogate`` it gives the gradients that a contact law declares in place of the derivative.
+
+    With ``simulator`` it runs only simulators of the user's own, see :class:`CallableScene`.
 
     With ``physics`` the backend steps a scene's :meth:`~EngineTwin.mjcf` twin by an integrator and a contact solver of
     its own, so its programs differ from those of other backends and need reference gradients of their own.

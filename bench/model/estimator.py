@@ -81,7 +81,13 @@ class Estimator(Plugin):
 
 @dataclass(frozen=True)
 class SampleMean(Estimator):
-    """An estimator that is the mean of one term per sample."""
+    """An estimator that is the mean of one term per sample, so that samples may be evaluated in parts."""
+
+    @property
+    def separable(self) -> bool:
+        """Whether an estimate is the mean of the terms, so that samples can be taken in parts, as long as
+        :meth:`estimate` is not defined anew."""
+        return type(self).estimate is SampleMean.estimate
 
     @abstractmethod
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:

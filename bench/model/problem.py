@@ -180,7 +180,14 @@ class Problem(ABC):
         theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
         w = np.asarray(w, dtype=np.float64)
         columns = blocks.size(w.shape[1], self.block, self.grain, self.threads)
-        return blocks.evaluate(function, theta, w, columns, self.threads, lead)
+
+        def real(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+            found = function(theta, w)
+            if np.iscomplexobj(found):
+                raise TypeError(f"{type(self).__name__}{function.__name__} returns complex numbers; costs are real")
+            return found
+
+        return blocks.evaluate(real, theta, w, columns, self.threads, lead)
 
     @abstractmethod
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...

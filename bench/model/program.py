@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from bench.errors import Unsupported, UserError, unknown
+from bench.model.callables import CallableScene
 from bench.model.contact import ContactLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
 from bench.model.integrator import Integrator
@@ -290,6 +291,27 @@ class FunctionProgram(Program):
         return ops.xp.sum(w * theta_scored, axis=0) / self.scene.sigma
 
 
+class CallableProgram(Program):
+    """The program of a scene whose cost is the user's own code: no array namespace runs it, only its simulator."""
+
+    scene: CallableScene
+
+    @property
+    def n_noise(self) -> int:
+        """n_w: one number per coordinate of theta, then those of the simulator's own."""
+        return self.dim + self.scene.simulator().noise
+
+    def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
+        """Raise :class:`Unsupported`: the simulator is called in NumPy columns, by a backend made for it."""
+        raise Unsupported(
+            f"scene {self.scene.name} is a simulator of its own: it runs on {' and '.join(self.scene.backends)}"
+        )
+
+    def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
+        """Return w . theta_scored / sigma, with the noise on theta."""
+        return ops.xp.sum(w[: self.dim] * theta_scored, axis=0) / self.scene.sigma
+
+
 class Rollout(Program):
     """The program of a mechanical scene: ``horizon`` steps of an integrator."""
 
@@ -496,10 +518,12 @@ def compose(
     """
     if isinstance(scene, FunctionScene):
         return FunctionProgram(scene, contact, integrator, decision)
+    if isinstance(scene, CallableScene):
+        return CallableProgram(scene, contact, integrator, decision)
     if isinstance(scene, MechanicalScene):
         return Rollout(scene, contact, integrator, decision)
     raise Unsupported(
-        f"scene {scene.name} is neither a FunctionScene nor a MechanicalScene: derive it from one of them"
+        f"scene {scene.name} is neither a FunctionScene, a CallableScene nor a MechanicalScene: derive it from one of them"
     )
 
 

@@ -13,7 +13,18 @@ from bench.model.parameters import Plugin, remember, values
 from bench.model.sources import hash_of, source_hash, sources
 
 CORE = {
-    model: ("backend", "contact", "dynamics", "estimator", "integrator", "ops", "problem", "program", "scene"),
+    model: (
+        "backend",
+        "callables",
+        "contact",
+        "dynamics",
+        "estimator",
+        "integrator",
+        "ops",
+        "problem",
+        "program",
+        "scene",
+    ),
     measure: ("batches", "jumps", "noise", "quadrature", "reference", "statistics"),
 }
 """Modules that decide numbers in every study."""
@@ -36,6 +47,8 @@ def fingerprint(plugin: Plugin | None) -> str:
 
 
 def _code(plugin: Plugin) -> str:
+    if isinstance(plugin, model.CallableScene):
+        return source_hash(type(plugin)) + hash_of(plugin.files())
     return study_hash(type(plugin)) if plugin.kind == "studies" else source_hash(type(plugin))
 
 

@@ -5,11 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar
 
 from bench.model import Array, Ops
 
 from .jax import Jax, JaxOps
+
+ROUNDED = 8.0
+"""Units in the last place of the unknown within which a residual is rounding."""
+PATIENCE = 8
+"""Iterations before rounding is taken for an answer: Newton's method ends within fewer wherever it can."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +50,10 @@ class ImplicitOps(JaxOps):
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
         """Solve by Newton's method, each column on its own: a failed one spoils no values or gradients of the others.
 
-        Residuals are met to a relative and absolute 1e-12 in the unknown (1e-6 in float32). Columns that do not
-        converge in 64 iterations come back as NaN, which makes their rollouts ``nonfinite`` instead of wrong.
+        Residuals are met to 1e-12 (1e-6 in float32), and the unknown to that plus as much of its own size; or the
+        residual is down to the rounding of the unknown, as no residual of a stiff equation gets as small as 1e-12.
+        Columns that do not converge in 64 iterations come back as NaN, values and gradients, which makes their rollouts
+        ``nonfinite`` instead of wrong.
         """
         import jax
         import jax.numpy as jnp
@@ -56,7 +64,7 @@ class ImplicitOps(JaxOps):
         scalar = guess.shape[0] == 1
         # one unknown per column: a division instead of a factorisation
         linear: Any = lineax.Diagonal(well_posed=True) if scalar else lineax.LU()
-        newton: Any = optimistix.Newton(rtol=tolerance, atol=tolerance, linear_solver=linear)
+        newton: Any = _newton()(rtol=tolerance, atol=tolerance, linear_solver=linear)
 
         def column(start: Array, args: Any) -> Array:
             def function(z: Array, args: Any) -> Array:
@@ -68,8 +76,50 @@ class ImplicitOps(JaxOps):
                 adjoint=optimistix.ImplicitAdjoint(linear),
                 tags=frozenset({lineax.diagonal_tag} if scalar else ()),
             )  # fmt: skip
-            return jnp.where(solution.result == optimistix.RESULTS.successful, solution.value, jnp.nan)
+            solved = solution.result == optimistix.RESULTS.successful
+            # a factor, since a choice between value and NaN would give the gradient of the value
+            return solution.value * jnp.where(solved, 1.0, jnp.nan).astype(guess.dtype)
 
         axes = jax.tree.map(lambda a: -1 if jnp.ndim(a) else None, args)
         # the root does not depend on where the search for it starts
         return jax.vmap(column, in_axes=(-1, axes), out_axes=-1)(jax.lax.stop_gradient(guess), args)
+
+
+@cache
+def _newton() -> Any:
+    """Return optimistix's Newton with an end that does not depend on the units of the residual."""
+    import equinox
+    import jax.numpy as jnp
+    import optimistix
+
+    class Newton(optimistix.Newton):  # type: ignore[type-arg,misc]
+        """Newton's method that also ends where the residual is what rounding the unknown makes of it.
+
+        A residual that multiplies a gap by dt^2 k / m = 1e11 rounds to 1e-5 at the root itself, and may step to and fro
+        between touching and not, which are one number apart. The steepest slope met is kept in a field of the state
+        that this end of the iteration leaves unused.
+        """
+
+        def step(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> Any:
+            """Take a step, and keep the steepest slope."""
+            after, found, aux = super().step(fn, y, args, options, state, tags)
+            slope = jnp.abs(found.f).max() / jnp.maximum(jnp.abs(found.diff).max(), jnp.finfo(y.dtype).tiny)
+            steepest = jnp.maximum(state.diffsize_prev, jnp.where(jnp.isfinite(slope), slope, 0.0))
+            return after, equinox.tree_at(lambda s: s.diffsize_prev, found, steepest.astype(y.dtype)), aux
+
+        def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> Any:
+            """Return whether to end, and with which result."""
+            done, result = super().terminate(fn, y, args, options, state, tags)
+            return done | self._rounded(y, state), result
+
+        def postprocess(
+            self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
+        ) -> Any:
+            """Return the unknown whose residual was looked at, where that was rounding; else the one after it."""
+            return jnp.where(self._rounded(y, state), y + state.diff, y), aux, {}
+
+        def _rounded(self, y: Any, state: Any) -> Any:
+            allowed = ROUNDED * jnp.finfo(y.dtype).eps * (1.0 + jnp.abs(y).max()) * state.diffsize_prev
+            return (state.step >= PATIENCE) & jnp.isfinite(state.f).all() & (jnp.abs(state.f).max() <= allowed)
+
+    return Newton

@@ -210,13 +210,21 @@ class JaxProblem(Problem):
         return self._derivative(cost, theta, w.shape[1])
 
     def _derivative(self, function: Callable[[Array], Array], theta: Array, batch: int) -> Array:
-        """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``."""
+        """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; NaN where b has no value.
+
+        A rollout can fail where the derivative is not looking: a choice between NaN and a number passes on the number's.
+        """
         import jax
         import jax.numpy as jnp
 
         full = jnp.broadcast_to(theta, (self.dim, batch))
         if self._mode == "reverse":
             result, back = jax.vjp(function, full)
-            return back(jnp.ones_like(result))[0]
+            return jnp.where(jnp.isfinite(result), back(jnp.ones_like(result))[0], jnp.nan)
         basis = jnp.eye(self.dim, dtype=full.dtype)
-        return jax.vmap(lambda e: jax.jvp(function, (full,), (jnp.broadcast_to(e[:, None], full.shape),))[1])(basis)
+
+        def along(direction: Array) -> Array:
+            result, slope = jax.jvp(function, (full,), (jnp.broadcast_to(direction[:, None], full.shape),))
+            return jnp.where(jnp.isfinite(result), slope, jnp.nan)
+
+        return jax.vmap(along)(basis)

@@ -46,7 +46,7 @@ class Mjx(Jax):
     def compile(self, program: Program) -> Problem:
         """Return the twin's steps as jitted functions, compiled at the first call with each batch shape."""
         ops = self.ops()
-        return JaxProblem(MjxProgram(rollout(program), self), ops, self.dtype, self._direction(program))
+        return MjxProblem(MjxProgram(rollout(program), self), ops, self.dtype, self._direction(program))
 
     def refuses(self, program: Program) -> str | None:
         """Return why the program cannot run: it has no twin, or MJX cannot differentiate it; or None."""
@@ -63,6 +63,12 @@ class Mjx(Jax):
         if self.mode != "auto":
             return self.mode
         return "reverse" if self.iterations == 1 and program.dim > FORWARD_UP_TO else "forward"
+
+
+class MjxProblem(JaxProblem):
+    """A program stepped by MJX, in smaller blocks, since a step of a column that is thrown away is dear."""
+
+    grain = 16
 
 
 class MjxProgram(Rollout):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from bench.model import (
     Rollout,
     State,
     Trajectory,
+    cores,
     param,
     rollout,
 )
@@ -132,7 +132,7 @@ class Engine:
         # a diverging rollout ends in NaN, which is report enough; by default MuJoCo also writes a log file
         mujoco.set_mju_user_warning(lambda message: None)
         self._mujoco, self._model = mujoco, model
-        self._data = [mujoco.MjData(model) for _ in range(_cores())]
+        self._data = [mujoco.MjData(model) for _ in range(cores())]
         self._pool = Rollout(nthread=len(self._data))
 
     def rollout(self, first: np.ndarray, controls: np.ndarray) -> np.ndarray:
@@ -217,14 +217,11 @@ def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -
     ops = TorchOps()
     result = program.log_probability(ops, fixed, free, noise) if scored else program.cost(ops, free, noise)
     (gradient,) = torch.autograd.grad(result.sum(), free, materialize_grads=True)
-    return np.asarray(gradient)
+    # a choice between NaN and a number passes on the number's derivative
+    return np.asarray(gradient.masked_fill(~torch.isfinite(result.detach()), float("nan")))
 
 
 def _is_open_loop(scene: MechanicalScene, dim: int) -> bool:
     """Return whether the control law ignores the state."""
     zero = np.zeros((scene.n_q, 1))
     return scene.feedback(np, np.zeros((dim, 1)), zero, zero) is None
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -83,10 +83,15 @@ class TorchProblem(Problem):
         return self._derivative(lambda full, w: self.program.explicit_cost(self._ops, fixed, full, w), theta, w)
 
     def _derivative(self, function: Callable[[Array, Array], Array], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; zero if disconnected."""
+        """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; zero if disconnected.
+
+        It is NaN where b has no value, as a choice between NaN and a number passes on the number's derivative.
+        """
         full = self._tensor(np.broadcast_to(theta, (self.dim, w.shape[1]))).requires_grad_()
         result = function(full, self._tensor(w))
+        lost = ~self._torch.isfinite(result.detach())
         if not result.requires_grad:
-            return np.zeros((self.dim, w.shape[1]))
-        (gradient,) = self._torch.autograd.grad(result.sum(), full, allow_unused=True, materialize_grads=True)
-        return gradient.to(self._torch.float64).numpy()
+            gradient = self._torch.zeros_like(full)
+        else:
+            (gradient,) = self._torch.autograd.grad(result.sum(), full, allow_unused=True, materialize_grads=True)
+        return gradient.masked_fill(lost, float("nan")).detach().to(self._torch.float64).numpy()

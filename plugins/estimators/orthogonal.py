@@ -27,6 +27,10 @@ class Orthogonal(Estimator):
         """True for drawn lengths."""
         return self.lengths == "drawn"
 
+    def declares_unbiased(self, program: Program) -> bool:
+        """Return whether it smoothes as J_sigma does: noise on theta."""
+        return program.noise_on_theta and super().declares_unbiased(program)
+
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of central differences along the rotated directions."""
         d, s = problem.dim, problem.sigma

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Estimator, Problem, columns, param, per_repeat
+from bench.model import Problem, SampleMean, columns, param, per_repeat
 
 
 @dataclass(frozen=True)
-class Reinforce(Estimator):
+class Reinforce(SampleMean):
     """Approximates grad J_sigma with the mean of (f - b) d log p(actions)/dtheta (Williams 1992).
 
     Where theta also sets the initial state, the derivative of f along that path, at given actions, is added.
@@ -24,16 +24,27 @@ class Reinforce(Estimator):
 
     baseline: str = param("center", "what is subtracted from f", choices=("none", "center", "leave_one_out"))
 
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean over samples of (f - b) * score."""
-        w = columns(noise)
-        f = per_repeat(problem.value(theta, w), noise)
-        score = per_repeat(problem.score(theta, w), noise)
+    @property
+    def separable(self) -> bool:
+        """Whether no cost is compared with those of other samples."""
+        return self.baseline != "leave_one_out"
+
+    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return (f - b) * score, and the explicit derivative, of each sample."""
+        f = problem.value(theta, w)
         if self.baseline == "center":
             f = f - problem.value(theta, np.zeros((w.shape[0], 1)))
-        elif self.baseline == "leave_one_out":
-            if f.shape[1] < 2:
-                raise ValueError("baseline leave_one_out needs at least 2 samples")
-            f = (f - f.mean(axis=1, keepdims=True)) * f.shape[1] / (f.shape[1] - 1)
+        return f * problem.score(theta, w) + problem.explicit(theta, w)
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the mean over samples of (f - b) * score."""
+        if self.separable:
+            return super().estimate(problem, theta, noise)
+        if noise.shape[1] < 2:
+            raise ValueError("baseline leave_one_out needs at least 2 samples")
+        w = columns(noise)
+        f = per_repeat(problem.value(theta, w), noise)
+        f = (f - f.mean(axis=1, keepdims=True)) * f.shape[1] / (f.shape[1] - 1)
+        score = per_repeat(problem.score(theta, w), noise)
         explicit = per_repeat(problem.explicit(theta, w), noise)
         return np.einsum("rn,rnd->rd", f, score) / f.shape[1] + explicit.mean(axis=1)

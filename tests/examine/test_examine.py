@@ -11,10 +11,10 @@ import pytest
 import bench
 from bench import cli
 from bench.errors import UserError
-from bench.examine.clock import seconds
-from bench.examine.layout import Layout
 from bench.examine.lines import scan
 from bench.examine.smoothing import Smoothed
+from bench.simulator.clock import seconds
+from bench.simulator.layout import Layout
 
 QUICK = {"progress": False, "budget": 20}
 
@@ -304,3 +304,36 @@ def test_methods_cost_what_their_variance_says():
     unclear = Smoothed(0.1, np.zeros(2), 1.0, 0.5, 64, math.nan, math.nan, math.nan, math.nan, "", ())
     assert unclear.best is None
     assert not unclear.biased
+
+
+def test_cost_that_is_constant_between_jumps_is_no_right_gradient():
+    """Its derivative is 0 wherever it exists, as a check of one theta would say."""
+    report = bench.examine(lambda x: np.floor(20 * x[0]) / 20, [1.01], sigma=0.1, **QUICK)
+    assert (report.status, report.cause) == (1, "staircase")
+
+
+def test_gradients_that_spread_too_widely_are_not_called_right():
+    """f = theta + 1e-4 sin(1e7 theta): each gradient is right, and their mean is noise of 1e3 beside grad J = 1."""
+    report = bench.examine(
+        lambda x: x[0] + 1e-4 * np.sin(1e7 * x[0]), [1.0], grad=lambda x: [1 + 1e3 * np.cos(1e7 * x[0])], sigma=0.01,
+        scale=1e-6, **QUICK,
+    )  # fmt: skip
+    assert (report.status, report.cause) == (1, "spread")
+    assert report.smoothed[0].best.name == "smoothing"
+
+
+def test_jumps_off_the_grid_of_steps_are_seen_by_the_integral():
+    """A slope of 1 made of jumps every 1e-4, beside one of 1 that the gradient has."""
+    report = bench.examine(lambda x: x[0] + np.floor(1e4 * x[0]) / 1e4, [1.00005], grad=lambda x: [1.0], **QUICK)
+    assert report.status == 1
+
+
+def test_slow_simulator_has_its_cause_named_within_the_budget():
+    """5 ms a cost and 6 s: no scan of a staircase, and the wrong component all the same."""
+
+    def slow(x):
+        time.sleep(0.005)
+        return bowl(x)
+
+    report = bench.examine(slow, [1.0, 0.5], grad=lambda x: [slope(x)[0], 3 * x[1] ** 2], progress=False, budget="6s")
+    assert (report.status, report.cause) == (1, "missing_term")

@@ -28,8 +28,11 @@ from bench.plugins.scenes.tossed_box import TossedBox
 from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
 
 from bench.cli import main
+from bench.conformance import backends
+from bench.conformance.kit import Failed
 from bench.conformance.subjects import distance, law_for, samples
 from bench.model import EngineScene, EngineTwin, compose, registry
+from bench.plugins import mjcf
 from bench.studies.bias_variance import BiasVariance
 from bench.sweep.cell import Cell
 from bench.sweep.experiment import Budget
@@ -266,3 +269,16 @@ def test_without_the_library_everything_else_is_listed_and_runs(tmp_path):
     rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet").set_index("backend")
     assert rows["status"].to_dict() == {"numpy": "ok", "mujoco": "unavailable", "mjx": "unavailable"}
     assert "pip install mujoco" in rows.loc["mjx", "reason"]
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_contact_with_friction_has_the_force_of_its_law(cone):
+    """A pyramid is four edges, each a spring: unscaled, they push with 64 N where the law says 10 N."""
+    report = backends.frictional_contact_has_the_force_of_its_law(Mujoco(cone=cone))
+    assert "sliding at 1 m/s it pushes with " + {"pyramidal": "1.4", "elliptic": "2.8"}[cone] in report
+
+
+def test_force_of_unscaled_edges_fails_the_kit(monkeypatch):
+    monkeypatch.setattr(mjcf, "_edges", lambda model: np.ones(model.npair))
+    with pytest.raises(Failed, match=r"63\.97 \(10\)"):
+        backends.frictional_contact_has_the_force_of_its_law(Mujoco())

@@ -10,14 +10,22 @@ from bench.plugins.backends.numpy import Numpy
 from bench.plugins.backends.torch import Torch
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.estimators.alpha_order import AlphaOrder
+from bench.plugins.estimators.clipped import Clipped
+from bench.plugins.estimators.control_variate import ControlVariate
 from bench.plugins.estimators.finite_difference import FiniteDifference
 from bench.plugins.estimators.fobg import Fobg
+from bench.plugins.estimators.guided import Guided
 from bench.plugins.estimators.inverse_variance import InverseVariance
+from bench.plugins.estimators.measure_valued import MeasureValued
+from bench.plugins.estimators.orthogonal import Orthogonal
 from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
 from bench.plugins.estimators.reinforce import Reinforce
+from bench.plugins.estimators.sphere_smoothing import SphereSmoothing
+from bench.plugins.estimators.total_propagation import TotalPropagation
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.cartpole import Cartpole
 from bench.plugins.scenes.heaviside import Heaviside
+from bench.plugins.scenes.linear import Linear
 from bench.plugins.scenes.pushing import Pushing
 from bench.plugins.scenes.soft_heaviside import SoftHeaviside
 from scipy import stats
@@ -203,3 +211,75 @@ def test_smoothing_gains_is_not_smoothing_actions(model):
             Cartpole(sigma=3.0), RandomizedSmoothing(radius=0.1), Jax(), SemiImplicitEuler(), samples=256, repeats=64
         )
         assert far.variance_low > near.variance_high
+
+
+def test_zeroth_orders_on_a_linear_cost_have_their_closed_form_errors():
+    """Relative squared errors on a plane of d variables: (d + 1) / N, (d - 1) / N, and 0 for d orthogonal directions."""
+    problem = Numpy().compile(compose(Linear(dimension=8)))
+    theta, truth = problem.program.theta0, problem.program.closed_form_gradient()
+    w = noise.draw(1, "plane", 4000, 8, 8, "cells")
+
+    def error(estimator):
+        return float(((estimator.estimate(problem, theta, w) - truth) ** 2).sum(axis=1).mean() / (truth @ truth))
+
+    tolerance = 0.05  # 4,000 repeats: 2%
+    assert error(RandomizedSmoothing()) == pytest.approx(9 / 8, rel=tolerance)
+    assert error(SphereSmoothing()) == pytest.approx(7 / 8, rel=tolerance)
+    assert error(Orthogonal(lengths="fixed")) < 1e-20
+    assert error(Orthogonal()) < 0.5 * error(RandomizedSmoothing())
+    assert error(ControlVariate()) < 1e-16  # what differences leave of the gradient at w = 0
+
+
+@pytest.mark.parametrize(("limit", "by"), [(2.0, "sample"), (2.0, "element")])
+def test_clipping_a_ramp_has_the_expectation_limit_times_chance(limit, by):
+    scene = SoftHeaviside(nu=0.1)
+    summary = measured(scene, Clipped(limit=limit, by=by), Numpy(step=1e-9))
+    truth = scene.closed_form_gradient(None, None)[0]
+    expected = truth - limit * scene.probability()
+    assert summary.bias_low <= expected <= summary.bias_high
+
+
+def test_clipping_a_batch_cuts_its_norm():
+    problem = Numpy().compile(compose(Linear(dimension=8)))
+    w = noise.draw(1, "plane", 3, 4, 8, "cells")
+    values, decided = Clipped(by="batch", limit=0.5).explained(problem, problem.program.theta0, w)
+    assert np.linalg.norm(values, axis=1) == pytest.approx(0.5)
+    assert (decided["cut"] == 1).all()
+
+
+def test_a_measure_valued_gradient_has_no_variance_on_a_symmetric_cost():
+    problem = Numpy().compile(compose(Heaviside()))
+    w = noise.draw(1, "step", 5, 3, 1, "cells")
+    values = MeasureValued().estimate(problem, problem.program.theta0, w)
+    assert values == pytest.approx(3.98942, rel=1e-5)
+
+
+def test_guided_directions_need_gradients_that_point_somewhere():
+    """In the gradients' subspace it beats plain smoothing; where they vanish it keeps only its share of the gradient."""
+    plane = Numpy().compile(compose(Linear(dimension=20)))
+    w = noise.draw(1, "plane", 400, 20, 20, "cells")
+    truth = plane.program.closed_form_gradient()
+    errors = [
+        float(((e.estimate(plane, plane.program.theta0, w) - truth) ** 2).sum(axis=1).mean())
+        for e in (Guided(), RandomizedSmoothing())
+    ]
+    assert errors[0] < 0.5 * errors[1]
+    step = Numpy().compile(compose(Heaviside()))
+    w = noise.draw(1, "step", 400, 64, 1, "cells")
+    kept = Guided().estimate(step, step.program.theta0, w).mean() / 3.98942
+    # exactly: the smoothing shrinks too, so that what is kept is sqrt(share), as differences of a step do not scale
+    assert kept == pytest.approx(0.1**0.5, rel=0.1)
+
+
+def test_total_propagation_weights_each_step_by_itself():
+    """Weights equal v0 / (v0 + v1) of each control, recomputed from the terms of single samples."""
+    program = compose(Pushing(horizon=4, sigma=0.1), Penalty(stiffness=1e3), SemiImplicitEuler())
+    problem = Numpy().compile(program)
+    w = noise.draw(0, "pushing", 2, 16, 4, "cells")
+    values, decided = TotalPropagation().explained(problem, program.theta0, w)
+    single = w.reshape(32, 1, 4)
+    first, zeroth = (e.estimate(problem, program.theta0, single).reshape(2, 16, 4) for e in (Fobg(), Reinforce()))
+    v1, v0 = first.var(axis=1, ddof=1), zeroth.var(axis=1, ddof=1)
+    np.testing.assert_allclose(decided["weight"], v0 / (v0 + v1), rtol=1e-9)
+    expected = decided["weight"] * first.mean(axis=1) + (1 - decided["weight"]) * zeroth.mean(axis=1)
+    np.testing.assert_allclose(values, expected, rtol=1e-9)

@@ -1,14 +1,22 @@
 """The implicit backend's root finder: the columns of a batch are solved independently."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from bench.plugins.backends.implicit import Implicit
+from bench.plugins.backends.jax import Jax
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.backends.torch import Torch
 from bench.plugins.contacts.complementarity import Complementarity
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.integrators.implicit_euler import ImplicitEuler
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.ground_wall import GroundWall
 from bench.plugins.scenes.pushing import Pushing
 
-from bench.model import compose
+from bench.model import FunctionScene, compose
 
 SOLVED = 1e-12
 """The root finder stops at a relative change of 1e-12, and Newton's last step on a linear equation is exact."""
@@ -42,3 +50,68 @@ def test_columns_of_any_scale_are_differentiated_alike(unknowns):
         return jnp.sum(ops.root(lambda z, a: a * z - 1.0, guess, a))
 
     assert np.asarray(jax.grad(total)(a)) == pytest.approx(-unknowns / np.asarray(a) ** 2, rel=SOLVED)
+
+
+def stiff(stiffness, **values):
+    """A ball on a spring so stiff that dt^2 k / m is ``stiffness``, all along the 10 steps before, at and after touch."""
+    scene = BounceOnce(horizon=10, height=0.1 + 5.3 * 2.0 / 480.0, **values)
+    return Implicit().compile(compose(scene, Penalty(stiffness=stiffness / scene.dt**2), ImplicitEuler()))
+
+
+@pytest.mark.parametrize("stiffness", [1e2, 1e8, 1e11])
+def test_stiff_equations_are_solved_whatever_the_size_of_their_residual(stiffness):
+    """A residual that multiplies the gap by 1e11 rounds to 1e-5, which is no failure."""
+    problem = stiff(stiffness)
+    w = 0.1 * np.random.default_rng(0).standard_normal((problem.program.n_noise, 64))
+    theta = problem.program.theta0
+    assert np.isfinite(problem.value(theta, w)).all()
+    assert np.isfinite(problem.grad(theta, w)).all()
+
+
+@pytest.mark.parametrize("mode", ["reverse", "forward"])
+def test_a_solve_that_fails_has_no_gradient(mode):
+    """z^2 + 1 = 0 has no root; what the last iteration left has a derivative all the same, of nothing."""
+    import jax
+    import jax.numpy as jnp
+
+    ops = Implicit().ops()
+    a = jnp.asarray([[-1.0, 1.0]])
+
+    def root(a):
+        return ops.root(lambda z, a: z * z + a, 2.0 + 0.0 * a, a)
+
+    assert np.isnan(np.asarray(root(a))).tolist() == [[False, True]]
+    reverse = mode == "reverse"
+    slope = jax.grad(lambda a: root(a).sum())(a) if reverse else jax.jvp(root, (a,), (jnp.ones_like(a),))[1]
+    assert np.isnan(np.asarray(slope)).tolist() == [[False, True]]
+    assert slope[0, 0] == pytest.approx(-0.5, rel=SOLVED)
+
+
+@dataclass(frozen=True)
+class Hidden(FunctionScene):
+    """theta^2 where theta is positive, else no number: chosen after the fact, as by a solver that looks whether it failed."""
+
+    name = "hidden"
+
+    def theta0(self):
+        return np.array([1.0])
+
+    def cost(self, xp, x):
+        return xp.where(x[0] > 0, x[0] * x[0], xp.nan * xp.ones_like(x[0]))
+
+
+@pytest.mark.parametrize("backend", [Jax(), Jax(mode="forward"), Torch(), Numpy()], ids=str)
+def test_a_cost_that_is_no_number_has_no_gradient(backend):
+    problem = backend.compile(compose(Hidden()))
+    gradient = problem.grad(np.array([[2.0, -2.0]]), np.zeros((1, 2)))
+    assert gradient[0, 0] == pytest.approx(4.0, rel=1e-6)
+    assert np.isnan(gradient[0, 1])
+
+
+def test_complex_numbers_are_an_error(monkeypatch):
+    from bench.plugins.backends.numpy import NumpyProblem
+
+    problem = Numpy().compile(compose(Hidden()))
+    monkeypatch.setattr(NumpyProblem, "_grad", lambda self, theta, w: np.ones((1, w.shape[1])) + 1j)
+    with pytest.raises(TypeError, match="complex"):
+        problem.grad(np.array([1.0]), np.zeros((1, 2)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import io
 import json
 import re
 import shlex
@@ -13,12 +14,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from browser import CHROMIUM, chromium
-from helpers import experiment, row, small_rows, table
+from helpers import experiment, row, small_rows, stiffness_rows, table
 
 from bench import cli, gallery
 from bench.model import registry
 from bench.report import reproduce, web
 from bench.report.web import document
+from bench.studies.bias_variance import page as bias_variance_page
 from bench.studies.bias_variance.columns import COLUMNS
 from bench.sweep import config, grid
 from bench.sweep.columns import Columns
@@ -242,6 +244,18 @@ def test_unsteady_times_are_marked(browser, tmp_path):
     ]
 
 
+def test_status_reason_and_time_are_in_sight_on_a_laptop(browser, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text(page(stiffness_rows()))
+    browser.size(1280, 900)
+    browser.open(path)
+    heads = "[...document.querySelectorAll('#table th')]"
+    for name in ("status", "reason", "time"):
+        right = browser.do(f"{heads}.find((h) => h.textContent.trim() === '{name}').getBoundingClientRect().right")
+        assert right <= 1280, name
+    browser.size(*WIDE)
+
+
 def test_charts_are_drawn_and_a_filter_takes_points_away(shown):
     rows = small_rows()
     before = shown.do(MARKS)
@@ -259,6 +273,41 @@ def test_charts_are_drawn_and_a_filter_takes_points_away(shown):
     assert f"{len(left)} of {len(rows)} cells" in shown.do("document.getElementById('shown').textContent")
     shown.do("document.getElementById('clear').click(); settled()")
     assert shown.do(MARKS) == before
+
+
+def test_filters_stay_in_the_address_and_the_csv_has_what_is_shown(shown, tmp_path):
+    rows = small_rows()
+    address = shown.do("location.href.split('#')[0]")
+    shown.do(
+        """(() => {
+        const box = document.querySelector('#filters details[data-column="estimator"] input[data-value="fobg"]');
+        box.checked = false;
+        box.dispatchEvent(new Event('change'));
+        return settled();
+        })()"""
+    )
+    link = shown.do("location.href")
+    assert link.startswith(f"{address}#estimator=")
+    assert "fobg" not in link
+    left = rows[rows["estimator"] != "fobg"]
+    back = pd.read_csv(io.StringIO(shown.do("csv()")))
+    assert len(back) == len(left)
+    assert set(back["estimator"]) == set(left["estimator"])
+    assert back["rmse_rel"].tolist() == pytest.approx(left["rmse_rel"].tolist(), rel=1e-5, nan_ok=True)
+    shown.do("document.getElementById('clear').click(); settled()")
+    assert shown.do("location.hash") == ""
+    shown.do(
+        f"location.hash = {json.dumps('#' + link.partition('#')[2])}; new Promise((done) => setTimeout(done, 200))"
+    )
+    assert f"{len(left)} of {len(rows)} cells" in shown.do("document.getElementById('shown').textContent")
+    shown.do("location.hash = '#nonsense=%E0%A4%A'; new Promise((done) => setTimeout(done, 200))")
+    assert f"{len(rows)} of {len(rows)} cells" in shown.do("document.getElementById('shown').textContent")
+
+
+def test_no_panel_pools_stiffness_or_sigma():
+    derived = bias_variance_page.derived(stiffness_rows())
+    pooled = derived.groupby("problem")[["stiffness", "sigma"]].nunique()
+    assert (pooled == 1).all().all()
 
 
 def test_number_of_points_in_the_first_chart_is_that_of_the_good_cells(shown):

@@ -230,7 +230,7 @@ def test_charts_are_written_as_pictures_and_data(tmp_path):
 def test_one_line_per_estimator_and_one_colour_everywhere():
     figures = drawn(stiffness_rows(), ["sigma", "stiffness"])
     panels = figures["bias_variance_stiffness"].axes
-    assert len(panels) == 2 * 4
+    assert len(panels) == 3 * 4
     colours = {}
     for figure in figures.values():
         for panel in figure.axes:
@@ -262,7 +262,14 @@ def test_failed_cells_are_crosses():
     rows = stiffness_rows(sigmas=(0.1,))
     panels = drawn(rows, ["stiffness"])["bias_variance_stiffness"].axes
     crosses = [[line for line in panel.lines if line.get_marker() == "x"] for panel in panels]
-    assert [len(found) for found in crosses] == [2, 0, 2, 0]  # fobg and inverse_variance, bias and variance
+    assert [len(found) for found in crosses] == [
+        2,
+        0,
+        2,
+        0,
+        2,
+        0,
+    ]  # fobg and inverse_variance, in RMSE, bias and variance
 
 
 def test_marks_are_drawn():
@@ -295,7 +302,7 @@ def test_the_parameter_behind_smoothing_is_an_axis():
     rows += [row(contact="complementarity", smoothing=k) for k in (1e-6, 1e-4)] + [row()]
     figures = drawn(table(rows), ["beta", "kappa"], sweep=sweep)
     assert set(figures) == {"bias_variance_beta", "bias_variance_kappa"}
-    assert len(figures["bias_variance_beta"].axes) == 2
+    assert len(figures["bias_variance_beta"].axes) == 3
 
 
 def test_zipped_axes_do_not_split_problems():
@@ -634,3 +641,30 @@ def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
     for name in NAMES:
         assert look(name) == {name: every[name]}
     assert look("of_my_own", *NAMES) == every | look("of_my_own")
+
+
+def test_titles_say_where_the_best_estimator_fails_and_what_never_does():
+    """Made-up first-order errors grow with the stiffness of the penalty law; beyond a marked value, or from one."""
+
+    def title(marks, **results):
+        made = [
+            row(estimator=name, contact=contact, stiffness=k) | {"rmse_rel": results[name](contact, k)}
+            for name in results
+            for contact in ("penalty", "complementarity")
+            for k in (10.0, 1e3, 1e5)
+        ]
+        given = experiment(sweep={"stiffness": [10.0, 1e3, 1e5]}, marks={"stiffness": marks})
+        shown = views.arranged(given, table(made))
+        axis = named(shown, "stiffness")
+        parts = [(part, views.lines(part.rows)) for part in views.families(shown, views.along(shown, axis))]
+        return findings.headline(parts, axis, marks)
+
+    stiff = lambda contact, k: 9.0 if contact == "penalty" and k > 1e4 else 0.1  # noqa: E731
+    fine, useless = (lambda contact, k: 0.5), (lambda contact, k: 2.0)
+    assert title({}, fobg=stiff, reinforce=fine) == (
+        "fobg fails at stiffness 1e5 with penalty, not with complementarity; reinforce better than zero everywhere"
+    )
+    assert title({"limit": 6400.0}, fobg=stiff).startswith("fobg fails beyond the limit (stiffness 6400) with penalty")
+    assert title({"limit": 20.0}, fobg=stiff).startswith("fobg fails at stiffness 1e5"), "20 is no limit of it"
+    assert title({}, fobg=fine, reinforce=useless) == "reinforce no better than zero; fobg better than zero everywhere"
+    assert title({}, fobg=useless) == "fobg no better than zero"

@@ -11,7 +11,7 @@ import pytest
 
 from bench.model import MechanicalScene, State, compose, registry
 from bench.model.parameters import build
-from bench.studies.stability import Stability, report
+from bench.studies.stability import Stability, report, summary
 from bench.studies.stability import measure as stability
 from bench.sweep import config, runner
 from bench.sweep.cell import Cell
@@ -257,8 +257,11 @@ def test_files_and_the_printed_table(tmp_path, capsys):
     names = {path.name for path in paths}
     assert names == {
         "stability_map.csv", "stability_map.md", "stability_map_semi_implicit_euler.png",
-        "stability_map_semi_implicit_euler.plotted.csv",
+        "stability_map_semi_implicit_euler.plotted.csv", "stability_summary.png", "stability_summary.plotted.csv",
     }  # fmt: skip
+    counted = pd.read_csv(given.directory / "stability_summary.plotted.csv")
+    assert counted["cells"].sum() == len(both)
+    assert dict(zip(counted["verdict"], counted["cells"], strict=True)) == both["verdict"].value_counts().to_dict()
     Stability().show(given, both)
     printed = capsys.readouterr().out
     assert "semi_implicit_euler" in printed
@@ -269,3 +272,13 @@ def test_files_and_the_printed_table(tmp_path, capsys):
     drawn = dict(zip(np.round(line.get_xdata(), 9), line.get_ydata(), strict=True))
     assert drawn[DT] == pytest.approx(2 / DT**2, rel=1e-6)
     assert {text.get_text() for text in axes.texts} >= {"D"}
+
+
+def test_the_summary_leads_with_what_is_right_where_and_how_often_it_is_never():
+    made = pd.DataFrame(
+        [("spring", "one", "ok", 3), ("spring", "one", "diverged", 1), ("ball", "one", "wrong_sign", 4)],
+        columns=["problem", "integrator", "verdict", "cells"],
+    )
+    assert summary.headline(made) == (
+        "The gradient is right in 38% of the cells; most often (75%) with one on spring; never in 1 of 2 combinations"
+    )

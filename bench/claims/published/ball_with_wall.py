@@ -58,6 +58,7 @@ class ThrownBall(Claim):
         "the samples can resolve turns alpha-order into the zeroth order."
     )
     labels = ("angle", "gradient of the smoothed cost")
+    quick = False
 
     def measure(self) -> Outcome:
         """Place the jumps, integrate the gradients, and descend."""

@@ -30,6 +30,7 @@ class Missed(Claim):
         "A surrogate gradient sees what was missed and keeps the motion, but it is not the derivative of the program."
     )
     labels = ("force across u0 [N]", "df / du0")
+    quick = False
 
     def measure(self) -> Outcome:
         """Count exact zeros over u0 in [-5, 5], and compare the smoothed gradients with the true one."""

@@ -28,6 +28,7 @@ class Directions(Claim):
     source = "Nesterov, Spokoiny 2017; Berahas et al. 2022"
     learned = "Zeroth order pays for dimension: it needs as many samples as variables to be 100% off."
     labels = ("samples N", "relative squared error")
+    quick = False
 
     def measure(self) -> Outcome:
         """Sample estimates at two noise levels."""

@@ -28,6 +28,7 @@ class Ramp(Claim):
     source = "Suh et al. 2022, ICML"
     learned = "An unbiased gradient can be useless: in finite samples a steep ramp is a jump."
     labels = ("width of the ramp / sigma", "variance of one sample")
+    quick = False
 
     def measure(self) -> Outcome:
         """Find the crossing of the variances, and errors of small batches."""

@@ -46,6 +46,8 @@ class Options:
     """Unit roundoff that the arithmetic is declared to have; the noise of the cost is measured beside it."""
     scale: np.ndarray | None = None
     """The scale of each input ``(d,)``; None for :func:`scales`."""
+    scanned: int = SUSPICIOUS
+    """Directions at most that are scanned for a staircase, some 450 costs each."""
     seed: int = 0
     """Of the random directions and thetas."""
 
@@ -332,7 +334,7 @@ class _Checker:
     ) -> list[Finding]:
         """Look for staircases in the cost along the directions that are not plainly right."""
         plain = ("smooth", "nonlinear", "mode_crossing", "zero", "nonfinite", "nondeterministic")
-        asked = [m for m, finding in enumerate(judged) if finding.verdict not in plain][:SUSPICIOUS]
+        asked = [m for m, finding in enumerate(judged) if finding.verdict not in plain][: self.options.scanned]
         along = roughness.scans(1.0, self.unit)
         for m in asked:
             at = thetas[:, m : m + 1] + vectors[:, m : m + 1] * along.reshape(1, -1)

@@ -120,6 +120,7 @@ function buildFilters() {
     });
     box.dataset.column = name;
     box.reset = () => inputs.forEach((input) => (input.checked = true));
+    box.keep = (kept) => inputs.forEach((input) => (input.checked = !kept || kept.includes(input.dataset.value)));
     box.update = update;
     box.append(element("fieldset", { ariaLabel: name }, all, none, ...labels));
     place.append(box);
@@ -143,6 +144,52 @@ function buildFilters() {
     state.find = event.target.value.trim().toLowerCase();
     refresh();
   });
+  document.getElementById("csv").addEventListener("click", saveCsv);
+  addEventListener("hashchange", () => { if (location.hash !== written) fromAddress(); });
+}
+
+/* The address keeps the filters, #estimator=fobg,reinforce&find=jax, so that a link shows what its sender saw. */
+let written = "";
+
+function toAddress() {
+  const parts = Object.entries(state.chosen).map(([name, kept]) =>
+    encodeURIComponent(name) + "=" + [...kept].map((value) => encodeURIComponent(String(value))).join(","));
+  if (state.find) parts.push("find=" + encodeURIComponent(state.find));
+  written = parts.length ? "#" + parts.join("&") : "";
+  if (location.hash !== written) history.replaceState(null, "", written || location.pathname + location.search);
+}
+
+function fromAddress() {
+  const given = new Map();
+  for (const part of location.hash.slice(1).split("&").filter(Boolean)) {
+    const [name, ...rest] = part.split("=");
+    try {
+      given.set(decodeURIComponent(name), rest.join("=").split(",").map(decodeURIComponent));
+    } catch { /* not an address that this page wrote */ }
+  }
+  const find = given.get("find");
+  state.find = document.getElementById("find").value = find ? find.join(",") : "";
+  const boxes = [...document.getElementById("filters").children];
+  for (const box of boxes) box.keep(given.get(box.dataset.column));
+  for (const box of boxes) box.update();
+}
+
+/* The cells shown, in the order of the table, every digit that the page has. */
+function csv() {
+  const names = [...new Set([...page.identity, ...page.columns.map((column) => column.name)])].filter((name) => page.tables.rows[name]);
+  const quoted = (value) => {
+    const text = value === null || value === undefined ? "" : String(value);
+    return /[",\r\n]/.test(text) ? '"' + text.replace(/"/g, '""') + '"' : text;
+  };
+  const readers = names.map((name) => reader("rows", name));
+  const lines = order().map((i) => readers.map((read) => quoted(read(i))).join(","));
+  return [names.map(quoted).join(","), ...lines].join("\n") + "\n";
+}
+
+function saveCsv() {
+  const address = URL.createObjectURL(new Blob([csv()], { type: "text/csv" }));
+  element("a", { href: address, download: document.title.replace(/\W+/g, "_") + ".csv" }).click();
+  setTimeout(() => URL.revokeObjectURL(address), 1000);
 }
 
 function applyFilters() {
@@ -162,6 +209,7 @@ function applyFilters() {
 function refresh() {
   const started = performance.now();
   applyFilters();
+  toAddress();
   state.limit = FIRST;
   drawTable();
   markDirty();
@@ -650,7 +698,8 @@ async function start() {
   buildTheme();
   buildFilters();
   buildTable();
-  refresh();
+  if (location.hash) fromAddress();
+  else refresh();
   buildCharts();
   if (!window.DecompressionStream) {
     document.getElementById("charts").prepend(element("p", { textContent: "Charts need a browser of 2023 or later." }));

@@ -31,19 +31,23 @@ class BiasVariance(Study):
         5, "estimates timed one by one on backends that do not compile; the other repeats are evaluated together",
         positive=True,
     )  # fmt: skip
+    settle_s: float = param(
+        0.02, "time within which calls are repeated until their interquartile range is below 10% of the median", "s",
+        low=0.0,
+    )  # fmt: skip
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Measure the estimates of one cell and their statistics."""
         from bench.studies.bias_variance.measure import measure
 
-        return measure(cell, session, self.timed_calls)
+        return measure(cell, session, self.timed_calls, self.settle_s)
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the main table, error against time, the charts, and the fastest methods where samples were swept."""
-        from bench.studies.bias_variance import charts, fastest, tables
+        """Write the main table, error against time, the charts, the fastest methods, and who wins where."""
+        from bench.studies.bias_variance import charts, fastest, standing, tables
 
         paths = tables.write(experiment, rows) + charts.write(experiment, rows)
-        return paths + fastest.write(experiment, rows)
+        return paths + fastest.write(experiment, rows) + standing.write(experiment, rows)
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
         """Print the digest: the main table, condensed where it is long, and the findings from it."""

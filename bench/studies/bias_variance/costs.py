@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -49,10 +50,43 @@ TIME_COMPILED = Cost(
     _half_range,
     _seconds,
 )
+RATIO = "gradient_cost"
+"""Column with the rollouts that take as long as one gradient; rows without it count a gradient as one rollout."""
+PROGRAM = (
+    "scene", "contact", "integrator", "noise", "horizon", "dt", "stiffness", "sigma", "smoothing", "backend", "dtype",
+)  # fmt: skip
+
+
+def charged(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with the measured cost of a gradient in rollouts, per program and backend.
+
+    It is the ratio of seconds per gradient to seconds per rollout, from the fastest rows that use gradients alone and
+    costs alone, at the largest number of samples that has both; NaN where nothing was measured.
+    """
+    rows = rows.assign(**{RATIO: math.nan})
+    known = rows[(rows["status"] == "ok") & (rows["time_s"] > 0)]
+    keys = [name for name in PROGRAM if name in rows]
+    for _, part in known.groupby(keys, dropna=False):
+        first = part[(part["gradients"] > 0) & (part["rollouts"] <= 0.01 * part["gradients"])]
+        zeroth = part[(part["gradients"] == 0) & (part["rollouts"] > 0)]
+        both = sorted(set(first["samples"]) & set(zeroth["samples"]))
+        if both:
+            a, b = (table[table["samples"] == both[-1]] for table in (first, zeroth))
+            ratio = (a["time_s"] / a["gradients"]).min() / (b["time_s"] / b["rollouts"]).min()
+            same = (rows[keys].eq(part[keys].iloc[0]) | (rows[keys].isna() & part[keys].iloc[0].isna())).all(axis=1)
+            rows.loc[same, RATIO] = ratio
+    return rows
+
+
+def _rollouts(rows: pd.DataFrame) -> pd.Series:
+    ratio = rows[RATIO].fillna(1.0) if RATIO in rows else 1.0
+    return rows["rollouts"] + ratio * rows["gradients"]
+
+
 ROLLOUTS = Cost(
     "its rollouts",
-    "rollouts, a gradient counting as one",
-    lambda rows: rows["rollouts"] + rows["gradients"],
+    "rollouts, a gradient at its measured cost",
+    _rollouts,
     lambda rows: 0.0 * rows["rollouts"],
     axis_value,
 )

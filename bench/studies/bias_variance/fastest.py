@@ -19,17 +19,19 @@ from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, number
 from bench.report.views import Family, Line, along, arranged, families, lines
 from bench.studies.bias_variance.charts import SAMPLES
-from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost
+from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost, charged
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import write_all
 
 TARGETS = (0.1, 0.01)
 """Relative errors asked for."""
 NOTES = (
-    "cost: of one estimate, compilation left out; rollouts: a gradient counts as one. how: `measured` between two sample "
-    "counts, `at once` where the fewest samples already suffice (the cost is an upper limit), `extrapolated` by RMSE^2 = "
-    "bias^2 + v / N beyond the most samples measured, where the 95% limit of the bias lies below the error asked for. "
-    "never: methods whose bias exceeds that error. unknown: methods whose bias is not known to be below it.",
+    "cost: of the cheapest estimate that reaches the error, in seconds without compilation, or in rollouts, where a "
+    "gradient counts as the rollouts that take as long (as measured at the most samples; as one where it was not). how: "
+    "`measured` between two sample counts, `at once` where the fewest samples already suffice (the cost is an upper "
+    "limit), `extrapolated` by RMSE^2 = bias^2 + v / N beyond the most samples measured, where the 95% limit of the bias "
+    "lies below the error asked for. never: methods whose bias exceeds that error. unknown: methods whose bias is not known "
+    "to be below it.",
 )
 
 
@@ -49,15 +51,18 @@ def reach(line: Line, target: float, cost: Cost) -> Reached:
     if rows.empty:
         return Reached("unknown")
     n, error, price = (rows.index.to_numpy(float), rows["rmse_rel"].to_numpy(float), cost.of(rows).to_numpy(float))
-    enough = np.flatnonzero(error <= target)
-    if enough.size == 0:
+    if not (error <= target).any():
         return _beyond(rows.iloc[-1], n[-1], price[-1], target)
-    first = int(enough[0])
-    if first == 0:
-        return Reached("at once", price[0], n[0])
-    share = math.log(error[first - 1] / target) / math.log(error[first - 1] / error[first])
-    samples, needed = (math.exp((1 - share) * math.log(v[first - 1]) + share * math.log(v[first])) for v in (n, price))
-    return Reached("measured", needed, samples)
+    # more samples may cost less: small batches are dominated by what a call costs at all
+    ways = [Reached("measured", price[i], n[i]) for i in range(1, len(n)) if error[i] <= target]
+    for i in range(1, len(n)):
+        if error[i] <= target < error[i - 1]:
+            share = math.log(error[i - 1] / target) / math.log(error[i - 1] / error[i])
+            samples, needed = (math.exp((1 - share) * math.log(v[i - 1]) + share * math.log(v[i])) for v in (n, price))
+            ways.append(Reached("measured", needed, samples))
+    if error[0] <= target:
+        ways.append(Reached("at once", price[0], n[0]))
+    return min(ways, key=lambda way: (way.cost, way.samples))
 
 
 def _beyond(row: Any, samples: float, price: float, target: float) -> Reached:
@@ -75,41 +80,67 @@ def _beyond(row: Any, samples: float, price: float, target: float) -> Reached:
 
 def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     """Return a line per problem, kind of cost and target; empty where samples were not swept."""
-    shown = arranged(experiment, rows)
+    shown = arranged(experiment, charged(rows))
+    costs = (("time", TIME), ("rollouts", ROLLOUTS))
+    timed = bool(np.isfinite(shown.rows["time_s"]).any())
     entries = [
         _line(problem, target, kind, cost)
         for problem in families(shown, along(shown, SAMPLES), ("scene",))
         if problem.rows["x"].nunique() > 1
-        for kind, cost in (("time", TIME), ("rollouts", ROLLOUTS))
+        for kind, cost in costs[0 if timed else 1 :]
         for target in TARGETS
     ]
     return pd.DataFrame(entries)
 
 
-def _line(problem: Family, target: float, kind: str, cost: Cost) -> dict[str, str]:
-    """Return the fastest method, the next one, and those that are out."""
+def methods(problem: Family, target: float, cost: Cost) -> dict[str, Reached]:
+    """Return what each method needs for an error: per estimator and backend in time, per estimator in rollouts."""
     reached: dict[str, Reached] = {}
     for line in lines(problem.rows, close=None):
         name = line.label if cost is ROLLOUTS else f"{line.label} on {line.rows['backend'].iloc[0]}"
         found = reach(line, target, cost)
         if name not in reached or found.cost < reached[name].cost or math.isnan(reached[name].cost):
             reached[name] = found
+    return reached
+
+
+def _line(problem: Family, target: float, kind: str, cost: Cost) -> dict[str, Any]:
+    """Return the fastest method, the next one, and those that are out."""
+    reached = methods(problem, target, cost)
     ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
-    texts = dict.fromkeys(("fastest", "cost", "samples", "how", "next", "factor"), "-")
+    entry: dict[str, Any] = {
+        "fastest": "-",
+        "cost": math.nan,
+        "samples": math.nan,
+        "how": "-",
+        "next": "-",
+        "factor": math.nan,
+    }
     if ranked:
         best = reached[ranked[0][1]]
-        texts |= {
-            "fastest": ranked[0][1],
-            "cost": cost.text(float(number(best.cost))),
-            "samples": axis_value(math.ceil(best.samples)),
-            "how": best.how,
-        }
+        entry |= {"fastest": ranked[0][1], "cost": best.cost, "samples": math.ceil(best.samples), "how": best.how}
+    elif any(r.how == "unknown" for r in reached.values()):
+        entry["how"] = "no bias known to be below"
     else:
-        texts["how"] = "no bias known to be below" if any(r.how == "unknown" for r in reached.values()) else "never"
+        entry["how"] = "never"
     if len(ranked) > 1:
-        texts |= {"next": ranked[1][1], "factor": number(ranked[1][0] / ranked[0][0])}
+        entry |= {"next": ranked[1][1], "factor": ranked[1][0] / ranked[0][0]}
     out = {how: ", ".join(name for name, r in reached.items() if r.how == how) or "-" for how in ("never", "unknown")}
-    return {"problem": problem.title(), "relative error": f"{target:.0%}", "by": kind, **texts, **out}
+    return {"problem": problem.title(), "relative error": target, "by": kind, **entry, **out}
+
+
+def texts(best: pd.DataFrame) -> pd.DataFrame:
+    """Return the table as it is printed; the CSV has the numbers."""
+    shown = best.astype(object)
+    kinds = {"time": TIME, "rollouts": ROLLOUTS}
+    shown["relative error"] = [f"{value:.0%}" for value in best["relative error"]]
+    shown["cost"] = [
+        kinds[kind].text(float(number(cost))) if math.isfinite(cost) else "-"
+        for kind, cost in zip(best["by"], best["cost"], strict=True)
+    ]
+    shown["samples"] = [axis_value(value) for value in best["samples"]]
+    shown["factor"] = [number(value) for value in best["factor"]]
+    return shown
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
@@ -122,7 +153,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         experiment.directory,
         {
             "fastest.csv": best.to_csv(index=False, lineterminator="\n"),
-            "fastest.md": "\n\n".join([title, plain_markdown(best), *NOTES]) + "\n",
+            "fastest.md": "\n\n".join([title, plain_markdown(texts(best)), *NOTES]) + "\n",
         },
     )
 
@@ -131,7 +162,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     """Print the table, if samples were swept."""
     best = table(experiment, rows)
     if not best.empty:
-        _print(best)
+        _print(texts(best))
 
 
 def _print(best: pd.DataFrame) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -59,3 +61,65 @@ def span(where: Mapping[float, bool]) -> str:
             return f">={axis_value(runs[0][0])}"
     texts = [axis_value(r[0]) if len(r) == 1 else f"{axis_value(r[0])}..{axis_value(r[-1])}" for r in runs]
     return f"at {' and '.join(texts)}"
+
+
+def headline(
+    parts: Sequence[tuple[Family, Sequence[Line]]], axis: Axis, marks: Mapping[str, float] = MappingProxyType({})
+) -> str:
+    """Write where estimators fail, the one that is lowest most often first, and which never does.
+
+    Failing is an error no better than answering zero, or a cell that did not end well.
+    """
+    wins = Counter(label for _, curves in parts for labels in winners(curves).values() for label in labels)
+    names = sorted(dict.fromkeys(line.label for _, curves in parts for line in curves), key=lambda name: -wins[name])
+    bad = {name: [_failures(curves, name) for _, curves in parts] for name in names}
+    names = [name for name in names if any(bad[name])]
+    sound = [name for name in names if not any(any(where.values()) for where in bad[name])]
+    useless = [name for name in names if all(all(where.values()) for where in bad[name])]
+    broken = [name for name in names if name not in (*sound, *useless)]
+    families = [family for family, _ in parts]
+    clauses = [f"{broken[0]} fails {_where(bad[broken[0]], families, axis, marks)}"] if broken else []
+    if useless and not broken:
+        clauses.append(f"{' and '.join(useless[:2])} no better than zero")
+    if sound:
+        clauses.append(f"{' and '.join(sound[:2])} better than zero everywhere")
+    return "; ".join(clauses) or f"No estimator is better than zero anywhere along {axis.column}"
+
+
+def _failures(curves: Sequence[Line], name: str) -> dict[float, bool]:
+    """Return, at each ``x`` that an estimator was run at, whether it failed on any backend; refused cells are left out."""
+    where: dict[float, bool] = {}
+    for line in curves:
+        for x, row in line.at.items() if line.label == name else ():
+            if row["status"] != "ok" or np.isfinite(row["rmse_rel"]):
+                where[x] = where.get(x, False) or row["status"] != "ok" or row["rmse_rel"] >= 1
+    return dict(sorted(where.items()))
+
+
+def _where(
+    bad: Sequence[Mapping[float, bool]], families: Sequence[Family], axis: Axis, marks: Mapping[str, float]
+) -> str:
+    """Write where along an axis something fails, and in which of several problems."""
+    failing = [i for i, where in enumerate(bad) if any(where.values())]
+    spans = list(dict.fromkeys(span(bad[i]) for i in failing))
+    text = ""
+    if len(spans) == 1 and spans[0]:
+        sign = "from" if spans[0].startswith(">=") else "up to" if spans[0].startswith("<=") else "at"
+        text = f"{sign} {axis.column} {spans[0].removeprefix('at ').lstrip('<>=')}"
+    ends = [
+        (max((x for x, b in bad[i].items() if not b), default=0.0), min(x for x, b in bad[i].items() if b))
+        for i in failing
+    ]
+    beyond = [name for name, value in marks.items() if all(good <= value < first for good, first in ends)]
+    if beyond:
+        text = f"beyond the {beyond[0]} ({axis.column} {axis_value(marks[beyond[0]])})"
+    for key in ("scene", "contact", "integrator"):
+        mine = {str(families[i].identity.get(key, "")) for i in failing}
+        others = {str(f.identity.get(key, "")) for i, f in enumerate(families) if i not in failing and bad[i]}
+        if others and not mine & others:
+            return f"{text} with {' and '.join(sorted(mine))}, not with {' and '.join(sorted(others))}".strip()
+    if not text and len(spans) == 1:
+        text = "everywhere"
+    ran = sum(map(bool, bad))
+    where = "" if len(failing) == ran else f" in {len(failing)} of {ran} problems"
+    return (text + where).strip() or "at some values"

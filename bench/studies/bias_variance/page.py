@@ -11,7 +11,7 @@ import pandas as pd
 
 from bench.model import registry
 from bench.report.style import Look
-from bench.report.text import counted, duration, number
+from bench.report.text import axis_value, counted, duration, number
 from bench.report.views import (
     CATEGORIES,
     Arranged,
@@ -59,12 +59,15 @@ RESULTS = [
     Column("variance_rel", "rel. variance"),
     Column("rmse_rel", "rel. RMSE"),
     Column("cosine", "cosine"),
-    Column("time_s", "time", "seconds", "unsteady"),
     Column("compile_s", "compile", "seconds"),
     Column("rollouts", "rollouts"),
 ]
+POOLED = ("horizon", "dt", "stiffness", "sigma", "smoothing")
+TIME = Column("time_s", "time", "seconds", "unsteady")
 GOAL = 0.1
 """Relative RMSE for which the fastest method is named."""
+IN_SIGHT = 5
+"""Identity columns that stand before time, status, reason and results, which a narrow screen has to show."""
 EXCEPTIONS = 2
 """Most settings with another best estimator that the finding names."""
 
@@ -110,7 +113,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     return Content(
         finding=nothing_ran(rows) or "; ".join(filter(None, [finding(summaries), fastest(rows), refused(rows)])) + ".",
         rows=table_,
-        columns=[*identity_columns(rows), *RESULTS, *STATUS],
+        columns=[*identity_columns(rows)[:IN_SIGHT], TIME, *STATUS, *RESULTS, *identity_columns(rows)[IN_SIGHT:]],
         charts=charts,
         answers=answers(summaries),
         tables=tables,
@@ -136,11 +139,21 @@ def derived(rows: pd.DataFrame) -> pd.DataFrame:
         "bias_limit": limit.astype(float),
         "unsteady": unsteady(rows).astype(float),
         "series": _label(rows),
-        "problem": titled(rows, ["scene", "contact"]),
+        # a panel never pools what makes costs differ
+        "problem": titled(rows.assign(**_named(rows)), ["scene", "contact", *POOLED]),
         "line": rows["backend"] + " " + rows["dtype"] + " " + _label(rows),
         "setting": problem(rows).astype(str),
     }
     return rows.assign(**{name: column.where(good) for name, column in values.items()}, **texts)
+
+
+def _named(rows: pd.DataFrame) -> dict[str, Iterable[str]]:
+    """Return the pooled columns as ``sigma=0.1``; nothing where a column has one value or a row has none."""
+    several = {name: rows[name].nunique() > 1 for name in POOLED}
+    return {
+        name: [f"{name}={axis_value(x)}" if several[name] and math.isfinite(x) else "" for x in rows[name]]
+        for name in POOLED
+    }
 
 
 def _label(rows: pd.DataFrame) -> pd.Series:

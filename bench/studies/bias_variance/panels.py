@@ -17,8 +17,9 @@ from matplotlib.transforms import Transform
 from bench.report.page import columns, page, shared
 from bench.report.scales import above, extent, log_axis, mark_values, scale_x, scale_y, shifts
 from bench.report.style import CROSS, DEVIANT, FRONT, GREY, MARKS, SHADE, TICK, Look, axis_name, plain, quantity, twin
-from bench.report.views import Family, Line, lines, pareto, resolved
+from bench.report.views import Family, Line, lines, pareto, resolved, rmse_interval
 from bench.studies.bias_variance.costs import Cost
+from bench.studies.bias_variance.findings import headline
 from bench.sweep.axes import Axis
 
 ALIKE = 0.03
@@ -38,25 +39,29 @@ DOWN, LEFT = (
 def bias_variance(
     problems: Sequence[Family], notes: Sequence[str], look: Look, axis: Axis, marks: Mapping[str, float]
 ) -> Figure:
-    """Draw relative bias above, relative variance below, against one axis; a column of panels per problem."""
+    """Draw relative RMSE, and its parts below it: bias and variance; against one axis, a column of panels per problem.
+
+    The title says where the best estimator fails.
+    """
     drawn = [lines(problem.rows, ALIKE) for problem in problems]
     across = columns(len(problems), 4)
     figure, panels = page(
-        problems, across, 3.3, ("|bias| / |∇J|", "variance / |∇J|²"),
-        f"Relative bias and variance along {axis_name(axis).split(' [')[0].split(',')[0]}", [*shared(problems, axis.column), *notes],
+        problems, across, 4.5, ("relative RMSE", "|bias| / |∇J|", "variance / |∇J|²"),
+        headline(list(zip(problems, drawn, strict=True)), axis, marks), [*shared(problems, axis.column), *notes],
         _line_legends(drawn, look, axis, marks),
     )  # fmt: skip
-    for (upper, lower), curves in zip(panels, drawn, strict=True):
+    for stack, curves in zip(panels, drawn, strict=True):
         values = np.array(sorted({x for line in curves for x in line.at}))
         for line, shift in zip(curves, shifts(values, len(curves), across), strict=True):
             style = look.marked(line) | _deviation(line, curves)
-            _draw_errors(upper, line, shift + upper.transData, style, "bias", 1)
-            _draw_errors(lower, line, shift + lower.transData, style, "variance", 2)
-        for panel in (upper, lower):
+            for panel, (column, power) in zip(stack, (("rmse", 1), ("bias", 1), ("variance", 2)), strict=True):
+                _draw_errors(panel, line, shift + panel.transData, style, column, power)
+        for panel in stack:
             scale_x(panel, values)
             mark_values(panel, marks)
-        upper.tick_params(labelbottom=False)
-        lower.set_xlabel(axis_name(axis))
+        for panel in stack[:-1]:
+            panel.tick_params(labelbottom=False)
+        stack[-1].set_xlabel(axis_name(axis))
     together = len({problem.rows["scene"].iloc[0] for problem in problems}) == 1
     step = across if together else 1
     for start in range(0, len(panels), step):
@@ -72,10 +77,14 @@ def _deviation(line: Line, curves: Sequence[Line]) -> dict[str, Any]:
 
 
 def _estimates(rows: pd.DataFrame, column: str, power: int) -> pd.DataFrame:
-    """Return rows with a bias or variance: value and interval relative to |grad J|, and whether it is a limit."""
+    """Return rows with an RMSE, bias or variance: value and interval relative to |grad J|, and whether it is a limit."""
     scale = _scale(rows, power)
     ends = {"value": "", "low": "_low", "high": "_high"}
-    table = pd.DataFrame({name: rows[column + end] / scale for name, end in ends.items()})
+    if column == "rmse":
+        table = pd.DataFrame([rmse_interval(row) for row in rows.to_dict("records")], rows.index, ["low", "high"])
+        table = table.assign(value=rows["rmse"] / scale)
+    else:
+        table = pd.DataFrame({name: rows[column + end] / scale for name, end in ends.items()})
     limit = ~resolved(rows) & (column == "bias")
     table["value"] = table["value"].where(~limit, table["high"])
     floor = FLOOR**power
@@ -91,7 +100,7 @@ def _scale(rows: pd.DataFrame, power: int) -> pd.Series:
 
 
 def _draw_errors(panel: Axes, line: Line, place: Transform, style: Mapping[str, Any], column: str, power: int) -> None:
-    """Draw one estimator's bias or variance along the axis at ``place``, and crosses where cells were lost."""
+    """Draw one estimator's RMSE, bias or variance along the axis at ``place``, and crosses where cells were lost."""
     points, at = _estimates(line.rows, column, power), line.rows.index.to_numpy(float)
     has = line.rows.index.isin(points.index)
     curve = {**style, "marker": "", "alpha": 0.75}

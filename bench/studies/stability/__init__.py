@@ -58,10 +58,10 @@ class Stability(Study):
         return measure(cell, session, Limits(self.diverged, self.grown, self.inaccurate, self.fine_steps, self.finer))
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the tables and charts."""
-        from bench.studies.stability import report
+        """Write the tables, the maps and their summary."""
+        from bench.studies.stability import report, summary
 
-        return report.write(experiment, rows)
+        return [*report.write(experiment, rows), *summary.write(experiment, rows)]
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
         """Print the shares of the verdicts, and the boundaries of the oscillators without contact."""

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from bench.errors import UserError, failure, unknown
-from bench.examine.clock import Clock
-from bench.examine.layout import Layout, as_numpy
+from bench.simulator.clock import Clock
+from bench.simulator.layout import Layout, as_numpy
 
 BATCHES = ("loop", "vmap", "columns", "rows")
 """How a cost takes several thetas: one by one, by the library's vmap, as ``(d, B)`` or as ``(B, d)``."""

@@ -1,0 +1,97 @@
+"""C8 and C9: one bounce: the time of impact decides the gradient's sign, and a penalty's gradient hangs on the step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.pieces import problem
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SOURCE = "Zhong, Han, Brikis 2022, arXiv 2207.05060, task 1"
+NAMES = ("df/dy0", "df/dvy0", "df/du0")
+
+
+class TimeOfImpact(Claim):
+    """A rigid bounce with and without the time of impact."""
+
+    name = "C8"
+    lesson = "Time of impact"
+    statement = (
+        "A rigid bounce differentiated with the time of impact gives (-1, -1, -.0021); without it (1, -.09583, -.0002): the "
+        "sign is wrong at every step size."
+    )
+    source = SOURCE
+    learned = (
+        "A motion that is right to first order can have a derivative of the wrong sign, and refining does not help."
+    )
+    labels = ("initial height [m]", "final height [m]")
+
+    def measure(self) -> Outcome:
+        """Differentiate both programs off the boundary between steps, and around the source's own start."""
+        still = np.zeros((3, 1))
+        step = 1 / 480
+        heights = np.linspace(1 - 4 * step, 1 + 8 * step, 97)
+        theta = np.stack([heights, np.full_like(heights, -2.0), np.zeros_like(heights)])
+        figures, series = [], {"height": heights.tolist()}
+        for name, law in (("with", "impulse"), ("without", "impulse[time_of_impact=false]")):
+            at = problem("bounce_once", law)
+            # 1 + 1/480 is half way between two boundaries; a start 2/480 m higher meets the ground one step later
+            off, late = (at.grad(np.array([1 + n * step, -2.0, 0.0]), still)[:, 0] for n in (1, 3))
+            exact = {"with": ("-1.000", "-1.000", "-0.0021"), "without": ("1.000", "-0.09583", "-0.0002")}[name]
+            figures += [
+                Figure(f"{part}, {name}", text, float(x)) for part, text, x in zip(NAMES, exact, late, strict=True)
+            ]
+            series[name] = at.value(theta, np.zeros((3, heights.size))).tolist()
+        return Outcome(
+            figures,
+            reservation=(
+                "the source's start is exactly on a boundary between two steps. Its df/dvy0 without the time of impact is that "
+                f"of an impact one step later, {late[1]:.5f}; half a step off the boundary it is {off[1]:.5f} here"
+            ),
+            series=series,
+        )
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw the final height against the initial one."""
+        axes.plot(series["height"], series["with"], label="with time of impact: slope -1")
+        axes.plot(series["height"], series["without"], label="without: slope +1 on every tooth")
+
+
+class PenaltyPhase(Claim):
+    """A penalty bounce over all phases of the step."""
+
+    name = "C9"
+    lesson = "Stiffness or step size"
+    statement = "A penalty bounce's gradient error grows with stiffness, and falls a hundredfold with the step."
+    source = f"{SOURCE}; recomputed over 256 phases"
+    learned = "What counts is stiffness times squared step: how many steps a contact lasts."
+    labels = ("stiffness [N/m]", "RMS of df/dy0 + 1")
+    quick = False
+
+    def measure(self) -> Outcome:
+        """Take the root mean square over 256 starts within one step's travel."""
+        figures, series = [], {"k": [1e2, 1e3, 1e4, 1e5]}
+        coarse, fine = ("0.020", "0.439", "2.37", "55.5"), ("2.3e-4", "0.0046", "0.0199", "0.391")
+        for parts, published in ((480, coarse), (48000, fine)):
+            errors = []
+            heights = 1.0 + 2.0 / parts * np.arange(256) / 256
+            theta = np.stack([heights, np.full_like(heights, -2.0), np.zeros_like(heights)])
+            for k, text in zip(series["k"], published, strict=True):
+                scene = f"bounce_once[horizon={parts},dt={1 / parts!r}]"
+                at = problem(scene, f"penalty[stiffness={k!r}]", backend="jax[mode=forward]")
+                slope = at.grad(theta, np.zeros((3, 256)))[0]
+                errors.append(float(np.sqrt(np.mean((slope + 1) ** 2))))
+                figures.append(Figure(f"k = {k:g}, dt = 1/{parts}", text, errors[-1], spread=0.02 * float(text)))
+            series[str(parts)] = errors
+        return Outcome(figures, series=series)
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw both errors against the stiffness."""
+        axes.loglog(series["k"], series["480"], "o-", label="dt = 1/480 s")
+        axes.loglog(series["k"], series["48000"], "s-", label="dt = 1/48000 s")

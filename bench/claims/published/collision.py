@@ -1,0 +1,59 @@
+"""C11: pushing one ball so that it strikes another: without the time of impact descent learns to give up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.pieces import descend, problem
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from bench.model import Problem
+
+
+class Collision(Claim):
+    """Control through a collision."""
+
+    name = "C11"
+    lesson = "Time of impact"
+    statement = (
+        "1,000 steps of descent through a collision end at 1.3958 with the time of impact, at 2.0014 without, where doing "
+        "nothing costs 2."
+    )
+    source = "Zhong, Han, Brikis 2022, arXiv 2207.05060, task 3"
+    learned = "With the wrong sign at the impact the optimiser learns not to touch: it gives up."
+    labels = ("iteration", "cost")
+    quick = False
+
+    def measure(self) -> Outcome:
+        """Descend at rate 10 under each law."""
+        scene = "two_balls[horizon=480,dt=0.0020833333333333333]"
+        cases = (
+            ("with", "impulse", "1.395808"),
+            ("without", "impulse[time_of_impact=false]", "2.001432"),
+        )
+        figures, series = [], {"iteration": list(range(0, 1001, 20))}
+        for name, law, loss in cases:
+            at = problem(scene, law)
+            _, path = descend(partial(_slope, at), np.full(960, 3.0), 10.0, 1000)
+            values = at.value(path[::20].T, np.zeros((960, 51)))
+            figures.append(Figure(f"cost at the end, {name}", loss, float(values[-1]), spread=2e-6))
+            series[name] = values.tolist()
+        return Outcome(figures, series=series)
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw the costs."""
+        for name in ("with", "without"):
+            axes.plot(series["iteration"], series[name], label=name)
+        axes.axhline(2.0, color="#404040", linewidth=0.6)
+
+
+def _slope(at: Problem, theta: np.ndarray, _: int) -> np.ndarray:
+    """Return the gradient without noise."""
+    return at.grad(theta, np.zeros((theta.size, 1)))[:, 0]

@@ -1,0 +1,62 @@
+"""C10: descending a throw at ground and wall: the law decides whether the target is met."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.pieces import descend, problem
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from bench.model import Problem
+
+
+class Throw(Claim):
+    """A thrown ball."""
+
+    name = "C10"
+    lesson = "Time of impact"
+    statement = (
+        "1,000 steps of descent on a throw end at a loss of 7.8e-5 with the time of impact, .00425 without, 7e-12 with a "
+        "penalty."
+    )
+    source = "Zhong, Han, Brikis 2022, arXiv 2207.05060, task 2"
+    learned = (
+        "A wrong gradient can still find a way, another one and a worse one; the forward law decides what is reachable."
+    )
+    labels = ("iteration", "squared distance to the target [m^2]")
+    quick = False
+
+    def measure(self) -> Outcome:
+        """Descend under three laws."""
+        cases = (
+            ("with", "impulse", "7.8e-5", ("10.184146", "-4.160555")),
+            ("without", "impulse[time_of_impact=false]", "0.00425", ("-2.493337", "-4.298402")),
+            ("penalty", "penalty", "7e-12", ("10.638576", "-4.282096")),
+        )
+        figures, series = [], {"iteration": list(range(0, 1001, 20))}
+        for name, law, loss, ends in cases:
+            at = problem("ground_wall", law)
+            end, path = descend(partial(_slope, at), np.array([5.0, -5.0]), 0.01, 1000)
+            values = at.value(path[::20].T, np.zeros((2, 51)))
+            figures.append(Figure(f"loss at the end, {name}", loss, float(values[-1]), spread=0.01 * float(loss)))
+            for part, text, x in zip(("vx", "vy"), ends, end, strict=True):
+                figures.append(Figure(f"{part} at the end, {name}", text, float(x), spread=1e-4))
+            series[name] = values.tolist()
+        return Outcome(figures, series=series)
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw the losses."""
+        for name in ("with", "without", "penalty"):
+            axes.semilogy(series["iteration"], series[name], label=name)
+
+
+def _slope(at: Problem, theta: np.ndarray, _: int) -> np.ndarray:
+    """Return the gradient without noise."""
+    return at.grad(theta, np.zeros((theta.size, 1)))[:, 0]

@@ -1,0 +1,157 @@
+"""L1 and L2: short windows need a value at their end; and a curve may be scored on another objective than it was given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.pieces import problem
+from bench.model import Array, FunctionScene, param
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+EFFORT, VALUE, GAIN = 10.0, 3.701562, 0.270156
+
+
+@dataclass(frozen=True)
+class Window(FunctionScene):
+    """theta holds the controls of a window of the plant x' = x + u from 1: sum x^2 + 10 u^2, plus a value of the end."""
+
+    name = "window"
+    steps: int = param(1, "H", positive=True)
+    value: float = param(0.0, "weight of the squared end state")
+
+    def theta0(self) -> np.ndarray:
+        """Return no control."""
+        return np.zeros(self.steps)
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """Return the window's cost."""
+        state, total = 1.0 + 0.0 * x[0], 0.0
+        for t in range(self.steps):
+            total = total + state * state + EFFORT * x[t] * x[t]
+            state = state + x[t]
+        return total + self.value * state * state
+
+
+class Windows(Claim):
+    """Short windows with and without a value."""
+
+    name = "L1"
+    lesson = "Windows and objectives"
+    statement = (
+        "A short window with the right value at its end has the optimum of the endless problem; without one its gain, and "
+        "the cost, are off by a share that falls geometrically with its length."
+    )
+    source = "Xu et al. 2022 (idea); closed form by Riccati steps"
+    learned = "Cutting a rollout is cheap only if its end is worth something."
+    labels = ("window H", "excess cost")
+
+    def measure(self) -> Outcome:
+        """Find the optimum of each window by its gradient, which is linear in the controls."""
+        gains = ("0.0", "0.090909", "0.160305", "0.206541", "0.234621", "0.250723")
+        excesses = ("", "0.68526", "0.15146", "0.04044", "0.01129", "0.00319")
+        figures: list[Figure] = []
+        series: dict[str, list[float]] = {"window": [], "excess": []}
+        best = _endless(GAIN)
+        for steps, (gain, excess) in enumerate(zip(gains, excesses, strict=True), 1):
+            plain = _first_gain(Window(steps=steps))
+            figures.append(Figure(f"gain of a window of {steps}", gain, plain, 1e-9))
+            if excess:
+                off = _endless(plain) / best - 1
+                figures.append(Figure(f"excess cost of a window of {steps}", excess, off, 1e-9))
+                series["window"].append(steps)
+                series["excess"].append(off)
+            valued = _first_gain(Window(steps=steps, value=VALUE))
+            figures.append(Figure(f"gain of a window of {steps} with the value", "0.270156", valued, 1e-7))
+        return Outcome(figures, series=series)
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw the excess cost."""
+        axes.semilogy(series["window"], series["excess"], "o-", label="no value at the end")
+
+
+def _first_gain(scene: Window) -> float:
+    """Return -u_0 of the best controls: the gradient is linear, so that d + 1 gradients give the optimum."""
+    at = problem(scene)
+    d = scene.steps
+    points = np.concatenate([np.zeros((d, 1)), np.eye(d)], axis=1)
+    gradient = at.grad(points, np.zeros((d, d + 1)))
+    hessian = gradient[:, 1:] - gradient[:, :1]
+    return float(-np.linalg.solve(hessian, -gradient[:, 0])[0])
+
+
+def _endless(gain: float) -> float:
+    """Return the cost of the policy u = -gain x for ever, from x = 1."""
+    return (1 + EFFORT * gain * gain) / (1 - (1 - gain) ** 2)
+
+
+class OtherObjective(Claim):
+    """An iLQR curve and what it minimises."""
+
+    name = "L2"
+    lesson = "Windows and objectives"
+    statement = "iLQR swings a pendulum up in five iterations: 1856.154, 1202.106, 699.799, 423.583, 357.476, 357.297."
+    source = "Suh et al. 2021, Bundled gradients, public result file"
+    learned = "Say which objective was given and on which one it is scored; nobody can tell from the curve."
+    labels = ("iteration", "cost with weights 1 and 1")
+
+    def measure(self) -> Outcome:
+        """Run iLQR on weights 1/2 and 20, scored on 1 and 1, then on those it is scored by."""
+        published = ("1856.154", "1202.106", "699.799", "423.583", "357.476", "357.297")
+        given = _ilqr(effort=0.5, terminal=20.0, iterations=5)
+        scored = _ilqr(effort=1.0, terminal=1.0, iterations=25)
+        figures = [
+            Figure(f"iteration {i}", text, cost, spread=2e-3)
+            for i, (text, cost) in enumerate(zip(published, given, strict=True))
+        ]
+        figures.append(Figure("least cost when it is the one minimised", "349.490454", scored[-1], spread=2e-4))
+        return Outcome(
+            figures,
+            reservation=(
+                "the curve solves with control weight 1/2 and terminal weight 20 and is scored with 1 and 1: it ends "
+                f"{given[-1] / scored[-1] - 1:.1%} above what the same method reaches when given the objective it is scored on"
+            ),
+            series={"given": given, "scored": scored[:8]},
+        )
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw both curves above the optimum."""
+        for name, label in (("given", "given weights 1/2 and 20"), ("scored", "given weights 1 and 1")):
+            axes.semilogy(np.array(series[name]) - 349.490454, "o-", label=label)
+        axes.set_ylabel("cost above the least, 349.49")
+
+
+def _ilqr(effort: float, terminal: float, iterations: int, dt: float = 0.05, horizon: int = 200) -> list[float]:
+    """Return the costs, with weights 1 and 1, of iLQR iterates that minimise other weights; full steps."""
+    scene = f"pendulum_swing[horizon={horizon},dt={dt!r},effort={{}},terminal={{}}]"
+    given, scored = problem(scene.format(effort, terminal)), problem(scene.format(1.0, 1.0))
+    still = np.zeros((horizon, 1))
+    u = np.full(horizon, 0.1)
+    costs = [float(scored.value(u, still)[0])]
+    goal = np.array([np.pi, 0.0])
+    for _ in range(iterations):
+        parts = given.jacobians(u, still)
+        x, a, b = parts.states[:, :, 0], parts.a[..., 0], parts.b[..., 0]
+        vx, vxx = 2 * terminal * (x[-1] - goal), 2 * terminal * np.eye(2)
+        feedback, feedforward = np.empty((horizon, 2)), np.empty(horizon)
+        for t in reversed(range(horizon)):
+            qu = 2 * effort * u[t] + b[t][:, 0] @ vx
+            quu = 2 * effort + b[t][:, 0] @ vxx @ b[t][:, 0]
+            qux = b[t][:, 0] @ vxx @ a[t]
+            feedback[t], feedforward[t] = -qux / quu, -qu / quu
+            vx = 2 * (x[t] - goal) + a[t].T @ vx + qux * feedforward[t]
+            vxx = 2 * np.eye(2) + a[t].T @ vxx @ a[t] - np.outer(qux, qux) / quu
+        state, new = x[0].copy(), np.empty(horizon)
+        for t in range(horizon):
+            new[t] = u[t] + feedforward[t] + feedback[t] @ (state - x[t])
+            velocity = state[1] + dt * (new[t] - np.sin(state[0]))
+            state = np.array([state[0] + dt * velocity, velocity])
+        u = new
+        costs.append(float(scored.value(u, still)[0]))
+    return costs

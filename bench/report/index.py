@@ -1,0 +1,126 @@
+"""The page over all experiments of a results folder: ``index.html``, with the state and the finding of each."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from bench.errors import UserError
+from bench.report.text import counted
+from bench.sweep.files import write_whole
+
+STYLE = """
+:root { color-scheme: light dark; }
+body { font: 16px/1.45 system-ui, sans-serif; max-width: 72rem; margin: 0 auto; padding: 0 1rem 3rem; }
+article { border-top: 1px solid #8888; padding: .8rem 0; }
+h2 { margin: 0; font-size: 1.1rem; }
+p { margin: .2rem 0; max-width: 60rem; }
+.state { font-variant-numeric: tabular-nums; }
+.bad { color: #d55e00; font-weight: 600; }
+.soft { opacity: .75; font-size: .9rem; }
+"""
+GOOD = ("ok", "unsupported", "unavailable")
+"""Statuses that are no failure: a number, or a cell that was refused with a reason."""
+
+
+def write(folder: Path) -> Path:
+    """Write ``index.html`` into a folder of results; raises :class:`UserError` if no experiment is below it."""
+    if not folder.is_dir():
+        raise UserError(f"'{folder}' is not a folder")
+    places = sorted(
+        {path.parent for path in folder.rglob("rows.parquet")} | {p.parent for p in folder.rglob("run.json")}
+    )
+    if not places:
+        raise UserError(f"'{folder}' has no experiments: no rows.parquet and no run.json below it")
+    articles = "\n".join(_article(folder, place) for place in places)
+    title = f"Results in {folder.name or folder.resolve().name}"
+    policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+    text = (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        f"<title>{html.escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<h1>{html.escape(title)}</h1>\n"
+        f"<p>{counted(len(places), 'experiment')}.</p>\n{articles}\n</body>\n</html>\n"
+    )
+    path = folder / "index.html"
+    write_whole(path, text.encode())
+    return path
+
+
+def _article(folder: Path, place: Path) -> str:
+    """Return what the page says of one experiment: its question, finding, state, and links to its files."""
+    e = html.escape
+    record = _record(place / "run.json")
+    name = str(record.get("experiment") or place.name)
+    there = place.relative_to(folder)
+    page = place / "report.html"
+    heading = f'<a href="{e((there / page.name).as_posix())}">{e(name)}</a>' if page.exists() else e(name)
+    parts = [f"<h2>{heading}</h2>"]
+    if record.get("question"):
+        parts.append(f"<p><em>{e(str(record['question']))}</em></p>")
+    if finding := _finding(page):
+        parts.append(f"<p>{finding}</p>")
+    parts.append(f'<p class="state">{_state(place / "rows.parquet", record)}</p>')
+    said = [str(record[key]) for key in ("finished", "git_commit") if record.get(key)]
+    said[1:] = [f"commit {commit[:12]}" for commit in said[1:]]
+    files = sorted(path.name for path in place.iterdir() if path.suffix in (".md", ".csv", ".png", ".tex"))
+    links = [f'<a href="{e((there / file).as_posix())}">{e(file)}</a>' for file in files if "plotted" not in file]
+    if not page.exists():
+        said.append("no page yet: python -m bench report writes it")
+    parts.append(f'<p class="soft">{e("; ".join(said))}<br>{", ".join(links)}</p>')
+    return "<article>\n" + "\n".join(parts) + "\n</article>"
+
+
+def _state(path: Path, record: dict[str, Any]) -> str:
+    """Return the cells by status, those that failed marked, and whether rows are missing or unreadable."""
+    counts: dict[str, int] = {}
+    if path.exists():
+        try:
+            table = pd.read_parquet(path, columns=["status", "stored_at"])
+        except Exception as error:  # whatever is wrong with the file, the page over all experiments has to say it
+            return f'<span class="bad">rows.parquet cannot be read: {html.escape(str(error)[:200])}</span>'
+        counts = {str(status): int(count) for status, count in table["status"].value_counts().items()}
+        newest = table["stored_at"].max()
+    else:
+        newest = float("nan")
+        counts = {str(k): int(v) for k, v in record.get("counts", {}).items()}
+    texts = [
+        f"<span{'' if status in GOOD else ' class=bad'}>{count} {html.escape(status)}</span>"
+        for status, count in counts.items()
+    ]
+    when = time.strftime(", newest of %Y-%m-%d %H:%M UTC", time.gmtime(newest)) if newest == newest else ""
+    return f"{counted(sum(counts.values()), 'cell')}: {', '.join(texts) or 'none'}{when}"
+
+
+def _finding(page: Path) -> str:
+    """Return the finding of an experiment's page as it stands there, escaped already; nothing without a page."""
+    try:
+        text = page.read_text(errors="replace")
+    except OSError:
+        return ""
+    found = re.search(r'id="finding">(.*?)</p>', text, re.DOTALL)
+    return re.sub(r"<(?!/?(br|b|em)\b)[^>]*>", "", found[1]) if found else ""
+
+
+def _record(path: Path) -> dict[str, Any]:
+    try:
+        record = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def main(words: Sequence[str]) -> int:
+    """Write the index of the folder named; ``results`` without one."""
+    if len(words) > 1 or any(word.startswith("-") or "=" in word for word in words):
+        raise UserError("name one folder of results: python -m bench index [DIR]")
+    path = write(Path(words[0] if words else "results").expanduser())
+    print(f"  {path}")
+    return 0

@@ -1,0 +1,198 @@
+"""A MuJoCo model of the user's own as a cost of theta: free joints, quaternions, motors, in C or in MJX.
+
+Theta and cost are functions of (model, data), written once for both engines: ``start`` returns fields of the data by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.errors import UserError, unknown
+
+ENGINES = {"mujoco": "mujoco", "mjx": "mujoco-mjx"}
+"""The engines, and what is installed for each."""
+STEP = 1e-6
+"""Step of the finite differences, in the model's units."""
+
+
+class Mjcf:
+    """A rollout of a model: ``sim(theta)`` is its cost, ``sim.gradient(theta)`` the engine's derivative, ``(d,)``.
+
+    ``model`` is MJCF text or a file. ``start(model, data, theta)`` returns fields to set before the first step, as
+    ``{"qvel": theta}``; ``cost(model, data)`` is a number from the data after ``steps`` steps and a forward pass;
+    ``control(model, data, theta, t)``, if given, returns the controls ``(nu,)`` of step t.
+
+    ``mujoco`` chains finite differences of single steps in the tangent space of the state, so that nq and nv may
+    differ. ``mjx`` differentiates in forward mode, which the constraint solver's loops allow. Raises
+    :class:`bench.UserError` where the engine is missing or the model cannot be read.
+    """
+
+    def __init__(
+        self,
+        model: str | Path,
+        start: Callable[..., Mapping[str, Any]],
+        cost: Callable[..., Any],
+        steps: int,
+        engine: str = "mujoco",
+        control: Callable[..., Any] | None = None,
+    ) -> None:
+        if engine not in ENGINES:
+            raise unknown("engine", engine, ENGINES)
+        try:
+            import mujoco
+        except ImportError:
+            raise UserError(f"engine={engine} is not installed: pip install {ENGINES[engine]}") from None
+        text = str(model)
+        try:
+            if "<mujoco" in text:
+                self.model = mujoco.MjModel.from_xml_string(text)
+            else:
+                self.model = mujoco.MjModel.from_xml_path(text)
+        except ValueError as error:
+            raise UserError(f"the model cannot be read: {error}") from None
+        self._start, self._cost, self._control, self.steps = start, cost, control, steps
+        self._mujoco, self._data, self._probe = mujoco, mujoco.MjData(self.model), mujoco.MjData(self.model)
+        self._engine = _Mjx(self) if engine == "mjx" else None
+        self.__name__ = self.__qualname__ = (
+            f"{engine} model, nq={self.model.nq}, nv={self.model.nv}, nu={self.model.nu}"
+        )
+        self.__module__ = ""
+
+    def __call__(self, theta: Any) -> float:
+        """Return the cost of the rollout from theta, ``(d,)``."""
+        if self._engine is not None:
+            return self._engine.value(theta)
+        data = self._begun(self._data, theta)
+        for t in range(self.steps):
+            self._controlled(data, theta, t)
+            self._mujoco.mj_step(self.model, data)
+        return self._ended(data)
+
+    def gradient(self, theta: Any) -> np.ndarray:
+        """Return the derivative of the cost by theta, ``(d,)``."""
+        if self._engine is not None:
+            return self._engine.slope(theta)
+        theta = np.asarray(theta, dtype=np.float64)
+        data, size = self._begun(self._data, theta), 2 * self.model.nv + self.model.na
+        slopes = self._by_theta(theta)
+        a, b = np.zeros((size, size)), np.zeros((size, self.model.nu))
+        for t in range(self.steps):
+            self._controlled(data, theta, t)
+            control = self._control_slopes(data, theta, t, slopes)
+            self._mujoco.mj_copyData(self._probe, self.model, data)
+            self._mujoco.mjd_transitionFD(self.model, self._probe, STEP, True, a, b, None, None)
+            slopes = a @ slopes + b @ control
+            self._mujoco.mj_step(self.model, data)
+        last = [self._ended(self._moved(data, i, h)) for i in range(size) for h in (STEP, -STEP)]
+        return (np.array(last[::2]) - np.array(last[1::2])) / (2 * STEP) @ slopes
+
+    # ------------------------------------------------------------------------------------------- the C engine
+
+    def _begun(self, data: Any, theta: Any) -> Any:
+        self._mujoco.mj_resetData(self.model, data)
+        for name, value in self._start(self.model, data, theta).items():
+            getattr(data, name)[:] = value
+        return data
+
+    def _controlled(self, data: Any, theta: Any, t: int) -> None:
+        if self._control is not None:
+            # positions of bodies belong to the state before the step
+            self._mujoco.mj_forward(self.model, data)
+            data.ctrl[:] = self._control(self.model, data, theta, t)
+
+    def _ended(self, data: Any) -> float:
+        self._mujoco.mj_forward(self.model, data)
+        return float(self._cost(self.model, data))
+
+    def _by_theta(self, theta: np.ndarray) -> np.ndarray:
+        """Return the derivative of the first state by theta, in the state's tangent space, ``(2 nv + na, d)``."""
+        columns = []
+        for i in range(theta.size):
+            moved = []
+            for h in (STEP, -STEP):
+                at = theta.copy()
+                at[i] += h
+                data = self._begun(self._probe, at)
+                moved.append((data.qpos.copy(), data.qvel.copy(), data.act.copy()))
+            up, down = moved
+            turned = np.zeros(self.model.nv)
+            self._mujoco.mj_differentiatePos(self.model, turned, 2 * STEP, down[0], up[0])
+            columns.append(np.concatenate([turned, *((up[k] - down[k]) / (2 * STEP) for k in (1, 2))]))
+        return np.stack(columns, axis=1)
+
+    def _moved(self, data: Any, index: int, by: float) -> Any:
+        """Return the state moved along one direction of its tangent space."""
+        nv, probe = self.model.nv, self._probe
+        self._mujoco.mj_copyData(probe, self.model, data)
+        if index < nv:
+            direction = np.zeros(nv)
+            direction[index] = 1.0
+            self._mujoco.mj_integratePos(self.model, probe.qpos, direction, by)
+        elif index < 2 * nv:
+            probe.qvel[index - nv] += by
+        else:
+            probe.act[index - 2 * nv] += by
+        return probe
+
+    def _control_slopes(self, data: Any, theta: np.ndarray, t: int, slopes: np.ndarray) -> np.ndarray:
+        """Return the derivative of the controls by theta, straight and through the state, ``(nu, d)``."""
+        if self._control is None:
+            return np.zeros((self.model.nu, theta.size))
+
+        def control(at: Any, theta: np.ndarray) -> np.ndarray:
+            self._mujoco.mj_forward(self.model, at)
+            return np.array(self._control(self.model, at, theta, t), dtype=np.float64)  # type: ignore[misc]
+
+        straight = [control(data, theta + h * row) for row in np.eye(theta.size) for h in (STEP, -STEP)]
+        through = [control(self._moved(data, i, h), theta) for i in range(len(slopes)) for h in (STEP, -STEP)]
+        by_theta = (np.array(straight[::2]) - np.array(straight[1::2])).T / (2 * STEP)
+        return by_theta + (np.array(through[::2]) - np.array(through[1::2])).T / (2 * STEP) @ slopes
+
+
+class _Mjx:
+    """The same rollout in MJX, compiled."""
+
+    def __init__(self, own: Mjcf) -> None:
+        try:
+            import jax
+            from mujoco import mjx
+        except ImportError:
+            raise UserError("engine=mjx is not installed: pip install mujoco-mjx") from None
+        model = mjx.put_model(own.model)
+
+        def rollout(theta: Any) -> Any:
+            data = _raised(mjx.make_data(model))
+            data = data.replace(**own._start(model, data, theta))
+
+            def step(data: Any, t: Any) -> Any:
+                if own._control is not None:
+                    data = mjx.forward(model, data)
+                    data = data.replace(ctrl=own._control(model, data, theta, t))
+                return mjx.step(model, data), None
+
+            last, _ = jax.lax.scan(step, data, jax.numpy.arange(own.steps))
+            return own._cost(model, mjx.forward(model, last))
+
+        self._value, self._slope, self._asarray = jax.jit(rollout), jax.jit(jax.jacfwd(rollout)), jax.numpy.asarray
+
+    def value(self, theta: Any) -> float:
+        return float(self._value(self._asarray(theta, dtype=float)))
+
+    def slope(self, theta: Any) -> np.ndarray:
+        return np.asarray(self._slope(self._asarray(theta, dtype=float)), dtype=np.float64)
+
+
+def _raised(data: Any) -> Any:
+    """Return data whose numbers have the precision that JAX is set to, since MJX may make them shorter."""
+    import jax
+
+    wide = jax.numpy.zeros(()).dtype
+
+    def raised(leaf: Any) -> Any:
+        return leaf.astype(wide) if jax.numpy.issubdtype(getattr(leaf, "dtype", int), jax.numpy.floating) else leaf
+
+    return jax.tree.map(raised, data)

@@ -1,0 +1,112 @@
+"""A cell's estimates from noise that is held whole, or drawn part by part where that would take much memory.
+
+Terms of an estimator that is a mean are summed per repeat in a fixed order, part by part, so memory does not grow with
+samples or repeats, and neither threads nor the machine change a digit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from bench.measure import noise
+from bench.measure.timing import Pause
+from bench.model import Auxiliaries, Problem, SampleMean, columns, per_repeat
+from bench.sweep.cell import Cell
+
+
+class Estimates:
+    """The independent estimates of a cell, computed on request, and what they leave behind."""
+
+    def __init__(self, cell: Cell, problem: Problem, theta: np.ndarray) -> None:
+        self.pause = Pause()
+        """Time spent drawing noise and on statistics, which is no time of an estimate."""
+        self.decided: dict[int, Auxiliaries] = {}
+        """What the estimator reports, by first repeat."""
+        self._cell, self._problem, self._theta = cell, problem, theta
+        self._width = problem.program.n_noise
+        self._estimator = cell.estimator
+        held = cell.repeats * cell.samples * self._width <= noise.HELD
+        self._noise = (
+            noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, self._width) if held else None
+        )
+        self._centre: np.ndarray | None = None
+        self._sums: dict[int, tuple[np.ndarray, float]] = {}
+
+    def of(self, start: int, stop: int) -> np.ndarray:
+        """Return the estimates of some repeats, ``(stop - start, d)``."""
+        estimator = self._estimator
+        if isinstance(estimator, SampleMean) and estimator.separable:
+            if self._noise is not None:
+                return self._means(estimator, start, self._noise[start:stop])
+            return np.stack([self._mean(estimator, repeat) for repeat in range(start, stop)])
+        if self._noise is not None:
+            return self._explained(start, self._noise[start:stop])
+        rows = []
+        for repeat in range(start, stop):
+            with self.pause:
+                whole = np.concatenate(list(self._drawn(repeat)), axis=1)
+            rows.append(self._explained(repeat, np.moveaxis(whole[:, None, :], 0, -1)))
+        return np.concatenate(rows)
+
+    @property
+    def sums(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Sums of all terms and of their squared norms per repeat, less a common centre; None without single terms."""
+        if not self._sums:
+            return None
+        ordered = [self._sums[repeat] for repeat in sorted(self._sums)]
+        return np.array([total for total, _ in ordered]), np.array([square for _, square in ordered])
+
+    def parts(self, repeat: int) -> Iterator[np.ndarray]:
+        """Yield the noise of one repeat in parts ``(n_w, b)``."""
+        return iter([self._noise[repeat].T]) if self._noise is not None else self._drawn(repeat)
+
+    def _drawn(self, repeat: int) -> Iterator[np.ndarray]:
+        cell = self._cell
+        return noise.parts(cell.seed, cell.scene.name, repeat, cell.samples, self._width, "cells")
+
+    def _explained(self, start: int, block: np.ndarray) -> np.ndarray:
+        result, self.decided[start] = self._estimator.explained(self._problem, self._theta, block)
+        result = np.asarray(result, dtype=np.float64)
+        self._check(result, (block.shape[0], self._problem.dim))
+        return result
+
+    def _means(self, estimator: SampleMean, start: int, block: np.ndarray) -> np.ndarray:
+        terms = np.asarray(estimator.terms(self._problem, self._theta, columns(block)), dtype=np.float64)
+        self._check(terms, (self._problem.dim, block.shape[0] * block.shape[1]))
+        split = per_repeat(terms, block)
+        result: np.ndarray = split.mean(axis=1)
+        with self.pause:
+            for i, repeat in enumerate(range(start, start + len(block))):
+                self._sums.setdefault(repeat, self._summed(split[i].T))
+        return result
+
+    def _mean(self, estimator: SampleMean, repeat: int) -> np.ndarray:
+        total, sums, square = np.zeros(self._problem.dim), np.zeros(self._problem.dim), 0.0
+        drawn = self._drawn(repeat)
+        while True:
+            with self.pause:
+                part = next(drawn, None)
+            if part is None:
+                break
+            terms = np.asarray(estimator.terms(self._problem, self._theta, part), dtype=np.float64)
+            self._check(terms, (self._problem.dim, part.shape[1]))
+            total += terms.sum(axis=1)
+            with self.pause:
+                more = self._summed(terms)
+                sums, square = sums + more[0], square + more[1]
+        self._sums.setdefault(repeat, (sums, square))
+        return total / self._cell.samples
+
+    def _summed(self, terms: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return sum and sum of squared norms of terms ``(d, b)`` less the mean of the first ones seen."""
+        if self._centre is None:
+            self._centre = terms.mean(axis=1)
+        with np.errstate(all="ignore"):
+            rest = terms - self._centre[:, None]
+            return rest.sum(axis=1), float(np.vdot(rest, rest))
+
+    def _check(self, result: np.ndarray, shape: tuple[int, ...]) -> None:
+        if result.shape != shape:
+            raise ValueError(f"{self._estimator.name} returned shape {result.shape}, not {shape}")

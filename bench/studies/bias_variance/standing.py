@@ -1,0 +1,92 @@
+"""Where each estimator wins and where it fails: relative errors with intervals, one column per problem."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bench.report.tables import csv, plain_markdown
+from bench.report.text import number
+from bench.sweep.experiment import Experiment
+from bench.sweep.files import write_all
+
+LEAST = 3
+"""Estimators from which on the table is written: with fewer the main table shows it at a glance."""
+WORTHLESS = 0.99
+"""Relative RMSE from which on an estimate is no better than answering zero."""
+MANY = 2.5
+"""Evaluations per sample from which on they are printed."""
+WINS, FAILS, BIASED = "wins", "fails", "biased"
+
+
+def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+    """Write the table as Markdown and CSV; nothing where few estimators ran, or something was swept."""
+    table = standing(rows)
+    if table.empty:
+        return []
+    texts = pd.DataFrame(
+        {"estimator": list(dict.fromkeys(table["label"]))}
+        | {problem: _column(table, problem) for problem in dict.fromkeys(table["problem"])}
+    )
+    legend = (
+        "\n\nRelative RMSE [95% interval] at equal samples, not at equal rollouts. *wins*: not distinguishable from the lowest "
+        "of its column. *fails*: no better than answering zero. *biased*: more than half of the error is bias. *(40x)*: it "
+        "evaluates 40 costs and gradients per sample, where others take one or two.\n"
+    )
+    contents = {"standing.md": plain_markdown(texts) + legend, "standing.csv": csv(table)}
+    return write_all(experiment.directory, contents)
+
+
+def _column(table: pd.DataFrame, problem: str) -> list[str]:
+    part = table[table["problem"] == problem].set_index("label")
+    return [part["text"].get(label, "") for label in dict.fromkeys(table["label"])]
+
+
+def standing(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one row per cell: estimator, problem, relative RMSE with its interval, and how it stands.
+
+    Empty unless at least three estimators ran on each of several problems, once each. The interval combines those of
+    bias and variance: rmse^2 is their sum.
+    """
+    rows = rows.assign(
+        label=np.where(
+            rows["estimator_params"] == "", rows["estimator"], rows["estimator"] + "[" + rows["estimator_params"] + "]"
+        ),
+        problem=np.where(rows["contact"] == "none", rows["scene"], rows["scene"] + ", " + rows["contact"]),
+    )
+    once = not rows.duplicated(["label", "problem"]).any()
+    if not once or rows["label"].nunique() < LEAST or rows["problem"].nunique() < 2:
+        return pd.DataFrame()
+    norm = rows["reference_norm"]
+    low = np.sqrt(rows["bias_low"] ** 2 + rows["variance_low"]) / norm
+    high = np.sqrt(rows["bias_high"] ** 2 + rows["variance_high"]) / norm
+    table = rows[["label", "problem", "status", "rmse_rel", "rollouts", "gradients"]].assign(
+        low=low, high=high, share=(rows["bias_low"] / rows["rmse"]) ** 2,
+        evaluations=(rows["rollouts"] + rows["gradients"]) / rows["samples"],
+    )  # fmt: skip
+    good = table["status"] == "ok"
+    lowest = table[good].groupby("problem")["high"].min()
+    table["stands"] = [_stands(row, lowest.get(row.problem, math.nan)) for row in table.itertuples()]
+    table["text"] = [_text(row) for row in table.itertuples()]
+    return table.reset_index(drop=True)
+
+
+def _stands(row: object, lowest: float) -> str:
+    status, low, share, rmse = (getattr(row, name) for name in ("status", "low", "share", "rmse_rel"))
+    if status != "ok":
+        return str(status)
+    wins = low <= lowest
+    said = [WINS] if wins and rmse < WORTHLESS else [FAILS] if rmse >= WORTHLESS else []
+    return ", ".join([*said, *([BIASED] if share > 0.5 else [])])
+
+
+def _text(row: object) -> str:
+    status, stands = getattr(row, "status"), getattr(row, "stands")  # noqa: B009, rows of a table have no type
+    if status != "ok":
+        return str(status)
+    middle, low, high = (number(float(getattr(row, name))) for name in ("rmse_rel", "low", "high"))
+    times = float(getattr(row, "evaluations"))  # noqa: B009
+    return f"{middle} [{low}, {high}]" + (f" {stands}" if stands else "") + (f" ({times:.0f}x)" if times > MANY else "")

@@ -1,0 +1,67 @@
+"""Simulators of the user's own: costs and gradients as their functions give them."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from bench.model import Backend, CallableProgram, Problem, Program, Unsupported, param
+
+
+@dataclass(frozen=True)
+class CallableBackend(Backend):
+    """Gradients: those of the user's own function or library, or central differences of the cost where there is none."""
+
+    name = "callable"
+    provides = Backend.provides | {"simulator"}
+    reference_rank: ClassVar[int | None] = 9
+
+    step: float = param(1e-5, "step of the central differences, in units of each input's scale", positive=True)
+
+    def compile(self, program: Program) -> Problem:
+        """Return the simulator ready to be called; raises :class:`Unsupported` for any other program."""
+        if reason := self.refuses(program):
+            raise Unsupported(reason)
+        assert isinstance(program, CallableProgram)
+        return CallableProblem(program, self.step)
+
+    def refuses(self, program: Program) -> str | None:
+        """Return why the program cannot run: it is no simulator of the user's own, or single precision is asked for."""
+        if not isinstance(program, CallableProgram):
+            return f"scene {program.scene.name} is no simulator of the user's own"
+        return None if self.dtype == "float64" else "the simulator chooses its own precision: leave dtype out"
+
+
+class CallableProblem(Problem):
+    """A user's simulator as a problem."""
+
+    def __init__(self, program: CallableProgram, step: float) -> None:
+        super().__init__(program)
+        self._simulator, self._step = program.scene.simulator(), step
+
+    def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return u / sigma, the score of the noise on theta, ``(d, B)``."""
+        return self._score(theta, w)
+
+    def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._simulator.costs(*self._split(theta, w))
+
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        thetas, own = self._split(theta, w)
+        if self._simulator.has_gradient:
+            return self._simulator.gradients(thetas, own)
+        self.usage.rollouts += 2 * self.dim * w.shape[1]
+        rows = []
+        for i, scale in enumerate(self._simulator.layout.scales()):
+            step = np.zeros((self.dim, 1))
+            step[i] = self._step * scale
+            up, down = self._simulator.costs(thetas + step, own), self._simulator.costs(thetas - step, own)
+            rows.append((up - down) / (2 * step[i]))
+        return np.stack(rows)
+
+    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return w[: self.dim] / self.sigma
+
+    def _split(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return theta with its noise, ``(d, B)``, and the simulator's own noise."""
+        return theta + self.sigma * w[: self.dim], w[self.dim :] if w.shape[0] > self.dim else None

@@ -1,0 +1,39 @@
+"""A simulator of the user's own, named by its file."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+from bench.model import CallableScene, loaded, param
+
+
+@dataclass(frozen=True)
+class Callable(CallableScene):
+    """f(theta, w) = cost(theta + sigma u, v), with a function of a file as the cost; w = (u, v).
+
+    theta is that of the file, or ``theta0=[..]``. Without ``grad`` its gradients are central differences.
+    """
+
+    name = "callable"
+    leaves_out = "whatever the simulator leaves out"
+    backends: ClassVar[tuple[str, ...]] = ("callable",)
+
+    cost: str = param("bench.simulator.example:cost", "the cost, as FILE:NAME or MODULE:NAME")
+    theta: str = param("theta", "where it starts: a name in the file")
+    grad: str = param("gradient", "jax, torch, or a function of theta in the file; empty for differences")
+    batch: str = param("", "how several thetas are taken at once; by default detected")
+    own_noise: int = param(0, "length of the noise that the cost itself takes", low=0)
+
+    def simulator(self) -> Any:
+        """Return the user's functions, loaded once."""
+        return _loaded(self.cost, self.theta, self.grad, self.batch, self.own_noise)
+
+    def files(self) -> tuple[Path, ...]:
+        """Return the file of the cost."""
+        return loaded.files(self.cost)
+
+
+@cache
+def _loaded(cost: str, theta: str, grad: str, batch: str, noise: int) -> Any:
+    return loaded.simulator(cost, theta, grad, batch, noise)

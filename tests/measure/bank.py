@@ -1,0 +1,275 @@
+"""A bank of problems whose smoothed gradient is known, to hold certified references to: `python tests/measure/bank.py`.
+
+Ridges f(x) = sum_j g_j(a_j . x) have grad J = sum_j a_j dE[g_j]/du with one-dimensional Gaussian expectations of powers,
+hinges, steps, bumps, waves and exponentials; shipped scenes have their closed forms, which the reference does not see.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.contacts.impulse import Impulse
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.bounce_once import BounceOnce
+from bench.plugins.scenes.cubic import Cubic
+from bench.plugins.scenes.double_integrator import DoubleIntegrator
+from bench.plugins.scenes.heaviside import Heaviside
+from bench.plugins.scenes.mass_spring import MassSpring
+from bench.plugins.scenes.quadratic import Quadratic
+from bench.plugins.scenes.soft_heaviside import SoftHeaviside
+from bench.plugins.scenes.stiff_decay import StiffDecay
+from scipy.special import ndtr
+
+from bench.measure.reference import Reference, certify
+from bench.model import FunctionScene, compose
+from bench.model.program import Program
+
+TOLERANCE = 0.005
+"""Relative error at which sampling stops, as in experiments."""
+SAMPLED = 4.0
+"""Standard errors within which a sampled reference has to lie; a stated error without sampling is a bound."""
+WORST = 3.0
+"""No reference may be further off than this times what is allowed."""
+
+
+def density(z: float) -> float:
+    return math.exp(-z * z / 2) / math.sqrt(2 * math.pi)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """g(u), and dE[g(u + sigma w)]/du as a function of u and sigma."""
+
+    name: str
+    g: Callable[[np.ndarray], np.ndarray]
+    slope: Callable[[float, float], float]
+
+
+def power(p: int, c: float = 1.0) -> Piece:
+    slopes = {1: lambda u, s: 1.0, 2: lambda u, s: 2 * u, 3: lambda u, s: 3 * (u * u + s * s)}
+    slopes[4] = lambda u, s: 4 * (u**3 + 3 * u * s * s)
+    return Piece(f"{c:g}u^{p}", lambda u: c * u**p, lambda u, s: c * slopes[p](u, s))
+
+
+def ramp(at: float, c: float) -> Piece:
+    return Piece(f"ramp({at:g},{c:g})", lambda u: c * np.maximum(u - at, 0), lambda u, s: c * ndtr((u - at) / s))
+
+
+def step(at: float, c: float) -> Piece:
+    return Piece(f"step({at:g},{c:g})", lambda u: c * (u > at), lambda u, s: c * density((u - at) / s) / s)
+
+
+def square(at: float, c: float) -> Piece:
+    def slope(u: float, s: float) -> float:
+        z = (u - at) / s
+        return 2 * c * s * (density(z) + z * float(ndtr(z)))
+
+    return Piece(f"hinge2({at:g},{c:g})", lambda u: c * np.maximum(u - at, 0) ** 2, slope)
+
+
+def bump(at: float, width: float, c: float) -> Piece:
+    def slope(u: float, s: float) -> float:
+        v = width * width + s * s
+        return -c * width / math.sqrt(v) * math.exp(-((u - at) ** 2) / (2 * v)) * (u - at) / v
+
+    return Piece(f"bump({at:g},{width:g},{c:g})", lambda u: c * np.exp(-((u - at) ** 2) / (2 * width**2)), slope)
+
+
+def wave(k: float, c: float = 1.0) -> Piece:
+    return Piece(
+        f"wave({k:g},{c:g})",
+        lambda u: c * np.sin(k * u),
+        lambda u, s: c * k * math.cos(k * u) * math.exp(-((k * s) ** 2) / 2),
+    )
+
+
+def growth(k: float) -> Piece:
+    return Piece(f"exp({k:g})", lambda u: np.exp(k * u), lambda u, s: k * math.exp(k * u + (k * s) ** 2 / 2))
+
+
+class Ridge(FunctionScene):
+    """A sum of pieces along unit vectors; ``listed`` are its breakpoints, ``says`` whether it declares to be continuous."""
+
+    name = "ridge"
+
+    def __init__(self, pieces, along, theta, sigma, says=True, listed=()):
+        for name, value in dict(
+            pieces=pieces,
+            along=along,
+            start=np.asarray(theta, float),
+            sigma=sigma,
+            noise="parameter",
+            says=says,
+            listed=listed,
+        ).items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def continuous(self):
+        return self.says
+
+    def theta0(self):
+        return self.start
+
+    def breakpoints(self):
+        return self.listed
+
+    def cost(self, xp, x):
+        return sum(piece.g(a @ x) for piece, a in zip(self.pieces, self.along, strict=True))
+
+    def truth(self):
+        return sum(
+            a * piece.slope(float(a @ self.start), self.sigma) for piece, a in zip(self.pieces, self.along, strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class Case:
+    """A problem and its gradient."""
+
+    label: str
+    program: Program
+    truth: np.ndarray
+
+
+class Hidden:
+    """Takes the closed form of a program away."""
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+
+    def __getattr__(self, name):
+        return getattr(self._program, name)
+
+    def closed_form_gradient(self):
+        return None
+
+
+def combinations() -> Iterator[tuple[str, list[Piece], bool, bool]]:
+    """Yield name, pieces in units of sigma from theta, whether declared continuous, and whether jumps are listed."""
+    line = power(1)
+    smooth = [
+        [line], [power(2), line], [power(3)], [power(3), power(4, 0.1)], [wave(1.0)], [wave(3.0), line], [growth(0.5)],
+        [growth(1.0), power(1, -1.5)], [bump(1.0, 0.3, 2.0)], [power(1, 0.01), wave(4.0, 0.05)], [power(2, 0.001), power(1, 1e-6)],
+    ]  # fmt: skip
+    kinked = [
+        [line, ramp(at, c)]
+        for at, c in ((0.5, 5.0), (1.0, -1.0), (2.0, 10.0), (3.0, 33.0), (3.5, 200.0), (4.0, 30.0), (-2.5, 100.0))
+    ]
+    kinked += [[ramp(0.0, 1.0), ramp(0.7, -2.0)], [square(1.0, 3.0)], [square(2.5, 100.0), line], [ramp(3.0, 5.0)]]
+    jumps = [
+        [line, step(at, c)]
+        for at, c in ((0.3, 1.0), (1.0, 0.1), (1.0, 10.0), (2.0, 1.0), (3.0, 1.0), (0.5, -0.01), (3.5, 20.0))
+    ]
+    jumps += [[step(0.4, 1.0), step(-0.9, 2.0)], [wave(2.0), step(0.1, 0.5)], [step(2.5, 1.0)]]
+    narrow = [[line, bump(at, w, 100.0)] for at, w in ((0.5, 0.01), (1.0, 0.001), (0.2, 0.1))]
+    for group, pieces in (("smooth", smooth), ("kink", kinked), ("unlisted jump", jumps), ("narrow", narrow)):
+        for each in pieces:
+            yield group, each, True, False
+    for each in jumps[:5]:
+        yield "declared jump", each, False, False
+        yield "listed jump", each, False, True
+
+
+def scaled(piece: Piece, unit: float) -> Piece:
+    """The piece as a function of u in units of ``unit``."""
+    return Piece(piece.name, lambda u: piece.g(u / unit), lambda u, s: piece.slope(u / unit, s / unit) / unit)
+
+
+def ridges() -> Iterator[Case]:
+    """Yield every combination in 1, 2, 3 and 10 dimensions, along an axis or across all of them, at a sigma that is not 1."""
+    draw = np.random.default_rng(11)
+    for dim, (i, (group, pieces, says, listed)) in itertools.product((1, 2, 3, 10), enumerate(combinations())):
+        if listed and dim > 1:
+            continue
+        sigma = (0.3, 1.7)[(i + dim) % 2]
+        along = [draw.standard_normal(dim) for _ in pieces] if i % 2 else [np.eye(dim)[0] for _ in pieces]
+        if dim > 1 and i % 4 == 1:
+            along = [along[0]] * len(pieces)
+        along = [a / np.linalg.norm(a) for a in along]
+        at = tuple(
+            sorted(float(p.name.split("(")[1].split(",")[0]) * sigma * along[0][0] for p in pieces if "step" in p.name)
+        )
+        scene = Ridge([scaled(p, sigma) for p in pieces], along, np.zeros(dim), sigma, says, (at,) if listed else ())
+        label = f"{group} d={dim} {'+'.join(p.name for p in pieces)}"
+        yield Case(label, compose(scene), scene.truth())
+
+
+def shipped() -> Iterator[Case]:
+    """Yield the scenes with closed forms, at other noise, horizons and laws."""
+    for sigma in (0.05, 0.5, 2.0):
+        for d in (1, 2, 5):
+            yield _shipped(Quadratic(dimension=d, sigma=sigma))
+            yield _shipped(Cubic(dimension=d, sigma=sigma))
+        yield _shipped(Heaviside(theta=0.05, sigma=sigma))
+        yield _shipped(SoftHeaviside(sigma=sigma))
+    for horizon in (5, 20, 60):
+        yield _shipped(DoubleIntegrator(horizon=horizon), None, SemiImplicitEuler())
+        yield _shipped(MassSpring(horizon=horizon, sigma=0.3), None, SemiImplicitEuler())
+        yield _shipped(StiffDecay(horizon=horizon), None, SemiImplicitEuler())
+    for height in (1.0, 1.5):
+        yield _shipped(BounceOnce(height=height, horizon=20, dt=0.05), Impulse(), SemiImplicitEuler())
+        yield _shipped(BounceOnce(height=height, horizon=20, dt=0.05, restitution=0.3), Impulse(), SemiImplicitEuler())
+
+
+def _shipped(scene, law=None, integrator=None) -> Case:
+    program = compose(scene, law, integrator)
+    truth = program.closed_form_gradient()
+    assert truth is not None, scene
+    return Case(f"shipped {scene}", program, truth)
+
+
+def certified(case: Case, samples: int) -> Reference:
+    """The reference of a case, its closed form unseen."""
+    problem = Numpy().compile(case.program)
+    problem.program = Hidden(case.program)
+    return certify(problem, Numpy.provides, samples, TOLERANCE)
+
+
+def excess(case: Case, found: Reference) -> float:
+    """Actual error over the allowed one: the stated error, or 4 standard errors where it comes from samples."""
+    stated = found.known().standard_error * (SAMPLED if len(found.batches) > 1 else 1.0)
+    error = float(np.linalg.norm(found.gradient - case.truth))
+    # closed forms are written here in double precision too
+    error = max(0.0, error - 1e-14 * float(np.linalg.norm(case.truth)) - 1e-300)
+    return error / stated if stated else math.inf if error else 0.0
+
+
+def cases() -> list[Case]:
+    """Every case."""
+    return [*ridges(), *shipped()]
+
+
+def main(samples: int = 1 << 18) -> int:
+    """Print a line per case and what share holds; return 1 where the bank is not held."""
+    held, worst, noted, every = 0, 0.0, [], cases()
+    for case in every:
+        started = time.perf_counter()
+        found = certified(case, samples)
+        over = excess(case, found)
+        error = float(np.linalg.norm(found.gradient - case.truth))
+        print(
+            f"{over:8.2f}  {error:.1e} of {found.known().standard_error:.1e}  {case.label}  {found.method}  {found.note}  "
+            f"{time.perf_counter() - started:.1f}s",
+            flush=True,
+        )
+        if over > 1.0 and found.note:
+            noted.append(case.label)
+        else:
+            held += over <= 1.0
+            worst = max(worst, over)
+    certain = len(every) - len(noted)
+    print(f"{len(every)} references: {held} of {certain} within what they state, the worst at {worst:.2f} times that;")
+    print(f"{len(noted)} more are off and say that they are not certain: {noted}")
+    return int(held < 0.99 * certain or worst > WORST)
+
+
+if __name__ == "__main__":
+    sys.exit(main(*(int(word) for word in sys.argv[1:2])))

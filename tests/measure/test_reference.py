@@ -1,0 +1,263 @@
+"""Certified references: against closed forms that they do not see, and how they draw, stop, and act on their checks."""
+
+import re
+
+import bank
+import numpy as np
+import pytest
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.scenes.heaviside import Heaviside
+
+from bench.measure import noise, reference
+from bench.measure.batches import in_columns
+from bench.measure.jumps import largest_jump
+from bench.measure.reference import BATCHES, certify
+from bench.model import compose
+from bench.model.problem import Problem
+
+EVERY = bank.cases()
+SAMPLES = 1 << 14
+"""Of the fast subset: enough for 64 batches of 256."""
+LISTED = 1e-9
+"""Relative error of quadrature between breakpoints where they are, against 1e-5 where they are elsewhere."""
+
+
+def ridge(*pieces, dim=3, sigma=0.5, **given):
+    """A case along the first axis."""
+    scene = bank.Ridge(
+        [bank.scaled(p, sigma) for p in pieces], [np.eye(dim)[0]] * len(pieces), np.zeros(dim), sigma, **given
+    )
+    return bank.Case("ridge", compose(scene), scene.truth())
+
+
+def found_at(found, name):
+    """A number in the method's text."""
+    return float(re.search(rf"{name}=([-\d.e]+)", found.method).group(1))
+
+
+# ------------------------------------------------------------------------------------------------ against truths
+
+
+@pytest.mark.parametrize("case", EVERY[::8], ids=lambda case: case.label[:50])
+def test_reference_is_within_what_it_states(case):
+    assert bank.excess(case, bank.certified(case, SAMPLES)) <= 1.0
+
+
+@pytest.mark.slow
+def test_bank_is_held():
+    """Over 200 references: 99% within what they state, none beyond three times that."""
+    assert len(EVERY) >= 200
+    assert bank.main() == 0
+
+
+def test_listed_breakpoints_are_panel_edges():
+    case = ridge(bank.step(0.3, 1.0), dim=1, sigma=0.2, says=False, listed=((0.06,),))
+    found = bank.certified(case, SAMPLES)
+    assert found.gradient == pytest.approx(case.truth, rel=LISTED)
+    assert found.error < LISTED * abs(case.truth[0])
+    elsewhere = ridge(bank.step(0.3, 1.0), dim=1, sigma=0.2, says=False, listed=((0.07,),))
+    assert bank.certified(elsewhere, SAMPLES).error > LISTED
+
+
+def test_stated_error_of_quadrature_counts_rounding():
+    """Costs of 1e6 have a rounding of 1e-10, whatever rules agree on."""
+    case = ridge(bank.Piece("far", lambda u: 1e6 + u, lambda u, s: 1.0), dim=1)
+    found = bank.certified(case, SAMPLES)
+    assert found.method.startswith("quadrature")
+    assert 1e-10 < found.error < 1e-6
+    assert abs(found.gradient[0] - case.truth[0]) < found.error
+
+
+def test_narrow_event_is_seen():
+    """A bump .001 wide, which a rule of 256 points misses: reference 1, truth 1.4."""
+    case = ridge(bank.power(1), bank.bump(1.0, 0.001, 700.0), dim=1)
+    assert abs(case.truth[0] - 2.0) > 0.1
+    assert bank.excess(case, bank.certified(case, 1 << 18)) <= 1.0
+
+
+def test_jumps_in_a_plane_that_no_breakpoint_lists_are_sampled():
+    case = ridge(bank.step(0.3, 1.0), dim=2, says=False)
+    assert bank.certified(case, SAMPLES).method.startswith("sampling[zeroth_order")
+
+
+def test_gradient_near_zero_is_known_absolutely():
+    """Two effects that cancel to 1e-9: relative criteria would reject quadrature and spend every sample."""
+    case = ridge(bank.wave(1.0), bank.power(1, -np.exp(-0.5) + 1e-9), bank.power(2), dim=2)
+    found = bank.certified(case, SAMPLES)
+    assert found.method.startswith("quadrature")
+    assert found.error < 1e-9
+    assert bank.excess(case, found) <= 1.0
+
+
+# ------------------------------------------------------------------------------------------------- what is drawn
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Every draw of noise: (stream, block, count)."""
+    seen = []
+    plain = noise.draw
+
+    def draw(seed, scene, repeats, samples, width, stream):
+        seen.append((stream, seed, samples))
+        return plain(seed, scene, repeats, samples, width, stream)
+
+    monkeypatch.setattr(noise, "draw", draw)
+    return seen
+
+
+def test_no_noise_is_drawn_twice_and_none_is_that_of_cells(drawn):
+    found = bank.certified(ridge(bank.power(3)), 1 << 16)
+    streams = {stream for stream, *_ in drawn}
+    assert {"pilot", "reference", "check", "tails"} <= streams
+    assert "cells" not in streams
+    blocks = [(stream, block) for stream, block, _ in drawn if stream != "tails"]
+    assert len(blocks) == len(set(blocks))
+    # as many samples as it says, and more than one block of them
+    counts = [count for stream, _, count in drawn if stream == "reference"]
+    assert sum(counts) == found_at(found, "n") == 1 << 16
+    assert len(counts) > 2
+    assert sum(count for stream, _, count in drawn if stream == "check") == 1 << 14
+
+
+def test_batches_are_independent_means_of_all_samples(drawn):
+    """The reference of a cubic cost is the mean of its own draws, batch by batch."""
+    case = ridge(bank.power(3), dim=4, sigma=0.5)
+    found = bank.certified(case, 1 << 14)
+    assert "first_order" in found.method
+    total, count = np.zeros((BATCHES, 4)), 0
+    for stream, block, size in list(drawn):
+        if stream == "reference":
+            w = noise.draw(block, "ridge", 1, size, 4, stream)[0].T
+            terms = np.zeros_like(w)
+            terms[0] = 3 * w[0] ** 2 / 0.5  # d/dx (x / sigma)^3 at x = sigma w
+            total += terms.reshape(4, BATCHES, -1).sum(axis=2).T
+            count += size // BATCHES
+    assert found.batches == pytest.approx(total / count, rel=1e-8, abs=1e-8)
+
+
+@pytest.mark.parametrize("tolerance", [0.02, 0.005])
+def test_sampling_stops_at_its_tolerance_and_not_before(tolerance):
+    case = ridge(bank.power(1), bank.power(2, 0.5))
+    problem = Numpy().compile(case.program)
+    found = certify(problem, Numpy.provides, 1 << 20, tolerance)
+    n, norm = found_at(found, "n"), np.linalg.norm(found.gradient)
+    assert found.known().standard_error <= tolerance * norm
+    assert n < 1 << 20
+    # half as many would not do, unless it was the least number
+    assert n == reference.LEAST_SAMPLES or found.known().standard_error * 2**0.5 > 0.9 * tolerance * norm
+
+
+def test_never_more_samples_than_allowed(drawn):
+    found = bank.certified(ridge(bank.step(2.0, 1.0)), 1 << 15)
+    assert found_at(found, "n") == sum(count for stream, _, count in drawn if stream == "reference") <= 1 << 15
+
+
+def test_points_of_a_quadrature_are_those_it_evaluates(monkeypatch):
+    seen = []
+    plain = Problem.value
+    monkeypatch.setattr(Problem, "value", lambda self, theta, w: seen.append(w.copy()) or plain(self, theta, w))
+    found = bank.certified(ridge(bank.power(3), dim=1), 1 << 18)
+    points = np.unique(np.concatenate([w[0] for w in seen]))
+    levels = found_at(found, "points") * 1.5  # and those of the level before
+    assert points.size == pytest.approx(levels, rel=0.02)
+    assert found_at(found, "spacing") == pytest.approx(18 / found_at(found, "points"), rel=0.02)
+
+
+def test_parts_of_one_length_give_the_whole():
+    sizes = []
+
+    def double(w):
+        sizes.append(w.shape[1])
+        return 2 * w
+
+    w = np.arange(22.0).reshape(2, 11)
+    assert np.array_equal(in_columns(double, w, 4), 2 * w)
+    assert sizes == [4, 4, 4]
+
+
+# --------------------------------------------------------------------------------------------- checks acted upon
+
+
+def test_small_spread_alone_certifies_nothing():
+    """An event 3 sigma away: a pilot that missed it would stop at once, with a standard error of 0."""
+    case = ridge(bank.power(1), bank.ramp(3.0, 33.0), dim=4)
+    found = bank.certified(case, 1 << 18)
+    assert found_at(found, "n") >= reference.LEAST_SAMPLES
+    assert found.known().standard_error > 0.0
+    assert bank.excess(case, found) <= 1.0
+
+
+def test_tails_that_samples_do_not_show_are_part_of_the_error():
+    """4.2 sigma away, 1e-5 of samples: of 16384 none or one; far tails along each coordinate are looked at."""
+    case = ridge(bank.power(1), bank.ramp(4.2, 2000.0), dim=3)
+    found = bank.certified(case, 1 << 14)
+    assert found.error > 5 * found.batches.std(axis=0).max() / 8
+    assert bank.excess(case, found) <= 1.0
+
+
+@pytest.mark.parametrize("jump", [0.003, 2.0])
+def test_jump_that_nobody_declares_makes_the_reference_zeroth_order(jump):
+    found = bank.certified(ridge(bank.power(1), bank.step(0.5, jump), dim=3), 1 << 16)
+    assert "zeroth_order" in found.method
+    assert "zeroth order is used" in found.note
+
+
+def test_disagreement_of_the_check_is_acted_upon(monkeypatch):
+    """First order wrong by 20% where neither a jump nor the pilot shows it."""
+    monkeypatch.setattr(reference, "_doubt", lambda *given: "")
+    case = ridge(bank.power(1), bank.power(2, 0.1))
+    problem = Numpy().compile(case.program)
+    plain = problem.grad
+    monkeypatch.setattr(problem, "grad", lambda theta, w: 1.2 * plain(theta, w))
+    found = certify(problem, Numpy.provides, 1 << 17, 0.005)
+    assert "zeroth_order" in found.method
+    assert "disagree" in found.note
+    assert bank.excess(case, found) <= 1.0
+
+
+def test_check_says_what_it_could_resolve():
+    found = bank.certified(ridge(bank.power(1), bank.power(2, 0.1)), 1 << 16)
+    assert abs(found_at(found, "check_z")) < 5
+    # zeroth order of a quarter of the samples knows the gradient, 2 of size, to some percent
+    assert 1e-3 < found_at(found, "check_resolves") < 1.0
+    assert found.note == ""
+
+
+def test_no_gradient_in_any_sample_is_said():
+    found = bank.certified(ridge(bank.step(6.0, 1.0), dim=5), 1 << 14)
+    assert "not seen" in found.note
+
+
+def test_rollouts_that_are_not_finite_fail():
+    case = ridge(bank.Piece("nan", lambda u: np.where(u > 0, np.nan, u), lambda u, s: 0.0))
+    found = bank.certified(case, 1 << 12)
+    assert "failed" in found.method
+    assert np.isnan(found.gradient).all()
+
+
+def test_closed_form_is_used_where_there_is_one():
+    problem = Numpy().compile(compose(Heaviside()))
+    assert certify(problem, Numpy.provides, SAMPLES, 0.005).method == "closed_form"
+    assert certify(problem, Numpy.provides | {"physics"}, SAMPLES, 0.005).method != "closed_form"
+
+
+# ------------------------------------------------------------------------------------------------ jumps on lines
+
+
+@pytest.mark.parametrize(
+    ("cost", "jump"),
+    [
+        (lambda x: x[0] + 0.01 * (x[1] > 0.3), 0.01),
+        (lambda x: np.sin(5 * x[0]) + np.abs(x[1]), 0.0),
+        (lambda x: 1e6 * np.maximum(x[0] - 0.2, 0) ** 2, 0.0),
+        (lambda x: 1e9 + np.sin(x[0]), 0.0),
+        (lambda x: np.sqrt(np.abs(x[0])), 0.0),
+        (lambda x: np.full(x.shape[1], np.nan), 0.0),
+    ],
+    ids=["jump", "kink", "stiff", "rounding", "root", "nan"],
+)
+def test_largest_jump(cost, jump):
+    draw = np.random.default_rng(0)
+    starts, ends = draw.standard_normal((2, 2, 8))
+    assert largest_jump(cost, starts, ends) == pytest.approx(jump, rel=1e-6)

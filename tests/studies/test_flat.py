@@ -1,0 +1,120 @@
+"""Estimates from noise in parts: the same numbers, in memory that does not grow with samples and repeats."""
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+
+from bench.measure import noise, statistics, timing
+from bench.model import compose, registry
+from bench.studies.bias_variance.estimates import Estimates
+from bench.sweep import config
+from bench.sweep.grid import cells
+
+ROUNDED = 1e-12
+"""Relative difference allowed between sums in one go and in parts."""
+
+
+def cell_of(estimator, samples=48, repeats=4):
+    words = [
+        "scenes=[cubic]",
+        "backends=[numpy]",
+        f"estimators=[{estimator}]",
+        f"samples={samples}",
+        f"repeats={repeats}",
+    ]
+    (cell,) = cells(config.load(words))
+    return cell
+
+
+def made(cell):
+    program = compose(cell.scene)
+    problem = cell.backend.compile(program)
+    estimates = Estimates(cell, problem, program.theta0)
+    return estimates, estimates.of(0, cell.repeats)
+
+
+def test_parts_are_the_noise_drawn_in_one_go(monkeypatch):
+    monkeypatch.setattr(noise, "HELD", 70)
+    whole = noise.draw(3, "a scene", 2, 50, 7, "cells")
+    for repeat in range(2):
+        parts = list(noise.parts(3, "a scene", repeat, 50, 7, "cells"))
+        assert max(part.size for part in parts) <= 70
+        assert np.array_equal(np.concatenate(parts, axis=1).T, whole[repeat])
+
+
+@pytest.mark.parametrize(
+    "estimator", ["fobg", "reinforce", "reinforce[baseline=leave_one_out]", "randomized_smoothing", "inverse_variance"]
+)
+def test_estimates_in_parts_are_those_in_one_go(estimator, monkeypatch):
+    cell = cell_of(estimator)
+    whole, expected = made(cell)
+    monkeypatch.setattr(noise, "HELD", 60)
+    parts, found = made(cell)
+    np.testing.assert_allclose(found, expected, rtol=ROUNDED, atol=ROUNDED * np.abs(expected).max())
+    assert (whole.sums is None) == (parts.sums is None)
+    if whole.sums is not None:
+        # each less its own centre, so the statistic is compared
+        values = [statistics.variance_per_sample(*one.sums, cell.samples) for one in (whole, parts)]
+        np.testing.assert_allclose(values[0], values[1], rtol=1e-9)
+
+
+def test_variance_per_sample_is_that_of_all_terms():
+    cell = cell_of("fobg", samples=400, repeats=8)
+    found, _ = made(cell)
+    program = compose(cell.scene)
+    w = noise.draw(cell.seed, "cubic", 8, 400, program.n_noise, "cells").reshape(-1, program.n_noise).T
+    terms = cell.backend.compile(program).grad(program.theta0, w)
+    value, low, high = statistics.variance_per_sample(*found.sums, 400)
+    assert value == pytest.approx(terms.var(axis=1, ddof=1).sum(), rel=1e-9)
+    assert low < value < high
+
+
+def test_an_estimator_with_an_estimate_of_its_own_is_not_taken_apart():
+    """A mean of terms that is clipped afterwards must not be replaced by the mean of its terms."""
+    fobg = registry.make("estimators", "fobg")
+
+    @dataclasses.dataclass(frozen=True)
+    class Doubled(type(fobg)):
+        def estimate(self, problem, theta, given):
+            return 2.0 * super().estimate(problem, theta, given)
+
+    cell = cell_of("fobg")
+    _, expected = made(cell)
+    _, found = made(cell.with_part("estimator", Doubled()))
+    np.testing.assert_allclose(found, 2.0 * expected, rtol=ROUNDED)
+
+
+def test_pauses_are_no_time_of_a_call():
+    pause = timing.Pause()
+
+    def call(_):
+        with pause:
+            time.sleep(0.02)
+        return np.zeros(1)
+
+    _, clock = timing.timed(call, 3, least_s=0.0, pause=pause)
+    assert clock.median_s < 0.01
+
+
+def test_times_are_repeated_until_they_are_steady():
+    waits = iter([0.0, *[0.001, 0.003] * 2, *[0.002] * 400])
+
+    def call(_):
+        time.sleep(next(waits))
+        return np.zeros(1)
+
+    _, short = timing.timed(call, 2, least_s=0.0, most=100)
+    assert short.calls == 3
+    waits = iter([0.0, *[0.001, 0.004] * 2, *[0.002] * 400])
+    _, settled = timing.timed(call, 2, least_s=0.0, most=100, settle_s=0.2)
+    assert settled.calls > 5
+
+
+def test_a_gradient_by_differences_counts_once():
+    """The rollouts inside a gradient are its cost, not further rollouts."""
+    program = compose(registry.make("scenes", "cubic"))
+    problem = registry.make("backends", "numpy").compile(program)
+    problem.grad(program.theta0, np.zeros((program.n_noise, 7)))
+    assert (problem.usage.rollouts, problem.usage.gradients) == (0, 7)
