@@ -234,6 +234,10 @@ def _plan(words: list[str]) -> int:
     experiment = _loaded(words)
     store = store_of(experiment)
     progress.print_plan(experiment, plan.plan(experiment, store), store.load())
+    if experiment.execution.launcher == "slurm":
+        from bench.sweep.launchers.slurm import script
+
+        print(f"\nthe job script:\n{script(experiment)}")
     return 0
 
 

@@ -15,7 +15,7 @@ from bench.sweep.execute import store_of
 from bench.sweep.experiment import Experiment
 from bench.sweep.grid import cells
 from bench.sweep.plan import plan
-from bench.sweep.runner import blank
+from bench.sweep.tasks import blank
 
 SIDE, QUICK_SIDE = 100, 5
 """Values on each of the two axes of the planned sweep."""

@@ -118,7 +118,7 @@ def _prepared(override: str, config_dirs: Sequence[Path]) -> str:
         return f"++{bare}={_quoted(value)}"
     if bare == "study":
         return f"study={_quoted(value)[1:-1]}"
-    if head in map(singular, kinds) or head in ("sweep", "marks"):
+    if head in map(singular, kinds) or head in ("sweep", "marks", "ray", "slurm"):
         return f"++{bare}={value}"
     if bare != head and head not in ("reference", "table"):
         raise UserError(f"'{bare}' is not a setting: '{head}' has no parts")
@@ -286,7 +286,37 @@ def _execution(config: Mapping[str, Any]) -> Execution:
         stop=_one_of("on_error", config["on_error"], ("continue", "stop")) == "stop",
         versions=_one_of("versions", config["versions"], ("ignore", "warn", "rerun")),
         retry=tuple(_one_of("retry", status, STATUSES) for status in retry if status is not None),
+        launcher=_one_of("launcher", config["launcher"], tuple(CLUSTERS)),
+        cluster=_cluster(config, str(config["launcher"])),
     )
+
+
+CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
+    "local": {},
+    "ray": {"address": (str, True), "cells": (int, False), "cpus": (float, False)},
+    "slurm": {
+        "cluster": (str, False), **dict.fromkeys(("cells", "minutes", "cpus", "parallel"), (int, False)),
+        **dict.fromkeys(("partition", "constraint", "account", "qos"), (str, True)),
+    },
+}  # fmt: skip
+"""Settings by launcher: the type of each, and whether it may be null."""
+
+
+def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
+    """Check the settings of all launchers; returns those of the chosen one."""
+    result: dict[str, dict[str, Any]] = {name: {} for name in CLUSTERS}
+    for one, known in CLUSTERS.items():
+        given = _table(config, one) if known else {}
+        for name in given:
+            if name not in known:
+                raise unknown(f"setting of {one}", name, known)
+        for name, (kind, empty) in known.items():
+            value = given.get(name)
+            result[one][name] = None if value is None and empty else coerce(kind, value, f"{one}.{name}")
+            if kind is not str and not result[one][name] >= 1:
+                raise UserError(f"{one}.{name}={value} must be at least 1")
+    _one_of("slurm.cluster", result["slurm"]["cluster"], ("slurm", "local"))
+    return result[launcher]
 
 
 def _one_of(key: str, value: Any, allowed: Sequence[str]) -> str:

@@ -48,6 +48,7 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     store = store_of(experiment)
     planned = plan(experiment, store)
     progress.print_versions(planned, experiment.execution.versions)
+    progress.print_machines(planned, experiment.execution.launcher)
     store.prepare()
     for folder in (experiment.directory, experiment.directory / "pending", experiment.results_dir / "references"):
         tidy(folder)

@@ -43,6 +43,10 @@ class Execution:
     """How to treat stored rows made with other library versions: ``ignore``, ``warn`` or ``rerun``."""
     retry: tuple[str, ...] = ()
     """Statuses of stored rows that are run again."""
+    launcher: str = "local"
+    """Where cells run: ``local``, ``ray`` or ``slurm``."""
+    cluster: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of that launcher."""
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,8 @@ class Planned:
     refusal: tuple[str, str] | None
     aged: str = ""
     """Library versions that made the stored row, if they differ from the installed ones."""
+    machine: str = ""
+    """The kind of machine that timed the stored row."""
 
     @property
     def runs(self) -> bool:
@@ -39,21 +41,23 @@ class Planned:
 def plan(experiment: Experiment, store: Store) -> list[Planned]:
     """Return every cell of the experiment in order, with its state; raises :class:`UserError` for a bad one."""
     rows = store.load()
-    stored = dict(zip(rows["key"], zip(rows["status"], rows["versions"], strict=True), strict=True))
+    facts = zip(rows["status"], rows["versions"], rows["machine"], strict=True)
+    stored = dict(zip(rows["key"], facts, strict=True))
     return [_planned(experiment, cell, stored) for cell in cells(experiment)]
 
 
-def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, str]]) -> Planned:
+def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, str, str]]) -> Planned:
     refusal = cell.refusal() or _refused(experiment, cell)
     if cell.key not in stored:
         return Planned(cell, False, refusal)
-    status, made_by = stored[cell.key]
+    status, made_by, machine = stored[cell.key]
     rules = experiment.execution
     aged = made_by if rules.versions != "ignore" and status == "ok" and made_by != versions(cell.backend) else ""
     again = status in rules.retry or (bool(aged) and rules.versions == "rerun")
     # a plugin that was missing when the row was stored is there now
     installed = status == "unavailable" and refusal is None
-    return Planned(cell, not (again or installed), refusal, aged)
+    timed = machine if cell.timing and status == "ok" and not again else ""
+    return Planned(cell, not (again or installed), refusal, aged, timed)
 
 
 def _refused(experiment: Experiment, cell: Cell) -> tuple[str, str] | None:

@@ -130,6 +130,21 @@ def print_versions(planned: Sequence[Planned], policy: str) -> None:
         print(f"bench: {count} stored rows were made with {versions}: {done}", file=sys.stderr)
 
 
+def print_machines(planned: Sequence[Planned], launcher: str) -> None:
+    """Print where stored times are of another kind of machine than those that are about to be measured here."""
+    from bench.sweep.machine import kind_of_machine
+
+    here = kind_of_machine()
+    others = Counter(item.machine for item in planned if item.machine not in ("", here))
+    if launcher == "local" and others and any(item.runs and item.cell.timing for item in planned):
+        for machine, count in others.most_common():
+            print(
+                f"bench: {count} stored rows were timed on '{machine}', and this machine is '{here}': times of two kinds of "
+                "machine do not compare; choose another folder with name=..., or leave times out with timing=false",
+                file=sys.stderr,
+            )
+
+
 def print_plan(experiment: Experiment, planned: list[Planned], rows: pd.DataFrame) -> None:
     """Print the number of cells, how many are stored, which are refused and why, and the expected time."""
     stored = [item for item in planned if item.stored]

@@ -77,6 +77,10 @@ class Answer:
     seconds: float
     output: str = ""
     """The last lines printed while the item was handled."""
+    machine: str = ""
+    """The kind of machine that handled it; empty for this one."""
+    stored: bool = False
+    """Whether that machine has stored the row."""
 
 
 # ------------------------------------------------------------------------------------------------ the pool

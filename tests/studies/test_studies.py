@@ -15,9 +15,11 @@ import bench.report
 from bench.measure.gradcheck import EPS
 from bench.model import registry
 from bench.report import reproduce, web
+from bench.report.plotted import plotted
 from bench.report.views import along, arranged, families
 from bench.report.web.content import Content, grouped, looks, problems
 from bench.report.web.document import data
+from bench.studies.gradient_check import matrix
 from bench.studies.gradient_check import report as gradient_check
 from bench.studies.growth import report as growth
 from bench.studies.stability import page as stability_page
@@ -125,8 +127,10 @@ def test_a_swept_parameter_keeps_lines_of_the_gradient_check_apart():
     found = table_of(gradient_check.markdown(shown))
     assert list(found["damping"]) == ["0", "1", "10"]
     assert set(found["scene"]) == {"mass_spring"}
-    titles = [panel.get_title() for panel in gradient_check.figure(shown).axes]
-    assert titles == ["mass_spring\ndamping=0", "mass_spring\ndamping=1", "mass_spring\ndamping=10"]
+    (panel,) = matrix.figure(shown).axes
+    lines = [label.get_text() for label in reversed(panel.get_yticklabels())]
+    assert lines == ["mass_spring, damping=0", "mass_spring, damping=1", "mass_spring, damping=10"]
+    assert [text.get_text() for text in panel.texts] == ["ok"] * 3 + ["2 steps"]
     assert web.content(given, rows).tables["checks"]["problem"].nunique() == 6
 
 
@@ -285,11 +289,15 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
     given, rows = made(
         "study=twins", "scenes=[pendulum]", "backends=[mujoco,mjx]", "estimators=[fobg]", "sweep.horizon=[2,3]"
     )
-    paths = [list(np.zeros(int(h) + 1)) for h in rows["horizon"]]
-    rows = rows.assign(state_difference=1e-3, path=paths, own_path=paths)
+    own = [list(np.zeros(int(h) + 1)) for h in rows["horizon"]]
+    away = [[0.0] * int(h) + [1e-3] for h in rows["horizon"]]
+    rows = rows.assign(state_difference=1e-3, state_difference_rel=1e-3, path=away, own_path=own)
     figure = twins.figure(arranged(given, rows))
     titles = [panel.get_title().splitlines()[0] for panel in figure.axes]
     assert titles == ["pendulum, horizon=2", "pendulum, horizon=3"]
+    drawn = plotted(figure)
+    assert set(drawn["y"]) == {twins.SMALL, 1e-3}, "the difference over time, and 0 at the lower edge"
+    assert "pendulum, horizon=2 (0.0010)" in figure.get_suptitle().replace("\n", " ")
     assert list(twins.readable(arranged(given, rows))["horizon"]) == ["2", "2", "3", "3"]
     table_ = table(given, rows)
     assert "own_path" not in table_
@@ -475,3 +483,10 @@ def test_the_command_of_a_gradient_check_repeats_its_cell(words):
 def test_the_command_of_a_gradient_check_without_time_steps_has_no_horizon():
     (cell,) = cells(config.load(["study=gradient_check", "scenes=[quadratic]", "estimators=[fobg]"]))
     assert reproduce.check_of(cell) == "python -m bench gradcheck quadratic 'backends=[jax]' seed=0"
+
+
+def test_the_matrix_of_gradient_checks_leads_with_what_is_wrong():
+    table = pd.DataFrame({"name": ["a", "b"], "point": ["start", "before"], "verdict": ["wrong_factor", "kink"]})
+    assert matrix.headline(table) == "Wrong gradients: a; kinks, jumps or no answer beside a switch in 1 of 2 problems"
+    assert matrix.headline(table[1:]).startswith("No gradient is wrong for its own program; kinks, jumps")
+    assert matrix.headline(table.assign(verdict="smooth")).startswith("Every gradient is the derivative")

@@ -12,7 +12,7 @@ from trees import ROOT, Tree
 from bench.cli import main
 from bench.model.sources import sources
 from bench.studies.bias_variance.columns import COLUMNS
-from bench.sweep import config, grid, plan, runner
+from bench.sweep import config, grid, plan, tasks
 from bench.sweep.cell import Cell
 from bench.sweep.keys import BOOKKEEPING, fingerprint
 from bench.sweep.store import Store
@@ -187,7 +187,7 @@ def test_other_versions_are_reported_and_rerun_when_asked(tmp_path, capsys, monk
     words = [*TINY, f"results_dir={tmp_path}"]
     assert main(words) == 0
     capsys.readouterr()
-    for module in (plan, runner):
+    for module in (plan, tasks):
         monkeypatch.setattr(module, "versions", lambda backend: "numpy=9.9")
     assert main(["plan", *words]) == 0
     assert "2 stored, 0 to run" in capsys.readouterr().out

@@ -76,10 +76,10 @@ class GradientCheck(Study):
         return measure(cell, session, Search(self.directions, self.drawn, self.reach, self.aside, self.around))
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the tables and charts."""
-        from bench.studies.gradient_check import report
+        """Write the tables and the matrix of verdicts."""
+        from bench.studies.gradient_check import matrix, report
 
-        return report.write(experiment, rows)
+        return [*report.write(experiment, rows), *matrix.write(experiment, rows)]
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
         """Print the counts of verdicts and every fault."""

@@ -1,8 +1,7 @@
-"""Writes gradient checks as files: a long table, a summary with the command that repeats each fault, and a chart."""
+"""Writes gradient checks as files: a long table, and a summary with the command that repeats each fault."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,15 +9,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.lines import Line2D
 
 from bench.measure.gradcheck import VERDICTS
-from bench.report.figures import save, styled
-from bench.report.style import GREY, STYLE, colour, plain
 from bench.report.tables import escape_markdown
 from bench.report.text import counted, number
 from bench.report.views import Arranged, arranged
@@ -30,11 +22,8 @@ from bench.sweep.columns import IDENTITY
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import write_all
 
-POINTS: dict[str, Any] = {"start": "-", "before": (0, (4, 1.5)), "at": (0, (1, 1.2)), "after": (0, (6, 1.5, 1, 1.5))}
-"""Line styles of the points at which gradients are checked."""
-FLOOR, CEILING = 1e-16, 1e2
-"""Errors beyond these are drawn at the edge."""
-ACROSS = 4
+POINTS = ("start", "before", "at", "after")
+"""The points at which gradients are checked."""
 CHECK = ["point", "sample", "direction", "derivative_program"]
 EACH = ["derivative_differences", "relative_error", "mode_minus", "mode_plus"]
 ORDER = [*CHECK, "eps", *EACH, "verdict"]
@@ -42,7 +31,7 @@ PROBLEM = ("scene", "contact", "integrator")
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``gradient_check`` (.csv, .md), ``gradient_components.csv`` and the chart; returns the files' paths."""
+    """Write ``gradient_check`` (.csv, .md) and ``gradient_components.csv``; returns the files' paths."""
     shown = arranged(experiment, rows)
     table = long_table(with_axes(experiment, rows))
     contents = {
@@ -50,11 +39,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         "gradient_check.md": markdown(shown),
         "gradient_components.csv": component_table(rows).to_csv(index=False, lineterminator="\n"),
     }
-    paths = write_all(experiment.directory, contents)
-    if (table["eps"].notna() & np.isfinite(table["relative_error"])).any():
-        with styled():
-            paths += save(figure(shown), experiment.directory / "gradient_check", experiment.formats)
-    return paths
+    return write_all(experiment.directory, contents)
 
 
 # ------------------------------------------------------------------------------------------------------ tables
@@ -222,68 +207,3 @@ def remarks(rows: pd.DataFrame) -> list[tuple[str, int]]:
 def problem_of(shown: Arranged) -> pd.Series:
     """Return, per row, the name of its problem, the same at every horizon."""
     return problems(shown, PROBLEM, together(shown, "horizon"), ("scene", "contact"))
-
-
-# ------------------------------------------------------------------------------------------------------- chart
-
-
-def figure(shown: Arranged) -> Figure:
-    """Draw relative error against eps, a panel per problem, a curve per horizon and point: the worst of its checks."""
-    table = long_table(shown.rows.assign(problem=problem_of(shown)))
-    table = table[table["eps"].notna() & np.isfinite(table["relative_error"])]
-    parts = list(table.groupby("problem", sort=False))
-    across = min(ACROSS, len(parts))
-    down = math.ceil(len(parts) / across)
-    size = (7.4 if across > 1 else 4.6, 0.85 + 1.55 * down)
-    chart = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03))
-    FigureCanvasAgg(chart)
-    panels = chart.subplots(down, across, squeeze=False, sharex=True, sharey=True)
-    horizons = sorted(table["horizon"].unique())
-    colours = {horizon: colour(i) for i, horizon in enumerate(horizons)}
-    for panel, (problem, part) in zip(panels.flat, parts, strict=False):
-        _curves(panel, part, colours)
-        panel.set_title("\n".join(map(plain, str(problem).split(", "))), pad=3)
-    for spare in panels.flat[len(parts) :]:
-        spare.remove()
-    _scale(panels[0, 0], table)
-    for column in range(across):
-        lowest = panels[(len(parts) - 1 - column) // across, column]
-        lowest.tick_params(labelbottom=True)
-    for panel in panels[-1, : len(parts) - across * (down - 1)]:
-        panel.set_xlabel("eps / scale of theta")
-    chart.supylabel("relative error, the worst check", fontsize=STYLE["font.size"])
-    points = [point for point in POINTS if point in set(table["point"])]
-    handles = [Line2D([], [], color=colours[h], label=_horizon(h)) for h in horizons]
-    handles += [Line2D([], [], color=GREY, linestyle=POINTS[p], label=_place(p)) for p in points]
-    handles.append(Line2D([], [], color=GREY, marker="o", markersize=3.5, linestyle="none", label="best eps"))
-    chart.legend(handles=handles, loc="outside lower center", ncols=4 if across > 1 else 2, columnspacing=1.2)
-    chart.suptitle("Program's gradient against central differences of its cost", fontsize=9, fontweight="bold")
-    return chart
-
-
-def _horizon(steps: int) -> str:
-    return "no steps" if steps == 0 else f"{steps} step{'' if steps == 1 else 's'}"
-
-
-def _place(point: str) -> str:
-    return point if point == "start" else f"{point} contact switch"
-
-
-def _scale(panel: Axes, table: pd.DataFrame) -> None:
-    panel.set_xscale("log")
-    panel.set_yscale("log")
-    largest = min(CEILING, max(1.0, float(table["relative_error"].max())))
-    panel.set_ylim(FLOOR / 2, 4 * largest)
-    panel.set_xticks([1e-10, 1e-6, 1e-2])
-    panel.set_yticks([1e-15, 1e-10, 1e-5, 1.0])
-    panel.minorticks_off()
-
-
-def _curves(panel: Axes, part: pd.DataFrame, colours: dict[int, str]) -> None:
-    for (horizon, point), checked in part.groupby(["horizon", "point"]):
-        worst = checked.groupby("eps")["relative_error"].max().clip(FLOOR, CEILING)
-        style: dict[str, Any] = {"color": colours[horizon], "linewidth": 1.0}
-        panel.plot(worst.index, worst, linestyle=POINTS[point], **style)
-        if point == "start":
-            panel.plot([worst.idxmin()], [worst.min()], marker="o", markersize=3.5, clip_on=False, **style)
-    panel.grid(axis="y", color="#e5e5e5", linewidth=0.5)
