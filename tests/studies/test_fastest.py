@@ -157,7 +157,7 @@ def test_charts_name_curves_floors_and_the_first_at_a_glance(tmp_path):
     assert {"e", "slow", "biased"} <= {text.get_text() for text in panel.texts}
     floors = [line.get_ydata()[0] for line in panel.lines if line.get_linestyle() == ":"]
     assert floors == pytest.approx([0.3])
-    guide = next(line for line in panel.lines if line.get_label() == "guide")
+    guide = next(line for line in panel.lines if line.get_label() == "_guide")
     slope = math.log(guide.get_ydata()[1] / guide.get_ydata()[0]) / math.log(
         guide.get_xdata()[1] / guide.get_xdata()[0]
     )
