@@ -340,7 +340,9 @@ def _scale(panel: Axes, values: np.ndarray) -> None:
     panel.axhspan(1.0, CEILING * 3, zorder=0, **SHADE)
     log_axis(panel, "x", values[0] / 1.4, values[-1] * 1.4)
     panel.xaxis.set_major_locator(FixedLocator(list(values)))
-    panel.xaxis.set_major_formatter(FuncFormatter(lambda x, _: number(x) if x in (values[0], values[-1]) else ""))
+    few = values if len(values) <= 3 else values[[0, -1]]
+    panel.xaxis.set_major_formatter(FuncFormatter(lambda x, _: number(x) if x in few else ""))
+    panel.tick_params(axis="x", labelsize=6.5)
 
 
 def _draw(line: Sequence[Axes], rows: pd.DataFrame, estimators: Sequence[str], style: Mapping[str, Any]) -> None:
