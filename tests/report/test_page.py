@@ -78,6 +78,19 @@ def test_finding_says_when_nothing_beats_zero_and_when_nothing_ran():
     assert "No cell gave a result" in finding(page(rows))
 
 
+def test_finding_leads_with_what_fails_and_tells_worse_than_zero_from_no_better():
+    rows = table([row(stiffness=k, estimator="wild") for k in (1.0, 10.0, 100.0, 1e3)] + [row(estimator="fine")])
+    rows["rmse_rel"] = [0.2, 1.1, 50.0, 0.3, 0.1]
+    rows[["bias_low", "variance_low"]] = 0.0
+    rows.loc[2, "variance_low"] = (40.0 * rows["reference_norm"][2]) ** 2
+    rows.loc[3, ["status", "reason"]] = ["diverged", "too far"]
+    assert finding(page(rows)).startswith(
+        "wild is worse than answering zero in 1 (up to 50 times the gradient), no better than zero in 1, "
+        "without a number in 1 of 4 cells; "
+    )
+    assert not bias_variance_page.failing(rows[rows["estimator"] == "fine"])
+
+
 def test_finding_tells_of_backends_that_refused_every_cell():
     rows = table([row(stiffness=k) for k in (10.0, 100.0)])
     refused = rows.assign(backend="stubborn", status="unsupported", reason="cannot", key=rows["key"] + "s")

@@ -11,7 +11,7 @@ def cell(estimator, scene, bias, variance, **more):
     row = {
         "estimator": estimator, "estimator_params": "", "scene": scene, "contact": "none", "status": "ok", "reference_norm": 2.0,
         "bias_low": 0.8 * bias, "bias_high": 1.2 * bias, "variance_low": 0.8 * variance, "variance_high": 1.2 * variance,
-        "rmse": float(np.hypot(bias, variance**0.5)), "rollouts": 1.0, "gradients": 0.0,
+        "rmse": float(np.hypot(bias, variance**0.5)), "samples": 8, "rollouts": 8.0, "gradients": 0.0,
     }  # fmt: skip
     return row | {"rmse_rel": row["rmse"] / 2.0} | more
 
@@ -20,12 +20,13 @@ def test_winners_failures_and_bias():
     rows = [
         cell(e, s, b, v) for s in ("one", "two") for e, b, v in (("good", 0, 0.04), ("near", 0, 0.05), ("off", 3, 0.1))
     ]
-    rows += [cell("missing", "one", 0, 1, status="unsupported"), cell("loud", "two", 0, 9.0)]
+    rows += [cell("missing", "one", 0, 1, status="unsupported"), cell("loud", "two", 0, 9.0, rollouts=320.0)]
     table = standing(pd.DataFrame(rows)).set_index(["label", "problem"])
     assert table.loc[("good", "one"), "stands"] == "wins"
     assert table.loc[("near", "one"), "stands"] == "wins"
     assert table.loc[("off", "one"), "stands"] == "fails, biased"
     assert table.loc[("loud", "two"), "stands"] == "fails"
+    assert table.loc[("loud", "two"), "text"].endswith("fails (40x)")
     assert table.loc[("missing", "one"), "text"] == "unsupported"
     assert np.isclose(table.loc[("good", "one"), "high"], (1.2 * 0.04) ** 0.5 / 2)
 

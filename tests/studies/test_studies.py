@@ -15,6 +15,7 @@ import bench.report
 from bench.measure.gradcheck import EPS
 from bench.model import registry
 from bench.report import reproduce, web
+from bench.report.plotted import plotted
 from bench.report.views import along, arranged, families
 from bench.report.web.content import Content, grouped, looks, problems
 from bench.report.web.document import data
@@ -288,11 +289,15 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
     given, rows = made(
         "study=twins", "scenes=[pendulum]", "backends=[mujoco,mjx]", "estimators=[fobg]", "sweep.horizon=[2,3]"
     )
-    paths = [list(np.zeros(int(h) + 1)) for h in rows["horizon"]]
-    rows = rows.assign(state_difference=1e-3, path=paths, own_path=paths)
+    own = [list(np.zeros(int(h) + 1)) for h in rows["horizon"]]
+    away = [[0.0] * int(h) + [1e-3] for h in rows["horizon"]]
+    rows = rows.assign(state_difference=1e-3, state_difference_rel=1e-3, path=away, own_path=own)
     figure = twins.figure(arranged(given, rows))
     titles = [panel.get_title().splitlines()[0] for panel in figure.axes]
     assert titles == ["pendulum, horizon=2", "pendulum, horizon=3"]
+    drawn = plotted(figure)
+    assert set(drawn["y"]) == {twins.SMALL, 1e-3}, "the difference over time, and 0 at the lower edge"
+    assert "pendulum, horizon=2 (0.0010)" in figure.get_suptitle().replace("\n", " ")
     assert list(twins.readable(arranged(given, rows))["horizon"]) == ["2", "2", "3", "3"]
     table_ = table(given, rows)
     assert "own_path" not in table_

@@ -15,6 +15,7 @@ from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
 from bench.cli import main
 from bench.model import compose
 from bench.report.views import arranged
+from bench.studies.three_errors import measure
 from bench.studies.three_errors.columns import COLUMNS
 from bench.studies.three_errors.measure import difference_check
 from bench.studies.three_errors.report import traps
@@ -116,10 +117,14 @@ def test_from_the_command_line(tmp_path, capsys):
         ({}, True),
         ({"program_error_rel": [1e-12, 1e-3]}, False),
         ({"model_cosine": [-0.5, 0.1]}, False),
+        ({"model_cosine": [0.38, 0.38], "model_error_rel": [1.05, 1.05]}, True),
+        ({"model_cosine": [0.85, 0.85], "model_error_rel": [0.74, 0.74]}, True),
+        ({"model_cosine": [0.9, 0.99], "model_error_rel": [0.74, 0.2]}, False),
+        ({"model_cosine": [0.99, 0.99], "model_error_rel": [0.02, 0.02]}, False),
         ({"forward_error_rel": [0.4, 0.3]}, False),
     ],
 )
-def test_a_trap_is_exact_convergent_and_turned_away_at_every_step(tmp_path, change, trapped):
+def test_a_trap_is_exact_convergent_and_turned_away_or_no_nearer_at_every_step(tmp_path, change, trapped):
     words = [
         "study=three_errors",
         "scenes=[bounce_once]",
@@ -130,7 +135,12 @@ def test_a_trap_is_exact_convergent_and_turned_away_at_every_step(tmp_path, chan
     given = config.load([*words, "estimators=[fobg]", f"results_dir={tmp_path}"])
     rows = pd.DataFrame([cell.columns() for cell in cells(given)]).assign(status="ok", reason="")
     values = {"program_error_rel": [1e-12, 1e-13], "model_cosine": [-0.5, -0.4], "forward_error_rel": [0.4, 0.1]}
+    values |= {"model_error_rel": [1.5, 0.5]}
     assert len(traps(arranged(given, rows.assign(**(values | change))))) == trapped
+
+
+def test_rounding_has_no_sign():
+    assert list(measure._signs(np.array([-7e-16, 0.4, -1e-3]))) == [0.0, 1.0, -1.0]
 
 
 LAWS = [("impulse", True), ("impulse", False), ("penalty", True), ("softplus", True), ("complementarity", True)]

@@ -23,6 +23,7 @@ from bench.report.views import (
     lines,
     ran,
     resolved,
+    rmse_interval,
     unsteady,
 )
 from bench.report.web.content import (
@@ -68,6 +69,8 @@ GOAL = 0.1
 """Relative RMSE for which the fastest method is named."""
 IN_SIGHT = 5
 """Identity columns that stand before time, status, reason and results, which a narrow screen has to show."""
+NAMED = 3
+"""Most estimators whose failures the finding names."""
 EXCEPTIONS = 2
 """Most settings with another best estimator that the finding names."""
 
@@ -111,7 +114,8 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         )
     )
     return Content(
-        finding=nothing_ran(rows) or "; ".join(filter(None, [finding(summaries), fastest(rows), refused(rows)])) + ".",
+        finding=nothing_ran(rows)
+        or "; ".join(filter(None, [failing(rows), finding(summaries), fastest(rows), refused(rows)])) + ".",
         rows=table_,
         columns=[*identity_columns(rows)[:IN_SIGHT], TIME, *STATUS, *RESULTS, *identity_columns(rows)[IN_SIGHT:]],
         charts=charts,
@@ -234,6 +238,31 @@ class Elsewhere:
         """Write the exception: ``pushing, penalty, stiffness >=1e4: use reinforce (0.5, where fobg has 300)``."""
         where = ", ".join(filter(None, [self.problem, self.where])) or "elsewhere"
         return f"{where}: use {self.use} ({between(self.errors)}, where {main} has {between(self.instead_of)})"
+
+
+def failing(rows: pd.DataFrame) -> str:
+    """Write which estimators fail and how: worse than answering zero beyond their interval, no better, or no number.
+
+    The estimator with the largest error comes first, at most :data:`NAMED` of them; nothing if none fails.
+    """
+    found = []
+    for label, part in ran(rows).groupby(_label(ran(rows)), sort=False):
+        good = part[(part["status"] == "ok") & np.isfinite(part["rmse_rel"])]
+        bad = good[good["rmse_rel"] >= 1]
+        lows = np.array([rmse_interval(row)[0] for row in bad.to_dict("records")])
+        worse, lost = int((lows > 1).sum()), int((part["status"] != "ok").sum())
+        texts = [
+            f"worse than answering zero in {worse} (up to {number(bad['rmse_rel'].max())} times the gradient)"
+            if worse
+            else "",
+            f"no better than zero in {len(bad) - worse}" if len(bad) > worse else "",
+            f"without a number in {lost}" if lost else "",
+        ]
+        if any(texts):
+            worst = float(bad["rmse_rel"].max()) if len(bad) else 0.0
+            found.append((worst, f"{label} is {', '.join(filter(None, texts))} of {counted(len(part), 'cell')}"))
+    found.sort(key=lambda one: -one[0])
+    return "; ".join(text for _, text in found[:NAMED])
 
 
 def finding(summaries: Sequence[ProblemSummary]) -> str:

@@ -23,6 +23,8 @@ SUMMARY = (
     "sign_agreement",
 )  # fmt: skip
 """The statistics of an estimator that are kept."""
+ROUNDING = 1e-9
+"""Share of a gradient's norm up to which a coordinate is rounding, with no sign."""
 STEPS = 10.0 ** -np.arange(1.0, 9.5, 0.5)
 """Step sizes of the central differences, in the units of theta."""
 
@@ -91,7 +93,7 @@ def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]
     """Return forward and model error, where the scene knows its physics.
 
     ``model_cosine`` is the cosine between the two gradients, ``model_signs`` the share of coordinates whose sign is
-    the physics'.
+    the physics', of those that have one.
     """
     result: dict[str, Any] = {}
     cost, physical = program.physical_cost(), program.physical_gradient()
@@ -100,18 +102,21 @@ def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]
         result |= {"physical_cost": cost, "forward_error": error, "forward_error_rel": _ratio(error, abs(cost))}
     if physical is not None:
         norm, error = _norm(physical), _norm(check.gradient - physical)
-        told = physical != 0
+        signs, told = _signs(check.gradient), _signs(physical)
         result |= {
             "physical_gradient": physical.tolist(),
             "physical_norm": norm,
             "model_error": error,
             "model_error_rel": _ratio(error, norm),
             "model_cosine": _ratio(float(check.gradient @ physical), norm * _norm(check.gradient)),
-            "model_signs": float((np.sign(check.gradient) == np.sign(physical))[told].mean())
-            if told.any()
-            else math.nan,
+            "model_signs": float((signs == told)[told != 0].mean()) if told.any() else math.nan,
         }
     return result
+
+
+def _signs(gradient: np.ndarray) -> np.ndarray:
+    """Return the signs of a gradient's coordinates, 0 for those that are rounding beside the others."""
+    return np.where(np.abs(gradient) > ROUNDING * _norm(gradient), np.sign(gradient), 0.0)
 
 
 def _norm(vector: np.ndarray) -> float:

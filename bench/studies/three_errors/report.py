@@ -39,7 +39,9 @@ ERRORS = {
 EXACT = 1e-6
 """Program error up to which a gradient counts as exact."""
 CONVERGED = 0.5
-"""Forward error at the smallest step over that at the largest, up to which a cost counts as converging."""
+"""Forward error at the smallest step over that at the largest, up to which a cost counts as converging; for a gradient likewise."""
+WRONG = 0.1
+"""Model error at the smallest step above which a gradient that does not converge is a trap."""
 AWAY: dict[str, Any] = {"marker": "x", "markersize": 6, "markeredgewidth": 1.6, "color": "#000000", "linestyle": "none"}
 HOLLOW: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 0.9}
 ORDER = (2, 0, 3, 4, 5, 6, 7, 1)
@@ -195,7 +197,10 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
 
 @dataclass(frozen=True)
 class Trap:
-    """A scene and law whose gradient passes every test but the physics': exact, of a converging cost, misdirected."""
+    """A scene and law whose gradient passes every test except the physics': exact, of a converging cost, and wrong.
+
+    It points away from the physics at every step, or its error does not fall with the step.
+    """
 
     name: str
     """Name of the scene and the law, with whatever else distinguishes it."""
@@ -204,14 +209,22 @@ class Trap:
     forward: tuple[float, float]
     """Relative forward error at the largest and the smallest value of the axis."""
     cosine: tuple[float, float]
-    """Smallest and largest cosine to the physical gradient, both negative."""
+    """Smallest and largest cosine to the physical gradient."""
+    model: tuple[float, float]
+    """Relative model error at the largest and the smallest value of the axis."""
 
     def __str__(self) -> str:
         """Write one sentence."""
+        against = (
+            f"and the gradient's cosine to the physics is {number(self.cosine[0])} to {number(self.cosine[1])}, negative "
+            f"at every time step."
+            if self.cosine[1] < 0
+            else f"and yet the gradient's error to the physics stays: {number(self.model[0])} at the largest time step, "
+            f"{number(self.model[1])} at the smallest, at a cosine of {number(self.cosine[0])} to {number(self.cosine[1])}."
+        )
         return (
             f"Trap: {self.name}: the gradient agrees with differences to {number(self.program)}, the "
-            f"cost's error falls from {number(self.forward[0])} to {number(self.forward[1])}, and the gradient's cosine "
-            f"to the physics is {number(self.cosine[0])} to {number(self.cosine[1])}, negative at every time step."
+            f"cost's error falls from {number(self.forward[0])} to {number(self.forward[1])}, {against}"
         )
 
 
@@ -225,9 +238,11 @@ def traps(shown: Arranged) -> list[Trap]:
         own = rows.drop_duplicates("x").sort_values("x")
         forward, cosine, program = own["forward_error_rel"], own["model_cosine"], own["program_error_rel"].max()
         converges = forward.is_monotonic_increasing and forward.iloc[0] <= CONVERGED * forward.iloc[-1]
-        if (cosine < 0).all() and program <= EXACT and converges:
-            ends = (float(forward.iloc[-1]), float(forward.iloc[0]))
-            result.append(Trap(str(name), float(program), ends, (float(cosine.min()), float(cosine.max()))))
+        model = own["model_error_rel"]
+        stays = model.iloc[0] > max(CONVERGED * model.iloc[-1], WRONG)
+        if ((cosine < 0).all() or stays) and program <= EXACT and converges:
+            ends, errors = ((float(v.iloc[-1]), float(v.iloc[0])) for v in (forward, model))
+            result.append(Trap(str(name), float(program), ends, (float(cosine.min()), float(cosine.max())), errors))
     return result
 
 
@@ -300,7 +315,7 @@ BOLD: dict[str, Any] = {"linewidth": 2.6, "markersize": 5.0, "zorder": 4}
 SAID = (
     (0.3, "looks right:\nfalls with $\\Delta t$"),
     (0.68, "looks right:\nexact"),
-    (0.42, "wrong direction\nat every $\\Delta t$"),
+    (0.42, "wrong\nat every $\\Delta t$"),
 )
 """Texts in the panels of a scene with a trap, and their heights."""
 THIN: dict[str, Any] = {"linewidth": 0.9, "markersize": 3.0, "zorder": 3}
@@ -309,7 +324,7 @@ THIN: dict[str, Any] = {"linewidth": 0.9, "markersize": 3.0, "zorder": 3}
 def _title(axis: Axis, trapped: bool) -> str:
     """Write what is drawn, and what to look at first."""
     text = f"Three errors of a gradient along {axis_name(axis)}, all relative"
-    return text + ("\nBold is a trap: right cost, exact derivative, wrong direction" if trapped else "")
+    return text + ("\nBold is a trap: right cost, exact derivative, and not that of the physics" if trapped else "")
 
 
 def _short_name(axis: Axis) -> str:
@@ -325,7 +340,9 @@ def _scale(panel: Axes, values: np.ndarray) -> None:
     panel.axhspan(1.0, CEILING * 3, zorder=0, **SHADE)
     log_axis(panel, "x", values[0] / 1.4, values[-1] * 1.4)
     panel.xaxis.set_major_locator(FixedLocator(list(values)))
-    panel.xaxis.set_major_formatter(FuncFormatter(lambda x, _: number(x) if x in (values[0], values[-1]) else ""))
+    few = values if len(values) <= 3 else values[[0, -1]]
+    panel.xaxis.set_major_formatter(FuncFormatter(lambda x, _: number(x) if x in few else ""))
+    panel.tick_params(axis="x", labelsize=6.5)
 
 
 def _draw(line: Sequence[Axes], rows: pd.DataFrame, estimators: Sequence[str], style: Mapping[str, Any]) -> None:

@@ -1,8 +1,9 @@
-"""Writes twins as a table and a chart: the trajectory of each scene's own program with the engines' on it."""
+"""Writes twins as a table and a chart: how far each engine is from the scene's own program over the rollout."""
 
 from __future__ import annotations
 
 import math
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from matplotlib.lines import Line2D
 
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH, columns
+from bench.report.scales import log_axis
 from bench.report.style import colour, plain
 from bench.report.tables import plain_markdown
 from bench.report.text import number
@@ -24,7 +26,10 @@ from bench.sweep.axes import table
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import write_all
 
-OWN: dict[str, Any] = {"color": "#b0b0b0", "linewidth": 4.0, "solid_capstyle": "round"}
+SMALL = 1e-17
+"""Differences below this, 0 included, are drawn here."""
+FAR = 1e-6
+"""Relative difference of states from which a twin is named as different: rounding through a rollout stays below."""
 COLOURS = tuple(map(colour, (0, 2, 3, 4, 5, 6, 7)))
 DASHES: tuple[Any, ...] = ("-", (0, (4, 3)), (0, (1, 2)), (0, (6, 2, 1, 2)))
 ENGINE = ("scene", "contact", "integrator", "backend")
@@ -73,7 +78,7 @@ def readable(shown: Arranged) -> pd.DataFrame:
 
 
 def figure(shown: Arranged) -> Figure:
-    """Draw a panel per problem: its coordinates over time, broad by its own program and thin by each engine."""
+    """Draw a panel per problem: the largest difference of any coordinate from its own program over time, by engine."""
     rows = shown.rows[shown.rows["status"] == "ok"]
     rows = rows.assign(engine=problems(shown, ["backend"], always=["backend"], rows=rows))
     titles = problems(shown, ["scene", "contact", "integrator"], rows=rows)
@@ -83,16 +88,25 @@ def figure(shown: Arranged) -> Figure:
     down = math.ceil(len(parts) / across)
     drawn = Figure(figsize=(WIDTH, 1.9 * down + 0.5), layout="constrained")
     FigureCanvasAgg(drawn)
-    panels = drawn.subplots(down, across, squeeze=False).ravel()
+    panels = drawn.subplots(down, across, squeeze=False, sharey=True).ravel()
     for panel, (title, part) in zip(panels, parts, strict=False):
         _draw(panel, str(title), part, engines)
     for panel in panels[len(parts) :]:
         panel.axis("off")
-    handles = [Line2D([], [], label="the scene's own program", **OWN)]
-    handles += [Line2D([], [], label=plain(name), **_style(i)) for i, name in enumerate(engines)]
+    handles = [Line2D([], [], label=plain(name), **_style(i)) for i, name in enumerate(engines)]
     drawn.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
-    drawn.suptitle("Engines on the trajectory of each scene", fontweight="bold", fontsize=9)
+    drawn.suptitle("\n".join(textwrap.wrap(headline(rows, titles), 90)), fontweight="bold", fontsize=9)
     return drawn
+
+
+def headline(rows: pd.DataFrame, titles: pd.Series) -> str:
+    """Write on which problems an engine is another program, the furthest first, and where all are the same."""
+    worst = rows["state_difference_rel"].groupby(titles, sort=False).max().sort_values(ascending=False)
+    away = [f"{title} ({number(value)})" for title, value in worst.items() if value > FAR]
+    if not away:
+        return f"The engines follow each scene's own program to {number(float(worst.max()))} of its states"
+    same = int((worst <= FAR).sum())
+    return f"Other states than the scene's own program, relative: {', '.join(away)}; the same on {same} of {len(worst)}"
 
 
 def _style(place: int) -> dict[str, Any]:
@@ -107,13 +121,15 @@ def _draw(panel: Axes, title: str, rows: pd.DataFrame, engines: list[str]) -> No
     first = rows.iloc[0]
     count = int(first["horizon"]) + 1
     time = np.arange(count) * first["dt"]
-    panel.plot(time, np.reshape(first["own_path"], (count, -1)), **OWN)
+    own = np.reshape(first["own_path"], (count, -1))
     for row in rows.to_dict("records"):
-        panel.plot(time, np.reshape(row["path"], (count, -1)), **_style(engines.index(row["engine"])))
+        apart = np.abs(np.reshape(row["path"], (count, -1)) - own).max(axis=1)
+        panel.plot(time, apart.clip(SMALL), **_style(engines.index(row["engine"])))
+    log_axis(panel, "y", SMALL / 3, 10.0)
     off = ", ".join(f"{plain(row['engine'])} {number(row['state_difference'], 2)}" for row in rows.to_dict("records"))
     panel.set_title(f"{plain(title)}\nlargest difference: {off}", fontsize=7)
     panel.set_xlabel("time [s]")
-    panel.set_ylabel("q")
+    panel.set_ylabel("largest |Δq|")
 
 
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
