@@ -17,6 +17,7 @@ OPTIONS = ("--list", "--quick", "--again")
 def main(words: Sequence[str]) -> int:
     """Run the claims named, or all; returns 1 where one is not reproduced or its code fails."""
     from bench.claims import results, shelf, tables
+    from bench.report.text import counted
     from bench.sweep.files import make_directory
 
     names = [word for word in words if not word.startswith("-") and "=" not in word]
@@ -34,9 +35,9 @@ def main(words: Sequence[str]) -> int:
         return 0
     directory = directory / "claims"
     make_directory(directory)
-    bad = False
+    found = {claim.name: results.stored(directory, claim) for claim in shelf.claims().values()}
     for claim in claims:
-        result = None if "--again" in words else results.stored(directory, claim)
+        result = None if "--again" in words else found[claim.name]
         fresh = result is None
         if result is None:
             print(f"{claim.name} ...", file=sys.stderr, flush=True)
@@ -44,12 +45,13 @@ def main(words: Sequence[str]) -> int:
             results.keep(directory, result)
         for line in tables.lines(claim, result, fresh):
             print(line, flush=True)
-        bad = bad or result.verdict in (NOT_REPRODUCED, results.FAILED)
-    # the page has all that is stored, also of claims that this command did not name
-    everything = [(claim, results.stored(directory, claim)) for claim in shelf.claims().values()]
-    found = [(claim, result) for claim, result in everything if result is not None]
-    if found:
-        for path in tables.write(directory, found)[-4:]:
+        found[claim.name] = result
+    # the page has all that is stored, also of claims that this command did not name, and what failed just now
+    shown = [(claim, result) for claim in shelf.claims().values() if (result := found[claim.name]) is not None]
+    if shown:
+        for path in tables.write(directory, shown)[-4:]:
             print(f"  {path}")
-        print(f"{len(found)} claims: {tables.counts(found)}")
-    return 1 if bad else 0
+        print(f"{counted(len(shown), 'claim')}: {tables.counts(shown)}")
+    asked = {claim.name for claim in claims}
+    bad = (NOT_REPRODUCED, results.FAILED)
+    return int(any(result.verdict in bad for claim, result in shown if claim.name in asked))

@@ -6,13 +6,14 @@ import importlib
 import inspect
 import pkgutil
 import re
+import sys
 from collections.abc import Sequence
 from functools import cache
 from importlib.metadata import entry_points
 
 from bench.claims import published
 from bench.claims.claim import Claim
-from bench.errors import UserError, unknown
+from bench.errors import UserError, printable, unknown
 
 ENTRY_POINT_GROUP = "bench.claims"
 """Each entry point names a :class:`~bench.claims.claim.Claim` class, or a module that holds some."""
@@ -34,7 +35,12 @@ def claims() -> dict[str, type[Claim]]:
     modules = [f"{published.__name__}.{module.name}" for module in pkgutil.iter_modules(published.__path__)]
     found = [claim for module in modules for claim in _of(importlib.import_module(module))]
     for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda point: point.name):
-        found += _of(point.load())
+        try:
+            found += _of(point.load())
+        except Exception as error:
+            # one broken package must not hide the claims of the others
+            said = f"{type(error).__name__}: {error}"
+            print(f"bench: claims of entry point '{point.name}' cannot be used: {printable(said)}", file=sys.stderr)
     table: dict[str, type[Claim]] = {}
     for claim in sorted(found, key=_place):
         if claim.name in table:

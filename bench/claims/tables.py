@@ -12,7 +12,7 @@ from bench.claims.claim import VERDICTS, Claim, Figure
 from bench.claims.results import FAILED, Result
 from bench.claims.shelf import LESSONS
 from bench.report.tables import csv, escape_latex, escape_markdown
-from bench.report.text import duration, number
+from bench.report.text import counted, duration, number
 from bench.sweep.files import write_all
 
 Found = Sequence[tuple[type[Claim], Result]]
@@ -42,21 +42,30 @@ def chart(directory: Path, claim: type[Claim], result: Result) -> list[Path]:
     """Draw one claim from its stored series; returns the picture's path, or nothing without a series."""
     if not result.series:
         return []
+    from cycler import cycler
+    from matplotlib import rcParams
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Picture
+    from matplotlib.ticker import NullFormatter
 
     from bench.report.figures import save, styled
+    from bench.report.style import PALETTE
 
     with styled():
+        rcParams["axes.prop_cycle"] = cycler(color=[PALETTE[i] for i in (2, 0, 3, 4)])
         picture = Picture(figsize=(3.5, 2.6), layout="constrained")
         FigureCanvasAgg(picture)
         axes = picture.add_subplot()
         claim().draw(axes, result.series)
+        # on short logarithmic axes the labels between powers of ten would overlap
+        for axis in (axes.xaxis, axes.yaxis):
+            if axis.get_scale() == "log":
+                axis.set_minor_formatter(NullFormatter())
         axes.set_xlabel(claim.labels[0])
         axes.set_ylabel(claim.labels[1])
         axes.set_title(f"{claim.name}: {result.verdict}", fontsize=8)
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=7)
+            axes.legend(fontsize=7, frameon=True, framealpha=0.85, edgecolor="none")
         return save(picture, directory / claim.name)[:1]
 
 
@@ -71,6 +80,8 @@ def resolution_text(figure: Figure) -> str:
     """Write from which change on the figure would have failed."""
     if figure.value == 0.0:
         return "any"
+    if figure.resolution < 1e-3:
+        return "<0.1%"
     return f"{figure.resolution:.1%}" if figure.resolution < 1 else f"factor {1 + figure.resolution:.1f}"
 
 
@@ -106,7 +117,7 @@ def counts(found: Found) -> str:
 
 def markdown(found: Found) -> str:
     """Write the verdicts and figures in Markdown, by lesson."""
-    parts = [f"# Published claims, run again\n\n{len(found)} claims: {counts(found)}.\n"]
+    parts = [f"# Published claims, run again\n\n{counted(len(found), 'claim')}: {counts(found)}.\n"]
     for lesson, sentence, own in lessons(found):
         parts.append(f"## {lesson}\n\n{sentence}\n")
         for claim, result in own:
@@ -148,7 +159,7 @@ def page(found: Found, charts: dict[str, Path]) -> str:
     """Write the page: lessons, claims, figures, charts, in one file with the pictures inside."""
     import base64
 
-    body = [f"<h1>Published claims, run again</h1><p>{len(found)} claims: {escape(counts(found))}.</p>"]
+    body = [f"<h1>Published claims, run again</h1><p>{counted(len(found), 'claim')}: {escape(counts(found))}.</p>"]
     for lesson, sentence, own in lessons(found):
         body.append(f"<section><h2>{escape(lesson)}</h2><p>{escape(sentence)}</p>")
         for claim, result in own:

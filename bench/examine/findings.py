@@ -109,6 +109,8 @@ class Findings:
             return "staircase"
         if not bad and self.missed > WANTED:
             return "jumps"
+        if not bad and not all(one.defined for one in self.smoothed):
+            return "nonfinite"
         if not bad and any(one.biased for one in self.smoothed):
             return "biased"
         if not bad and any(one.unshown for one in self.smoothed):
@@ -140,6 +142,8 @@ class Findings:
                     "jumps, which no gradient sees, make the rest"
                 )
             for one in self.smoothed:
+                if not one.defined:
+                    found.append(f"nonfinite: at sigma {number(one.sigma)} J is not defined: {one.remark}")
                 if one.unshown:
                     found.append(
                         f"spread: at sigma {number(one.sigma)} the gradients vary so widely that {one.pairs} pairs do not show "

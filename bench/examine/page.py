@@ -109,7 +109,7 @@ def _steps(report: Findings) -> Figure:
     left.set_ylabel("relative error of the gradient")
     left.set_title("A right gradient: falls with the step squared,\nuntil rounding takes over", fontsize=8)
     if components:
-        left.legend(fontsize=7, loc="upper left")
+        left.legend(fontsize=7, loc="best", frameon=True, framealpha=0.8, edgecolor="none")
     whole = [part for part in report.check.parts if part.component is None]
     for index, part in enumerate(whole):
         sample = part.sample
@@ -168,7 +168,10 @@ def _sigmas(report: Findings) -> Figure:
         )
         clear = bias[:, 1] > 0
         panel.vlines(sigma[clear], bias[clear, 1], bias[clear, 2], color=PALETTE[2])
-        panel.plot(sigma[clear], bias[clear, 0], "o", color=PALETTE[2], label="bias of the gradient, with 95% interval")
+        if clear.any():
+            panel.plot(
+                sigma[clear], bias[clear, 0], "o", color=PALETTE[2], label="bias of the gradient, with 95% interval"
+            )
         panel.plot(
             sigma[~clear],
             bias[~clear, 2],

@@ -70,6 +70,11 @@ class Smoothed:
     methods: tuple[Method, ...]
 
     @property
+    def defined(self) -> bool:
+        """Whether every cost was a number, so that there is a grad J."""
+        return math.isfinite(self.norm)
+
+    @property
     def known(self) -> bool:
         """Whether grad J stands clear of its own error."""
         return self.norm > 4.0 * self.error

@@ -41,7 +41,7 @@ def bootstrap(
 ) -> Interval:
     """Return the percentile interval of a statistic of strata, each resampled along its first axis by itself.
 
-    An infinite statistic stays infinite: where a quarter of the resamples has no success, an upper end is infinite.
+    Resamples in which the statistic is NaN are left out.
     """
     rng = np.random.default_rng(seed)
     values = np.array(
@@ -64,6 +64,15 @@ def average_runtime(spent: np.ndarray, reached: np.ndarray) -> float:
     """
     count = int(np.count_nonzero(reached))
     return float(np.sum(spent) / count) if count else math.inf
+
+
+def runtime_interval(spent: np.ndarray, reached: np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
+    """Return the bootstrap interval of :func:`average_runtime`; infinite at its upper end where resamples often fail."""
+    drawn = np.random.default_rng(seed).integers(0, len(spent), (draws, len(spent)))
+    counts = reached[drawn].sum(axis=1)
+    values = np.where(counts > 0, spent[drawn].sum(axis=1) / np.maximum(counts, 1), math.inf)
+    low, high = np.quantile(values, [0.025, 0.975], method="nearest")
+    return float(low), float(high)
 
 
 def runtimes(spent: np.ndarray, reached: np.ndarray, count: int, seed: int = 0) -> np.ndarray:

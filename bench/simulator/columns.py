@@ -305,7 +305,9 @@ class Simulator:
             return mapped(thetas) if w is None else mapped(thetas, w)
         columns = range(thetas.shape[1])
         costs = [self._call(self._theta(thetas[:, i]), None if w is None else w[:, i]) for i in columns]
-        return torch.stack([torch.as_tensor(cost).reshape(()) for cost in costs])
+        # a Python number has double precision, which torch would cut
+        doubles = [cost if torch.is_tensor(cost) else torch.as_tensor(cost, dtype=torch.float64) for cost in costs]
+        return torch.stack([cost.reshape(()) for cost in doubles])
 
     def _jax_values(self, thetas: np.ndarray, w: np.ndarray | None, batch: str) -> Any:
         import jax

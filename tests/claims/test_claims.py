@@ -139,6 +139,7 @@ def test_a_wrong_claim_and_a_broken_one_give_exit_status_1(toy, tmp_path, monkey
     monkeypatch.setattr(toy, "value", None)
     assert cli.main(["claims", "--again", f"results_dir={tmp_path}"]) == 1
     assert "ValueError: no value" in capsys.readouterr().out
+    assert "no value" in (tmp_path / "claims" / "claims.html").read_text()
 
 
 def test_names_options_and_folders_are_checked(capsys):
@@ -162,6 +163,23 @@ def test_claims_of_other_packages_are_found(monkeypatch):
         assert list(shelf.claims())[-1] == "T1"
     finally:
         shelf.claims.cache_clear()
+
+
+def test_a_broken_package_hides_no_other_claim(monkeypatch, capsys):
+    def broken():
+        raise ImportError("no such module")
+
+    points = [SimpleNamespace(name="bad", load=broken), SimpleNamespace(name="odd", load=lambda: int)]
+    monkeypatch.setattr(shelf, "entry_points", lambda group: points)
+    shelf.claims.cache_clear()
+    try:
+        assert "C1" in shelf.claims()
+    finally:
+        shelf.claims.cache_clear()
+    said = capsys.readouterr().err
+    assert "'bad'" in said
+    assert "no such module" in said
+    assert "'odd'" in said
 
 
 def test_every_claim_says_what_where_and_why():

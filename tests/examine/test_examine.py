@@ -11,9 +11,11 @@ import pytest
 import bench
 from bench import cli
 from bench.errors import UserError
+from bench.examine.examination import _Examination
 from bench.examine.lines import scan
 from bench.examine.smoothing import Smoothed
-from bench.simulator.clock import seconds
+from bench.simulator.clock import Clock, seconds
+from bench.simulator.columns import Simulator
 from bench.simulator.layout import Layout
 
 QUICK = {"progress": False, "budget": 20}
@@ -328,12 +330,30 @@ def test_jumps_off_the_grid_of_steps_are_seen_by_the_integral():
     assert report.status == 1
 
 
-def test_slow_simulator_has_its_cause_named_within_the_budget():
-    """5 ms a cost and 6 s: no scan of a staircase, and the wrong component all the same."""
+def test_slow_simulator_is_checked_in_every_component_before_anything_else():
+    """5 ms a cost and 6 s: 1,200 costs, so that no time is left to scan for staircases."""
+    clock = Clock(6.0)
+    clock.count("costs", 100, 0.5, warm=True)
+    simulator = Simulator(bowl, Layout([1.0, 0.5]), slope, clock=clock)
+    examination = _Examination(simulator, simulator.layout, np.ones(2), [], clock, 0, "slow")
+    chosen = examination._options()
+    assert (chosen.components, chosen.scanned) == (16, 0)
+    assert "not done" not in str(examination.left_out)
+    assert "the whole check" in examination.left_out[0]
 
-    def slow(x):
-        time.sleep(0.005)
-        return bowl(x)
 
-    report = bench.examine(slow, [1.0, 0.5], grad=lambda x: [slope(x)[0], 3 * x[1] ** 2], progress=False, budget="6s")
-    assert (report.status, report.cause) == (1, "missing_term")
+def test_costs_that_are_no_numbers_beside_theta_leave_no_mean():
+    def bounded(x):
+        if x[0] > 1.05:
+            raise ValueError("out of domain")
+        return float(x[0] ** 2)
+
+    report = bench.examine(bounded, [1.0], grad=lambda x: 2 * x, sigma=0.1, **QUICK)
+    assert (report.status, report.cause) == (1, "nonfinite")
+    assert "ValueError: out of domain" in str(report)
+
+
+def test_python_number_from_torch_is_disconnected_in_double_precision():
+    pytest.importorskip("torch")
+    report = bench.examine(lambda x: (x**2).sum().item(), [1.0, 2.0], grad="torch", **QUICK)
+    assert (report.status, report.cause) == (1, "disconnected")

@@ -75,6 +75,11 @@ def test_narrow_event_is_seen():
     assert bank.excess(case, bank.certified(case, 1 << 18)) <= 1.0
 
 
+@pytest.mark.parametrize(("dim", "least"), [(1, 1 << 15), (2, 1 << 17)])
+def test_rules_that_agree_at_once_are_still_refined(dim, least):
+    assert found_at(bank.certified(ridge(bank.power(1), dim=dim), SAMPLES), "points") >= least
+
+
 def test_jumps_in_a_plane_that_no_breakpoint_lists_are_sampled():
     case = ridge(bank.step(0.3, 1.0), dim=2, says=False)
     assert bank.certified(case, SAMPLES).method.startswith("sampling[zeroth_order")

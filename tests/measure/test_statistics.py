@@ -122,6 +122,27 @@ def test_interval_of_one_coordinate_is_students() -> None:
     assert high == pytest.approx(mean + quantile * error, abs=0.02 * error)
 
 
+@pytest.mark.parametrize(("repeats", "batches"), [(5, 8), (8, 5)])
+def test_interval_of_two_error_sources_has_welchs_degrees(repeats: int, batches: int) -> None:
+    # Far from zero, in one dimension, the ends are |m| -+ t se with Welch's degrees of freedom.
+    from scipy.special import stdtrit
+
+    rng = np.random.default_rng(21)
+    estimates, reference = 3.0 * rng.standard_normal((repeats, 1)) + 500.0, rng.standard_normal((batches, 1)) + 100.0
+    one, other = (float(np.var(sample, ddof=1)) / len(sample) for sample in (estimates, reference))
+    error = math.sqrt(one + other)
+    degrees = (one + other) ** 2 / (one**2 / (repeats - 1) + other**2 / (batches - 1))
+    quantile = float(stdtrit(degrees, 0.975))
+    assert quantile > 1.1 * 1.96
+    distance = float(estimates.mean() - reference.mean())
+    summary = summarise(estimates, Truth.from_batches(reference), 1)
+    # Sankaran's form errs by less than a hundredth of a standard error here.
+    assert summary.bias_low == pytest.approx(distance - quantile * error, abs=0.02 * error)
+    assert summary.bias_high == pytest.approx(distance + quantile * error, abs=0.02 * error)
+    assert summary.bias_rel == pytest.approx(summary.bias / abs(float(reference.mean())))
+    assert summary.rmse_rel == pytest.approx(summary.rmse / abs(float(reference.mean())))
+
+
 def test_interval_uses_the_noise_along_the_bias() -> None:
     # 10 average errors of bias across the noise: known to a fraction of what it would be along it.
     rng = np.random.default_rng(7)

@@ -1,6 +1,8 @@
 """Optimizers against their closed forms, torch.optim, optax and the constants of cma."""
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from scipy.stats import norm
 
 from bench.conformance import optimizers as kit
 from bench.conformance.kit import Failed
-from bench.model import Answer
+from bench.model import Answer, registry
 
 SAMPLES = 400_000
 """Samples of the population methods' limits: the mean of a normal is then known to 0.0016 standard deviations."""
@@ -282,3 +284,19 @@ class Climbing(GradientDescent):
 def test_kit_catches(fault, check, message):
     with pytest.raises(Failed, match=message):
         check(fault)
+
+
+def test_the_example_of_the_documents_takes_25_lines_and_passes_the_kit(tmp_path):
+    text = (Path(__file__).resolve().parents[2] / "docs" / "extending.md").read_text()
+    (example,) = re.findall(r"```python\n# my_plugins/sign_descent.py\n(.*?)```", text, re.DOTALL)
+    assert len(example.strip().splitlines()) <= 25
+    (tmp_path / "sign_descent.py").write_text(example)
+    registry.add_folder(tmp_path)
+    optimizer = registry.make("optimizers", "sign_descent")
+    for check in (
+        kit.needs_are_declared,
+        kit.path_repeats_after_a_stop,
+        kit.state_is_left_alone,
+        kit.descends_on_a_bowl,
+    ):
+        check(optimizer)

@@ -295,6 +295,12 @@ def test_quality_subtracts_noise():
     assert biased["bias_share"] == pytest.approx(1.0 / 1.25, rel=0.02)
 
 
+def test_quality_is_unknown_where_the_reference_is_noisier_than_the_estimates():
+    rng = np.random.default_rng(0)
+    found = compared(3.0 + 0.01 * rng.standard_normal((50, 4)), 3.0 + 100.0 * rng.standard_normal((4, 1000)))
+    assert all(math.isnan(value) for value in found.values())
+
+
 # ---------------------------------------------------------------------------------------------------- statistics
 
 
@@ -312,6 +318,9 @@ def test_average_runtime_counts_failures():
     spent, reached = np.array([10.0, 100.0, 30.0]), np.array([True, False, True])
     assert performance.average_runtime(spent, reached) == 70.0
     assert math.isinf(performance.average_runtime(spent, np.zeros(3, dtype=bool)))
+    low, high = performance.runtime_interval(spent, reached)
+    assert low < 70.0 < high
+    assert math.isinf(performance.runtime_interval(spent, np.array([True, False, False]))[1])  # a third of a third fail
     # restarts draw from the same law: their mean is the average runtime
     times = performance.runtimes(spent, reached, 40_000)
     assert times.mean() == pytest.approx(70.0, rel=0.03)

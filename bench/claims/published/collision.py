@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from bench.model import Problem
 
 
+LABELS = {"with": "with time of impact", "without": "without", "penalty": "penalty"}
+
+
 class Collision(Claim):
     """Control through a collision."""
 
@@ -50,7 +53,7 @@ class Collision(Claim):
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw the costs."""
         for name in ("with", "without"):
-            axes.plot(series["iteration"], series[name], label=name)
+            axes.plot(series["iteration"], series[name], label=LABELS[name])
         axes.axhline(2.0, color="#404040", linewidth=0.6)
 
 

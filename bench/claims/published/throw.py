@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from bench.model import Problem
 
 
+LABELS = {"with": "with time of impact", "without": "without", "penalty": "penalty"}
+
+
 class Throw(Claim):
     """A thrown ball."""
 
@@ -54,7 +57,7 @@ class Throw(Claim):
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw the losses."""
         for name in ("with", "without", "penalty"):
-            axes.semilogy(series["iteration"], series[name], label=name)
+            axes.semilogy(series["iteration"], series[name], label=LABELS[name])
 
 
 def _slope(at: Problem, theta: np.ndarray, _: int) -> np.ndarray:

@@ -99,7 +99,7 @@ class OtherObjective(Claim):
     statement = "iLQR swings a pendulum up in five iterations: 1856.154, 1202.106, 699.799, 423.583, 357.476, 357.297."
     source = "Suh et al. 2021, Bundled gradients, public result file"
     learned = "Say which objective was given and on which one it is scored; nobody can tell from the curve."
-    labels = ("iteration", "cost with weights 1 and 1")
+    labels = ("iteration", "cost above the least, 349.49")
 
     def measure(self) -> Outcome:
         """Run iLQR on weights 1/2 and 20, scored on 1 and 1, then on those it is scored by."""
@@ -124,7 +124,6 @@ class OtherObjective(Claim):
         """Draw both curves above the optimum."""
         for name, label in (("given", "given weights 1/2 and 20"), ("scored", "given weights 1 and 1")):
             axes.semilogy(np.array(series[name]) - 349.490454, "o-", label=label)
-        axes.set_ylabel("cost above the least, 349.49")
 
 
 def _ilqr(effort: float, terminal: float, iterations: int, dt: float = 0.05, horizon: int = 200) -> list[float]:

@@ -182,6 +182,8 @@ def figure(lines: pd.DataFrame) -> Figure:
             linestyle=(0, (3, 2)),
             zorder=0,
         )
+        if column == "error":
+            panel.set_xscale("log")
         panel.set_xlabel(title)
     panels[0].set_yticks(range(len(names)), [plain(name).replace(", ", "\n", 1) for name in names])
     panels[0].set_ylim(len(names) - 0.5, -0.5)

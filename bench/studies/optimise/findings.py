@@ -56,6 +56,8 @@ def ranking(summed: pd.DataFrame) -> str:
         return ""
     first = known.iloc[0]
     text = f"Best score: {first['method']} with {number(first['score'], 3)} [{number(first['score_low'], 3)}, {number(first['score_high'], 3)}]"
+    if known["searches"].sum() < FEW_SEEDS * known["problems"].sum():
+        text += f" (fewer than {FEW_SEEDS} seeds: the intervals are too narrow)"
     level = known.iloc[1:][known.iloc[1:]["score_high"] >= first["score_low"]]["method"]
     return text + (
         f"; not distinguishable from it: {', '.join(level)}." if len(level) else "; no other interval reaches it."

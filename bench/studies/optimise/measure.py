@@ -305,6 +305,9 @@ def gradient_ratio(problem: Problem, cell: Cell, calls: int = 5) -> float:
 
 # ---------------------------------------------------------------------------------------------- gradient quality
 
+BLURRED = 0.5
+"""Share of a measured squared error that may come from the reference: the rest is then known to about its half."""
+
 _qualities: dict[tuple[Any, ...], dict[str, float]] = {}
 
 
@@ -313,8 +316,8 @@ def qualities(
 ) -> dict[str, dict[str, float]]:
     """Return, by place, the relative error, cosine and share of bias of the estimator's gradients at theta.
 
-    The reference is a mean of many gradients, or of many zeroth-order terms where the cost jumps; its own noise, and
-    that of the mean estimate, are subtracted from the bias.
+    The reference is a mean of many gradients or zeroth-order terms, whichever vary less, zeroth-order ones where the cost
+    jumps. Its own noise, and that of the mean estimate, are subtracted from the bias.
     """
     cell, problem, estimator = search.cell, search.problem, search.estimator
     if estimator is None:
@@ -331,23 +334,31 @@ def qualities(
     if key not in _qualities:
         program, scene = problem.program, cell.scene.name
         w = noise.draw(0, scene, 1, settings.quality_samples, program.n_noise, "optimise: reference")[0].T
-        if program.continuous and "grad" in cell.backend.provides:
-            terms = problem.grad(theta, w)
-        else:
+        with np.errstate(all="ignore"):
             cost = problem.value(theta, w) - problem.value(theta, 0.0 * w[:, :1])
             terms = cost * problem.score(theta, w)
+            if program.continuous and "grad" in cell.backend.provides:
+                first = problem.grad(theta, w)
+                terms = first if first.var(axis=1).sum() < terms.var(axis=1).sum() else terms
         drawn = noise.draw(0, scene, max(cell.repeats, 2), cell.samples, program.n_noise, "optimise: quality")
         _qualities[key] = compared(estimator.estimate(problem, theta, drawn), terms)
     return dict.fromkeys(places, _qualities[key])
 
 
 def compared(estimates: np.ndarray, terms: np.ndarray) -> dict[str, float]:
-    """Compare estimates ``(R, d)`` with the mean of reference terms ``(d, M)``."""
+    """Compare estimates ``(R, d)`` with the mean of reference terms ``(d, M)``.
+
+    Everything is NaN where the reference is not known well enough to tell: its own squared error is above
+    :data:`BLURRED` of what is measured against it.
+    """
     truth = terms.mean(axis=1)
     own = float(terms.var(axis=1, ddof=1).sum()) / terms.shape[1]
     norm = float(np.linalg.norm(truth))
     off = estimates - truth
-    error = max(float((off**2).sum(axis=1).mean()) - own, 0.0)
+    seen = float((off**2).sum(axis=1).mean())
+    if not own <= BLURRED * seen:
+        return dict.fromkeys(("rmse_rel", "cosine", "bias_share"), np.nan)
+    error = seen - own
     spread = float(estimates.var(axis=0, ddof=1).sum())
     bias = max(float((off.mean(axis=0) ** 2).sum()) - spread / len(estimates) - own, 0.0)
     sizes = np.linalg.norm(estimates, axis=1) * norm

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from bench.measure import performance
+from bench.model.parameters import remember
 from bench.report.text import axis_value
 from bench.report.views import Arranged, arranged, ran
 from bench.report.web.content import problems
@@ -74,8 +75,20 @@ class Races:
             yield str(key[0]), str(key[1]), part
 
 
+_made: dict[tuple[int, int], tuple[Experiment, pd.DataFrame, Races]] = {}
+"""The races arranged last, by identity of experiment and rows, which are kept so that no other gets their place."""
+
+
 def races(experiment: Experiment, rows: pd.DataFrame) -> Races:
     """Arrange the rows of searches; refused ones are left out."""
+    key = (id(experiment), id(rows))
+    if key not in _made:
+        _made.clear()
+        _made[key] = (experiment, rows, _races(experiment, rows))
+    return _made[key][2]
+
+
+def _races(experiment: Experiment, rows: pd.DataFrame) -> Races:
     shown = arranged(experiment, rows)
     kept = ran(shown.rows)
     kept = kept[np.isfinite(kept["start_cost"])]
@@ -172,6 +185,7 @@ def arrival(row: pd.Series, factor: float, cost: np.ndarray) -> tuple[float, boo
 # ------------------------------------------------------------------------------------------------------- tables
 
 
+@remember
 def targets(found: Races, default: float) -> pd.DataFrame:
     """Return, per problem, method and target, successes with Wilson's interval and the average runtime in rollouts."""
     lines = []
@@ -181,9 +195,7 @@ def targets(found: Races, default: float) -> pd.DataFrame:
             pairs = np.array([arrival(row, factor, spent(row, ratio)) for _, row in part.iterrows()])
             reached, costs = pairs[:, 1].astype(bool), pairs[:, 0]
             low, high = performance.wilson(int(reached.sum()), len(reached))
-            art_low, art_high = performance.bootstrap(
-                [pairs], lambda parts: performance.average_runtime(parts[0][:, 0], parts[0][:, 1].astype(bool))
-            )
+            art_low, art_high = performance.runtime_interval(costs, reached)
             lines.append({
                 "problem": problem, "method": method, "tuning": found.chosen[problem, method], "target": factor,
                 "successes": int(reached.sum()), "searches": len(reached), "rate": float(reached.mean()),
@@ -204,6 +216,7 @@ def runtimes(found: Races, default: float) -> dict[str, np.ndarray]:
     return {method: np.concatenate(parts) for method, parts in times.items() if parts}
 
 
+@remember
 def summary(found: Races, default: float, baseline: str = "fobg") -> pd.DataFrame:
     """Return, per method, the interquartile mean score, its chance to beat the baseline, and its share of best times.
 
@@ -253,6 +266,7 @@ def _improvement(found: Races, method: str, base: str | None) -> tuple[float, fl
     return share(strata), *performance.bootstrap(strata, share)
 
 
+@remember
 def quality(found: Races, default: float, factor: float = TARGETS[0]) -> pd.DataFrame:
     """Return, per problem and method with an estimator: its gradient's quality at the start, and the runtime to a target."""
     lines = []

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH, columns
 from bench.report.scales import log_axis
-from bench.report.style import MARKERS, PALETTE, VARIANTS, colour, plain
+from bench.report.style import MARKERS, PALETTE, VARIANTS, colour, inches, plain, wrapped
 from bench.report.tables import plain_markdown
 from bench.report.text import counted, number
 from bench.studies.optimise import findings, races
@@ -34,6 +34,10 @@ NOTES = (
     "score over all its tunings stands beside it, and their number is what the tuning cost.",
 )
 
+ACROSS = 4
+"""Most panels side by side."""
+TITLE = 1.6
+"""Inches of a line of a panel's title."""
 DEPTH = 1e-7
 """Regrets below this share of the largest are not drawn: one search reaches 0 where J* is the lowest cost of any."""
 
@@ -164,8 +168,10 @@ def _grid(count: int, most: int, height: float, title: str) -> tuple[Figure, lis
 
 
 def _legend(drawn: Figure, names: dict[str, dict[str, Any]], extra: tuple[Any, ...] = ()) -> None:
-    handles = [Line2D([], [], label=plain(name), **style) for name, style in names.items()]
-    drawn.legend(handles=[*handles, *extra], loc="outside lower center", ncols=3, columnspacing=1.2)
+    handles = [*(Line2D([], [], label=plain(name), **style) for name, style in names.items()), *extra]
+    longest = max(0.6 + inches(str(handle.get_label())) for handle in handles)
+    across = max(1, min(3, int(drawn.get_figwidth() / longest)))
+    drawn.legend(handles=handles, loc="outside lower center", ncols=across, columnspacing=1.2)
 
 
 def quality_figure(found: Races, default: float) -> Figure | None:
@@ -218,17 +224,21 @@ def quality_figure(found: Races, default: float) -> Figure | None:
 
 def anytime_figure(found: Races, default: float) -> Figure:
     """Draw regret against rollouts, and against seconds where they were measured: median and 20% to 80% of seeds."""
-    timed = bool(found.rows["search_s"].notna().any())
-    rows = 2 if timed else 1
+    units = ("rollouts", "seconds") if found.rows["search_s"].notna().any() else ("rollouts",)
     names, styles = found.problems, looks(found)
-    drawn = Figure(figsize=(max(WIDTH, 2.4 * len(names)), 2.4 * rows + 1.0), layout="constrained")
+    across = columns(len(names), ACROSS)
+    down = math.ceil(len(names) / across) * len(units)
+    drawn = Figure(figsize=(WIDTH, 1.9 * down + 1.0), layout="constrained")
     FigureCanvasAgg(drawn)
     drawn.suptitle("Regret on the way, each method at its best tuning", fontsize=9, fontweight="bold")
-    grid = drawn.subplots(rows, len(names), squeeze=False)
-    for line, unit in zip(grid, ("rollouts", "seconds"), strict=False):
-        for panel, problem in zip(line, names, strict=True):
-            part = found.best[found.best["problem"] == problem]
-            ratio = races.ratio_of(found.rows[found.rows["problem"] == problem], default)
+    grid = drawn.subplots(down, across, squeeze=False)
+    blocks = grid.reshape(-1, len(units), across).swapaxes(1, 2).reshape(-1, len(units))
+    for spare in blocks[len(names) :].ravel():
+        spare.remove()
+    for problem, panels in zip(names, blocks, strict=False):
+        rows = found.rows[found.rows["problem"] == problem]
+        part, ratio = found.best[found.best["problem"] == problem], races.ratio_of(rows, default)
+        for unit, panel in zip(units, panels, strict=True):
             for method, own in part.groupby("method", sort=False):
                 places = [
                     races.spent(row, ratio) if unit == "rollouts" else np.asarray(row["path_s"], dtype=float)
@@ -239,13 +249,20 @@ def anytime_figure(found: Races, default: float) -> Figure:
             low, high = panel.get_ylim()
             panel.set_ylim(max(low, DEPTH * high), high)
             panel.set_xscale("log")
-            panel.set_xlabel(unit if unit == "seconds" else "rollouts, a gradient at its time")
+            panel.set_xlabel(unit)
+        first = rows.iloc[0]
+        panels[0].set_title(
+            f"{_wrapped(problem)}\nJ* = {first['least']:.6g},\n{short(first['least_status'])}", fontsize=7
+        )
+    for line in grid:
         line[0].set_ylabel("J - J*")
-    for panel, problem in zip(grid[0], names, strict=True):
-        first = found.rows[found.rows["problem"] == problem].iloc[0]
-        panel.set_title(f"{plain(problem)}\nJ* = {first['least']:.6g}, {short(first['least_status'])}", fontsize=7)
     _legend(drawn, {name: {**style, "marker": ""} for name, style in styles.items()})
     return drawn
+
+
+def _wrapped(name: str) -> str:
+    """Break a name at its commas, into lines that fit a panel."""
+    return wrapped(plain(name).split(", "), TITLE)
 
 
 def short(status: str) -> str:
@@ -307,7 +324,7 @@ def rates_figure(found: Races, default: float) -> Figure | None:
         if (part["value"] > 0).all():
             log_axis(panel, "x", part["value"].min() / 1.3, part["value"].max() * 1.3, sorted(set(part["value"])))
         panel.set_ylim(-0.03, 1.03)
-        panel.set_title(plain(str(problem)), fontsize=7)
+        panel.set_title(_wrapped(str(problem)), fontsize=7)
         panel.set_xlabel(plain(str(axis)))
         panel.set_ylabel("score")
     _legend(drawn, styles)
