@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-CPU, MEMORY = 60, 6 << 30
+CPU, MEMORY = 40, 6 << 30
 """Seconds and bytes that the tests of one fault may take."""
 ROOT = Path(__file__).resolve().parents[1]
 COPIED = ("bench", "plugins", "conf", "tests", "docs", "README.md", "CONTRIBUTING.md", "pyproject.toml")
