@@ -158,6 +158,11 @@ def test_rounding_of_a_large_component_is_no_fault_of_a_small_one_but_an_exact_0
     assert check(uneven, lambda x: np.array([2.0 * x[0], 0.0]), theta).cause == "disconnected"
 
 
+def test_cost_that_has_decayed_below_the_smallest_number_is_no_fault():
+    found = check(lambda x: 5e-320 * x[0] ** 2, lambda x: 1e-319 * x, np.array([1.0]))
+    assert found.trusted, found.sentence()
+
+
 def test_noise_of_the_cost_is_measured():
     rough = check(lambda x: cost(x) + 1e-7 * np.sin(1e13 * x).sum(axis=0), gradient, THETA)
     assert rough.cause == "rounding"

@@ -84,6 +84,8 @@ class Sample:
     def rounding(self, unit: float) -> np.ndarray:
         """Return the error of the differences that rounding at that unit roundoff explains, ``(K,)``."""
         costs = np.maximum(np.maximum(np.abs(self.minus), np.abs(self.plus)), abs(self.centre))
+        # numbers below the smallest normal one have no relative precision
+        costs = costs + float(np.finfo(np.float64).tiny) / unit
         if self.noise is None:
             return np.asarray(GUARD * unit * (costs + self.slope * self.scale) / self.step)
         # what was measured has more in it than the guess above, and no word of the program's
