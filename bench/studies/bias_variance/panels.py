@@ -235,7 +235,9 @@ def _draw_guide(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
     at = cost.of(rows)
     best = rows.assign(at=at)[pareto(at, rows["rmse_rel"])].sort_values("at").iloc[-1]
     ends = np.array(panel.get_xlim())
-    panel.plot(ends, best["rmse_rel"] * (ends / best["at"]) ** -0.5, label="_guide", scalex=False, scaley=False, **GUIDE)
+    panel.plot(
+        ends, best["rmse_rel"] * (ends / best["at"]) ** -0.5, label="_guide", scalex=False, scaley=False, **GUIDE
+    )
 
 
 def _name_curves(panel: Axes, curves: Sequence[Line], cost: Cost, look: Look) -> None:
