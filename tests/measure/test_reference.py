@@ -193,6 +193,17 @@ def test_small_spread_alone_certifies_nothing():
     assert bank.excess(case, found) <= 1.0
 
 
+def test_constant_gradient_takes_the_least_samples_and_no_fewer():
+    found = bank.certified(ridge(bank.power(1), dim=3), 1 << 18)
+    assert found_at(found, "n") == reference.LEAST_SAMPLES
+
+
+def test_streams_scenes_and_repeats_have_noise_of_their_own():
+    drawn = [noise.draw(0, scene, 2, 4, 1, stream) for scene in ("a", "b") for stream in ("cells", "pilot", "check")]
+    numbers = np.concatenate([block.ravel() for block in drawn])
+    assert np.unique(numbers).size == numbers.size
+
+
 def test_tails_that_samples_do_not_show_are_part_of_the_error():
     """4.2 sigma away, 1e-5 of samples: of 16384 none or one; far tails along each coordinate are looked at."""
     case = ridge(bank.power(1), bank.ramp(4.2, 2000.0), dim=3)
@@ -225,7 +236,7 @@ def test_check_says_what_it_could_resolve():
     found = bank.certified(ridge(bank.power(1), bank.power(2, 0.1)), 1 << 16)
     assert abs(found_at(found, "check_z")) < 5
     # zeroth order of a quarter of the samples knows the gradient, 2 of size, to some percent
-    assert 1e-3 < found_at(found, "check_resolves") < 1.0
+    assert 0.01 < found_at(found, "check_resolves") < 1.0
     assert found.note == ""
 
 
