@@ -27,7 +27,8 @@ class Fused(Backend):
 
     name = "fused"
     requires: ClassVar[tuple[str, ...]] = ("jax", "numba")
-    provides = Jax.provides
+    # surrogate gradients are refused
+    provides = Jax.provides - {"surrogate"}
 
     def compile(self, program: Program) -> Problem:
         """Return the program, whose kernels are compiled at the first call of each function, for any batch."""
@@ -38,6 +39,8 @@ class Fused(Backend):
         """Return the operation that has no form as scalar code, or None."""
         if program.needs - self.provides:
             return None
+        if program.surrogate:
+            return f"backend {self.name} differentiates the program itself, not a law's surrogate: use jax"
         _use_double()
         try:
             for function in ("value", "grad"):
