@@ -77,6 +77,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         where = f"'{printable(error.filename)}': " if error.filename else ""
         print(f"bench: {where}{error.strerror or printable(error)}", file=sys.stderr)
         return 2
+    except RuntimeError as error:
+        if "home directory" not in str(error):  # what pathlib says of ~ and ~name
+            raise
+        print("bench: a folder begins with ~ and a name that no user of this machine has", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("\nbench: stopped", file=sys.stderr)
         return 130

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Literal, get_args
+
+if sys.platform == "win32":
+    raise ImportError(
+        "bench runs on Linux and macOS, where processes can be killed in groups; on Windows use it inside WSL"
+    )
 
 Status = Literal["ok", "nonfinite", "diverged", "timeout", "crashed", "unsupported", "unavailable", "error"]
 STATUSES: tuple[str, ...] = get_args(Status)

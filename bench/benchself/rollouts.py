@@ -57,6 +57,10 @@ def timed(what: str, call: Callable[[], Any], count: int, target: float = float(
 def backends(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
     """Measure every subject at every batch size, with memory where gradients are fast enough for the largest."""
     for subject in settings["subjects"]:
+        entry = registry.find("backends", subject["backend"])
+        if not entry.available:
+            yield Line(f"{subject['backend']} {subject['call']}", math.nan, "us", note=f"unavailable: {entry.reason}")
+            continue
         compiled = problem(settings, subject["backend"], subject["contact"])
         theta = compiled.program.theta0
         for count in QUICK_SIZES if quick else SIZES:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from bench.errors import UserError
+from bench.errors import UserError, printable
 from bench.model.parameters import Plugin, parameters, values
 
 
@@ -50,7 +50,12 @@ def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
             key, equals, value = item.partition("=")
             if not equals:
                 raise UserError(f"'{item}' in '{text}' is not parameter=value")
-            raw[key.strip()] = yaml.safe_load(value)
+            try:
+                raw[key.strip()] = yaml.safe_load(value)
+            except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: a date that there is not
+                raise UserError(
+                    f"'{value}' in '{printable(text)[:200]}' is not a value: write parameter=value"
+                ) from None
     return name.strip(), raw
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 import types
 import typing
 from abc import ABC
@@ -14,6 +15,8 @@ from typing import Any, ClassVar, TypeVar, cast
 
 from bench.errors import UserError, unknown
 
+LARGEST = 2**53
+"""The largest whole number that is exact as float64, the type of number columns."""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -145,12 +148,18 @@ def coerce(kind: Any, value: Any, where: str) -> Any:
                 value, number = float(value), True
             except ValueError:
                 number = False
+        if number and abs(value) > sys.float_info.max and value not in (math.inf, -math.inf):
+            raise UserError(f"{where} is larger than any number that is calculated with, {sys.float_info.max:g}")
         if number and not math.isnan(value):
             return float(value)
     elif kind is int:
-        if number and float(value).is_integer():
+        if number and abs(value) <= LARGEST and float(value).is_integer():
             return int(value)
+        if number and value == value and abs(value) > LARGEST:
+            raise UserError(f"{where} must be a whole number of at most {LARGEST}")
+    elif kind is str and isinstance(value, str) and not value.isprintable():
+        raise UserError(f"{where}={value[:100]!r} must be a string without control characters")
     elif (kind is bool and isinstance(value, bool)) or (kind is str and isinstance(value, str)):
         return value
     article = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}.get(kind, str(kind))
-    raise UserError(f"{where}={value!r} must be {article}, not {type(value).__name__}")
+    raise UserError(f"{where}={repr(value)[:200]} must be {article}, not {type(value).__name__}")

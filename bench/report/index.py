@@ -106,7 +106,9 @@ def _finding(page: Path) -> str:
     except OSError:
         return ""
     found = re.search(r'id="finding">(.*?)</p>', text, re.DOTALL)
-    return re.sub(r"<(?!/?(br|b|em)\b)[^>]*>", "", found[1]) if found else ""
+    # the page has a clause per element
+    text = re.sub(r"<(?!/?(br|b|em)\b)[^>]*>", "; ", found[1]) if found else ""
+    return re.sub(r"(\s*;\s*)+", "; ", re.sub(r"(&\w+);", r"\1\0", text)).strip("; ").replace("\0", ";")
 
 
 def _record(path: Path) -> dict[str, Any]:

@@ -191,7 +191,14 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows as the CSV has them: the study's table, the swept axes, then the cell's whole identity."""
     extra = [axis.column for axis in axes(experiment.sweep, rows) if axis.column not in rows]
     wide = with_axes(experiment, rows)
-    return wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
+    wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
+    texts = [name for name in experiment.columns.named("text") if name in wide]
+    return wide.assign(**{name: wide[name].map(_harmless) for name in texts})
+
+
+def _harmless(text: Any) -> Any:
+    """Return a string that a spreadsheet shows and does not calculate: with an apostrophe before a formula's sign."""
+    return f"'{text}" if isinstance(text, str) and text[:1] in ("=", "+", "-", "@") else text
 
 
 def revived(given: Mapping[str, Any]) -> dict[str, Plugin | None]:

@@ -14,7 +14,7 @@ from bench.model import Decision, registry
 from bench.model.identity import parse_identity
 from bench.model.parameters import build, coerce, remember, singular
 from bench.sweep.experiment import Budget, Choice, Execution, Experiment, Layout
-from bench.sweep.grid import swept
+from bench.sweep.grid import refuse_too_many, swept
 from bench.sweep.study import Study
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -61,9 +61,9 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
         word = _prepared(override, config_dirs)
         try:
             parser.parse_override(word)
-        except HydraException:
+        except (HydraException, ValueError, RecursionError):  # ValueError: a number of 5000 digits
             raise UserError(
-                f"'{override}' cannot be read: write key=value with lists as [a,b] and strings in quotes"
+                f"'{override[:200]}' cannot be read: write key=value with lists as [a,b] and strings in quotes"
             ) from None
         prepared.append(word)
     if config_dirs:
@@ -176,7 +176,7 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
     extra = set(config) - _known_keys()
     if extra:
         raise unknown("setting", sorted(extra)[0], _known_keys())
-    name = str(config["name"])
+    name = "" if config["name"] is None else str(config["name"])
     if not SAFE_NAME.fullmatch(name) or ".." in name:
         raise UserError(f"name={name!r} must be letters, digits, '.', '_' and '-', since it names a folder")
     for folder in _listed_or_none(config["plugins"]):
@@ -193,6 +193,7 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
             if entry.plugin is not None:
                 build(entry.plugin, given)
     timing = config["timing"]
+    refuse_too_many(_table(config, "sweep"))
     return Experiment(
         name=name,
         study=study,
@@ -203,7 +204,7 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         values=values,
         sweep=_table(config, "sweep"),
         decision=_decision(config),
-        results_dir=Path(str(config["results_dir"])).expanduser(),
+        results_dir=_folder(config["results_dir"]),
         question=str(config["question"] or ""),
         marks=_table(config, "marks"),
         compile_time=coerce(bool, config["compile_time"], "compile_time"),
@@ -224,10 +225,19 @@ def _study(text: Any) -> Study:
     return study
 
 
+def _folder(value: Any) -> Path:
+    if not isinstance(value, str | Path) or not str(value).strip():
+        raise UserError(f"results_dir={value!r} must be a folder")
+    return Path(value).expanduser()
+
+
 def _budget(settings: Mapping[str, Any]) -> Budget:
     for key in settings:
         if key not in ("samples", "tolerance"):
             raise unknown("setting of reference", key, ("samples", "tolerance"))
+    for key in ("samples", "tolerance"):
+        if key not in settings:
+            raise UserError(f"reference has no {key}: write reference.{key}=... and leave the other as it is")
     samples = coerce(int, settings["samples"], "reference.samples")
     tolerance = coerce(float, settings["tolerance"], "reference.tolerance")
     if samples < 256 or not tolerance > 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,12 +14,15 @@ from bench.sweep.cell import Cell
 from bench.sweep.experiment import Choice, Experiment
 from bench.sweep.study import study_of
 
+MOST = 1_000_000
+"""Cells of the largest sweep: planning them takes minutes."""
 COUNTS = ("samples", "repeats", "seed")
 """What a sweep can vary besides plugin parameters."""
 
 
 def cells(experiment: Experiment) -> list[Cell]:
     """Return the cells of an experiment, each once, in sweep order; raises :class:`UserError` for impossible ones."""
+    refuse_too_many(experiment.sweep, math.prod(len(some) for some in experiment.choices.values()))
     _check_axes(experiment)
     unique: dict[str, Cell] = {}
     expansion = _Expansion(experiment)
@@ -47,6 +51,32 @@ def _check_theta(cells: Sequence[Cell]) -> None:
             return
     if first is not None:
         raise first
+
+
+def refuse_too_many(sweep: Mapping[str, Any], each: int = 1) -> None:
+    """Raise :class:`UserError` for a sweep of more than :data:`MOST` cells, ``each`` of them at a point."""
+    size = _size(sweep) * each
+    if size > MOST:
+        raise UserError(
+            f"the sweep has {size} cells, and more than {MOST} are not run at once: give it fewer values, or split it"
+        )
+
+
+def _size(sweep: Mapping[str, Any]) -> int:
+    """Return the number of points of a sweep without expanding it."""
+    size = 1
+    for axis, value in sweep.items():
+        if axis == "product":
+            size *= _size(_mapping(value, "sweep.product"))
+        elif axis == "zip":
+            size *= max((len(_values(n, v)) for n, v in _flat(_mapping(value, "sweep.zip")).items()), default=1)
+        elif axis == "union":
+            size *= (
+                sum(_size(_mapping(part, "sweep.union")) for part in value) if isinstance(value, list | tuple) else 1
+            )
+        else:
+            size *= math.prod(len(_values(name, values)) for name, values in _flat({axis: value}).items())
+    return size
 
 
 def points(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:

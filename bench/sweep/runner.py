@@ -15,8 +15,10 @@ from bench.sweep.plan import Planned
 from bench.sweep.referees import reference_key
 from bench.sweep.session import Session
 from bench.sweep.store import Store
-from bench.sweep.tasks import FAILED, Task, blank, explained, grouped
+from bench.sweep.tasks import FAILED, Task, blank, explained, grouped, outcome, row_of
 from bench.sweep.workers import Answer
+
+__all__ = ["Stopped", "Watcher", "blank", "outcome", "run"]
 
 
 class Watcher(Protocol):
@@ -98,7 +100,7 @@ class _Run:
 
     def _finish(self, results: list[tuple[Cell, dict[str, Any]]], stored: bool = False) -> None:
         """Store results where their machine has not done so, then show them."""
-        rows = [blank(self._experiment, cell) | result for cell, result in results]
+        rows = [row_of(self._experiment, cell, result) for cell, result in results]
         if rows and not stored:
             self._store.append(*rows)
         for (cell, _), row in zip(results, rows, strict=True):

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from bench.errors import StorageError, failure
+from bench.errors import StorageError, failure, printable
 from bench.model import Backend
 from bench.sweep.cell import Cell
 from bench.sweep.experiment import Experiment
@@ -21,6 +21,8 @@ from bench.sweep.session import Session
 from bench.sweep.study import Study, study_of
 from bench.sweep.workers import Answer
 
+LONGEST = 2000
+"""Letters of a reason that are kept."""
 FAILED = ("error", "crashed", "timeout")
 """Statuses of cells in which something went wrong."""
 
@@ -123,6 +125,13 @@ def explained(answer: Answer, about: str = "") -> dict[str, Any]:
         output = f"; last output: {answer.output}" if answer.output else ""
         result["reason"] = f"{about}{result['reason']}{output}"
     return result
+
+
+def row_of(experiment: Experiment, cell: Cell, result: dict[str, Any]) -> dict[str, Any]:
+    """Return the row of a result; a reason is one line of a length that can be read, whatever a plugin says."""
+    row = blank(experiment, cell) | result
+    reason = printable(row["reason"])
+    return row | {"reason": reason if len(reason) <= LONGEST else f"{reason[:LONGEST]}... ({len(reason)} letters)"}
 
 
 def blank(experiment: Experiment, cell: Cell) -> dict[str, Any]:

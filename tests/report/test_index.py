@@ -23,7 +23,9 @@ def folder(tmp_path):
         record = {"experiment": name, "question": HOSTILE, "counts": {"ok": 7}, "git_commit": "0123456789abcdef"}
         (tmp_path / name / "run.json").write_text(json.dumps(record))
     rows.to_parquet(tmp_path / "good" / "rows.parquet")
-    (tmp_path / "good" / "report.html").write_text('<p class="finding" id="finding">use <b>fobg</b> &lt; 3</p>')
+    (tmp_path / "good" / "report.html").write_text(
+        '<p class="finding" id="finding"><span>bad</span><span>use <b>fobg</b> &lt; 3</span></p>'
+    )
     (tmp_path / "broken" / "rows.parquet").write_text("not Parquet")
     return tmp_path
 
@@ -33,7 +35,7 @@ def test_every_experiment_is_there_with_its_state(folder):
     text = (folder / "index.html").read_text()
     assert text.count("<article>") == 3
     assert 'href="good/report.html"' in text
-    assert "use <b>fobg</b> &lt; 3" in text
+    assert "<p>bad; use <b>fobg</b> &lt; 3</p>" in text
     assert "3 cells" in text
     assert "<span class=bad>1 error</span>" in text
     assert "<span>1 unsupported</span>" in text

@@ -224,7 +224,8 @@ def test_charts_are_written_as_pictures_and_data(tmp_path):
         content = path.read_bytes()
         starts = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF", ".csv": b"panel,"}
         assert content.startswith(starts[path.suffix])
-        assert len(content) > 10_000
+        # data of a few curves are short
+        assert len(content) > (5_000 if path.suffix == ".csv" else 10_000)
 
 
 def test_one_line_per_estimator_and_one_colour_everywhere():
@@ -668,3 +669,34 @@ def test_titles_say_where_the_best_estimator_fails_and_what_never_does():
     assert title({"limit": 20.0}, fobg=stiff).startswith("fobg fails at stiffness 1e5"), "20 is no limit of it"
     assert title({}, fobg=fine, reinforce=useless) == "reinforce no better than zero; fobg better than zero everywhere"
     assert title({}, fobg=useless) == "fobg no better than zero"
+
+
+BLIND = {
+    "protan": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deutan": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "tritan": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+"""Linear RGB as seen without one kind of cone (Machado, Oliveira and Fernandes 2009, table of severity 1)."""
+
+
+def lab_of(linear):
+    """CIE L*a*b* of linear sRGB, under D65."""
+    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ linear
+    f = np.array([math.cbrt(t) if t > 0.008856 else 7.787 * t + 16 / 116 for t in xyz / [0.9505, 1.0, 1.089]])
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+@pytest.mark.parametrize("eyes", ["all", *BLIND])
+def test_twelve_estimators_stay_distinct_for_colour_blind_readers_too(eyes):
+    """Colours differ by 8 (just noticeable: 2.3), and by 30 where the marker is the same."""
+    seen = np.array(BLIND.get(eyes, np.eye(3)))
+    names = [f"estimator_{i}" for i in range(12)]
+    look = Look(table([row(estimator=name) for name in names]), names)
+    styles = [look.marked(views.Line(name, "", {}, pd.DataFrame(), {}, frozenset(), 0)) for name in names]
+    linear = [
+        np.array([c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(s["color"])])
+        for s in styles
+    ]
+    colours = [lab_of(np.clip(seen @ rgb, 0, 1)) for rgb in linear]
+    for (a, one), (b, two) in itertools.combinations(zip(colours, styles, strict=True), 2):
+        assert np.linalg.norm(a - b) > (30 if one["marker"] == two["marker"] else 8)

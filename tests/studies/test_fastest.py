@@ -8,8 +8,9 @@ import pytest
 from helpers import described_by
 
 from bench.report.views import Line
+from bench.studies.bias_variance.charts import figures
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, charged
-from bench.studies.bias_variance.fastest import reach, table
+from bench.studies.bias_variance.fastest import reach, sentence, table
 from bench.sweep import config
 
 SAMPLES = (16, 64, 256)
@@ -127,3 +128,39 @@ def test_rollouts_are_those_of_the_cheapest_backend(tmp_path, order):
 def test_nothing_is_told_where_samples_are_not_swept(tmp_path):
     given = config.load([f"results_dir={tmp_path}"])
     assert table(given, rows()[:1]).empty
+
+
+def with_intervals(table, width):
+    """Rows with an interval of the variance of one sample, ``width`` times up and down."""
+    v = table["variance"] * table["samples"]
+    table = table.assign(variance_low=table["variance"] / width, variance_high=table["variance"] * width)
+    return table.assign(variance_per_sample=v, variance_per_sample_low=v / width, variance_per_sample_high=v * width)
+
+
+@pytest.mark.parametrize(
+    ("width", "said"), [(1.2, "e on b, 3.0 times (2.3 to 3.9) before slow on b"), (3.0, "not distinguishable")]
+)
+def test_a_factor_is_claimed_only_where_its_interval_excludes_1(tmp_path, width, said):
+    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
+    slow = rows(estimator="slow").assign(time_s=lambda r: 3 * r["time_s"])
+    found = table(given, with_intervals(pd.concat([rows(), slow], ignore_index=True), width))
+    assert said in sentence(found[(found["by"] == "time") & (found["relative error"] == 0.1)].iloc[0])
+
+
+def test_charts_name_curves_floors_and_the_first_at_a_glance(tmp_path):
+    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
+    slow = rows(estimator="slow", backend="other").assign(time_s=lambda r: 3 * r["time_s"])
+    biased = rows(bias=0.3, estimator="biased", estimator_params="")
+    every = with_intervals(pd.concat([rows(), slow, biased], ignore_index=True), 1.2)
+    drawn = figures(given, every.assign(reason="", dim=1.0))
+    (panel,) = drawn["speed_accuracy"].axes
+    assert {"e", "slow", "biased"} <= {text.get_text() for text in panel.texts}
+    floors = [line.get_ydata()[0] for line in panel.lines if line.get_linestyle() == ":"]
+    assert floors == pytest.approx([0.3])
+    guide = next(line for line in panel.lines if line.get_label() == "_guide")
+    slope = math.log(guide.get_ydata()[1] / guide.get_ydata()[0]) / math.log(
+        guide.get_xdata()[1] / guide.get_xdata()[0]
+    )
+    assert slope == pytest.approx(-0.5)
+    cells = [text.get_text() for text in drawn["at_a_glance"].axes[0].texts]
+    assert cells == ["400 ms\nb", "1.2 s\nother", "bias"]

@@ -21,14 +21,16 @@ from bench.model import SURROGATE, registry
 from bench.report.figures import save, styled
 from bench.report.style import Look, plain, symbol
 from bench.report.views import CATEGORIES, Family, along, arranged, families, ran
-from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost
+from bench.studies.bias_variance import fastest
+from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost, charged
+from bench.studies.bias_variance.fastest import SAMPLES
+from bench.studies.bias_variance.glance import glance
 from bench.studies.bias_variance.panels import bias_variance, overview, speed_accuracy
 from bench.sweep.axes import Axis
 from bench.sweep.experiment import Experiment
 
 ROOM = 4
 """Number of problems beyond which a chart shows only some of them."""
-SAMPLES = Axis("samples", ("samples",))
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
@@ -55,7 +57,7 @@ def along_longest(experiment: Experiment, rows: pd.DataFrame) -> list[str]:
 
 def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
     """Return the charts by file name."""
-    shown = arranged(experiment, rows)
+    shown = arranged(experiment, charged(rows))
     rows = shown.rows
     look = Look(rows, sorted(registry.entries()["estimators"]))
     seeds = rows["seed"].nunique()
@@ -82,12 +84,27 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
             curves = [problem for problem in costed if ran(problem.rows)["x"].nunique() > 1]
             chosen, held = choose(curves or costed)
             if chosen and (cost is not ROLLOUTS or good["samples"].nunique() > 1):
-                drawings[name] = speed_accuracy(chosen, held + merged, look, cost)
+                drawings[name] = speed_accuracy(chosen, held + merged, look, cost, _said(experiment, chosen, cost))
+        raced = problems(SAMPLES, lambda part: ran(part)["x"].nunique() > 1)
+        if raced:
+            costs = [TIME, ROLLOUTS] if good["time_s"].notna().any() else [ROLLOUTS]
+            drawings["at_a_glance"] = glance(choose(raced, 2 * ROOM)[0], costs)
     if nothing_swept:
         chosen = problems(None, lambda part: len(ran(part)) > 0)
         if chosen:
             drawings["overview"] = overview(chosen, merged, look)
     return drawings
+
+
+def _said(experiment: Experiment, problems: Sequence[Family], cost: Cost) -> dict[int, str]:
+    """Return, for each problem by place, who reaches an error of 10% and of 1% first."""
+    kind = "rollouts" if cost is ROLLOUTS else "time"
+    said = {}
+    for place, problem in enumerate(problems):
+        if problem.rows["x"].nunique() > 1:
+            entries = [fastest.line(problem, target, kind, cost) for target in fastest.TARGETS]
+            said[place] = "\n".join(map(fastest.sentence, entries))
+    return said
 
 
 def _costed(cost: Cost, rows: pd.DataFrame) -> bool:

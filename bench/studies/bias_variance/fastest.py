@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,12 @@ import pandas as pd
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, number
 from bench.report.views import Family, Line, along, arranged, families, lines
-from bench.studies.bias_variance.charts import SAMPLES
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost, charged
+from bench.sweep.axes import Axis
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import write_all
 
+SAMPLES = Axis("samples", ("samples",))
 TARGETS = (0.1, 0.01)
 """Relative errors asked for."""
 NOTES = (
@@ -43,6 +44,8 @@ class Reached:
     """``measured``, ``at once``, ``extrapolated``, ``never`` or ``unknown``."""
     cost: float = math.nan
     samples: float = math.nan
+    spread: float = 0.0
+    """Half the width of the 95% interval of the cost's logarithm: by the variance's interval, and the times' range."""
 
 
 def reach(line: Line, target: float, cost: Cost) -> Reached:
@@ -50,6 +53,18 @@ def reach(line: Line, target: float, cost: Cost) -> Reached:
     rows = cost.known(line.rows).sort_index()
     if rows.empty:
         return Reached("unknown")
+    return replace(_reach(rows, target, cost), spread=_spread(rows.iloc[-1], cost))
+
+
+def _spread(row: Any, cost: Cost) -> float:
+    """Return the uncertainty of what a method needs, from its row with most samples: N is proportional to v."""
+    low, high = row.get("variance_low", math.nan), row.get("variance_high", math.nan)
+    spread = 0.5 * math.log(high / low) if low > 0 and math.isfinite(high) else math.nan
+    times = row["time_iqr_s"] / row["time_s"] if cost is not ROLLOUTS else 0.0
+    return math.hypot(spread, times)
+
+
+def _reach(rows: pd.DataFrame, target: float, cost: Cost) -> Reached:
     n, error, price = (rows.index.to_numpy(float), rows["rmse_rel"].to_numpy(float), cost.of(rows).to_numpy(float))
     if not (error <= target).any():
         return _beyond(rows.iloc[-1], n[-1], price[-1], target)
@@ -84,7 +99,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     costs = (("time", TIME), ("rollouts", ROLLOUTS))
     timed = bool(np.isfinite(shown.rows["time_s"]).any())
     entries = [
-        _line(problem, target, kind, cost)
+        line(problem, target, kind, cost)
         for problem in families(shown, along(shown, SAMPLES), ("scene",))
         if problem.rows["x"].nunique() > 1
         for kind, cost in costs[0 if timed else 1 :]
@@ -96,15 +111,15 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
 def methods(problem: Family, target: float, cost: Cost) -> dict[str, Reached]:
     """Return what each method needs for an error: per estimator and backend in time, per estimator in rollouts."""
     reached: dict[str, Reached] = {}
-    for line in lines(problem.rows, close=None):
-        name = line.label if cost is ROLLOUTS else f"{line.label} on {line.rows['backend'].iloc[0]}"
-        found = reach(line, target, cost)
+    for curve in lines(problem.rows, close=None):
+        name = curve.label if cost is ROLLOUTS else f"{curve.label} on {curve.rows['backend'].iloc[0]}"
+        found = reach(curve, target, cost)
         if name not in reached or found.cost < reached[name].cost or math.isnan(reached[name].cost):
             reached[name] = found
     return reached
 
 
-def _line(problem: Family, target: float, kind: str, cost: Cost) -> dict[str, Any]:
+def line(problem: Family, target: float, kind: str, cost: Cost) -> dict[str, Any]:
     """Return the fastest method, the next one, and those that are out."""
     reached = methods(problem, target, cost)
     ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
@@ -124,7 +139,9 @@ def _line(problem: Family, target: float, kind: str, cost: Cost) -> dict[str, An
     else:
         entry["how"] = "never"
     if len(ranked) > 1:
-        entry |= {"next": ranked[1][1], "factor": ranked[1][0] / ranked[0][0]}
+        factor = ranked[1][0] / ranked[0][0]
+        width = math.exp(math.hypot(reached[ranked[0][1]].spread, reached[ranked[1][1]].spread))
+        entry |= {"next": ranked[1][1], "factor": factor, "factor_low": factor / width, "factor_high": factor * width}
     out = {how: ", ".join(name for name, r in reached.items() if r.how == how) or "-" for how in ("never", "unknown")}
     return {"problem": problem.title(), "relative error": target, "by": kind, **entry, **out}
 
@@ -139,8 +156,26 @@ def texts(best: pd.DataFrame) -> pd.DataFrame:
         for kind, cost in zip(best["by"], best["cost"], strict=True)
     ]
     shown["samples"] = [axis_value(value) for value in best["samples"]]
-    shown["factor"] = [number(value) for value in best["factor"]]
-    return shown
+    ends = zip(best["factor"], best["factor_low"], best["factor_high"], strict=True)
+    shown["factor"] = [
+        number(value) + (f" ({number(low)} to {number(high)})" if math.isfinite(low) else "")
+        for value, low, high in ends
+    ]
+    return shown.drop(columns=["factor_low", "factor_high"])
+
+
+def sentence(entry: Any) -> str:
+    """Return a line of the table as a sentence: who gets there first, and by what factor over the next."""
+    what = f"to {entry['relative error']:.0%}"
+    if entry["fastest"] == "-":
+        never = "nobody, all have a larger bias"
+        return f"{what}: {never if entry['how'] == 'never' else 'not known, no bias is certain to be below'}"
+    if entry["next"] == "-":
+        return f"{what}: only {entry['fastest']}"
+    if not entry["factor_low"] > 1.0:
+        return f"{what}: {entry['fastest']} or {entry['next']}, not distinguishable"
+    low, high = number(entry["factor_low"]), number(entry["factor_high"])
+    return f"{what}: {entry['fastest']}, {number(entry['factor'])} times ({low} to {high}) before {entry['next']}"
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:

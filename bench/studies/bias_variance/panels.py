@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,7 +17,7 @@ from matplotlib.transforms import Transform
 
 from bench.report.page import columns, page, shared
 from bench.report.scales import above, extent, log_axis, mark_values, scale_x, scale_y, shifts
-from bench.report.style import CROSS, DEVIANT, FRONT, GREY, MARKS, SHADE, TICK, Look, axis_name, plain, quantity, twin
+from bench.report.style import CROSS, DEVIANT, GREY, MARKS, SHADE, TICK, Look, axis_name, plain, quantity, twin
 from bench.report.views import Family, Line, lines, pareto, resolved, rmse_interval
 from bench.studies.bias_variance.costs import Cost
 from bench.studies.bias_variance.findings import headline
@@ -171,51 +172,109 @@ def _handle(text: str, color: str = GREY, **style: Any) -> Line2D:
     return Line2D([], [], label=plain(text), color=color, **style)
 
 
-def speed_accuracy(problems: Sequence[Family], notes: Sequence[str], look: Look, cost: Cost) -> Figure:
-    """Draw relative RMSE of one estimate against its cost, a panel per problem, a curve per estimator and backend."""
+BACKENDS = ("solid", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)), (0, (8, 2)))
+"""Line styles of backends, in order of appearance."""
+
+
+def speed_accuracy(
+    problems: Sequence[Family], notes: Sequence[str], look: Look, cost: Cost, said: Mapping[int, str]
+) -> Figure:
+    """Draw relative RMSE of one estimate against its cost, a panel per problem, a curve per estimator and backend.
+
+    Colour and marker are the estimator, the line style the backend; the best backend's curve has the estimator's name at
+    its end. Along a thin grey guide the error falls as N^-1/2; a dotted line is a bias that no samples remove. ``said``
+    are sentences by problem.
+    """
     drawn = [lines(problem.rows, close=None) for problem in problems]
     every = [line for curves in drawn for line in curves]
-    entries = {line.label: _handle(line.label, **look.line(line)) for line in every}
-    backends = dict.fromkeys(line.rows["backend"].iloc[0] for line in every)
-    symbols: list[Any] = [_handle(name, marker=look.backend(name), linestyle="none") for name in backends]
-    symbols += [Line2D([], [], **FRONT), Patch(label="worse than answering zero", **SHADE)]
-    samples = sorted({int(x) for line in every for x in line.at})
-    curve = [f"along a curve $N$ = {', '.join(map(str, samples))}"] if len(samples) > 1 else []
+    backends = list(dict.fromkeys(line.rows["backend"].iloc[0] for line in every))
+    dashes = {name: BACKENDS[i % len(BACKENDS)] for i, name in enumerate(backends)}
+    entries = {line.label: _handle(line.label, **{**look.marked(line), "linestyle": "none"}) for line in every}
+    symbols: list[Any] = [_handle(name, linestyle=dashes[name]) for name in backends]
+    symbols += [
+        Line2D([], [], **GUIDE, label="error falling as $N^{-1/2}$"),
+        Line2D([], [], color=GREY, linewidth=0.9, linestyle=":", label="bias, which samples do not remove"),
+        Patch(label="worse than answering zero", **SHADE),
+    ]
     figure, panels = page(
-        problems, columns(len(problems), 3), 2.4, ("relative RMSE",),
-        f"Relative RMSE of one estimate against {cost.name}", [*shared(problems, "samples"), *notes, *curve],
+        problems, columns(len(problems), 3), 2.7, ("relative RMSE",),
+        f"Relative RMSE of one estimate against {cost.name}", [*shared(problems, "samples"), *notes],
         (list(entries.values()), symbols),
     )  # fmt: skip
-    for (panel,), problem, curves in zip(panels, problems, drawn, strict=True):
+    for place, ((panel,), problem, curves) in enumerate(zip(panels, problems, drawn, strict=True)):
         for line in curves:
-            _draw_curve(panel, line, cost, {**look.line(line), "marker": look.backend(line.rows["backend"].iloc[0])})
-        _draw_front(panel, cost.known(problem.rows), cost)
-        panel.set_xlabel(cost.label)
+            style = {**look.marked(line), "linestyle": dashes[line.rows["backend"].iloc[0]], "markersize": 3}
+            _draw_curve(panel, line, cost, style)
+        _draw_scales(panel, cost.known(problem.rows), cost)
+        _draw_guide(panel, cost.known(problem.rows), cost)
+        _name_curves(panel, curves, cost, look)
+        room = 150 // columns(len(problems), 3)
+        told = ["\n".join(textwrap.wrap(text, room)) for text in said.get(place, "").splitlines()]
+        panel.set_xlabel("\n".join([cost.label, *told]), fontsize=6.2)
     return figure
+
+
+GUIDE: dict[str, Any] = {"color": "#b0b0b0", "linewidth": 0.8, "zorder": 0.4}
 
 
 def _draw_curve(panel: Axes, line: Line, cost: Cost, style: Mapping[str, Any]) -> None:
     rows = cost.known(line.rows)
+    if rows.empty:
+        return
     spread, at = cost.spread(rows), cost.of(rows)
     bars = [np.minimum(spread, 0.9 * at), spread]
     panel.errorbar(at, rows["rmse_rel"], xerr=bars, elinewidth=0.7, label=line.label, **style)
+    last = rows.sort_index().iloc[-1]
+    if last["bias_low"] > 0 and last["bias"] > 0.5 * last["rmse"]:
+        floor = last["bias"] / last["reference_norm"]
+        panel.axhline(floor, color=style["color"], linewidth=0.9, linestyle=":", zorder=0.6)
 
 
-def _draw_front(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
-    """Draw the Pareto front as steps from the cheapest point down to the most accurate, and set the panel's scales."""
+def _draw_guide(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
+    """Draw a line of slope -1/2 across the panel, through the point of the front with most samples."""
     at = cost.of(rows)
-    front = rows.assign(at=at)[pareto(at, rows["rmse_rel"])].sort_values(["at", "rmse_rel"])
+    best = rows.assign(at=at)[pareto(at, rows["rmse_rel"])].sort_values("at").iloc[-1]
+    ends = np.array(panel.get_xlim())
+    panel.plot(
+        ends, best["rmse_rel"] * (ends / best["at"]) ** -0.5, label="_guide", scalex=False, scaley=False, **GUIDE
+    )
+
+
+def _name_curves(panel: Axes, curves: Sequence[Line], cost: Cost, look: Look) -> None:
+    """Write each estimator's name at the end of its cheapest curve, names apart from each other."""
+    ends: dict[str, tuple[float, float, Line]] = {}
+    for line in curves:
+        rows = cost.known(line.rows)
+        if not rows.empty:
+            last = rows.sort_index().iloc[-1]
+            at = float(cost.of(rows.sort_index()).iloc[-1])
+            if line.label not in ends or at < ends[line.label][0]:
+                ends[line.label] = (at, float(last["rmse_rel"]), line)
+    low, high = np.log(panel.get_ylim())
+    taken: list[float] = []
+    for label, (at, error, line) in sorted(ends.items(), key=lambda item: item[1][1]):
+        height = (np.log(error) - low) / (high - low)
+        height = max(height, taken[-1] + 0.075) if taken else max(height, 0.04)
+        taken.append(height)
+        left, right = np.log(panel.get_xlim())
+        x = min((np.log(at) - left) / (right - left) + 0.03, 0.74)
+        panel.text(
+            x, height, plain(label), transform=panel.transAxes, color=look.line(line)["color"], fontsize=6, va="center",
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.3, "alpha": 0.75}, zorder=5,
+        )  # fmt: skip
+
+
+def _draw_scales(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
+    """Set the panel's scales, with room at the right for names, and shade errors above that of answering zero."""
+    at = cost.of(rows)
     low, high = rows["rmse_rel"].min(), rows["rmse_rel"].max()
     spread = np.minimum(cost.spread(rows), at / 2)
     first, last = (at - spread).min(), (at + spread).max()
     tall, wide = max(high / low, 4.0) ** 0.08, max(last / first, 4.0) ** 0.08
-    log_axis(panel, "x", first / wide, last * wide, text=cost.text)
+    log_axis(panel, "x", first / wide, last * wide**3, text=cost.text)
     log_axis(panel, "y", low / tall, high * tall)
     if high * tall > 1:
         panel.axhspan(1.0, high * tall, zorder=0, **SHADE)
-    x = [front["at"].iloc[0], *front["at"], last * wide]
-    y = [high * tall, *front["rmse_rel"], front["rmse_rel"].iloc[-1]]
-    panel.step(x, y, where="post", zorder=0.5, solid_capstyle="butt", **FRONT)
 
 
 def overview(problems: Sequence[Family], notes: Sequence[str], look: Look) -> Figure:

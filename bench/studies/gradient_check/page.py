@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from bench.measure.gradcheck import TRUSTED, UNTRUSTED, VERDICTS
+from bench.measure.gradcheck import UNTRUSTED, VERDICTS
 from bench.report.style import PALETTE
 from bench.report.text import counted, number
 from bench.report.views import Arranged, arranged
@@ -122,7 +122,7 @@ def answers(rows: pd.DataFrame) -> pd.DataFrame:
     for verdict in VERDICTS:
         part = points[points["verdict"] == verdict]
         if len(part):
-            fault = "yes" if verdict in TRUSTED else "no"
+            fault = "yes" if doubtful(part).empty else "no"
             scenes = ", ".join(dict.fromkeys(part["scene"]))
             largest = number(part["error"].max())
             lines.append(

@@ -14,7 +14,7 @@ from bench.model import registry
 from bench.sweep.experiment import Experiment
 from bench.sweep.machine import kind_of_machine
 from bench.sweep.store import Store
-from bench.sweep.tasks import Task, blank, explained
+from bench.sweep.tasks import Task, explained, row_of
 from bench.sweep.workers import Answer
 
 ELSEWHERE = "elsewhere"
@@ -65,7 +65,7 @@ def answers(job: Job) -> Iterator[tuple[int, dict[str, Any]]]:
     store = Store(experiment.directory, experiment.columns, experiment.study.name) if job.stores else None
     with local(experiment, job.timed, job.workers) as pool:
         for some in pool.run([tasks]):
-            rows = [blank(experiment, a.item.cell) | explained(a) for a in some if not a.item.reference]
+            rows = [row_of(experiment, a.item.cell, explained(a)) for a in some if not a.item.reference]
             if rows and store is not None:
                 store.append(*rows)
             for a in some:

@@ -1,0 +1,90 @@
+"""One figure for five seconds: what each estimator needs for an error, scene by scene, and who is first."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from bench.report.style import plain
+from bench.report.text import number
+from bench.report.views import Family
+from bench.studies.bias_variance.costs import Cost
+from bench.studies.bias_variance.fastest import TARGETS, Reached, methods
+
+FIRST = "#009E73"
+SHADES = (
+    (1.0, "#009E73", "white"),
+    (3.0, "#7fcbb3", "black"),
+    (30.0, "#dff2ec", "black"),
+    (math.inf, "#f4f4f4", "black"),
+)
+"""Largest factor over the first of a column, with the colours of cell and text."""
+WHY = {"never": "bias", "unknown": "bias?"}
+"""What stands in a cell without a number."""
+
+
+def glance(problems: Sequence[Family], costs: Sequence[Cost]) -> Figure:
+    """Draw, per cost and error, estimators down and problems across: the cost on the best backend, coloured by factor."""
+    found = {
+        (cost.label, target): [_best(methods(problem, target, cost)) for problem in problems]
+        for cost in costs
+        for target in TARGETS
+    }
+    names = list(dict.fromkeys(name for columns in found.values() for column in columns for name in column))
+    wide, tall = max(7.0, 1.6 + 0.95 * len(problems) * len(TARGETS)), 0.75 + (0.8 + 0.26 * len(names)) * len(costs)
+    figure = Figure(figsize=(wide, tall), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(
+        "What one estimate needs for an error: the first in each column is dark, and bold",
+        fontsize=9,
+        fontweight="bold",
+    )
+    grid = figure.subplots(len(costs), len(TARGETS), squeeze=False)
+    for row, cost in zip(grid, costs, strict=True):
+        for i, (panel, target) in enumerate(zip(row, TARGETS, strict=True)):
+            _matrix(panel, found[cost.label, target], names, cost)
+            panel.set_title(f"{target:.0%} error, {cost.label}", fontsize=8)
+            panel.set_xticks(range(len(problems)), [plain(p.title().partition(",")[0]) for p in problems], fontsize=6.5)
+            panel.set_yticks(
+                range(len(names)), [plain(name) for name in names] if i == 0 else [""] * len(names), fontsize=7
+            )
+    return figure
+
+
+def _best(reached: Mapping[str, Reached]) -> dict[str, tuple[Reached, str]]:
+    """Return what each estimator needs on its best backend, and that backend."""
+    best: dict[str, tuple[Reached, str]] = {}
+    for name, way in reached.items():
+        estimator, _, backend = name.partition(" on ")
+        known = best.get(estimator)
+        if known is None or math.isnan(known[0].cost) or way.cost < known[0].cost:
+            best[estimator] = (way, backend)
+    return best
+
+
+def _matrix(panel: Any, columns: Sequence[Mapping[str, tuple[Reached, str]]], names: Sequence[str], cost: Cost) -> None:
+    panel.set_xlim(-0.5, len(columns) - 0.5)
+    panel.set_ylim(len(names) - 0.5, -0.5)
+    panel.tick_params(length=0)
+    for spine in panel.spines.values():
+        spine.set_visible(False)
+    for x, column in enumerate(columns):
+        least = min((way.cost for way, _ in column.values() if math.isfinite(way.cost)), default=math.nan)
+        for y, name in enumerate(names):
+            way, backend = column.get(name, (Reached("unknown"), ""))
+            factor = way.cost / least
+            back, front = ("white", "#595959")
+            text = WHY.get(way.how, "-")
+            if math.isfinite(way.cost):
+                back, front = next((b, f) for most, b, f in SHADES if factor <= most)
+                text = cost.text(float(number(way.cost))) + (f"\n{backend}" if backend else "")
+            panel.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, facecolor=back, edgecolor="none"))
+            weight = "bold" if factor == 1.0 else "normal"
+            panel.text(
+                x, y, text, ha="center", va="center", fontsize=5.5, color=front, fontweight=weight, linespacing=0.95
+            )

@@ -1,0 +1,18 @@
+"""bench-self on a machine that lacks a library: a line that says so, and no failure."""
+
+import dataclasses
+
+import yaml
+
+from bench.benchself import rollouts
+from bench.model import registry
+from bench.sweep.config import config_dir
+
+
+def test_an_absent_library_is_a_line_with_the_command_that_installs_it(monkeypatch):
+    settings = yaml.safe_load((config_dir() / "bench_self.yaml").read_text())
+    settings["subjects"] = [one for one in settings["subjects"] if one["backend"] == "fused"]
+    entry = dataclasses.replace(registry.find("backends", "fused"), reason="not installed: numba; pip install numba")
+    monkeypatch.setattr(registry, "find", lambda kind, name: entry)
+    (line,) = rollouts.backends(settings, True)
+    assert line.note == "unavailable: not installed: numba; pip install numba"
