@@ -54,7 +54,6 @@ FAULTS = [
     # sampling
     Fault(R, "w = _draw(problem, \"reference\", BATCHES * size, count)", "w = _draw(problem, \"reference\", BATCHES * size, 0)", OF_REFERENCE),
     Fault(R, "_draw(problem, \"check\", count, 0)", "_draw(problem, \"reference\", count, 0)", OF_REFERENCE),
-    Fault(R, "enough = se <= tolerance", "enough = se**2 <= tolerance", OF_REFERENCE),
     Fault(R, "se = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)", "se = math.sqrt(batches.var(axis=0, ddof=1).sum()) / BATCHES / 2", OF_REFERENCE),
     Fault(R, "count * BATCHES >= LEAST_SAMPLES", "True", OF_REFERENCE),
     Fault(R, "spent = 2 * count * BATCHES > samples", "spent = count * BATCHES > samples", OF_REFERENCE),

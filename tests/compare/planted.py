@@ -22,7 +22,7 @@ from helpers import loaded
 
 from bench.compare import cells
 from bench.model import Problem, registry
-from bench.sweep import runner
+from bench.sweep import tasks
 from bench.sweep.session import Session
 
 SHORT = ("pushing", "cartpole", "double_pendulum", "pendulum", "hopper", "friction_block", "tossed_box", "mass_spring", "ground_wall", "bouncing_ball")  # fmt: skip
@@ -86,7 +86,7 @@ def rows(scene: str, fault: str) -> tuple[Any, pd.DataFrame]:
         for cell in found:
             refused = cell.refusal()
             if refused is None:
-                table.append(runner.blank(made, cell) | runner.outcome(cell, session, made.study))
+                table.append(tasks.blank(made, cell) | tasks.outcome(cell, session, made.study))
     return made.columns, made.columns.typed(pd.DataFrame(table))
 
 
