@@ -14,6 +14,9 @@ from ..fused import emit, kernels, trace
 from ..fused.graph import Refused
 from .jax import Jax, JaxOps, JaxProblem
 
+BEYOND = 1e75
+"""Size of a slope from which the cost itself is looked at."""
+
 
 @dataclass(frozen=True)
 class Fused(Backend):
@@ -27,7 +30,8 @@ class Fused(Backend):
 
     name = "fused"
     requires: ClassVar[tuple[str, ...]] = ("jax", "numba")
-    provides = Jax.provides
+    # surrogate gradients are refused
+    provides = Jax.provides - {"surrogate"}
 
     def compile(self, program: Program) -> Problem:
         """Return the program, whose kernels are compiled at the first call of each function, for any batch."""
@@ -38,6 +42,8 @@ class Fused(Backend):
         """Return the operation that has no form as scalar code, or None."""
         if program.needs - self.provides:
             return None
+        if program.surrogate:
+            return f"backend {self.name} differentiates the program itself, not a law's surrogate: use jax"
         _use_double()
         try:
             for function in ("value", "grad"):
@@ -122,7 +128,11 @@ class FusedProblem(JaxProblem):
         return self._kernel("value", theta, w, 1)[0]
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._kernel("grad", theta, w, self.dim)
+        gradient = self._kernel("grad", theta, w, self.dim)
+        # a cost that overflows has no gradient, finite as its slope may be; asked only of slopes beyond reason
+        if not (np.abs(gradient) < BEYOND).all():
+            gradient = np.where(np.isfinite(self._value(theta, w)), gradient, np.nan)
+        return gradient
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._kernel("score", theta, w, self.dim)

@@ -133,6 +133,12 @@ def test_an_operation_without_scalar_form_is_refused_by_name():
         registry.make("integrators", "semi_implicit_euler"),
     )
     assert "no root finder" in str(backend.lacks(pushed))
+    surrogate = compose(
+        registry.make("scenes", "pushing"),
+        registry.make("contacts", "straight_through"),
+        registry.make("integrators", "semi_implicit_euler"),
+    )
+    assert "surrogate" in str(backend.lacks(surrogate))
 
 
 def test_formulas_of_a_step_are_found_along_the_horizon():
