@@ -10,7 +10,6 @@ so never branch on it in Python; every other type is static.
 """
 
 from bench.errors import Unsupported
-from bench.model import loaded
 from bench.model.adjoint import Slopes, slopes
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
@@ -30,6 +29,7 @@ from bench.model.estimator import (
 )
 from bench.model.integrator import Integrator
 from bench.model.known import Identified, KnownOptimum, KnownValue
+from bench.model.loaded import simulator_files, simulator_of
 from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
@@ -110,10 +110,11 @@ __all__ = [
     "cores",
     "first_order",
     "halves",
-    "loaded",
     "param",
     "per_repeat",
     "rollout",
+    "simulator_files",
+    "simulator_of",
     "slopes",
     "stopped",
     "zeroth_order",

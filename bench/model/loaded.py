@@ -8,7 +8,7 @@ from bench.simulator import LIBRARIES, Layout, Simulator, attribute, load
 from bench.simulator.clock import Clock
 
 
-def simulator(cost: str, theta: str = "theta", grad: str = "", batch: str = "", noise: int = 0) -> Simulator:
+def simulator_of(cost: str, theta: str = "theta", grad: str = "", batch: str = "", noise: int = 0) -> Simulator:
     """Return the simulator of ``FILE:NAME`` with a theta and a gradient by their names in the same file."""
     module = load(cost.rpartition(":")[0])
     start = attribute(theta, module)
@@ -17,6 +17,6 @@ def simulator(cost: str, theta: str = "theta", grad: str = "", batch: str = "", 
     return Simulator(attribute(cost), layout, gradient, noise, batch or None, Clock(float("inf")))
 
 
-def files(cost: str) -> tuple[Path, ...]:
+def simulator_files(cost: str) -> tuple[Path, ...]:
     """Return the file of ``FILE:NAME``."""
     return (Path(str(load(cost.rpartition(":")[0]).__file__)),)

@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
-from bench.model import CallableScene, loaded, param
+from bench.model import CallableScene, param, simulator_files, simulator_of
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Callable(CallableScene):
 
     def files(self) -> tuple[Path, ...]:
         """Return the file of the cost."""
-        return loaded.files(self.cost)
+        return simulator_files(self.cost)
 
 
 @cache
 def _loaded(cost: str, theta: str, grad: str, batch: str, noise: int) -> Any:
-    return loaded.simulator(cost, theta, grad, batch, noise)
+    return simulator_of(cost, theta, grad, batch, noise)

@@ -2,7 +2,7 @@
 
     python tests/measure/false_alarms.py 5000
 
-prints the counts of verdicts, every gradient blamed, and the seconds of a check without compilation.
+prints the counts of verdicts, every gradient blamed, and the seconds of a check, the first of each program with its compilation.
 """
 
 import sys
