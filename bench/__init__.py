@@ -15,7 +15,7 @@ from bench.sweep.experiment import Experiment
 from bench.sweep.session import Session
 from bench.sweep.study import Study
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = [
     *_contracts,
     "Cell",
