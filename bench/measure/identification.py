@@ -86,7 +86,7 @@ class Information:
 
     @property
     def words(self) -> str:
-        """What can and cannot be told, in a sentence."""
+        """What can be known and what cannot, in a sentence."""
         if self.rank == len(self.names):
             return f"{_listed(self.names)} can be told" + (" apart" if len(self.names) > 1 else "")
         hidden = [_direction(self.names, row) for row in self.gauge]

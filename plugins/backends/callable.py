@@ -48,9 +48,13 @@ class CallableProblem(Problem):
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         thetas, own = self._split(theta, w)
-        if self._simulator.has_gradient:
-            return self._simulator.gradients(thetas, own)
-        self.usage.rollouts += 2 * self.dim * w.shape[1]
+        gradients = (
+            self._simulator.gradients(thetas, own) if self._simulator.has_gradient else self._differences(thetas, own)
+        )
+        return np.where(np.isfinite(self._simulator.costs(thetas, own)), gradients, np.nan)
+
+    def _differences(self, thetas: np.ndarray, own: np.ndarray | None) -> np.ndarray:
+        self.usage.rollouts += 2 * self.dim * thetas.shape[1]
         rows = []
         for i, scale in enumerate(self._simulator.layout.scales()):
             step = np.zeros((self.dim, 1))

@@ -1,7 +1,7 @@
-"""Planted faults are caught, and right gradients pass; `python tests/examine/bank.py` prints the whole table."""
+"""Planted faults are caught, and right gradients pass; `python tests/examine/simulators.py` prints the whole table."""
 
-import bank
 import pytest
+import simulators
 
 SLOW = ("contact", "missing contact term", "missing damper")
 """Cases whose rollouts take long in Python; the quick tests have others of their kind."""
@@ -14,7 +14,7 @@ MISSED = "argmin of a grid"
 
 
 def judge(case):
-    report = bank.examined(case)
+    report = simulators.examined(case)
     if case.name == MISSED:
         assert "jumps: along a line" in str(report)
         return
@@ -23,13 +23,13 @@ def judge(case):
         assert report.cause in case.causes, case.name
 
 
-@pytest.mark.parametrize("case", [c for c in bank.numpy_cases() if c.name not in SLOW], ids=lambda c: c.name)
+@pytest.mark.parametrize("case", [c for c in simulators.numpy_cases() if c.name not in SLOW], ids=lambda c: c.name)
 def test_numpy_simulators_are_judged_rightly(case):
     judge(case)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [c for c in bank.numpy_cases() if c.name in SLOW], ids=lambda c: c.name)
+@pytest.mark.parametrize("case", [c for c in simulators.numpy_cases() if c.name in SLOW], ids=lambda c: c.name)
 def test_longer_numpy_simulators_are_judged_rightly(case):
     judge(case)
 
@@ -37,5 +37,5 @@ def test_longer_numpy_simulators_are_judged_rightly(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("library", ["torch", "jax"])
 def test_simulators_with_tapes_are_judged_rightly(library):
-    for case in bank.CASES[library]():
+    for case in simulators.CASES[library]():
         judge(case)

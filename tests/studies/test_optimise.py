@@ -186,7 +186,7 @@ def test_tables_charts_and_page(finished):
         assert (folder / name).stat().st_size > 0, name
     text = (folder / "optimise.md").read_text()
     assert "Best score" in text
-    assert "cannot be told" in text  # two methods on one problem say nothing about gradients in general
+    assert "not known" in text  # two methods on one problem say nothing about gradients in general
     found = races.races(experiment, bench.load(folder))
     assert found.methods == ["fobg, gradient_descent", "cem[elites=5,population=20]", "reinforce, gradient_descent"]
     assert found.chosen[found.problems[0], "fobg, gradient_descent"] == "rate=0.1"

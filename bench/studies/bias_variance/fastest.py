@@ -130,6 +130,8 @@ def line(problem: Family, target: float, kind: str, cost: Cost) -> dict[str, Any
         "how": "-",
         "next": "-",
         "factor": math.nan,
+        "factor_low": math.nan,
+        "factor_high": math.nan,
     }
     if ranked:
         best = reached[ranked[0][1]]

@@ -96,7 +96,7 @@ def _steps(horizon: int) -> str:
 
 
 def headline(table: pd.DataFrame) -> str:
-    """Write where gradients are not derivatives, or cannot be told to be, before how many are right."""
+    """Write where gradients are not derivatives, or are not known to be, before how many are right."""
     faults = table[table["verdict"].isin(FAULTS)]
     beside = [
         not trusted(point, verdict) and verdict not in FAULTS

@@ -331,7 +331,7 @@ def step_dependence(cell: Cell, model: Model, known: Information, settings: Sett
     theta = model.values[:, None]
     change = (half.record(theta) - model.record(theta))[:, 0] / settings.measurement
     if not known.rank or not np.isfinite(change).all():
-        return {"step_shift": math.nan, "step_note": "cannot be told"}
+        return {"step_shift": math.nan, "step_note": "not distinguishable"}
     moved = known.invariants @ np.linalg.lstsq(known.jacobian, change, rcond=1e-8)[0]
     shift, bound = np.abs(moved), np.sqrt(np.diag(known.covariance()))
     worst = int(np.argmax(shift / bound))

@@ -27,25 +27,25 @@ def sentences(found: Races, default: float) -> list[str]:
 
 
 def pays(rho: pd.DataFrame) -> str:
-    """Say for each class of scene whether the smaller error arrives sooner: yes, no, or cannot be told."""
+    """Say for each class of scene whether the smaller error arrives sooner: yes, no, or not known."""
     if rho.empty:
-        return "Whether a better gradient pays cannot be told: no search has a gradient whose quality was measured."
+        return "Whether a better gradient pays is not known: no search has a gradient whose quality was measured."
     parts = []
     for row in rho[rho["scene_class"] != "all"].to_dict("records"):
         if math.isnan(row["rho"]) or row["points"] < 4:
-            parts.append(f"{row['scene_class']}: cannot be told from {counted(row['points'], 'point')}")
+            parts.append(f"{row['scene_class']}: not known from {counted(row['points'], 'point')}")
             continue
         figures = f"rho {row['rho']:.2f} [{row['rho_low']:.2f}, {row['rho_high']:.2f}], {row['points']} points"
         if row["chance"] > CHANCE:
             parts.append(
-                f"{row['scene_class']}: cannot be told ({figures}; random order does as well {row['chance']:.0%} of the time)"
+                f"{row['scene_class']}: not known ({figures}; random order does as well {row['chance']:.0%} of the time)"
             )
         elif row["rho_low"] > 0:
             parts.append(f"{row['scene_class']}: yes ({figures})")
         elif row["rho_high"] < 0:
             parts.append(f"{row['scene_class']}: no, the reverse ({figures})")
         else:
-            parts.append(f"{row['scene_class']}: cannot be told ({figures})")
+            parts.append(f"{row['scene_class']}: not known ({figures})")
     return "Does the gradient with the smaller error at the start arrive sooner? " + "; ".join(parts) + "."
 
 

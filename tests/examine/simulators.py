@@ -1,6 +1,6 @@
 """Planted faults and right gradients in NumPy, torch and JAX simulators, and the table of what each checker finds.
 
-    python tests/examine/bank.py [numpy] [torch] [jax]
+    python tests/examine/simulators.py [numpy] [torch] [jax]
 
 prints a line per case: the cause that `bench.examine` names, its exit status, calls and seconds, and beside it whether
 `torch.autograd.gradcheck` or `jax.test_util.check_grads` complains, at their own default steps and tolerances.
