@@ -57,6 +57,7 @@ def installed(tmp_path_factory) -> Path:
     return site
 
 
+@pytest.mark.slow
 def test_wheel_runs_in_an_empty_directory_with_numpy_only(installed, tmp_path):
     done = bench(*TINY, cwd=tmp_path, path=str(installed))
     assert done.returncode == 0, done.stderr
@@ -69,6 +70,7 @@ def test_wheel_runs_in_an_empty_directory_with_numpy_only(installed, tmp_path):
         assert done.returncode == 0, done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_wheel_holds_the_plugins_and_the_experiments(installed):
     assert (installed / "bench" / "plugins" / "scenes" / "pushing.py").exists()
     assert (installed / "bench" / "conf" / "experiment" / "quick.yaml").exists()
@@ -137,6 +139,7 @@ repeats: 4
 """
 
 
+@pytest.mark.slow
 def test_own_plugins_and_experiments_from_folders(tmp_path):
     (tmp_path / "own" / "estimators").mkdir(parents=True)
     (tmp_path / "own" / "estimators" / "share.py").write_text(OWN_ESTIMATOR)

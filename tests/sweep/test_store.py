@@ -319,6 +319,7 @@ def test_one_and_two_workers_give_the_same_bytes(tmp_path):
     assert table(tmp_path / "1")["time_s"].isna().all()
 
 
+@pytest.mark.slow
 def test_two_runs_of_one_experiment_at_once(tmp_path):
     words = [*sweep(40), f"results_dir={tmp_path}"]
     runs = [start(*words) for _ in range(2)]
