@@ -82,7 +82,8 @@ def log_axis(
     getattr(panel, f"set_{which}lim")(low, high)
     ticks = list(wanted)
     if not ticks or high > 1e3 * low or np.diff(np.log10(ticks)).min() <= 0.15:
-        ticks = _round_ticks(low, high, 4 if which == "x" else 5)
+        words = 3 if text is not None else 4  # labels with a unit are wider than numbers
+        ticks = _round_ticks(low, high, words if which == "x" else 5)
     if text is None:
         powers = any(not 1e-3 <= t <= 1e3 for t in ticks) and all(f"{t:.1e}".startswith("1.0e") for t in ticks)
         text = _power if powers else axis_value

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from helpers import described_by
 
+from bench.measure.statistics import UNEXPLAINED
 from bench.report.views import Line
 from bench.studies.bias_variance.charts import figures
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, charged
@@ -91,6 +92,10 @@ def test_a_bias_below_the_error_takes_more_samples():
 
 def test_a_bias_above_the_error_never_gets_there():
     assert reach(line(bias=0.2), 0.1, TIME).how == "never"
+
+
+def test_a_bias_that_is_not_explained_leaves_it_open():
+    assert reach(line(bias=0.2, reason=f"declared unbiased: {UNEXPLAINED}"), 0.1, TIME).how == "unknown"
 
 
 def test_a_bias_that_may_exceed_the_error_is_not_extrapolated():

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.measure.statistics import unexplained
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, number
 from bench.report.views import Family, Line, along, arranged, families, lines
@@ -32,7 +33,7 @@ NOTES = (
     "`measured` between two sample counts, `at once` where the fewest samples already suffice (the cost is an upper "
     "limit), `extrapolated` by RMSE^2 = bias^2 + v / N beyond the most samples measured, where the 95% limit of the bias "
     "lies below the error asked for. never: methods whose bias exceeds that error. unknown: methods whose bias is not known "
-    "to be below it.",
+    "to be below it, or is one that they declare not to have.",
 )
 
 
@@ -84,7 +85,8 @@ def _beyond(row: Any, samples: float, price: float, target: float) -> Reached:
     """Extrapolate from the row with most samples: v is N times its variance, and the cost is proportional to N."""
     low, high, bias = (row[name] / row["reference_norm"] for name in ("bias_low", "bias_high", "bias"))
     if low >= target:
-        return Reached("never")
+        # a bias that the method should not have may be tails that were not seen
+        return Reached("unknown" if unexplained(str(row.get("reason", ""))) else "never")
     if not high < target:
         return Reached("unknown")
     certain_bias = bias if low > 0 else 0.0
