@@ -134,6 +134,8 @@ def combinations(root):
             "friction_block": [FrictionBlock(horizon=400)],
         }.get(name, [cls()])
         for scene in scenes:
+            if scene.backends:  # it says itself where it runs
+                continue
             contacts = getattr(scene, "n_contacts", 0)
             laws = [law for law in LAWS.values() if law.needs_root == root] if contacts else [] if root else [None]
             for law in laws:
@@ -182,7 +184,7 @@ def test_implicit_gradient_is_that_of_its_program(scene, law):
     theta = scene.theta0()
     free = Jax().compile(program(scene))
     w = 0.5 * normal(free.program.n_noise, 3)
-    for stiffness in (math.inf, scene.contact_values["stiffness"]):
+    for stiffness in (math.inf, scene.contact_values.get("stiffness", 1e4)):
         for kappa in (1e-2, 1e-4, 1e-6):
             problem = Implicit().compile(program(scene, law, kappa=kappa, stiffness=stiffness))
             assert np.all(np.abs(problem.value(theta, w) - free.value(theta, w)) > 1e-4), "the contact is not active"
