@@ -178,7 +178,7 @@ def test_jobs_of_submitit_give_the_rows_of_a_local_run(tmp_path):
     assert "6 cells, 6 stored" in again.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.cluster
 def test_a_ray_cluster_that_loses_a_node_gives_the_table_of_a_local_run(tmp_path):
     pytest.importorskip("ray")
     (tmp_path / "mine").mkdir()
@@ -217,6 +217,8 @@ def test_a_ray_cluster_that_loses_a_node_gives_the_table_of_a_local_run(tmp_path
             cluster.wait(30)
         except subprocess.TimeoutExpired:
             cluster.kill()
+            cluster.wait()
+        cluster.stdout.close()
     assert main([*words, "name=local", "workers=2"]) == 0
     pd.testing.assert_frame_equal(rows(tmp_path / "sent"), rows(tmp_path / "local"), check_exact=True)
     assert (rows(tmp_path / "timed")["time_s"] > 0).all()
