@@ -8,6 +8,7 @@ from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 
 from bench.report.style import plain
@@ -37,8 +38,8 @@ def glance(problems: Sequence[Family], costs: Sequence[Cost]) -> Figure:
     }
     names = list(dict.fromkeys(name for columns in found.values() for column in columns for name in column))
     wide, tall = max(7.0, 1.6 + 0.95 * len(problems) * len(TARGETS)), 0.75 + (0.8 + 0.26 * len(names)) * len(costs)
-    figure = Figure(figsize=(wide, tall), layout="constrained")
-    figure.get_layout_engine().set(rect=(0.02, 0.0, 0.98, 1.0))  # the labels of the first column need room
+    room = ConstrainedLayoutEngine(rect=(0.02, 0.0, 0.98, 1.0))  # for the labels of the first column
+    figure = Figure(figsize=(wide, tall), layout=room)
     FigureCanvasAgg(figure)
     figure.suptitle(
         "What one estimate needs for an error: the first in each column is dark, and bold",
