@@ -10,7 +10,7 @@ so never branch on it in Python; every other type is static.
 """
 
 from bench.errors import Unsupported
-from bench.model.adjoint import Slopes, slopes
+from bench.model.adjoint import Slopes, by_actions, by_theta, slopes
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
 from bench.model.blocks import cores
@@ -111,6 +111,8 @@ __all__ = [
     "Unsupported",
     "Usage",
     "adjoint_gradient",
+    "by_actions",
+    "by_theta",
     "columns",
     "compose",
     "cores",
