@@ -96,7 +96,8 @@ def gradient(problem: Problem, found: Slopes, cut: Cut | None = None) -> np.ndar
         if cut is not None and t > 0:
             adjoint = cut(t, found.states[t], adjoint)
     if scene.open_loop:
-        result = by_control.reshape(program.dim, -1)
+        each = by_control.reshape(scene.controls, -1, *by_control.shape[1:])
+        result = each.sum(axis=1).reshape(program.dim, -1)
     else:
         result = _by_theta(lambda theta: scene.planned_controls(np, theta), found.theta, by_control)
     x = _flat(found.states[:-1])

@@ -223,7 +223,8 @@ class Program(ABC):
     @property
     def _as_declared(self) -> bool:
         """Whether the scene's statements about its own theta0 hold for this program."""
-        return self.decision == OWN
+        at = self.decision.at
+        return not self._named and (at is None or bool(np.array_equal(at, self.scene.theta0())))
 
     def closed_form_gradient(self) -> np.ndarray | None:
         """Return grad J_sigma at theta0, or None where the scene does not know it."""
@@ -347,8 +348,8 @@ class Rollout(Program):
 
     @property
     def n_noise(self) -> int:
-        """n_w: one number per control of each step, or one per coordinate of theta."""
-        return self.scene.horizon * self.scene.n_u if self.action_noise else self.dim
+        """n_w: one number per control, or one per coordinate of theta."""
+        return self.scene.controls * self.scene.n_u if self.action_noise else self.dim
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
         """Return the stage costs and the terminal cost of the rollout."""
@@ -361,9 +362,11 @@ class Rollout(Program):
         This is the part of log p(actions) that is linear in the policy's change. Where the program is
         :attr:`explicit`, the states are those of ``theta_scored`` under the same actions.
         """
+        # a control that is held is drawn once, and counted at each of its steps
+        scale = self.scene.sigma * (self.scene.horizon // self.scene.controls)
         if self.explicit:
-            return self._replayed(ops, theta, theta_scored, w)[1] / self.scene.sigma
-        return self._rollout(ops, theta, w, theta_scored)[1] / self.scene.sigma
+            return self._replayed(ops, theta, theta_scored, w)[1] / scale
+        return self._rollout(ops, theta, w, theta_scored)[1] / scale
 
     def explicit_cost(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> Array:
         """Return the cost from the initial state of ``theta_moved``, under the actions that theta and w lead to."""
@@ -400,7 +403,7 @@ class Rollout(Program):
         shape = (scene.horizon, scene.n_u, w.shape[1])
         scanned = []
         if self.action_noise:
-            scanned.append(xp.reshape(w, shape))
+            scanned.append(scene.held(xp, xp.reshape(w, (scene.controls, *shape[1:]))))
         else:
             theta = theta + scene.sigma * w
         planned = scene.planned_controls(xp, theta)
