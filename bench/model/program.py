@@ -223,7 +223,8 @@ class Program(ABC):
     @property
     def _as_declared(self) -> bool:
         """Whether the scene's statements about its own theta0 hold for this program."""
-        return self.decision == OWN
+        at = self.decision.at
+        return not self._named and (at is None or bool(np.array_equal(at, self.scene.theta0())))
 
     def closed_form_gradient(self) -> np.ndarray | None:
         """Return grad J_sigma at theta0, or None where the scene does not know it."""
