@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from bench.model import registry
+from bench.model import registry, trial
 
 QUICK = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true"
@@ -14,6 +14,7 @@ quarter of the time, to the same numbers but for rounding. Processes that a test
 
 
 def pytest_configure(config):
+    os.environ["XDG_CACHE_HOME"] = str(config.rootpath / ".pytest_cache" / "home")
     os.environ["XLA_FLAGS"] = f"{QUICK} {os.environ.get('XLA_FLAGS', '')}".strip()
     config.addinivalue_line(
         "markers",
@@ -46,6 +47,13 @@ def backend(request):
     if needs - chosen.provides:
         pytest.skip(f"{chosen.name} does not provide {', '.join(sorted(needs - chosen.provides))}")
     return chosen
+
+
+@pytest.fixture(autouse=True)
+def untried(request, monkeypatch):
+    """Plugin files are imported without a trial in a process of their own, but where that is what is tested."""
+    if request.module.__name__ != "test_trial":
+        monkeypatch.setattr(trial, "fatal", lambda *_: {})
 
 
 @pytest.fixture(autouse=True)

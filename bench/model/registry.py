@@ -26,9 +26,12 @@ from types import ModuleType
 from typing import Any
 
 from bench.errors import UserError, printable, unknown
+from bench.model import trial
 from bench.model.parameters import Plugin, build, parameters, remember, singular
 
-BUILT_IN = ("bench.plugins", "bench.studies")
+CORE = "bench.studies"
+"""What is no plugin file of anyone's: its import is not tried first."""
+BUILT_IN = ("bench.plugins", CORE)
 KINDS = ("scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "studies")
 """The kinds that come with the package, in the order in which they are listed; a plugin may declare another."""
 ENTRY_POINT_GROUP = "bench.plugins"
@@ -85,11 +88,18 @@ def _package(path: Path) -> str:
 def entries() -> Table:
     """Return all plugins by kind and name."""
     table: Table = {kind: {} for kind in KINDS}
-    for name in (*BUILT_IN, *map(_package, _folders)):
-        for kind, module in _modules(importlib.import_module(name)):
-            _load_module(table, kind, module)
-    for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name):
+    packages = (*BUILT_IN, *map(_package, _folders))
+    modules = [found for name in packages for found in _modules(importlib.import_module(name))]
+    points = sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name)
+    stamps = {module: trial.stamp(module) for _, module in modules if not module.startswith(CORE)}
+    stamps |= {point.module: point.dist.version if point.dist else "" for point in points}
+    fatal = trial.fatal(stamps, {_package(path): path for path in _folders})
+    for kind, module in modules:
+        _load_module(table, kind, module, fatal.get(module, ""))
+    for point in points:
         try:
+            if point.module in fatal:
+                raise ImportError(fatal[point.module])
             plugin = point.load()
             if not (isinstance(plugin, type) and issubclass(plugin, Plugin) and plugin.kind):
                 raise TypeError(f"{point.value} is not a plugin class")
@@ -124,8 +134,10 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
                 yield folder.name, f"{space.__name__}.{module.name}"
 
 
-def _load_module(found: Table, kind: str, path: str) -> None:
+def _load_module(found: Table, kind: str, path: str, fatal: str) -> None:
     try:
+        if fatal:
+            raise ImportError(fatal)
         module = importlib.import_module(path)
     except KeyboardInterrupt:
         raise

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.errors import Unsupported
+from bench.errors import Unsupported, UserError
 from bench.model.contact import Contact, ContactLaw
 from bench.model.ops import Array, State
 from bench.model.parameters import Plugin, param
@@ -66,6 +66,26 @@ class FunctionScene(Scene):
 
 
 @dataclass(frozen=True)
+class DisturbedScene(FunctionScene):
+    """A role: a plain function with noise of its own, beside the noise on theta.
+
+    ``J_sigma(theta) = E f(theta + sigma u, e)`` over both: d normal numbers u, then ``exogenous`` of the scene's own, e.
+    No estimator smoothes over e by shifting it, and no score takes it.
+    """
+
+    exogenous: ClassVar[int]
+    """How many normal numbers of its own a sample has."""
+
+    @abstractmethod
+    def disturbed_cost(self, xp: Any, x: Array, e: Array) -> Array:
+        """Return f at ``x (d, B)`` under the scene's own noise ``e (exogenous, B)``: ``(B,)``."""
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """Return f without noise of its own."""
+        return self.disturbed_cost(xp, x, xp.zeros((self.exogenous, x.shape[1]), dtype=x.dtype))
+
+
+@dataclass(frozen=True)
 class MechanicalScene(Scene):
     """A scene with dynamics ``q' = v``, ``v' = acceleration(q, v, u) + contact``, ``horizon`` steps of ``dt``.
 
@@ -109,7 +129,18 @@ class MechanicalScene(Scene):
 
     def planned_controls(self, xp: Any, theta: Array) -> Array | None:
         """Return the open-loop part of the control law, ``(horizon, n_u, B)``, or None."""
-        return xp.reshape(theta, (self.horizon, self.n_u, theta.shape[1])) if self.open_loop else None
+        if not self.open_loop:
+            return None
+        return self.held(xp, xp.reshape(theta, (self.controls, self.n_u, theta.shape[1])))
+
+    @property
+    def controls(self) -> int:
+        """Number of controls in a rollout: one per step unless a :class:`HeldScene` holds them."""
+        return self.horizon
+
+    def held(self, xp: Any, values: Array) -> Array:
+        """Return what each control has, ``(controls, ...)``, for each step, ``(horizon, ...)``."""
+        return values
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array | None:
         """Return the feedback part of the control law, ``(n_u, B)``, added to the planned one, or None."""
@@ -138,6 +169,37 @@ class DampedScene(MechanicalScene):
     def carried(self, v: Array) -> Array:
         """Return the factor times v."""
         return self.velocity_factor * v
+
+
+@dataclass(frozen=True)
+class HeldScene(MechanicalScene):
+    """A role: each control of an open loop, and its noise, is held over ``hold`` steps (zero-order hold).
+
+    The step can then be refined with theta, the noise and the duration as they were: ``horizon`` and ``hold`` grow by a
+    factor by which ``dt`` falls. Weight a stage cost by ``1 / hold`` to keep the objective as it was too.
+    """
+
+    hold: int = param(1, "steps over which each control and its noise are held", "steps", positive=True)
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if not cls.open_loop:
+            raise TypeError(f"{cls.__name__} holds its controls: set open_loop, a feedback law acts at every step")
+
+    @property
+    def controls(self) -> int:
+        """Number of controls; raises :class:`UserError` unless they fill the horizon."""
+        if self.horizon % self.hold:
+            raise UserError(f"hold={self.hold} does not divide the horizon of {self.horizon} steps")
+        return self.horizon // self.hold
+
+    def held(self, xp: Any, values: Array) -> Array:
+        """Return each control's values ``hold`` times."""
+        if self.hold == 1:
+            return values
+        rest = values.shape[1:]
+        every = xp.broadcast_to(values[:, None, ...], (self.controls, self.hold, *rest))
+        return xp.reshape(every, (self.horizon, *rest))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from bench.model import Plugin, registry
 from bench.model.parameters import Parameter, build, parameters
 from bench.sweep.cell import labels
 from bench.sweep.experiment import Experiment
-from bench.sweep.grid import COUNTS, applies, points, swept
+from bench.sweep.grid import COUNTS, THETA, applies, of_theta, points, short, swept
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,7 +39,7 @@ class Axis:
     @property
     def short(self) -> str:
         """The parameter's own name: ``gamma`` of ``alpha_order.gamma``."""
-        return self.column.rpartition(".")[2]
+        return short(self.column)
 
     @property
     def title(self) -> str:
@@ -59,12 +59,22 @@ def parsed(rows: pd.DataFrame) -> list[Mapping[str, Any]]:
 
 def value_of(name: str, given: Mapping[str, Any]) -> Any:
     """Return the value that a row's parameters give to a name in a sweep; None if it applies to none of its plugins."""
+    if of_theta(name):
+        return _coordinate(name, (given.get("theta") or {}).get("at") or ())
     for group, part in given.items():
         if group not in NOT_PARTS and part is not None:
             parameter = applies(name, registry.kind_of(group), part["name"], part)
             if parameter is not None and parameter != "name":
                 return part[parameter]
     return None
+
+
+def _coordinate(name: str, at: Sequence[float]) -> float | None:
+    """Return a coordinate of theta0; of ``theta0`` itself the only one, None where it has several."""
+    _, dot, coordinate = name.partition(".")
+    if not dot:
+        return at[0] if len(at) == 1 else None
+    return at[int(coordinate)] if int(coordinate) < len(at) else None
 
 
 def values_of(axis: Axis, rows: pd.DataFrame) -> np.ndarray:
@@ -119,16 +129,17 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
     """
     import numpy as np
 
-    names = swept(sweep)
+    given = list({id(one): one for one in parsed(rows)}.values())
+    coordinates = _moved(given) if THETA in swept(sweep) else ()
+    names = [part for name in swept(sweep) for part in (coordinates if name == THETA else (name,))]
     groups: dict[str, list[str]] = {}
     for name in names:
-        groups.setdefault(name.rpartition(".")[2], []).append(name)
-    given = list({id(one): one for one in parsed(rows)}.values())
+        groups.setdefault(short(name), []).append(name)
     result = []
-    for short, members in groups.items():
+    for own_name, members in groups.items():
         clash = any(sum(value_of(name, one) is not None for name in members) > 1 for one in given)
         for part in [[name] for name in members] if clash else [members]:
-            column = part[0] if clash else short
+            column = part[0] if clash else own_name
             axis = Axis(column, tuple(part), *_meaning(part, given))
             values = values_of(axis, rows)
             own = np.isfinite(values)
@@ -137,10 +148,19 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
             if not clash and column in rows and column not in COUNTS:
                 shown = np.asarray(rows[column], dtype=float)
                 if not np.array_equal(shown[own], values[own]):
-                    axis = Axis(part[0] if "." in part[0] else f"swept.{short}", axis.names, axis.unit, axis.doc)
+                    axis = Axis(part[0] if "." in part[0] else f"swept.{own_name}", axis.names, axis.unit, axis.doc)
             result.append(axis)
-    together = _together(sweep)
+    together = [*_together(sweep), *([frozenset(coordinates)] if len(coordinates) > 1 else [])]
     return [Axis(axis.column, axis.names, axis.unit, axis.doc, _moving(axis, result, together)) for axis in result]
+
+
+def _moved(given: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return the names of theta0's coordinates that differ between rows; ``theta0`` where it has but one."""
+    thetas = [tuple(at) for one in given if (at := (one.get("theta") or {}).get("at"))]
+    longest = max(map(len, thetas), default=1)
+    if longest == 1:
+        return (THETA,)
+    return tuple(f"{THETA}.{i}" for i in range(longest) if len({at[i] for at in thetas if i < len(at)}) > 1)
 
 
 def _moving(axis: Axis, found: Sequence[Axis], together: Sequence[frozenset[str]]) -> tuple[str, ...]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bench.errors import Unsupported, UserError, unknown
-from bench.model import Decision, MechanicalScene, Plugin, Scene
+from bench.model import Decision, MechanicalScene, Plugin, Scene, compose
 from bench.model.parameters import build, coerce, parameters, singular
+from bench.model.program import OWN
 from bench.sweep.cell import Cell
 from bench.sweep.experiment import Choice, Experiment
 from bench.sweep.study import study_of
@@ -17,7 +19,24 @@ from bench.sweep.study import study_of
 MOST = 1_000_000
 """Cells of the largest sweep: planning them takes minutes."""
 COUNTS = ("samples", "repeats", "seed")
-"""What a sweep can vary besides plugin parameters."""
+"""What a sweep can vary besides plugin parameters, and besides :data:`THETA`."""
+THETA = "theta0"
+"""The axis of where gradients are taken: whole thetas, or ``theta0.2`` for one coordinate of it."""
+
+
+def of_theta(axis: str) -> bool:
+    """Return whether an axis is theta0 or one of its coordinates.
+
+    >>> [of_theta(axis) for axis in ("theta0", "theta0.2", "heaviside.theta", "theta0.x")]
+    [True, True, False, False]
+    """
+    name, dot, coordinate = axis.partition(".")
+    return name == THETA and (not dot or coordinate.isdecimal())
+
+
+def short(axis: str) -> str:
+    """Return the parameter's own name: ``gamma`` of ``alpha_order.gamma``; a coordinate of theta0 has no shorter one."""
+    return axis if of_theta(axis) else axis.rpartition(".")[2]
 
 
 def cells(experiment: Experiment) -> list[Cell]:
@@ -32,7 +51,7 @@ def cells(experiment: Experiment) -> list[Cell]:
             unique.setdefault(cell.key, cell)
     if not unique:
         raise UserError("the experiment has no cells: choose at least one of each of scenes, backends, estimators")
-    if experiment.decision != Decision():
+    if any(cell.decision != OWN for cell in unique.values()):
         _check_theta(list(unique.values()))
     return list(unique.values())
 
@@ -142,6 +161,16 @@ def _values(axis: str, values: Any) -> list[Any]:
     return listed
 
 
+def coerce_finite(values: Any, name: str) -> tuple[float, ...]:
+    """Return one number or a list as finite floats; raises :class:`UserError` otherwise."""
+    numbers = tuple(coerce(float, value, name) for value in (values if isinstance(values, list | tuple) else [values]))
+    if not all(map(math.isfinite, numbers)):
+        raise UserError(f"{name}={list(numbers)} must be finite")
+    if "." in name and len(numbers) != 1:
+        raise UserError(f"{name} takes one number at a time, not {list(numbers)}")
+    return numbers
+
+
 def applies(axis: str, kind: str, plugin: str, known: Mapping[str, Any]) -> str | None:
     """Return the parameter of a plugin that a sweep axis names, or None.
 
@@ -163,9 +192,9 @@ def _applies(axis: str, plugin: type[Plugin]) -> str | None:
 
 def _check_axes(experiment: Experiment) -> None:
     chosen = [c.entry.plugin for some in experiment.choices.values() for c in some if c.entry.plugin]
-    names = {name for plugin in chosen for name in parameters(plugin)} | set(COUNTS)
+    names = {name for plugin in chosen for name in parameters(plugin)} | {*COUNTS, THETA}
     for axis in swept(experiment.sweep):
-        if axis not in COUNTS and not any(_applies(axis, plugin) for plugin in chosen):
+        if axis not in COUNTS and not of_theta(axis) and not any(_applies(axis, plugin) for plugin in chosen):
             raise unknown("sweep axis", axis, names)
 
 
@@ -198,9 +227,31 @@ class _Expansion:
                 assert isinstance(scene, Scene)
         experiment = self._experiment
         return Cell(
-            study_of(experiment).parts(parts), **self._counts(point), study=experiment.study, decision=experiment.decision,
-            timing=experiment.timing, budget=experiment.budget,
+            study_of(experiment).parts(parts), **self._counts(point), study=experiment.study,
+            decision=self._decision(point, parts), timing=experiment.timing, budget=experiment.budget,
         )  # fmt: skip
+
+    def _decision(self, point: Mapping[str, Any], parts: Mapping[str, Plugin | None]) -> Decision:
+        """Return what theta is at a point of the sweep; coordinates that are not swept stay where they are."""
+        decision = self._experiment.decision
+        given = {name: coerce_finite(values, name) for name, values in point.items() if of_theta(name)}
+        if not given:
+            return decision
+        if THETA in given:
+            if len(given) > 1:
+                raise UserError(f"the sweep gives theta0 and {', '.join(given.keys() - {THETA})}: give one of them")
+            return dataclasses.replace(decision, at=given[THETA])
+        try:
+            scene, contact, integrator = (parts.get(axis) for axis in ("scene", "contact", "integrator"))
+            at = compose(scene, contact, integrator, decision).theta0.tolist()  # type: ignore[arg-type]
+        except (Unsupported, UserError):  # the cell says so itself
+            return decision
+        for name, values in given.items():
+            coordinate = int(name.partition(".")[2])
+            if coordinate >= len(at):
+                raise UserError(f"sweep axis '{name}': theta has {len(at)} coordinates, counted from 0")
+            (at[coordinate],) = values
+        return dataclasses.replace(decision, at=tuple(at))
 
     def _counts(self, point: Mapping[str, Any]) -> dict[str, int]:
         counts: dict[str, int] = {}

@@ -6,15 +6,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.model import Array, ContactScene, DampedScene, EngineTwin, State, param
+from bench.model import Array, ContactScene, DampedScene, EngineTwin, HeldScene, State, param
 
 
 @dataclass(frozen=True)
-class Pushing(EngineTwin, DampedScene, ContactScene):
+class Pushing(EngineTwin, HeldScene, DampedScene, ContactScene):
     """Two bodies on a line, the first pushed by an open-loop force; they touch when closer than 1 m.
 
-    State (x1, x2, v1, v2); theta is the force sequence (d = horizon). f = sum over steps of the Q-weighted squared
-    distance to the goal before the step plus u^2, plus the same distance of the last state. Source: Suh et al. 2022.
+    State (x1, x2, v1, v2); theta is the force sequence (d = horizon / hold). f = sum over steps of the Q-weighted squared
+    distance to the goal before the step plus u^2, divided by ``hold``, plus the same distance of the last state. Source:
+    Suh et al. 2022.
     """
 
     name = "pushing"
@@ -39,8 +40,8 @@ class Pushing(EngineTwin, DampedScene, ContactScene):
     restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
-        """Return the same push for every step."""
-        return np.full(self.horizon, self.push)
+        """Return the same push for every control."""
+        return np.full(self.controls, self.push)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Start with the bodies just touching, the first moving at ``speed``."""
@@ -81,8 +82,8 @@ class Pushing(EngineTwin, DampedScene, ContactScene):
             <actuator><motor joint="first"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the distance to the goal before the step, plus effort."""
-        return self.terminal_cost(xp, q, v) + u[0] * u[0]
+        """Return the distance to the goal before the step, plus effort, weighted by the step's share of a control."""
+        return (self.terminal_cost(xp, q, v) + u[0] * u[0]) / self.hold
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         """Weight the squared distance to x = (1, 2), v = (speed, 0) by (0.1, 10, 0.1, 0.1)."""

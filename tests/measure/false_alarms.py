@@ -56,12 +56,12 @@ def run(count, only=None):
             verdicts[found.cause] += 1
             if found.cause in FAULTS:
                 blamed.append((name, seed, found.sentence()))
+                print("blamed:", *blamed[-1], flush=True)
     return verdicts, blamed, seconds
 
 
 if __name__ == "__main__":
     verdicts, blamed, seconds = run(int(sys.argv[1]) if len(sys.argv) > 1 else 100)
     print(f"{sum(verdicts.values())} checks: " + ", ".join(f"{n} {name}" for name, n in verdicts.most_common()))
+    print(f"{len(blamed)} gradients of right programs blamed")
     print(f"seconds of a check: median {np.median(seconds):.3f}, largest {max(seconds):.1f}")
-    for line in blamed:
-        print("blamed:", *line)

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from bench.measure.statistics import Sampling, Summary, Truth, bias_interval, summarise, variance_interval
 
@@ -455,6 +456,35 @@ def test_variance_interval_allows_for_kurtosis() -> None:
     # Normal: 2 * 1.97 * sqrt(2 / 255) = 0.349.
     assert widths["normal"] == pytest.approx(0.349, rel=0.1)
     assert widths["t5"] > 1.25 * widths["normal"]
+
+
+def test_variance_interval_allows_for_skewed_squares() -> None:
+    """Means of 16 lognormal terms; symmetric intervals lie too low for 10% of them."""
+    rng = np.random.default_rng(21)
+    truth, above, below, sets = (math.e - 1.0) * math.e / 16, 0, 0, 400
+    for _ in range(sets):
+        sample = np.exp(rng.standard_normal((16, 16))).mean(axis=1)[:, None]
+        low, high = variance_interval(sample - sample.mean(axis=0))
+        above, below = above + (high < truth), below + (low > truth)
+    # three standard errors of a share of 400 are 3 points
+    assert above / sets < 0.075
+    assert below / sets < 0.05
+
+
+def test_upper_end_of_a_variance_is_that_of_hall() -> None:
+    """Pseudo-values by leaving out, one at a time; T is where Hall's cubic has Student's quantile."""
+    x = np.array([0.1, -0.3, 0.5, 0.2, 4.0, -0.6, 0.0, 0.3])[:, None]
+    repeats = len(x)
+    whole = math.log(x.var(ddof=1))
+    pseudo = np.array([repeats * whole - (repeats - 1) * math.log(np.delete(x, r).var(ddof=1)) for r in range(repeats)])
+    low, high = variance_interval(x - x.mean(axis=0))
+    centre, spread = pseudo.mean(), pseudo.std(ddof=1)
+    g = float(scipy.stats.skew(pseudo, bias=False))
+    quantile = scipy.stats.t.ppf(0.975, repeats - 1) / math.sqrt(repeats)
+    t = (centre - math.log(high)) / spread
+    assert t + g * t**2 / 3 + g**2 * t**3 / 27 + g / (6 * repeats) == pytest.approx(-quantile, rel=1e-9)
+    assert math.log(low) == pytest.approx(centre - quantile * spread, rel=1e-9)
+    assert math.log(high) > centre + 1.5 * quantile * spread
 
 
 @pytest.mark.slow

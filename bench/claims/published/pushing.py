@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.pieces import estimator, plugin_class, problem, spread, terms
+from bench.claims.pieces import estimator, problem, spread, terms
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,6 +102,7 @@ class StiffPush(Claim):
     def measure(self) -> Outcome:
         """Sample the published step, then a step 20 times finer with every control held over 20 steps."""
         values = "velocity_factor=0.998,push=0.1,sigma=0.1"
+        finer = f"velocity_factor={0.998 ** (1 / 20)!r},push=0.1,sigma=0.1,horizon=4000,hold=20,dt=0.00025"
         coarse = {10.0: "46", 100.0: "7e2", 300.0: "4e4", 1000.0: "1e10"}
         fine = {10.0: "44", 100.0: "6e2", 300.0: "1e4", 1000.0: "2e7"}
         figures: list[Figure] = []
@@ -115,7 +115,7 @@ class StiffPush(Claim):
             figures.append(_heavy(f"first order, k = {k:g}", text, v1, e1))
             figures.append(Figure(f"zeroth order, k = {k:g}", "1.3e7", v0, e0, spread=0.15e7))
         for k, text in fine.items():
-            at = problem(held_push(20), f"penalty[stiffness={k!r}]")
+            at = problem(f"pushing[{finer}]", f"penalty[stiffness={k!r}]")
             w = np.random.default_rng(171).standard_normal((200, 1024))
             v1, e1 = spread(terms(at, estimator("fobg"), w), 16)
             series["fine"].append(v1)
@@ -142,32 +142,3 @@ def _heavy(what: str, text: str, measured: float, error: float) -> Figure:
     if error < 0.1 * measured:
         return Figure(what, text, measured, error, spread=0.1 * float(text))
     return Figure(what, text, measured, error, factor=10.0)
-
-
-def held_push(parts: int) -> Any:
-    """Return the pushing scene of 200 controls, each held over ``parts`` steps of 5 ms / parts."""
-    base = plugin_class("scenes", "pushing")
-
-    @dataclass(frozen=True)
-    class HeldPush(base):  # type: ignore[misc, valid-type]
-        """Pushing with a finer step than its controls."""
-
-        name = "held_push"
-        open_loop = False
-
-        def theta0(self) -> np.ndarray:
-            """Return the same push for every control."""
-            return np.full(self.horizon // parts, self.push)
-
-        def planned_controls(self, xp: Any, theta: Any) -> Any:
-            """Repeat every control."""
-            held = xp.stack([theta] * parts, axis=1)
-            return xp.reshape(held, (self.horizon, 1, theta.shape[1]))
-
-        def stage_cost(self, xp: Any, q: Any, v: Any, u: Any) -> Any:
-            """Weight a step's cost by its share of a control."""
-            return super().stage_cost(xp, q, v, u) / parts
-
-    # each control's noise is held with it, so that it is noise on theta
-    values = {"velocity_factor": 0.998 ** (1 / parts), "push": 0.1, "sigma": 0.1, "noise": "parameter"}
-    return HeldPush(horizon=200 * parts, dt=0.005 / parts, **values)

@@ -1,0 +1,73 @@
+"""A plugin file that ends the process that imports it is listed, and ends nothing else."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from bench.model import registry, trial
+
+GOOD = "from bench.model import SampleMean\n"
+FATAL = {
+    "exits": ("import os\nos._exit(0)\n", "ended the process (exit status 0)"),
+    "crashes": ("import ctypes\nctypes.string_at(0)\n", "ended the process by SIGSEGV"),
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder of plugins, and an empty memory of what was imported."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "good.py").write_text(GOOD)
+    return tmp_path / "mine"
+
+
+def fatal(folder, names, patience=60.0):
+    package = registry._package(folder)
+    return trial.fatal(
+        {f"{package}.{name}": (folder / f"{name}.py").read_text() for name in names}, {package: folder}, patience
+    )
+
+
+@pytest.mark.filterwarnings("error")
+def test_listed_with_what_happened_and_the_others_are_listed_too(folder):
+    for name, (text, _) in FATAL.items():
+        (folder / f"{name}.py").write_text(text)
+    (folder / "waits.py").write_text(
+        "import threading, time\nthreading.Thread(target=time.sleep, args=(600,)).start()\n"
+    )
+    command = [sys.executable, "-m", "bench", "list", "estimators", f"plugins={folder}"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)  # waits for no thread
+    assert done.returncode == 0, done.stderr
+    for name, (_, said) in FATAL.items():
+        (line,) = [line for line in done.stdout.splitlines() if line.startswith(f"  {name} ")]
+        assert "UNAVAILABLE" in line
+        assert said in line
+    assert "  fobg " in done.stdout
+
+
+def test_an_import_that_does_not_come_back(folder):
+    (folder / "hangs.py").write_text("import time\nprint('x' * 100000)\nwhile True: time.sleep(1)\n")
+    (folder / "raises.py").write_text("1 / 0\n")
+    found = fatal(folder, ["good", "hangs", "raises"], patience=3.0)
+    assert {name.rpartition(".")[2]: said for name, said in found.items()} == {"hangs": "did not come back within 3 s"}
+
+
+def test_a_file_is_tried_once_until_its_text_changes(folder, monkeypatch):
+    tried = []
+    monkeypatch.setattr(trial, "_import", lambda names, *_: (tried.append(list(names)), (len(names), ""))[1])
+    for text, times in ((GOOD, 1), (GOOD, 1), (f"{GOOD}#", 2)):
+        (folder / "good.py").write_text(text)
+        assert fatal(folder, ["good"]) == {}
+        assert len(tried) == times
+
+
+def test_without_a_place_to_remember_each_command_tries_again(folder, monkeypatch):
+    (folder / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "file"))
+    monkeypatch.setattr(trial, "_import", lambda names, *_: (len(names), ""))
+    assert fatal(folder, ["good"]) == {}
+    assert trial._known() == frozenset()
