@@ -15,6 +15,8 @@ import numpy as np
 
 from bench.errors import UserError
 
+ROUNDED = 1e-14
+"""Size of a number, relative to its array, that is a 0 which rounding has left."""
 MOST = 100_000
 """Numbers of a theta at most: some thousand thetas are held at once."""
 
@@ -90,7 +92,7 @@ class Layout:
         for leaf in self.leaves:
             part = scale[leaf.start : leaf.start + leaf.size]
             typical = float(np.sqrt(np.mean(part[part > 0] ** 2))) if part.any() else 1.0
-            part[part <= 1e-8 * typical] = typical
+            part[part <= ROUNDED * typical] = typical
         return scale
 
     def build(self, vector: Any, convert: Any = None) -> Any:
