@@ -56,6 +56,10 @@ def bad_shape(self, gradient):
     return np.vstack([gradient, gradient])
 
 
+def bad_kind(self, gradient):
+    return gradient * 1j
+
+
 def bad_number(self, gradient):
     gradient = gradient.copy()
     gradient[:, 3] = np.nan
@@ -107,7 +111,7 @@ def refuses(self, gradient):
 
 
 for function in (
-    bad_shape, bad_number, hangs, allocates, shouts, forks, forks_and_returns, forks_and_dies, leaves, refuses
+    bad_shape, bad_kind, bad_number, hangs, allocates, shouts, forks, forks_and_returns, forks_and_dies, leaves, refuses
 ):
     make(function.__name__, function)
 make("crashes", lambda self, gradient: ctypes.string_at(0))
@@ -128,6 +132,7 @@ Hidden = local()
 
 EXPECTED = {
     "bad_shape": ("error", "returned shape"),
+    "bad_kind": ("error", "complex numbers"),
     "bad_number": ("nonfinite", "theta"),
     "hangs": ("timeout", "no result within 5 s"),
     "allocates": ("crashed", "GiB of memory"),

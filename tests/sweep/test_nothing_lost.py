@@ -288,3 +288,17 @@ def test_signals_stop_a_run_in_peace(tmp_path, sent, times):
     assert "Traceback" not in said
     assert "KeyboardInterrupt" not in said
     assert not Store(tmp_path / "custom", COLUMNS).load().empty
+
+
+def test_two_studies_that_start_at_once_in_an_empty_folder_do_not_mix(tmp_path):
+    first, second = (Store(tmp_path / "mine", COLUMNS, study) for study in ("bias_variance", "growth"))
+    for store in (first, second):
+        assert store.load().empty
+    first.prepare()
+    with pytest.raises(UserError, match="a run of study bias_variance has started"):
+        second.prepare()
+    first.append(COLUMNS.blank() | {"key": "1", "study": "bias_variance"})
+    first.compact()
+    assert not (tmp_path / "mine" / "pending").exists()
+    with pytest.raises(UserError, match="holds rows of study bias_variance"):
+        second.prepare()
