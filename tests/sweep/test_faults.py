@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import psutil
 import pytest
-from trees import Tree
+from trees import Tree, hear_signals
 
 from bench.errors import UserError
 from bench.sweep.workers import Limits, Pool
@@ -252,7 +252,13 @@ def start(tree: Tree, *words: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "bench", *words]
     environment = {**os.environ, "PYTHONPATH": str(tree.packages)}
     return subprocess.Popen(
-        command, cwd=tree.root, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+        command,
+        cwd=tree.root,
+        env=environment,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        preexec_fn=hear_signals,
     )
 
 
