@@ -138,12 +138,12 @@ FAULTS = [
     Fault(S, "if error > VAGUE * norm:", "if error > norm:", OF_STATISTICS),
     Fault(S, "math.hypot(float(np.linalg.norm(self.sampling.rows)), self.unseen)", "float(np.linalg.norm(self.sampling.rows))", OF_STATISTICS),
     # noise
-    Fault(N, "zlib.crc32(scene.encode()), repeat]", "0, repeat]", OF_REFERENCE + " tests/studies/test_flat.py"),
-    Fault(N, "zlib.crc32(scene.encode()), repeat]", "zlib.crc32(scene.encode()), 0]", OF_REFERENCE + " tests/studies/test_flat.py"),
-    Fault(N, "SeedSequence([seed, ", "SeedSequence([0, ", OF_REFERENCE + " tests/studies/test_flat.py"),
-    Fault(N, "standard_normal((samples, width)).T", "standard_normal((width, samples))", OF_REFERENCE + " tests/studies/test_flat.py"),
-    Fault(N, "block.setflags(write=False)", "pass", OF_REFERENCE + " tests/studies/test_flat.py"),
-    Fault(N, "min(columns, samples - start)", "columns", OF_REFERENCE + " tests/studies/test_flat.py"),
+    Fault(N, "zlib.crc32(scene.encode()), repeat]", "0, repeat]", "tests/measure/test_noise.py"),
+    Fault(N, "zlib.crc32(scene.encode()), repeat]", "zlib.crc32(scene.encode()), 0]", "tests/measure/test_noise.py"),
+    Fault(N, "SeedSequence([seed, ", "SeedSequence([0, ", "tests/measure/test_noise.py"),
+    Fault(N, "standard_normal((samples, width)).T", "standard_normal((width, samples))", "tests/measure/test_noise.py"),
+    Fault(N, "block.setflags(write=False)", "pass", "tests/measure/test_noise.py"),
+    Fault(N, "min(columns, samples - start)", "columns", "tests/measure/test_noise.py"),
     # timing
     Fault(T, "seconds.append(time.perf_counter() - start - (pause.seconds - paused))", "seconds.append(time.perf_counter() - start)", OF_TIMING),
     Fault(T, "np.percentile(seconds, [25, 50, 75])\n    return results", "(*np.percentile(seconds, [25]), np.mean(seconds), max(seconds))\n    return results", OF_TIMING),
