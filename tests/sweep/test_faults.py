@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import psutil
 import pytest
-from trees import Tree
+from trees import Tree, hear_signals
 
 from bench.errors import UserError
 from bench.sweep.workers import Limits, Pool
@@ -54,6 +54,10 @@ def make(name, fault):
 
 def bad_shape(self, gradient):
     return np.vstack([gradient, gradient])
+
+
+def bad_kind(self, gradient):
+    return gradient * 1j
 
 
 def bad_number(self, gradient):
@@ -107,7 +111,7 @@ def refuses(self, gradient):
 
 
 for function in (
-    bad_shape, bad_number, hangs, allocates, shouts, forks, forks_and_returns, forks_and_dies, leaves, refuses
+    bad_shape, bad_kind, bad_number, hangs, allocates, shouts, forks, forks_and_returns, forks_and_dies, leaves, refuses
 ):
     make(function.__name__, function)
 make("crashes", lambda self, gradient: ctypes.string_at(0))
@@ -128,6 +132,7 @@ Hidden = local()
 
 EXPECTED = {
     "bad_shape": ("error", "returned shape"),
+    "bad_kind": ("error", "complex numbers"),
     "bad_number": ("nonfinite", "theta"),
     "hangs": ("timeout", "no result within 5 s"),
     "allocates": ("crashed", "GiB of memory"),
@@ -247,7 +252,13 @@ def start(tree: Tree, *words: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "bench", *words]
     environment = {**os.environ, "PYTHONPATH": str(tree.packages)}
     return subprocess.Popen(
-        command, cwd=tree.root, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+        command,
+        cwd=tree.root,
+        env=environment,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        preexec_fn=hear_signals,
     )
 
 

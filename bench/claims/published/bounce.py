@@ -87,7 +87,7 @@ class PenaltyPhase(Claim):
                 at = problem(scene, f"penalty[stiffness={k!r}]", backend="jax[mode=forward]")
                 slope = at.grad(theta, np.zeros((3, 256)))[0]
                 errors.append(float(np.sqrt(np.mean((slope + 1) ** 2))))
-                figures.append(Figure(f"k = {k:g}, dt = 1/{parts}", text, errors[-1], spread=0.02 * float(text)))
+                figures.append(Figure(f"k = {k:g}, dt = 1/{parts}", text, errors[-1]))
             series[str(parts)] = errors
         return Outcome(figures, series=series)
 
