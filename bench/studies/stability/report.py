@@ -57,12 +57,14 @@ CAUSES = {
     "step": (ORANGE, "wrong by the step: the same law is right at a far finer one"),
     "law": (SKY, "wrong by the law, however fine the step"),
     "both": (PINK, "wrong by step and law"),
-    "unknown": ("#a39bc8", "wrong, the cause is not resolved"),
+    "unknown": ("#a39bc8", "?: wrong, the cause is not resolved"),
     "": ("#c9b458", "wrong, the cause was not recorded"),
 }
 """Colour and meaning of each cause of a finite but wrong gradient."""
-FILLS = {name: fill for name, (_, fill, _) in VERDICTS.items() if name not in WRONG} | {
-    f"by {cause}": fill for cause, (fill, _) in CAUSES.items()
+FILLS = {
+    "ok": VERDICTS["ok"][1],
+    **{f"by {cause}": fill for cause, (fill, _) in CAUSES.items()},
+    **{name: fill for name, (_, fill, _) in VERDICTS.items() if name not in ("ok", *WRONG)},
 }
 """Colours of cells and bars, by :func:`looks`."""
 LOST = ("diverged", "nonfinite")

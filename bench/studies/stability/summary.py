@@ -18,8 +18,10 @@ from bench.studies.stability.report import DARK, FILLS, Panel, looks, panels, pl
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import write_whole
 
-SHOWN = 0.17
-"""Least share of the cells whose name is written into its bar."""
+SHORT = {"by step": "step", "by law": "law", "by both": "both", "by unknown": "?", "diverged": "D", "nonfinite": "N"}
+"""What is written into a bar, where it has the room."""
+LETTER = 0.055
+"""Share of the cells that is as wide as a letter."""
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
@@ -78,12 +80,13 @@ def figure(maps: Sequence[Panel]) -> Figure:
             for name in names:
                 share = float(shares.get(name, 0.0))
                 panel.barh(height, share, left=left, color=FILLS[name], edgecolor="white", linewidth=0.4)
-                if share >= SHOWN:
+                said = SHORT.get(name, name)
+                if share >= LETTER * (len(said) + 1):
                     colour = "white" if name in DARK else "black"
                     panel.text(
                         left + share / 2,
                         height,
-                        name.removeprefix("by "),
+                        said,
                         ha="center",
                         va="center",
                         fontsize=6.5,
