@@ -55,7 +55,7 @@ class Collision(Claim):
         """Draw the costs."""
         for name in LABELS:
             axes.plot(series["iteration"], series[name], label=LABELS[name])
-        axes.axhline(2.0, color="#404040", linewidth=0.6)
+        axes.axhline(2.0, color="#404040", linewidth=0.6, label="doing nothing")
 
 
 def _slope(at: Problem, theta: np.ndarray, _: int) -> np.ndarray:

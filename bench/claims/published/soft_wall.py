@@ -49,4 +49,4 @@ class SoftWall(Claim):
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw the error against the step."""
         axes.loglog(series["dt"], series["error"], "o-", label="penalty program")
-        axes.axhline(SPEED, color="#404040", linewidth=0.6)
+        axes.axhline(SPEED, color="#404040", linewidth=0.6, label="size of the gradient")

@@ -87,7 +87,7 @@ class Switching(Claim):
         for part, mark, label in ((slice(0, jumps), "o", "jumps"), (slice(jumps, None), "s", "rollouts")):
             axes.loglog(series["best"][part], series["weighted"][part], mark, label=label)
         ends = [0.5 * min(series["best"] + series["weighted"]), 2.0 * max(series["best"] + series["weighted"])]
-        axes.plot(ends, ends, color="#404040", linewidth=0.6)
+        axes.plot(ends, ends, color="#404040", linewidth=0.6, label="the same error")
 
 
 class _Found:
