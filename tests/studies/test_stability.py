@@ -97,7 +97,7 @@ def test_implicit_steps_never_diverge(tmp_path, integrator):
     assert (rows["first_bad_step"].isna()).all()
 
 
-@pytest.mark.parametrize("damping", [0.0, 3.0])
+@pytest.mark.parametrize("damping", [0.0, pytest.param(3.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("integrator", sorted(registry.entries()["integrators"]))
 def test_measured_boundary_is_within_a_cell_of_the_theoretical_one(tmp_path, integrator, damping):
     """For every integrator, those too that grow too slowly to diverge within the rollout."""

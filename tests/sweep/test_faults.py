@@ -175,7 +175,7 @@ def run(request, tree):
     names = [name for fault in EXPECTED for name in (fault, "fobg")]
     words = [
         f"estimators=[{','.join(dict.fromkeys(names))},reinforce]",
-        "sweep.samples=[8,16]",
+        *(["sweep.samples=[8,16]"] if request.param == 1 else []),
         f"name=of{request.param}",
     ]
     done = tree.run(*BASE, *words, *LIMITS, f"workers={request.param}", "results_dir=out")
@@ -188,18 +188,20 @@ def run(request, tree):
 def test_fault_has_its_status_and_reason(run, name):
     status, said = EXPECTED[name]
     rows = run[1][run[1]["estimator"] == name]
-    assert list(rows["status"]) == [status] * 2
+    assert len(rows)
+    assert set(rows["status"]) == {status}
     for reason in rows["reason"].fillna(""):
         assert said in reason
         assert "\n" not in reason
 
 
 def test_sound_cells_are_untouched(tree, run):
+    swept = ["sweep.samples=[8,16]"] if len(run[1]["samples"].unique()) > 1 else []
     done = tree.run(
-        *BASE, "estimators=[fobg,reinforce]", "sweep.samples=[8,16]", "name=sound", "workers=0", "results_dir=out"
+        *BASE, "estimators=[fobg,reinforce]", *swept, f"name=sound{len(swept)}", "workers=0", "results_dir=out"
     )
     assert done.returncode == 0, done.stderr
-    alone = pd.read_csv(tree.root / "out" / "sound" / "bias_variance.csv")
+    alone = pd.read_csv(tree.root / "out" / f"sound{len(swept)}" / "bias_variance.csv")
     among = run[1][run[1]["estimator"].isin(["fobg", "reinforce"])].reset_index(drop=True)
     pd.testing.assert_frame_equal(alone.drop(columns="experiment"), among.drop(columns="experiment"), check_exact=True)
 
