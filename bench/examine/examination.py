@@ -99,9 +99,8 @@ def examine(
 
 
 def _levels(sigma: float | Sequence[float]) -> list[float]:
-    given = [sigma] if np.ndim(sigma) == 0 else list(sigma)  # type: ignore[arg-type]
     try:
-        levels = [float(one) for one in given]
+        levels = [float(one) for one in np.atleast_1d(np.asarray(sigma, dtype=np.float64)).ravel()]
     except (TypeError, ValueError):
         levels = [math.nan]
     if not all(one > 0 and math.isfinite(one) for one in levels):
