@@ -29,7 +29,7 @@ CHILD = "import json, sys; given = json.load(sys.stdin); sys.path[:] = given['pa
 
 
 def fatal(
-    modules: Mapping[str, str], packages: Mapping[str, Path] = MappingProxyType({}), patience: float = PATIENCE
+    modules: Mapping[str, str], packages: Mapping[str, Path] = MappingProxyType({}), patience: float | None = None
 ) -> dict[str, str]:
     """Return what happened to the process that imported a module, for each one that ended it or did not come back.
 
@@ -40,7 +40,7 @@ def fatal(
     waiting = [name for name, text in modules.items() if _digest(name, text) not in known]
     found: dict[str, str] = {}
     while waiting:
-        came, end = _import(waiting, packages, patience)
+        came, end = _import(waiting, packages, PATIENCE if patience is None else patience)
         passed = waiting[: came - 1] if end else waiting
         if end and not came:
             return found  # the process could not start: nothing can be told, and the import says why

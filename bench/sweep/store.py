@@ -44,8 +44,10 @@ class Store:
         self._columns = columns
         self._study = study
         self._last: int | None = None
+        self._seen: dict[Path, tuple[int, int]] = {}
         self._table = directory / "rows.parquet"
         self._pending = directory / "pending"
+        self._claim = self._pending / ".study"
 
     def prepare(self) -> None:
         """Make the directory, and make sure that it can be written."""
@@ -56,6 +58,45 @@ class Store:
             probe.unlink()
         except OSError as error:
             raise StorageError(f"results directory '{self.directory}' cannot be written: {error.strerror}") from None
+        if self._study:
+            self._claim_it()
+
+    def _claim_it(self) -> None:
+        """Have the directory belong to this study before it has rows; raises :class:`UserError` if another has it.
+
+        The claim is made at once, like a file that is linked into place, and goes when there are rows, which say the same.
+        """
+        part = temporary(self._pending / "study")
+        try:
+            part.write_text(self._study)
+            _link(part, self._claim)
+        except FileExistsError:
+            with suppress(OSError):  # whoever removes it has stored rows
+                self._refuse({self._claim.read_text()})
+        except OSError as error:
+            raise StorageError(f"'{self._claim}' cannot be made: {error.strerror}") from None
+        finally:
+            part.unlink(missing_ok=True)
+        if self._files() != self._seen:
+            try:
+                self.load()  # another run came and went since they were read
+            except UserError:
+                self._unclaim()
+                raise
+
+    def _unclaim(self) -> None:
+        with suppress(OSError):
+            if self._claim.read_text() == self._study:
+                self._claim.unlink()
+
+    def _refuse(self, studies: Iterable[str]) -> None:
+        """Raise :class:`UserError` if one of these is another study."""
+        others = sorted(set(studies) - {"", self._study}) if self._study else []
+        if others:
+            raise UserError(
+                f"'{self.directory}' holds rows of study {', '.join(map(printable, others))}, and this is study {self._study}: "
+                "choose another folder with name=..."
+            )
 
     def append(self, *rows: dict[str, Any]) -> None:
         """Store finished cells: when this returns, they outlast a power cut."""
@@ -100,6 +141,7 @@ class Store:
                 continue
             # a file folded while others were read may have been missed in both places
             if files.items() <= self._files().items():
+                self._seen = dict(files)
                 return self._union(frames), files
         raise StorageError(f"'{self.directory}' changes faster than it can be read: too many runs write to it")
 
@@ -110,12 +152,7 @@ class Store:
             self._last = self._last or 0
             return pd.DataFrame(columns=self._columns.stored)
         table = pd.concat(frames, ignore_index=True)
-        others = sorted(set(table["study"]) - {"", self._study}) if self._study else []
-        if others:
-            raise UserError(
-                f"'{self.directory}' holds rows of study {', '.join(map(printable, others))}, and this is study {self._study}: "
-                "choose another folder with name=..."
-            )
+        self._refuse(table["study"])
         count = table["sequence"].where(table["sequence"].between(0, LARGEST), 0.0)
         self._last = max(self._last or 0, int(count.max()))
         # rows of older versions have no count: among them the clock decides, and any counted row is newer
@@ -174,6 +211,8 @@ class Store:
     def _tidy(self) -> None:
         """Remove half-written files of killed runs, and the directory of small files when it is empty."""
         tidy(self._pending)
+        if self._table.exists():
+            self._unclaim()
         with suppress(OSError):
             self._pending.rmdir()
 
