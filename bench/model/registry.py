@@ -13,6 +13,7 @@ import importlib
 import importlib.machinery
 import importlib.util
 import inspect
+import os
 import pkgutil
 import re
 import sys
@@ -94,8 +95,10 @@ def entries() -> Table:
     stamps = {module: trial.stamp(module) for _, module in modules if not module.startswith(CORE)}
     stamps |= {point.module: point.dist.version if point.dist else "" for point in points}
     fatal = trial.fatal(stamps, {_package(path): path for path in _folders})
+    own = os.getpid()
     for kind, module in modules:
         _load_module(table, kind, module, fatal.get(module, ""))
+        trial.end_copies(own)
     for point in points:
         try:
             if point.module in fatal:

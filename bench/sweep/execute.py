@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 
 from bench.errors import StorageError
 from bench.measure import timing
+from bench.model import trial
 from bench.sweep import progress, runner
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import tidy
@@ -42,11 +44,12 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     Raises :class:`runner.Stopped` after a failed cell where the experiment says so, and KeyboardInterrupt when
     interrupted; every cell finished by then is stored.
     """
-    started = time.time()
+    started, own = time.time(), os.getpid()
     # asked now, before the run itself loads the machine
     timing.load_at_start()
     store = store_of(experiment)
     planned = plan(experiment, store)
+    trial.end_copies(own)
     progress.print_versions(planned, experiment.execution.versions)
     progress.print_machines(planned, experiment.execution.launcher)
     store.prepare()

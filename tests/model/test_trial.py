@@ -53,7 +53,7 @@ def test_an_import_that_does_not_come_back(folder):
     (folder / "hangs.py").write_text("import time\nprint('x' * 100000)\nwhile True: time.sleep(1)\n")
     (folder / "raises.py").write_text("1 / 0\n")
     found = fatal(folder, ["good", "hangs", "raises"], patience=3.0)
-    assert {name.rpartition(".")[2]: said for name, said in found.items()} == {"hangs": "did not come back within 3 s"}
+    assert {name.rpartition(".")[2]: said for name, said in found.items()} == {"hangs": "did not come back within 3 s when it was imported"}
 
 
 def test_a_file_is_tried_once_until_its_text_changes(folder, monkeypatch):
