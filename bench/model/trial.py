@@ -18,7 +18,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
@@ -79,7 +79,7 @@ def child(given: Mapping[str, Any]) -> None:
             os.write(pipe, b"," if os.getpid() == own else b"")
             _ask(module)
         end_copies(own)
-    end_children()
+        end_children()
     os.write(pipe, b"!")
     os._exit(0)  # threads that a plugin has left running keep nothing waiting
 
@@ -121,6 +121,25 @@ def end_copies(own: int) -> None:
     """End this process if a plugin has forked it from the one of that number, whose work it must not do again."""
     if os.getpid() != own:
         os._exit(0)
+
+
+@contextlib.contextmanager
+def guarded() -> Iterator[None]:
+    """Keep the process what it is while a plugin is at work: in its working folder, and no forked copy of it goes on."""
+    own, here = os.getpid(), _folder()
+    try:
+        yield
+    finally:
+        end_copies(own)
+        if here and _folder() != here:
+            os.chdir(here)
+
+
+def _folder() -> str:
+    try:
+        return os.getcwd()
+    except FileNotFoundError:  # it has been removed
+        return ""
 
 
 def end_children() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -44,12 +43,12 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     Raises :class:`runner.Stopped` after a failed cell where the experiment says so, and KeyboardInterrupt when
     interrupted; every cell finished by then is stored.
     """
-    started, own = time.time(), os.getpid()
+    started = time.time()
     # asked now, before the run itself loads the machine
     timing.load_at_start()
     store = store_of(experiment)
-    planned = plan(experiment, store)
-    trial.end_copies(own)
+    with trial.guarded():
+        planned = plan(experiment, store)
     progress.print_versions(planned, experiment.execution.versions)
     progress.print_machines(planned, experiment.execution.launcher)
     store.prepare()

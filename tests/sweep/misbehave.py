@@ -61,7 +61,9 @@ HARMLESS = {
     "catches_signals": "signal.signal(signal.SIGTERM, signal.SIG_IGN) if threading.current_thread() is threading.main_thread() else None",
 }
 """Bad manners after which the numbers may be right: ``ok`` is a row of its own."""
-WRITES = {"writes_to_descriptors": "[os.write(d, b'garbage' * 99) for d in range(3, 64) if os.path.exists(f'/dev/fd/{d}')]"}
+WRITES = {
+    "writes_to_descriptors": "[os.write(d, b'garbage' * 99) for d in range(3, 64) if os.path.exists(f'/dev/fd/{d}')]"
+}
 """Breaks the worker's messages; at import and when a run is planned it may do no harm."""
 LIES = {
     "lies_in_shape": "np.vstack([value, value])",
@@ -97,8 +99,10 @@ KINDS = {
     "integrators": ("semi_implicit_euler", "SemiImplicitEuler", "scenes=[mass_spring] backends=[numpy] estimators=[fobg]", "integrators=[semi_implicit_euler{}]", ("step",), ("transition",)),
 }  # fmt: skip
 """By kind: a sound plugin and its class, the rest of a sweep, its own axis, calls of a worker, calls of the plan."""
-WORDS = ["samples=8", "repeats=3", "timing=false", "workers=2", "timeout=4", "memory=700m", "reference.samples=4096", "horizon=5", "formats=[png]", "--quiet"]  # fmt: skip
-START = "import runpy; from bench.model import trial; trial.PATIENCE = 5.0; runpy.run_module('bench', run_name='__main__')"
+WORDS = ["samples=8", "repeats=3", "timing=false", "workers=2", "timeout=4", "memory=700m", "reference.samples=4096", "formats=[png]", "--quiet"]  # fmt: skip
+START = (
+    "import runpy; from bench.model import trial; trial.PATIENCE = 5.0; runpy.run_module('bench', run_name='__main__')"
+)
 SAID = re.compile(r"Traceback|[\x00-\x08\x0b-\x1f]")
 
 
@@ -127,7 +131,12 @@ class Case:
         act = (ENDS | RAISES | HARMLESS | WRITES).get(self.fault, "pass")
         lines += ["def fault():", f"    {act}", "def lie(value):", f"    return {LIES.get(self.fault, 'value')}"]
         lines += ["fault()"] if self.place == "import" else []
-        lines += ["@dataclass(frozen=True)", f"class Bad({base}):", '    """Misbehaves."""', f"    name = {self.name!r}"]
+        lines += [
+            "@dataclass(frozen=True)",
+            f"class Bad({base}):",
+            '    """Misbehaves."""',
+            f"    name = {self.name!r}",
+        ]
         if self.place == "declared":
             lines.append(f"    {DECLARES[self.fault].format(taken=module)}")
         elif self.place != "import":
@@ -143,7 +152,12 @@ def bank() -> list[Case]:
     for kind, (*_, work, planned) in KINDS.items():
         loud = ENDS | RAISES | HARMLESS | WRITES
         cases += [Case(kind, "declared", fault) for fault in DECLARES]
-        cases += [Case(kind, place, fault) for place in ("import", "construction", *work, *planned) for fault in loud]
+        cases += [
+            Case(kind, place, fault)
+            for place in ("import", "construction", *work, *planned)
+            for fault in loud
+            if place in work or fault != "shouts"  # outside of a worker it has the command's own terminal
+        ]
         cases += [Case(kind, place, fault) for place in (*work, *planned) for fault in LIES]
     return cases
 
@@ -175,6 +189,11 @@ class Bank:
         for case in self.cases:
             (self.root / "mine" / f"{case.name}.py").write_text(case.text())
 
+    def find(self, what: str) -> None:
+        """Keep a finding, and print it."""
+        self.findings.append(what)
+        print(what, flush=True)
+
     def bench(self, *words: str) -> subprocess.CompletedProcess[str]:
         """Run a command on the folder."""
         environment = {
@@ -188,24 +207,24 @@ class Bank:
             )  # fmt: skip
         done.stdout, done.stderr = ((self.root / name).read_text(errors="replace") for name in ("out.txt", "err.txt"))
         if SAID.search(done.stderr) or SAID.search(done.stdout):
-            self.findings.append(f"{words}: {SAID.findall(done.stderr + done.stdout)[:3]}: {done.stderr[-1500:]!r}")
+            self.find(f"{words}: {SAID.findall(done.stderr + done.stdout)[:3]}: {done.stderr[-1500:]!r}")
         return done
 
     def listed(self) -> dict[str, str]:
         """Look at the listing; returns the line of each case that cannot be used."""
         done = self.bench("list")
         if done.returncode or "fobg" not in done.stdout:
-            self.findings.append(f"list ended with {done.returncode}: {done.stderr[-500:]!r}")
+            self.find(f"list ended with {done.returncode}: {done.stderr[-500:]!r}")
         lines = done.stdout.splitlines()
         found = {}
         for case in self.cases:
             own = [line for line in lines if case.name in line]
             if not own:
-                self.findings.append(f"{case.name} is not listed")
+                self.find(f"{case.name} is not listed")
             elif any("UNAVAILABLE" in line for line in own):
                 found[case.name] = own[0]
             elif case.harmful and case.place in ("import", "declared"):
-                self.findings.append(f"{case.name} is listed as sound: {own[0].strip()}")
+                self.find(f"{case.name} is listed as sound: {own[0].strip()}")
         return found
 
     def run(self, kind: str, cases: list[Case]) -> None:
@@ -215,32 +234,32 @@ class Bank:
         alone = self.bench(*words, axis.format(""), f"name={kind}-alone")
         truth = self.rows(f"{kind}-alone")
         if alone.returncode or truth.empty:
-            self.findings.append(f"the sound {kind} ended with {alone.returncode}: {alone.stderr[-500:]!r}")
+            self.find(f"the sound {kind} ended with {alone.returncode}: {alone.stderr[-500:]!r}")
             return
         names = "".join(f",{case.name}" for case in cases)
         done = self.bench(*words, axis.format(names), f"name={kind}")
         rows = self.rows(kind)
         if done.returncode not in (0, 1):
-            self.findings.append(f"run of {kind} ended with {done.returncode}: {done.stderr[-700:]!r}")
+            self.find(f"run of {kind} ended with {done.returncode}: {done.stderr[-700:]!r}")
             if len(cases) > 1:  # which one was it?
                 for case in cases:
                     one = self.bench(*words, axis.format(f",{case.name}"), f"name={case.name}")
                     if one.returncode not in (0, 1):
-                        self.findings.append(f"  {case.name}: {one.returncode}, {one.stderr[-300:]!r}")
+                        self.find(f"  {case.name}: {one.returncode}, {one.stderr[-300:]!r}")
             return
         for case in cases:
             own = rows[rows["parameters"].str.contains(f'"{case.name}"')]
             if own.empty:
-                self.findings.append(f"{case.name} has no row")
+                self.find(f"{case.name} has no row")
             for status, reason in zip(own["status"], own["reason"], strict=True):
                 if (case.harmful and case.place in KINDS[kind][4] and status == "ok") or SAID.search(reason):
-                    self.findings.append(f"{case.name} has a row {status}: {reason[:200]}")
+                    self.find(f"{case.name} has a row {status}: {reason[:200]}")
                 if status != "ok" and not reason:
-                    self.findings.append(f"{case.name} has a row {status} without a reason")
+                    self.find(f"{case.name} has a row {status} without a reason")
         among = rows[rows["key"].isin(truth["key"])].sort_values("key").reset_index(drop=True)
         for column in set(truth) - {"stored_at", "sequence", "wall_s", "experiment"}:
             if not truth[column].equals(among[column]):
-                self.findings.append(f"the sound rows of {kind} have another {column}")
+                self.find(f"the sound rows of {kind} have another {column}")
 
     def rows(self, name: str) -> pd.DataFrame:
         """Return stored rows."""
@@ -276,9 +295,8 @@ def main(count: int, seed: int = 0) -> int:
             if not made.left():
                 break
             time.sleep(0.05)
-        made.findings += [f"left behind: {line}" for line in made.left()]
-        for finding in made.findings:
-            print(finding)
+        for line in made.left():
+            made.find(f"left behind: {line}")
         print(f"{len(made.cases)} plugins of {len(bank())}: {len(unavailable)} listed as unavailable, rows {statuses}, "
               f"{len(made.findings)} findings")  # fmt: skip
         return 1 if made.findings else 0
