@@ -73,9 +73,11 @@ def noise_is_where_declared(scene: Scene) -> str:
     program = programs(scene)[0]
     if not program.noise_on_theta:
         raise Skipped("its noise is on the actions of a policy")
-    require(program.n_noise == program.dim, f"{program.n_noise} normal numbers for {program.dim} components of theta")
+    wanted = program.dim + program.exogenous
+    require(program.n_noise == wanted, f"{program.n_noise} normal numbers for {program.dim} components of theta")
     (theta, w), problem = samples(program), able_backend(program).compile(program)
-    off = distance(problem.value(theta + scene.sigma * w, 0 * w), problem.value(theta, w))
+    shift = scene.sigma * w[: program.dim]
+    off = distance(problem.value(theta + shift, problem.centred(w)), problem.value(theta, w))
     require(off < SAME, f"noise w and a step of sigma w in theta differ by {off:.1e}: theta is not the controls")
     return f"on theta, to {off:.0e}"
 

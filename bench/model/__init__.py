@@ -10,7 +10,7 @@ so never branch on it in Python; every other type is static.
 """
 
 from bench.errors import Unsupported
-from bench.model.adjoint import Slopes, slopes
+from bench.model.adjoint import Slopes, by_actions, by_theta, slopes
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
 from bench.model.blocks import cores
@@ -21,6 +21,7 @@ from bench.model.estimator import (
     Auxiliaries,
     Estimator,
     SampleMean,
+    Smoothing,
     columns,
     first_order,
     halves,
@@ -48,6 +49,7 @@ from bench.model.program import (
 from bench.model.scene import (
     ContactScene,
     DampedScene,
+    DisturbedScene,
     EngineScene,
     EngineTwin,
     FrictionScene,
@@ -73,6 +75,7 @@ __all__ = [
     "DampedScene",
     "Decision",
     "Descent",
+    "DisturbedScene",
     "Dynamics",
     "EngineScene",
     "EngineTwin",
@@ -102,11 +105,14 @@ __all__ = [
     "SampleMean",
     "Scene",
     "Slopes",
+    "Smoothing",
     "State",
     "Trajectory",
     "Unsupported",
     "Usage",
     "adjoint_gradient",
+    "by_actions",
+    "by_theta",
     "columns",
     "compose",
     "cores",

@@ -85,8 +85,12 @@ def gradient(problem: Problem, found: Slopes, cut: Cut | None = None) -> np.ndar
 
     Without a cut it is the derivative of the cost. The adjoint of the state at step t is that of all costs from t on.
     """
-    program = rollout(problem.program)
-    scene, horizon = program.scene, len(found.a)
+    return by_theta(problem, found, *by_actions(found, cut))
+
+
+def by_actions(found: Slopes, cut: Cut | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cost's derivatives by each step's action ``(T, m, B)``, later feedback included, and by the first state."""
+    horizon = len(found.a)
     adjoint, by_control = found.cost_x[-1], np.empty_like(found.cost_u)
     for t in range(horizon - 1, -1, -1):
         by_control[t] = found.cost_u[t] + np.einsum("nmb,nb->mb", found.b[t], adjoint)
@@ -95,6 +99,13 @@ def gradient(problem: Problem, found: Slopes, cut: Cut | None = None) -> np.ndar
             adjoint = adjoint + np.einsum("mnb,mb->nb", found.feedback_x[t], by_control[t])
         if cut is not None and t > 0:
             adjoint = cut(t, found.states[t], adjoint)
+    return by_control, adjoint
+
+
+def by_theta(problem: Problem, found: Slopes, by_control: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
+    """Return ``(d, B)``: derivatives by actions ``(T, m, B)`` and by the first state ``(n, B)``, chained to theta."""
+    program = rollout(problem.program)
+    scene, horizon = program.scene, len(found.a)
     if scene.open_loop:
         each = by_control.reshape(scene.controls, -1, *by_control.shape[1:])
         result = each.sum(axis=1).reshape(program.dim, -1)

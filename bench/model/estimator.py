@@ -18,6 +18,14 @@ Auxiliaries = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
+class Smoothing:
+    """Another smoothing of the cost than J_sigma's: ``gaussian`` of standard deviation, or ``ball`` of radius, ``radius``."""
+
+    shape: str
+    radius: float
+
+
+@dataclass(frozen=True)
 class Estimator(Plugin):
     """Turns sampled costs and gradients into independent estimates of grad J."""
 
@@ -57,6 +65,10 @@ class Estimator(Plugin):
         """Whether its expectation is grad J_sigma of the program, by what it declares."""
         derivative = program.continuous and not program.surrogate
         return self.unbiased and self.target == "smoothed" and (derivative or self.across_jumps)
+
+    def smoothing(self, program: Program) -> Smoothing | None:
+        """Return the smoothing whose gradient its rows are measured against; None for J_sigma."""
+        return None
 
     def refuses(self, program: Program) -> str | None:
         """Return why this estimator cannot be used on the program, or None."""

@@ -135,7 +135,7 @@ class Problem(ABC):
     def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return per-sample scores d log p(actions | theta)/dtheta, ``(d, B)``; w / sigma where noise is on theta."""
         if self.noise_on_theta:
-            return w / self.sigma
+            return w[: self.dim] / self.sigma
         if self.program.explicit and type(self)._explicit is Problem._explicit:
             raise Unsupported(NO_EXPLICIT.format(type(self).__name__))
         return self._blocks(self._score, theta, w, (self.dim,))
@@ -160,6 +160,13 @@ class Problem(ABC):
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """Return states, controls and step Jacobians along each rollout; raises :class:`Unsupported` without steps."""
         raise Unsupported(f"{type(self).__name__} gives no step Jacobians: use a backend with jacobians()")
+
+    def centred(self, w: np.ndarray) -> np.ndarray:
+        """Return noise ``(n_w, B)`` with 0 on theta, or on the actions, and the scene's own numbers as they are."""
+        still = np.zeros_like(w)
+        if own := self.program.exogenous:
+            still[-own:] = w[-own:]
+        return still
 
     def directions(self, w: np.ndarray) -> np.ndarray:
         """Return standard normal directions in theta space made from ``w``, ``(d, B)``.

@@ -19,7 +19,7 @@ from bench.model.dynamics import Dynamics
 from bench.model.integrator import Integrator
 from bench.model.ops import Array, Ops, State
 from bench.model.parameters import Plugin, traced
-from bench.model.scene import EngineScene, FunctionScene, MechanicalScene, Scene
+from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, MechanicalScene, Scene
 
 SURROGATE = "the gradient is a surrogate, not the derivative of the program"
 """What rows, tables and charts say where :attr:`Program.surrogate` holds."""
@@ -151,9 +151,14 @@ class Program(ABC):
         return False
 
     @property
+    def exogenous(self) -> int:
+        """Count of normal numbers of the scene's own, which follow the d numbers on theta."""
+        return 0
+
+    @property
     def n_noise(self) -> int:
         """n_w, the count of normal numbers in one rollout."""
-        return self.dim
+        return self.dim + self.exogenous
 
     @cached_property
     def structure(self) -> tuple[Any, ...]:
@@ -280,16 +285,23 @@ class FunctionProgram(Program):
     scene: FunctionScene
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
-        """Return the scene's cost at theta + sigma w."""
-        if self._named:
-            bound, own = self._own_theta(ops.xp, theta, w)
-            assert isinstance(bound.scene, FunctionScene)
-            return bound.scene.cost(ops.xp, own)
-        return self.scene.cost(ops.xp, theta + self.scene.sigma * w)
+        """Return the scene's cost at theta + sigma w, or sigma times the first d numbers where it has its own."""
+        if self.exogenous:
+            w, own_noise = w[: self.dim], w[self.dim :]
+        bound, own = self._own_theta(ops.xp, theta, w) if self._named else (self, theta + self.scene.sigma * w)
+        if isinstance(bound.scene, DisturbedScene):
+            return bound.scene.disturbed_cost(ops.xp, own, own_noise)
+        assert isinstance(bound.scene, FunctionScene)
+        return bound.scene.cost(ops.xp, own)
+
+    @property
+    def exogenous(self) -> int:
+        """Count of normal numbers of the scene's own."""
+        return self.scene.exogenous if isinstance(self.scene, DisturbedScene) else 0
 
     def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
-        """Return w . theta_scored / sigma."""
-        return ops.xp.sum(w * theta_scored, axis=0) / self.scene.sigma
+        """Return w . theta_scored / sigma, with the noise on theta."""
+        return ops.xp.sum((w[: self.dim] if self.exogenous else w) * theta_scored, axis=0) / self.scene.sigma
 
 
 class CallableProgram(Program):
@@ -298,9 +310,9 @@ class CallableProgram(Program):
     scene: CallableScene
 
     @property
-    def n_noise(self) -> int:
-        """n_w: one number per coordinate of theta, then those of the simulator's own."""
-        return self.dim + self.scene.simulator().noise
+    def exogenous(self) -> int:
+        """Count of normal numbers of the simulator's own."""
+        return self.scene.simulator().noise
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
         """Raise :class:`Unsupported`: the simulator is called in NumPy columns, by a backend made for it."""

@@ -66,6 +66,26 @@ class FunctionScene(Scene):
 
 
 @dataclass(frozen=True)
+class DisturbedScene(FunctionScene):
+    """A role: a plain function with noise of its own, beside the noise on theta.
+
+    ``J_sigma(theta) = E f(theta + sigma u, e)`` over both: d normal numbers u, then ``exogenous`` of the scene's own, e.
+    No estimator smoothes over e by shifting it, and no score takes it.
+    """
+
+    exogenous: ClassVar[int]
+    """How many normal numbers of its own a sample has."""
+
+    @abstractmethod
+    def disturbed_cost(self, xp: Any, x: Array, e: Array) -> Array:
+        """Return f at ``x (d, B)`` under the scene's own noise ``e (exogenous, B)``: ``(B,)``."""
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        """Return f without noise of its own."""
+        return self.disturbed_cost(xp, x, xp.zeros((self.exogenous, x.shape[1]), dtype=x.dtype))
+
+
+@dataclass(frozen=True)
 class MechanicalScene(Scene):
     """A scene with dynamics ``q' = v``, ``v' = acceleration(q, v, u) + contact``, ``horizon`` steps of ``dt``.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from bench.errors import UserError, printable
-from bench.report import web
+from bench.report import averages, web
 from bench.report.views import latest
 from bench.sweep.execute import Finished, store_of
 from bench.sweep.experiment import Experiment
@@ -37,7 +37,8 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write the study's tables and charts, and the page; raises :class:`UserError` where there are no rows."""
     if rows.empty:
         raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
-    return [*study_of(experiment).write(experiment, rows), web.write(experiment, rows)]
+    written = study_of(experiment).write(experiment, rows)
+    return [*written, *averages.write(experiment, rows), web.write(experiment, rows)]
 
 
 def shown(rows: pd.DataFrame) -> pd.DataFrame:

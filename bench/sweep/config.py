@@ -14,7 +14,7 @@ from bench.model import Decision, registry
 from bench.model.identity import parse_identity
 from bench.model.parameters import build, coerce, remember, singular
 from bench.sweep.experiment import Budget, Choice, Execution, Experiment, Layout
-from bench.sweep.grid import refuse_too_many, swept
+from bench.sweep.grid import refuse_too_many, short, swept
 from bench.sweep.study import Study
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -210,6 +210,7 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         compile_time=coerce(bool, config["compile_time"], "compile_time"),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _listed_or_none(config["formats"])),
         table=_layout(_table(config, "table"), _table(config, "sweep")),
+        average=_average(config["average"], _table(config, "sweep")),
         reference=_budget(_table(config, "reference")),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
@@ -260,6 +261,18 @@ def _layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> Layout:
     if "estimator" not in rows:
         raise UserError(f"table.rows={list(rows)} must hold estimator; [estimator,backend] gives each backend a row")
     return Layout(columns, rows)
+
+
+def _average(names: Any, sweep: Mapping[str, Any]) -> tuple[str, ...]:
+    known = {part for name in swept(sweep) for part in (name, short(name), name.partition(".")[0])}
+    for name in _listed_or_none(names):
+        if name not in known:
+            raise (
+                unknown("axis for average:", str(name), known)
+                if known
+                else UserError(f"average={name}: nothing is swept, so there is nothing to average over")
+            )
+    return tuple(map(str, _listed_or_none(names)))
 
 
 def _decision(config: Mapping[str, Any]) -> Decision:

@@ -97,6 +97,8 @@ class Experiment:
     formats: tuple[str, ...] = ("png",)
     """File formats of the charts."""
     table: Layout = Layout()
+    average: tuple[str, ...] = ()
+    """Swept axes over which averages are written; it decides no number."""
     reference: Budget = Budget()
     compile_cache: Path | None = None
     """Folder of compiled programs kept between runs."""
@@ -129,6 +131,7 @@ class Experiment:
             "theta0": None if self.decision.at is None else list(self.decision.at),
             **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks", "compile_time")},
             "formats": list(self.formats),
+            "average": list(self.average),
             "table": dataclasses.asdict(self.table),
             "reference": dataclasses.asdict(self.reference),
             "results_dir": str(self.results_dir),

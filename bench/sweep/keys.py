@@ -25,7 +25,7 @@ CORE = {
         "program",
         "scene",
     ),
-    measure: ("batches", "jumps", "noise", "quadrature", "reference", "statistics"),
+    measure: ("batches", "jumps", "noise", "quadrature", "reference", "smoothed", "statistics"),
 }
 """Modules that decide numbers in every study."""
 BOOKKEEPING = ("bench.errors", "bench.model", "bench.sweep", "bench.report")

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 from bench.errors import Unsupported
-from bench.model import Backend, Problem, Program, registry
+from bench.model import Backend, Estimator, Problem, Program, Smoothing, registry
 from bench.model.parameters import build
 from bench.sweep.cell import Cell
 from bench.sweep.keys import fingerprint, hashed
@@ -32,7 +32,15 @@ def reference_key(cell: Cell) -> str:
             f"study {cell.study.name} computes no reference: add a column `reference_method` to its columns to get one"
         )
     budget = [cell.budget.samples, cell.budget.tolerance]
-    return hashed(cell.program_key, budget, fingerprint(next(reference_backends(cell))))
+    asked = smoothing_of(cell)
+    other = [] if asked is None else [[asked.shape, asked.radius]]
+    return hashed(cell.program_key, budget, fingerprint(next(reference_backends(cell))), *other)
+
+
+def smoothing_of(cell: Cell) -> Smoothing | None:
+    """Return the smoothing that the cell's estimator is measured against; None for J_sigma."""
+    estimator = cell.parts.get("estimator")
+    return estimator.smoothing(cell.program()) if isinstance(estimator, Estimator) else None
 
 
 def ranked_backends(cell: Cell) -> list[Backend]:

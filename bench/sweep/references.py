@@ -9,14 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.measure import reference
+from bench.measure import reference, smoothed
 from bench.measure.reference import Reference
+from bench.model import Backend
 from bench.sweep.cell import Cell
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import make_directory, write_whole
 from bench.sweep.keys import fingerprint
 from bench.sweep.problems import Problems
-from bench.sweep.referees import ranked_backends, reference_backends, reference_key
+from bench.sweep.referees import ranked_backends, reference_backends, reference_key, smoothing_of
 
 
 class References:
@@ -52,8 +53,7 @@ class References:
         budget = self._budget.samples, self._budget.tolerance
         for backend in {fingerprint(b): b for b in reference_backends(cell)}.values():
             try:
-                problem = self._problems.of(backend, cell)
-                result = reference.certify(problem, backend.provides, *budget, self._stood_for(cell))
+                result = self._of_backend(backend, cell, *budget)
             except Exception as error:
                 failed.append((backend.name, error))
                 continue
@@ -63,6 +63,19 @@ class References:
             note = f"the reference is from {backend.name}, after a failure of {said}"
             return replace(result, note="; ".join(part for part in (note, result.note) if part))
         raise failed[0][1]
+
+    def _of_backend(self, backend: Backend, cell: Cell, samples: int, tolerance: float) -> Reference:
+        """Compute the reference on one backend: of J_sigma, or of the smoothing that the estimator asks for."""
+        asked = smoothing_of(cell)
+        if asked is None:
+            problem = self._problems.of(backend, cell)
+            return reference.certify(problem, backend.provides, samples, tolerance, self._stood_for(cell))
+        if asked.shape == "ball":
+            problem = self._problems.of(backend, cell)
+            return smoothed.over_ball(problem, backend.provides, asked.radius, samples, tolerance)
+        wider = backend.compile(smoothed.widened(cell.program(), asked.radius))
+        found = reference.certify(wider, backend.provides, samples, tolerance)
+        return replace(found, method=f"gaussian[radius={asked.radius:g}],{found.method}")
 
     def _path(self, cell: Cell) -> Path:
         return self._directory / f"{reference_key(cell)}.parquet"

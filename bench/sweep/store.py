@@ -72,7 +72,12 @@ class Store:
             _link(part, self._claim)
         except FileExistsError:
             with suppress(OSError):  # whoever removes it has stored rows
-                self._refuse({self._claim.read_text()})
+                claimed = self._claim.read_text()
+                if claimed not in ("", self._study):
+                    raise UserError(
+                        f"a run of study {printable(claimed)} has started in '{self.directory}', and this is study {self._study}: "
+                        "choose another folder with name=..., or remove that one"
+                    ) from None
         except OSError as error:
             raise StorageError(f"'{self._claim}' cannot be made: {error.strerror}") from None
         finally:

@@ -38,7 +38,7 @@ class Guided(Estimator):
         inside = np.einsum("rkd,rke,rne->rnd", basis, basis, w)
         s = problem.sigma
         shift = s * columns(inside + np.sqrt(self.share) * (w - inside))
-        still = np.zeros((noise.shape[2], shift.shape[1]))
+        still = problem.centred(columns(fresh))
         change = problem.displaced(shift, theta, still) - problem.displaced(-shift, theta, still)
         return per_repeat(change * shift / (2.0 * s * s), fresh).mean(axis=1)
 

@@ -38,7 +38,7 @@ class Orthogonal(Estimator):
         v = np.concatenate([_rotated(normal[:, i : i + d]) for i in range(0, noise.shape[1], d)], axis=1)
         lengths = np.linalg.norm(normal, axis=2, keepdims=True) if self.lengths == "drawn" else np.sqrt(d)
         shift = s * columns(lengths * v)
-        still = np.zeros((noise.shape[2], shift.shape[1]))
+        still = problem.centred(columns(noise))
         change = problem.displaced(shift, theta, still) - problem.displaced(-shift, theta, still)
         return per_repeat(change * shift / (2.0 * s * s), noise).mean(axis=1)
 

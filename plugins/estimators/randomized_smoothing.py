@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Problem, Program, SampleMean, param
+from bench.model import Problem, Program, SampleMean, Smoothing, param
 
 
 @dataclass(frozen=True)
@@ -13,7 +13,7 @@ class RandomizedSmoothing(SampleMean):
 
     ``variant``: ``antithetic`` (2 rollouts per sample) or ``forward`` (1 per sample, and one for the centre). The
     radius s is sigma by default; noise is on theta, never on actions: under a feedback policy with action noise, or
-    with another radius, the target is not J_sigma. Requires only costs (Nesterov, Spokoiny 2017).
+    with another radius, the target is not J_sigma (``reference=own`` measures against its own, where noise is on theta). Requires only costs (Nesterov, Spokoiny 2017).
     """
 
     name = "randomized_smoothing"
@@ -23,21 +23,35 @@ class RandomizedSmoothing(SampleMean):
     radius: float | None = param(
         None, "s, standard deviation of the smoothing, in units of theta; null: sigma", positive=True
     )
+    reference: str = param(
+        "sigma",
+        "what its rows are measured against: J_sigma, or the smoothing it does itself",
+        choices=("sigma", "own"),
+    )
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return one directional difference per sample, along its own direction."""
         s = problem.sigma if self.radius is None else self.radius
         direction = problem.directions(w)
-        still = np.zeros_like(w)
+        still = problem.centred(w)
         ahead = problem.displaced(s * direction, theta, still)
         if self.variant == "antithetic":
             return (ahead - problem.displaced(-s * direction, theta, still)) * direction / (2 * s)
-        return (ahead - problem.value(theta, still[:, :1])) * direction / s
+        centre = still if problem.program.exogenous else still[:, :1]
+        return (ahead - problem.value(theta, centre)) * direction / s
 
     def declares_unbiased(self, program: Program) -> bool:
         """Return whether it smoothes as J_sigma does: noise on theta, and no radius of its own."""
-        own = self.radius is not None and self.radius != program.scene.sigma
-        return program.noise_on_theta and not own and super().declares_unbiased(program)
+        if self.smoothing(program) is not None:
+            return True
+        other = self.radius is not None and self.radius != program.scene.sigma
+        return program.noise_on_theta and not other and super().declares_unbiased(program)
+
+    def smoothing(self, program: Program) -> Smoothing | None:
+        """Return the Gaussian of its own radius, where its rows are measured against it and noise is on theta."""
+        if self.reference == "sigma" or self.radius is None or not program.noise_on_theta:
+            return None
+        return Smoothing("gaussian", self.radius)
 
     def refuses(self, program: Program) -> str | None:
         """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""

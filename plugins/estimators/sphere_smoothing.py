@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Problem, Program, SampleMean, param
+from bench.model import Problem, Program, SampleMean, Smoothing, param
 
 
 @dataclass(frozen=True)
@@ -13,7 +13,7 @@ class SphereSmoothing(SampleMean):
 
     Its expectation is the gradient of the cost averaged over a *ball* of radius r. By default r = sigma sqrt(d + 2),
     at which ball and Gaussian have the same covariance, so that both agree for cubic costs; others differ, hence it is
-    declared biased. On a linear cost its relative squared error is (d - 1) / N, Gaussian directions give (d + 1) / N
+    declared biased, unless ``reference=own`` measures it against the ball itself. On a linear cost its relative squared error is (d - 1) / N, Gaussian directions give (d + 1) / N
     (Flaxman et al. 2005; Berahas et al. 2022). Requires only costs.
     """
 
@@ -21,16 +21,32 @@ class SphereSmoothing(SampleMean):
     unbiased = False
 
     radius: float | None = param(None, "r, in units of theta; null: sigma sqrt(d + 2)", positive=True)
+    reference: str = param(
+        "sigma",
+        "what its rows are measured against: J_sigma, or the smoothing it does itself",
+        choices=("sigma", "own"),
+    )
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return one central difference per sample, along its own direction."""
         d = problem.dim
-        r = problem.sigma * np.sqrt(d + 2.0) if self.radius is None else self.radius
+        r = self._radius(problem.program)
         normal = problem.directions(w)
         u = normal / np.linalg.norm(normal, axis=0)
-        still = np.zeros_like(w)
+        still = problem.centred(w)
         change = problem.displaced(r * u, theta, still) - problem.displaced(-r * u, theta, still)
         return d * change * u / (2.0 * r)
+
+    def _radius(self, program: Program) -> float:
+        return float(program.scene.sigma * np.sqrt(program.dim + 2.0)) if self.radius is None else self.radius
+
+    def smoothing(self, program: Program) -> Smoothing | None:
+        """Return the ball, where its rows are measured against it."""
+        return Smoothing("ball", self._radius(program)) if self.reference == "own" else None
+
+    def declares_unbiased(self, program: Program) -> bool:
+        """Return whether its expectation is the reference: that of the ball is, whatever the cost."""
+        return self.reference == "own"
 
     def refuses(self, program: Program) -> str | None:
         """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""

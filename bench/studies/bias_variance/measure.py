@@ -64,6 +64,7 @@ def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> 
         "device": problem.device,
         "compilations": session.compilations.made,
         "shapes": " ".join(sorted(session.compilations.shapes)),
+        **made.singles,
         "point": theta.tolist(),
         "mean_estimate": estimates.mean(axis=0).tolist(),
         "reference_gradient": truth.gradient.tolist(),

@@ -30,7 +30,7 @@ NOTES = (
     "stratified by problem. beats fobg: chance of a lower final cost, paired by problem and seed. profile: integral of the "
     "share of targets reached within 1 to 4 times the best method's runtime. aRT: average runtime in rollouts (a gradient "
     "counts as many as it takes the time of): all that the searches spent, over the number that arrived; inf if none did. "
-    "Each method is shown at its best tuning on each problem, chosen by median final cost of the same seeds; the median "
+    "Each method is shown at its best tuning on each problem, chosen by median final cost of {seeds}; the median "
     "score over all its tunings stands beside it, and their number is what the tuning cost.",
 )
 
@@ -40,6 +40,15 @@ TITLE = 1.6
 """Inches of a line of a panel's title."""
 DEPTH = 1e-7
 """Regrets below this share of the largest are not drawn: one search reaches 0 where J* is the lowest cost of any."""
+
+
+def notes(found: Races) -> list[str]:
+    """Explain the columns, and say which seeds chose the tunings."""
+    chosen = found.tuning_seeds
+    seeds = (
+        f"seeds {', '.join(map(str, chosen))}, which score nothing" if chosen else "the same seeds that it is scored on"
+    )
+    return [text.format(seeds=seeds) for text in NOTES]
 
 
 def default_ratio(experiment: Experiment) -> float:
@@ -59,7 +68,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     contents["summary.csv"] = summed.to_csv(index=False, lineterminator="\n")
     texts = [f"# {experiment.name}: does a better gradient get there sooner?", *findings.sentences(found, default)]
     texts += ["## Methods", plain_markdown(methods(summed)), "## Times to targets", plain_markdown(arrivals(reached))]
-    texts += ["## Least costs", plain_markdown(optima(found)), *NOTES]
+    texts += ["## Least costs", plain_markdown(optima(found)), *notes(found)]
     contents["optimise.md"] = "\n\n".join(texts) + "\n"
     paths = write_all(experiment.directory, contents)
     drawings = {
@@ -139,7 +148,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
             console.print(sentence)
     for reason in rows.loc[rows["reason"] != "", "reason"].unique():
         console.print(reason)
-    console.print(*NOTES)
+    console.print(*notes(found))
 
 
 # ------------------------------------------------------------------------------------------------------- charts

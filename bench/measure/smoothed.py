@@ -1,0 +1,84 @@
+"""References of other smoothings than J_sigma: a Gaussian of another width, or the average over a ball."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from bench.measure import noise
+from bench.measure.batches import in_columns
+from bench.measure.reference import BATCHES, COLUMNS, Reference
+from bench.model import Problem, Program, compose
+
+LEAST_SAMPLES = 16384
+"""Fewest samples, where so many are allowed: a small spread of few samples proves nothing."""
+
+
+def widened(program: Program, radius: float) -> Program:
+    """Return the program with the Gaussian of another standard deviation: its J_sigma is that smoothing."""
+    scene = dataclasses.replace(program.scene, sigma=radius)
+    return compose(scene, program.contact, program.integrator, program.decision)
+
+
+def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples: int, tolerance: float) -> Reference:
+    """Compute the gradient at theta0 of the cost averaged over the ball of that radius around theta.
+
+    It equals d / r times the mean of f u over the sphere (the divergence theorem; Flaxman et al. 2005, lemma 2.1). With
+    one variable that is a difference of two costs. Else it is sampled: first order inside the ball where the cost is
+    continuous, or central differences across the sphere, whichever has the lower variance in a pilot.
+    """
+    program, theta, d = problem.program, problem.program.theta0, problem.dim
+    name = f"ball[radius={radius:g}]"
+    if d == 1 and not program.exogenous:
+        still = np.zeros((program.n_noise, 2))
+        low, high = problem.value(theta[:, None] + np.array([[-radius, radius]]), still)
+        return Reference(np.array([[(high - low) / (2 * radius)]]), f"{name},exact")
+
+    def zeroth(w: np.ndarray) -> np.ndarray:
+        u, _ = _polar(problem, w)
+        still = problem.centred(w)
+        change = problem.displaced(radius * u, theta, still) - problem.displaced(-radius * u, theta, still)
+        return d * change * u / (2 * radius)
+
+    def first(w: np.ndarray) -> np.ndarray:
+        u, share = _polar(problem, w)
+        return problem.grad(theta[:, None] + radius * share * u, problem.centred(w))
+
+    orders: dict[str, Callable[[np.ndarray], np.ndarray]] = {"zeroth_order": zeroth}
+    if program.continuous and "grad" in provides and not program.surrogate:
+        orders["first_order"] = first
+    columns = min(COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
+    pilot = _draw(problem, "ball pilot", columns, 0)
+    spread = {order: float(terms(pilot).var(axis=1).sum()) for order, terms in orders.items()}
+    chosen = min(spread, key=lambda order: spread[order] if math.isfinite(spread[order]) else math.inf)
+    size, count, batches = columns // BATCHES, 0, np.zeros((BATCHES, d))
+    while True:
+        w = _draw(problem, "ball", BATCHES * size, count)
+        means = in_columns(orders[chosen], w, columns).reshape(d, BATCHES, size).mean(axis=2).T
+        batches = (batches * count + means * size) / (count + size)
+        count += size
+        error = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)
+        enough = error <= tolerance * np.linalg.norm(batches.mean(axis=0)) and count * BATCHES >= LEAST_SAMPLES
+        if enough or 2 * count * BATCHES > samples or not math.isfinite(error):
+            return Reference(batches, f"{name},sampling[{chosen},n={count * BATCHES}]")
+        size = count
+
+
+def _polar(problem: Problem, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return directions ``(d, B)`` and shares of the radius ``(B,)`` such that share u is uniform in the unit ball."""
+    from scipy.special import gammainc
+
+    normal = problem.directions(w)
+    size = np.linalg.norm(normal, axis=0)
+    # the squared length is chi-squared, independent of the direction: its rank is uniform
+    return normal / size, gammainc(problem.dim / 2, size**2 / 2) ** (1 / problem.dim)
+
+
+def _draw(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
+    """Draw noise ``(n_w, count)`` from streams that no cell uses."""
+    program = problem.program
+    drawn = noise.draw(block, program.scene.name, 1, count, program.n_noise, stream)
+    return np.moveaxis(drawn, -1, 0).reshape(program.n_noise, count)

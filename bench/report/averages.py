@@ -1,0 +1,113 @@
+"""Averages over swept axes, such as the phase of a step or theta: one line per quantity of each group of cells."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bench.report.tables import csv, plain_markdown
+from bench.report.text import number
+from bench.sweep.axes import Axis, axes, relabelled, with_axes
+from bench.sweep.columns import IDENTITY
+from bench.sweep.experiment import Experiment
+from bench.sweep.files import write_all
+
+SIGNED = "signed error"
+"""The length of the average of (mean estimate - reference): errors of opposite sign cancel in it."""
+ROOM = ("bias", "variance", "rmse", "rmse_rel", "model_error", SIGNED)
+"""Quantities of the Markdown table, where a study has them; the CSV has all."""
+
+
+def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+    """Write ``averages.csv`` and ``averages.md``; nothing unless the experiment names axes to average over."""
+    table = averages(experiment, rows)
+    if table.empty:
+        return []
+    shown = table[table["quantity"].isin(ROOM)] if table["quantity"].isin(ROOM).any() else table
+    said = shown.drop(columns=["standard_error"]).assign(
+        mean=[
+            f"{number(m)} +- {number(1.96 * e)}" for m, e in zip(shown["mean"], shown["standard_error"], strict=True)
+        ],
+        **{name: shown[name].map(number) for name in ("rms", "least", "largest")},
+    )
+    legend = (
+        f"\n\nAverages over {', '.join(experiment.average)}: mean +- 1.96 standard errors (as if the values of the axis had "
+        "been drawn at random), root mean square, least and largest.\n"
+    )
+    return write_all(
+        experiment.directory, {"averages.csv": csv(table), "averages.md": plain_markdown(said.astype(str)) + legend}
+    )
+
+
+def averages(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one row per group of cells and quantity: points, mean, its standard error, RMS, least and largest.
+
+    A group holds the cells that differ in nothing but the axes of ``experiment.average`` and what moves with them. Rows
+    that are not ok are left out, and so counted in no ``points``. Where rows hold signed means and references, the
+    quantity ``signed error`` is the length of the average of their differences.
+    """
+    wanted = experiment.average
+    good = rows[rows["status"] == "ok"]
+    if not wanted or good.empty:
+        return pd.DataFrame()
+    found = axes(experiment.sweep, good)
+    over = [axis for axis in found if _meant(axis, wanted)]
+    gone = {axis.column for axis in over} | {column for axis in over for column in axis.moves}
+    gone_axes = [axis for axis in found if axis.column in gone]
+    wide = relabelled(with_axes(experiment, good), gone_axes).reset_index(drop=True)
+    left = [axis.column for axis in found if axis.column not in gone]
+    keys = [name for name in dict.fromkeys([*IDENTITY, *left]) if name in wide and name not in gone]
+    numbers = [
+        column.name
+        for column in experiment.columns.all
+        if column.kind == "number" and column.table and not column.measured and column.name not in (*IDENTITY, "dim")
+    ]
+    lines = []
+    for key, part in wide.groupby(keys, sort=False, dropna=False):
+        shown = dict(zip(keys, key, strict=True))
+        lines += [shown | {"quantity": name} | _moments(part[name].to_numpy(float)) for name in numbers]
+        if {"mean_estimate", "reference_gradient"} <= set(part):
+            lines.append(shown | {"quantity": SIGNED} | _signed(part))
+    table = pd.DataFrame(lines)
+    table = table[table["points"] > 0]
+    same = [name for name in keys if name != "estimator" and table[name].nunique(dropna=False) == 1]
+    return table.drop(columns=same).reset_index(drop=True)
+
+
+def _meant(axis: Axis, wanted: tuple[str, ...]) -> bool:
+    """Whether a name means an axis: its column, a name in the sweep, or ``theta0`` for its coordinates."""
+    names = {axis.column, axis.short, axis.column.partition(".")[0], *axis.names}
+    return bool(names & set(wanted))
+
+
+def _moments(values: np.ndarray) -> dict[str, float]:
+    values = values[np.isfinite(values)]
+    n = len(values)
+    if not n:
+        return {"points": 0}
+    return {
+        "points": n, "mean": float(values.mean()),
+        "standard_error": float(values.std(ddof=1) / math.sqrt(n)) if n > 1 else math.nan,
+        "rms": float(np.sqrt(np.mean(values**2))), "least": float(values.min()), "largest": float(values.max()),
+    }  # fmt: skip
+
+
+def _signed(part: pd.DataFrame) -> dict[str, float]:
+    """Return the length of the mean difference; its error, and RMS, least and largest length of single differences."""
+    pairs = [
+        (np.asarray(mean, float), np.asarray(truth, float))
+        for mean, truth in zip(part["mean_estimate"], part["reference_gradient"], strict=True)
+    ]
+    if len({len(one) for pair in pairs for one in pair}) != 1:
+        return {"points": 0}
+    apart = np.array([mean - truth for mean, truth in pairs])
+    apart = apart[np.isfinite(apart).all(axis=1)]
+    lengths = _moments(np.linalg.norm(apart, axis=1))
+    if not lengths["points"]:
+        return lengths
+    n = len(apart)
+    error = math.sqrt(apart.var(axis=0, ddof=1).sum() / n) if n > 1 else math.nan
+    return lengths | {"mean": float(np.linalg.norm(apart.mean(axis=0))), "standard_error": error}
