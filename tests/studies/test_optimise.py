@@ -457,3 +457,20 @@ def test_few_seeds_or_nothing_tuned_use_all_seeds(finals):
     found = searches(finals)
     assert found.tuning_seeds == ()
     assert len(found.best) == len(next(iter(finals.values())))
+
+
+def test_quality_along_the_path_is_summed_up_over_seeds():
+    found = searches({("one", ""): [1, 2, 3]})
+    rows = found.rows.assign(
+        path_quality_iteration=[[0, 10, 20], [0, 10, 20], [0, 12, 20]],
+        path_quality_rmse_rel=[[0.1, 0.2, 0.4], [0.1, 0.3, 0.8], [0.1, 0.4, 0.6]],
+        path_quality_cosine=[[1.0, 0.9, 0.5]] * 3,
+    )
+    lines = races.path_quality(races.Races(rows, ()))
+    error = lines[lines["quantity"] == "rmse_rel"]
+    assert error["iteration"].tolist() == [0, 10, 20]
+    assert error["value"].tolist() == pytest.approx([0.1, 0.3, 0.6])
+    assert error["low"].iloc[2] == pytest.approx(np.quantile([0.4, 0.8, 0.6], 0.2))
+    assert len(report.path_figure(races.Races(rows, ()), 4.0).axes) == 2
+    alone = rows.assign(path_quality_iteration=[[0]] * 3)
+    assert report.path_figure(races.Races(alone, ()), 4.0) is None

@@ -323,6 +323,41 @@ def correlations(points: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def path_quality(found: Races) -> pd.DataFrame:
+    """Return median, 20% and 80% quantile over seeds of the gradient's relative error and cosine, by place on the path.
+
+    A row for each problem, method, quantity and place; empty where quality was measured at the start alone.
+    """
+    lines = []
+    for problem, method, part in found.each():
+        paths = [row for _, row in part.iterrows() if len(_listed(row["path_quality_iteration"])) > 1]
+        places = max((len(_listed(row["path_quality_iteration"])) for row in paths), default=0)
+        whole = [row for row in paths if len(_listed(row["path_quality_iteration"])) == places]
+        for quantity in ("rmse_rel", "cosine") if whole else ():
+            values = np.array([_listed(row[f"path_quality_{quantity}"]) for row in whole], dtype=float)
+            moments = np.median(
+                np.array([_listed(row["path_quality_iteration"]) for row in whole], dtype=float), axis=0
+            )
+            low, middle, high = np.quantile(values, [0.2, 0.5, 0.8], axis=0)
+            lines += [
+                {
+                    "problem": problem,
+                    "method": method,
+                    "quantity": quantity,
+                    "iteration": i,
+                    "value": m,
+                    "low": a,
+                    "high": b,
+                }
+                for i, m, a, b in zip(moments, middle, low, high, strict=True)
+            ]
+    return pd.DataFrame(lines, columns=["problem", "method", "quantity", "iteration", "value", "low", "high"])
+
+
+def _listed(value: object) -> list[float]:
+    return list(value) if isinstance(value, list | tuple | np.ndarray) else []
+
+
 def rates(found: Races) -> pd.DataFrame:
     """Return median score and its 20% to 80% range by problem, method and value of each tuned axis."""
     lines = []

@@ -73,6 +73,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     paths = write_all(experiment.directory, contents)
     drawings = {
         "quality_runtime": quality_figure, "anytime": anytime_figure, "targets": targets_figure, "learning_rates": rates_figure,
+        "path_quality": path_figure,
     }  # fmt: skip
     with styled():
         for stem, draw in drawings.items():
@@ -228,6 +229,43 @@ def quality_figure(found: Races, default: float) -> Figure | None:
     _legend(
         drawn, {name: {**style, "marker": "", "linestyle": "-"} for name, style in styles.items()}, (*shapes, hollow)
     )
+    return drawn
+
+
+def path_figure(found: Races, default: float) -> Figure | None:
+    """Draw the gradient's relative error and cosine along the path, a row of panels each: median and 20% to 80% of seeds.
+
+    None where quality was measured at the start alone.
+    """
+    lines = races.path_quality(found)
+    if lines.empty:
+        return None
+    names = list(dict.fromkeys(lines["problem"]))
+    drawn = Figure(figsize=(min(WIDTH, max(0.5 * WIDTH, 1.9 * len(names))), 4.9), layout="constrained")
+    FigureCanvasAgg(drawn)
+    drawn.suptitle("How good is the gradient on the way?", fontsize=9, fontweight="bold")
+    grid = drawn.subplots(2, len(names), squeeze=False)
+    styles = {name: style for name, style in looks(found).items() if name in set(lines["method"])}
+    labels = {"rmse_rel": "relative RMSE of the gradient", "cosine": "cosine with the reference"}
+    for row, (quantity, label) in zip(grid, labels.items(), strict=True):
+        for panel, problem in zip(row, names, strict=True):
+            part = lines[(lines["problem"] == problem) & (lines["quantity"] == quantity)]
+            for method, own in part.groupby("method", sort=False):
+                style = styles[str(method)]
+                panel.fill_between(
+                    own["iteration"], own["low"], own["high"], color=style["color"], alpha=0.15, linewidth=0
+                )
+                panel.plot(own["iteration"], own["value"], label=plain(str(method)), **style)
+            panel.set_xlabel("iteration")
+            if quantity == "rmse_rel":
+                known = part[(part["low"] > 0) & np.isfinite(part["high"])]
+                if len(known):
+                    log_axis(panel, "y", known["low"].min() / 2, known["high"].max() * 2)
+                panel.set_title(_wrapped(str(problem)), fontsize=7)
+            else:
+                panel.set_ylim(-1.05, 1.05)
+        row[0].set_ylabel(label)
+    _legend(drawn, styles)
     return drawn
 
 
