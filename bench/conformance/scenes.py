@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -245,7 +246,8 @@ def physical_gradient_is_the_limit(scene: Scene) -> str:
         for factor in FINER:
             program = _refined(scene, factor, law, integrator)
             physical = program.scene.physical_gradient()
-            require(physical is not None, f"has a physical gradient at its own step, and none at one of a {factor}th")
+            if physical is None:
+                raise Failed(f"has a physical gradient at its own step, and none at one of a {factor}th")
             ratios.append(_ratios(program, physical))
         off = float(np.abs(ratios[1] - 1.0).max())
         if off <= LIMITING:
@@ -277,7 +279,7 @@ def _refined(scene: Scene, factor: int, law: ContactLaw | None, integrator: Inte
     """Compose the scene with a step finer by ``factor``, over the same time. Raises :class:`Skipped` if theta changes."""
     if not isinstance(scene, MechanicalScene):
         return compose(scene)
-    finer = {"horizon": scene.horizon * factor, "dt": scene.dt / factor}
+    finer: dict[str, Any] = {"horizon": scene.horizon * factor, "dt": scene.dt / factor}
     if isinstance(scene, HeldScene):
         finer["hold"] = scene.hold * factor
     fine = dataclasses.replace(scene, **finer)
