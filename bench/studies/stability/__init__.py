@@ -36,11 +36,12 @@ class Stability(Study):
         Column("truth_error", "relative change of the truth on its last refinement"),
         text("verdict", "ok, or what is wrong", judged=Judged("verdict", "verdict", order=WORST_FIRST)),
         text("truth", "how the truth was computed: physical or refined"),
-        text(
-            "cause", "of a finite but wrong gradient, from the same law at a far finer step: step, law, both or unknown"
+        text("cause", "of a finite but wrong gradient: step (or how it is differentiated), law, both or unknown"),
+        Column(
+            "step_error",
+            "distance from the law's own gradient, which is differences of its cost at a far finer step, / norm of the truth",
         ),
-        Column("step_error", "norm of (gradient - that of the same law at a far finer step) / norm of the latter"),
-        Column("law_error", "norm of (gradient of the same law at a far finer step - truth) / norm of the truth"),
+        Column("law_error", "distance of the law's own gradient from the truth / norm of the truth"),
         numbers("state_at_first_bad_step", "the state at the first bad step"),
     )
 

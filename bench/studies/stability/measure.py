@@ -81,12 +81,8 @@ def _measured(cell: Cell, program: Rollout, session: Session, limits: Limits) ->
     if not error <= resolved:
         reason = f"halving the finest step moves the truth by {error:.1%}, more than {resolved:.0%}"
         return result | {"verdict": "unresolved", "reason": reason}
-    judged = compare(gradient, truth, limits.inaccurate)
-    if judged["verdict"] == "ok":
-        return result | judged
-    if kind == "refined" or cell.contact is None:  # the truth is this very program's at a finer step
-        return result | judged | {"cause": "step", "step_error": judged["relative_error"], "law_error": 0.0}
-    return result | judged | cause_of(gradient, truth, *refined(cell, limits), limits.inaccurate)
+    result |= compare(gradient, truth, limits.inaccurate)
+    return result if result["verdict"] == "ok" else result | cause_of(cell, kind, gradient, truth, limits)
 
 
 # ---------------------------------------------------------------------------------------------- trajectories
@@ -159,37 +155,14 @@ def truth_of(cell: Cell, limits: Limits) -> tuple[str, np.ndarray, float]:
     physical = program.physical_gradient()
     if physical is not None:
         return "physical", np.asarray(physical), 0.0
-    return "refined", *refined(cell, limits)
-
-
-def refined(cell: Cell, limits: Limits) -> tuple[np.ndarray, float]:
-    """Return the gradient ``(d,)`` of the same law at a far finer step, and its relative change on the last halving."""
-    steps = max(limits.fine_steps, limits.finer * rollout(cell.program()).scene.horizon)
+    steps = max(limits.fine_steps, limits.finer * program.scene.horizon)
     coarse, fine = _gradient_at(cell, steps // 2), _gradient_at(cell, steps)
     change = float(np.linalg.norm(fine - coarse))
-    return fine, change / float(np.linalg.norm(fine)) if change else 0.0
+    return "refined", fine, change / float(np.linalg.norm(fine)) if change else 0.0
 
 
-def cause_of(
-    gradient: np.ndarray, truth: np.ndarray, fine: np.ndarray, change: float, inaccurate: float
-) -> dict[str, Any]:
-    """Tell whether a wrong gradient is the step's doing or the law's, from the law's own at a far finer step, ``fine``.
-
-    ``law``: the law is as wrong however fine the step. ``step``: the law is right, this step is not. ``both``: each alone
-    is off by more than ``inaccurate``, or the two add up to it. ``unknown``: ``fine`` has not converged to half of that.
-    """
-    if not change <= inaccurate / 2:
-        return {"cause": "unknown"}
-    law = float(np.linalg.norm(fine - truth) / np.linalg.norm(truth))
-    size = float(np.linalg.norm(fine))
-    step = float(np.linalg.norm(gradient - fine)) / size if size else math.inf
-    by_law, by_step = law > inaccurate, step > inaccurate
-    cause = "both" if by_law == by_step else "law" if by_law else "step"
-    return {"cause": cause, "law_error": law, "step_error": step}
-
-
-def _gradient_at(cell: Cell, steps: int) -> np.ndarray:
-    """Return the cell's gradient with its duration cut into ``steps`` steps, keeping numerical damping per second."""
+def _refined(cell: Cell, steps: int) -> Cell:
+    """Return the cell with its duration cut into ``steps`` steps, keeping numerical damping per second."""
     program = rollout(cell.program())
     scene = program.scene
     dt = scene.horizon * scene.dt / steps
@@ -199,15 +172,24 @@ def _gradient_at(cell: Cell, steps: int) -> np.ndarray:
     fine = cell.with_part("scene", replace(scene, **values))
     if fine.program().dim != program.dim:
         raise Unsupported(f"theta of scene {scene.name} changes with the horizon, so that no finer step has the truth")
-    key = fine.program_key
-    if key not in _fine_gradients:
-        if len(_fine_gradients) >= KEPT:
-            del _fine_gradients[next(iter(_fine_gradients))]
-        _fine_gradients[key] = _gradient(next(reference_backends(fine)), fine.program())
-    return _fine_gradients[key]
+    return fine
 
 
-KEPT = 64
+def _gradient_at(cell: Cell, steps: int) -> np.ndarray:
+    """Return the cell's gradient with its duration cut into ``steps`` steps."""
+    fine = _refined(cell, steps)
+    if fine.program_key not in _fine_gradients:
+        _keep(fine.program_key, _gradient(next(reference_backends(fine)), fine.program()))
+    return _fine_gradients[fine.program_key]
+
+
+def _keep(key: str, gradient: np.ndarray) -> None:
+    if len(_fine_gradients) >= KEPT:
+        del _fine_gradients[next(iter(_fine_gradients))]
+    _fine_gradients[key] = gradient
+
+
+KEPT = 4096
 _fine_gradients: dict[str, np.ndarray] = {}
 """Gradients at fine steps by program, shared by all cells whose fine program is the same."""
 
@@ -233,6 +215,63 @@ def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[
     else:
         verdict = "ok" if error <= inaccurate else "inaccurate"
     return {"verdict": verdict, "relative_error": error, "cosine": cosine}
+
+
+# ---------------------------------------------------------------------------------------------------- cause
+
+SPAN = 0.01
+"""Half the span of theta for differences of the law's own cost, in units of theta's largest component (1 if that is 0).
+
+It moves an impact by many of the fine steps, so that the place of the impact within its step averages out.
+"""
+
+
+def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarray, limits: Limits) -> dict[str, Any]:
+    """Return why a gradient is wrong: ``cause``, ``step_error`` and ``law_error``, both in units of the truth's norm.
+
+    The law's own gradient is between the two: that of the same law and integrator at a far smaller step. What the cell
+    differs from it is the step's, what it differs from the physics is the law's. Their sum is at least the cell's
+    error, so that one of them is always there to blame. Without a law all is the step's.
+    """
+    norm = float(np.linalg.norm(truth))
+    away = float(np.linalg.norm(gradient - truth)) / norm if norm else math.inf
+    if truth_kind != "physical" or cell.contact is None:
+        return {"cause": "step", "step_error": away, "law_error": 0.0}
+    if not norm:
+        return {"cause": "unknown"}
+    own, coarse = law_gradient(cell, limits)
+    step, law, change = (float(np.linalg.norm(part)) / norm for part in (gradient - own, own - truth, own - coarse))
+    errors = {"step_error": step, "law_error": law}
+    if not change <= limits.inaccurate / 2:
+        return {"cause": "unknown"} | errors
+    blamed = [name for name, error in (("step", step), ("law", law)) if error > limits.inaccurate]
+    return {"cause": "both" if len(blamed) == 2 else blamed[0] if blamed else "step" if step >= law else "law"} | errors
+
+
+def law_gradient(cell: Cell, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gradient ``(d,)`` of the cell's law at a far smaller step, and one at half its resolution.
+
+    Both are central differences of the cost over a span of theta (:data:`SPAN`): a derivative through a contact jumps
+    with the place of the impact within its step, however small that is.
+    """
+    steps = max(limits.fine_steps, limits.finer * rollout(cell.program()).scene.horizon)
+    return _differences(cell, steps, SPAN), _differences(cell, steps // 2, 2 * SPAN)
+
+
+def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
+    """Return central differences ``(d,)`` of the cell's cost with its duration cut into ``steps`` steps."""
+    fine = _refined(cell, steps)
+    key = f"{fine.program_key} {span}"
+    if key not in _fine_gradients:
+        program = fine.program()
+        problem = next(reference_backends(fine)).compile(program)
+        theta, still = program.theta0, np.zeros((program.n_noise, 1))
+        h = span * (float(np.abs(theta).max(initial=0.0)) or 1.0)
+        ends = [
+            (problem.value(theta + e, still)[0], problem.value(theta - e, still)[0]) for e in h * np.eye(len(theta))
+        ]
+        _keep(key, np.array([(after - before) / (2 * h) for after, before in ends]))
+    return _fine_gradients[key]
 
 
 # --------------------------------------------------------------------------------------------------- theory

@@ -54,7 +54,7 @@ DARK = ("nonfinite", "diverged")
 WRONG = ("inaccurate", "wrong_sign", "zero")
 """Verdicts of finite but wrong gradients, which the maps colour by their cause."""
 CAUSES = {
-    "step": (ORANGE, "wrong by the step: the same law is right at a far finer one"),
+    "step": (ORANGE, "wrong by the step or its derivative, the law is right"),
     "law": (SKY, "wrong by the law, however fine the step"),
     "both": (PINK, "wrong by step and law"),
     "unknown": ("#a39bc8", "?: wrong, the cause is not resolved"),
