@@ -168,4 +168,4 @@ def test_charts_name_curves_floors_and_the_first_at_a_glance(tmp_path):
     )
     assert slope == pytest.approx(-0.5)
     cells = [text.get_text() for text in drawn["at_a_glance"].axes[0].texts]
-    assert cells == ["400 ms\nb", "1.2 s\nother", "bias"]
+    assert cells == ["400 ms\nb", "1.2 s\nother", "bias", "3.0 times\n(2.3 to 3.9)"]
