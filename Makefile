@@ -12,7 +12,7 @@ test: $(VENV)/.installed
 	$(BIN)/python -m pytest
 
 slow: $(VENV)/.installed
-	$(BIN)/python -m pytest -m slow --dist load
+	$(BIN)/python -m pytest -m slow --dist worksteal
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

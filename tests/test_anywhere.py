@@ -77,6 +77,7 @@ def test_wheel_holds_the_plugins_and_the_experiments(installed):
     assert not (installed / "plugins").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", ["plugins", "conf"])
 def test_a_directory_with_packages_of_the_same_names(hidden, tmp_path):
     (tmp_path / hidden).mkdir()

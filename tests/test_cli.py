@@ -110,6 +110,7 @@ def test_identity_strings_survive_the_shell(value, tmp_path):
     assert list(table["estimator_params"].fillna("")) == ["", "baseline=none"]
 
 
+@pytest.mark.slow
 def test_identity_columns_tell_cells_apart(tmp_path):
     words = [
         "scenes=[pushing]", "contacts=[impulse,'impulse[time_of_impact=false]','softplus[beta=10,smooths=clip]',softplus]",

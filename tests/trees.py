@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -38,3 +39,9 @@ class Tree:
         return subprocess.run(
             [sys.executable, "-m", "bench", *words], cwd=self.root, env=environment, capture_output=True, text=True
         )
+
+
+def hear_signals() -> None:
+    """A shell ignores interrupts in its background jobs and nohup hang-ups, and what they start inherits that."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        signal.signal(getattr(signal, name), signal.SIG_DFL)

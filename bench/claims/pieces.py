@@ -59,6 +59,14 @@ def problem(
     return compiled
 
 
+def native(scene: Scene | str, contact: str = "penalty") -> Problem:
+    """Compile a scene as a native loop, or with JAX where that library is missing: for thousands of small calls."""
+    try:
+        return problem(scene, contact, backend="fused")
+    except Unsupported:
+        return problem(scene, contact)
+
+
 def terms(problem: Problem, estimator: Estimator, w: np.ndarray, theta: np.ndarray | None = None) -> np.ndarray:
     """Return the estimates of one sample each, ``(B, d)``, for noise ``w (n_w, B)``."""
     at = problem.program.theta0 if theta is None else np.atleast_1d(theta)

@@ -16,6 +16,8 @@ from bench.report.text import counted, duration, number
 from bench.sweep.files import write_all
 
 Found = Sequence[tuple[type[Claim], Result]]
+WIDE = 26
+"""Letters of the longest label with which two fit beside each other above a chart."""
 CSS = """body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
 table{border-collapse:collapse;font-size:14px;margin:.6rem 0}td,th{padding:.15rem .8rem .15rem 0;text-align:left}
 td.n{text-align:right;font-variant-numeric:tabular-nums}th{border-bottom:1px solid #888}img{max-width:100%}
@@ -53,7 +55,7 @@ def chart(directory: Path, claim: type[Claim], result: Result) -> list[Path]:
 
     with styled():
         rcParams["axes.prop_cycle"] = cycler(color=[PALETTE[i] for i in (2, 0, 3, 4)])
-        picture = Picture(figsize=(3.5, 2.6), layout="constrained")
+        picture = Picture(figsize=(3.5, 2.9), layout="constrained")
         FigureCanvasAgg(picture)
         axes = picture.add_subplot()
         claim().draw(axes, result.series)
@@ -64,8 +66,11 @@ def chart(directory: Path, claim: type[Claim], result: Result) -> list[Path]:
         axes.set_xlabel(claim.labels[0])
         axes.set_ylabel(claim.labels[1])
         axes.set_title(f"{claim.name}: {result.verdict}", fontsize=8)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=7, frameon=True, framealpha=0.85, edgecolor="none")
+        # above the axes, where no line is
+        labels = axes.get_legend_handles_labels()[1]
+        if labels:
+            columns = 2 if max(map(len, labels)) <= WIDE else 1
+            picture.legend(loc="outside upper center", ncols=columns, fontsize=7, frameon=False)
         return save(picture, directory / claim.name)[:1]
 
 

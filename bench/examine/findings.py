@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.examine.lines import Line
 from bench.examine.smoothing import WANTED, Smoothed
-from bench.measure.gradcheck import FAULTS, Check, Part
+from bench.measure.gradcheck import FAULTS, MEANING, Check, Part
 from bench.report.text import counted, duration, number
 
 if TYPE_CHECKING:
@@ -156,6 +156,18 @@ class Findings:
                         f"{number(100 * high)}% of grad J, though each gradient is right: it does not see the jumps"
                     )
         return found
+
+    @property
+    def conclusion(self) -> str:
+        """The verdict in one line: what cannot be trusted first, else what was shown, which without a gradient is little."""
+        if self.problems:
+            return f"CANNOT BE TRUSTED: {self.problems[0]}"
+        how = MEANING[self.cause].removeprefix("right").lstrip(":; ")
+        if self.gradient:
+            return f"RIGHT: the gradient is the derivative of its cost ({self.cause}: {how})"
+        return (
+            f"NO GRADIENT GIVEN, none was checked: the cost has a derivative here, by differences ({self.cause}: {how})"
+        )
 
     @property
     def warnings(self) -> list[str]:
@@ -419,8 +431,26 @@ class Findings:
         lines = [f"warning: {text}" for text in self.warnings]
         if self.problems:
             return [*lines, *(f"CANNOT BE TRUSTED: {text}" for text in self.problems)]
-        what = "the gradient is the derivative of its cost" if self.gradient else "the cost has a derivative here"
-        return [*lines, f"RIGHT: {what} ({self.cause})"]
+        return [*lines, self.conclusion, *self._scope()]
+
+    def _scope(self) -> list[str]:
+        """Say what was looked at and what was not, where nothing wrong was found."""
+        check = self.check
+        assert check is not None
+        dim, seen = self.theta.size, len(check.components)
+        whole = len(check.parts) - seen
+        checked = f"checked: {seen} of {dim} components" if seen < dim else f"checked: {counted(dim, 'component')}"
+        checked += f" and {counted(whole, 'random direction')} at theta"
+        if check.draws:
+            checked += f", {counted(len(check.draws), 'direction')} at other thetas around it"
+        if self.lines:
+            checked += f", jumps on {counted(len(self.lines), 'line')}"
+        if self.smoothed:
+            checked += f", noise of sigma {', '.join(number(one.sigma) for one in self.smoothed)}"
+        rest = [] if self.gradient else ["any gradient"]
+        rest += ["the gradient under noise on theta: give sigma"] if self.gradient and not self.smoothed else []
+        rest += ["thetas far from this one"]
+        return [checked, f"not checked: {'; '.join(rest)}"]
 
 
 def _table(rows: Sequence[Sequence[str]]) -> list[str]:

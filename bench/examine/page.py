@@ -62,7 +62,7 @@ def write(report: Findings, directory: Path) -> list[Path]:
     page = PAGE.format(
         title=escape(f"{report.name}, examined"),
         colour="#D55E00" if report.status else "#009E73",
-        verdict=escape(" ".join(report.problems) or str(report).rpartition("\n")[2]),
+        verdict=escape(" ".join(report.problems) or report.conclusion),
         charts="\n".join(pictures),
         text=escape(str(report)),
         table=report.frame.to_html(index=False, float_format=lambda x: number(x, 5), border=0),

@@ -61,7 +61,7 @@ def stamp(module: str) -> str:
 
 
 def child(given: Mapping[str, Any]) -> None:
-    """Import modules one by one; the pipe hears of each before it is tried, and of the end."""
+    """Import modules one by one and make their plugins; the pipe hears of each before it is tried, and of the end."""
     pipe = os.dup(1)
     nowhere = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
@@ -72,7 +72,9 @@ def child(given: Mapping[str, Any]) -> None:
     for name in given["modules"]:
         os.write(pipe, b".")
         try:
-            importlib.import_module(name)
+            for plugin in list(vars(importlib.import_module(name)).values()):
+                if isinstance(plugin, type) and plugin.__module__ == name and getattr(plugin, "kind", ""):
+                    plugin()  # every field of a plugin has a default
         except BaseException:  # it is imported again where its error is listed
             continue
     os.write(pipe, b"!")

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 ATTEMPTS = 100
 """Times that a directory is read again while other runs change it."""
+CLAIM = ".study"
+"""File under ``pending/`` that names the study of the rows to come, while ``rows.parquet`` cannot say it yet."""
 LARGEST = 2.0**53
 """Larger counts than this are not kept exactly as float64, so no run has written them."""
 
@@ -48,14 +50,28 @@ class Store:
         self._pending = directory / "pending"
 
     def prepare(self) -> None:
-        """Make the directory, and make sure that it can be written."""
+        """Make the directory, make sure that it can be written, and claim it for this study."""
         try:
             self._pending.mkdir(parents=True, exist_ok=True)
             probe = temporary(self._pending / "probe")
-            probe.write_text("")
-            probe.unlink()
+            probe.write_text(self._study)
+            try:
+                _link(probe, self._pending / CLAIM)
+            except FileExistsError:
+                pass
+            finally:
+                probe.unlink(missing_ok=True)
+            claimed = ""
+            with suppress(FileNotFoundError):  # a run that has just ended takes its claim away, and its rows tell
+                claimed = (self._pending / CLAIM).read_text()
         except OSError as error:
             raise StorageError(f"results directory '{self.directory}' cannot be written: {error.strerror}") from None
+        if self._study and claimed not in ("", self._study):
+            raise UserError(
+                f"a run of study {printable(claimed)} has started in '{self.directory}', and this is study {self._study}: "
+                "choose another folder with name=..., or remove that one"
+            )
+        self.load()  # another study may have run to its end since the rows were read
 
     def append(self, *rows: dict[str, Any]) -> None:
         """Store finished cells: when this returns, they outlast a power cut."""
@@ -175,6 +191,8 @@ class Store:
         """Remove half-written files of killed runs, and the directory of small files when it is empty."""
         tidy(self._pending)
         with suppress(OSError):
+            if not any(self._pending.glob("[!.]*")):
+                (self._pending / CLAIM).unlink(missing_ok=True)
             self._pending.rmdir()
 
 

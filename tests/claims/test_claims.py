@@ -1,6 +1,7 @@
 """Claims: their verdicts can fail, their results are kept, and those of other packages are found."""
 
 import json
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -163,6 +164,40 @@ def test_claims_of_other_packages_are_found(monkeypatch):
         assert list(shelf.claims())[-1] == "T1"
     finally:
         shelf.claims.cache_clear()
+
+
+OF_ANOTHER = """
+from bench.claims import Claim, Figure, Outcome
+
+
+class Mine(Claim):
+    name, lesson, statement, source, learned = "M1", "My lesson", "two is two", "my package", "that it is"
+    labels = ("x", "y")
+
+    def measure(self):
+        return Outcome([Figure("two", "2.00", 2.0)], series={"x": [0, 1]})
+
+    def draw(self, axes, series):
+        axes.plot(series["x"], series["x"])
+"""
+
+
+def test_an_installed_package_brings_claims_by_its_entry_point(tmp_path, monkeypatch, capsys):
+    """Nothing is replaced here: the package has the metadata that an installer writes."""
+    made = tmp_path / "mine-1.0.dist-info"
+    made.mkdir()
+    (made / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (made / "entry_points.txt").write_text("[bench.claims]\nmine = claims_of_mine\n")
+    (tmp_path / "claims_of_mine.py").write_text(OF_ANOTHER)
+    monkeypatch.syspath_prepend(tmp_path)
+    shelf.claims.cache_clear()
+    try:
+        assert cli.main(["claims", "M1", f"results_dir={tmp_path}"]) == 0
+        assert "two is two" in capsys.readouterr().out
+        assert "<h2>My lesson</h2>" in (tmp_path / "claims" / "claims.html").read_text()
+    finally:
+        shelf.claims.cache_clear()
+        sys.modules.pop("claims_of_mine", None)
 
 
 def test_a_broken_package_hides_no_other_claim(monkeypatch, capsys):

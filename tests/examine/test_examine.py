@@ -84,6 +84,15 @@ def test_right_gradient_passes_with_every_digit():
     assert report.check.order == pytest.approx(2.0, abs=0.1)
 
 
+def test_what_was_not_checked_is_said():
+    """Without a gradient nothing is called right; with one, its behaviour under noise is only known where asked for."""
+    alone, given = (str(bench.examine(bowl, [1.0, 0.5], grad=grad, **QUICK)) for grad in (None, slope))
+    assert "RIGHT" not in alone
+    assert "not checked: any gradient" in alone
+    assert "checked: 2 components and 2 random directions at theta, 16 directions at other thetas" in given
+    assert "not checked: the gradient under noise on theta: give sigma" in given
+
+
 def test_missing_term_is_named_with_its_component_and_raises():
     report = bench.examine(bowl, [1.0, 0.5], grad=lambda x: [slope(x)[0], 3 * x[1] ** 2], **QUICK)
     assert (report.status, report.cause) == (1, "missing_term")
@@ -263,7 +272,7 @@ def mysim(tmp_path):
     [
         (["grad=right", "sigma=0.01"], 0, "RIGHT"),
         (["grad=wrong", "theta=1,2"], 1, "wrong_factor"),
-        ([], 0, "differences alone"),
+        ([], 0, "NO GRADIENT GIVEN, none was checked"),
     ],
 )
 def test_command_gives_text_and_status(mysim, capsys, words, status, said):

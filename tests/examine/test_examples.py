@@ -1,8 +1,12 @@
-"""The examples on foreign simulators: short, and each ends in a report; what that finds is its own affair."""
+"""The examples on foreign simulators: short, and each ends in a report; what that finds is its own affair.
+
+Those whose libraries are missing are skipped; `make examples` builds an environment that has them all.
+"""
 
 import importlib.util
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +14,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+EXAMPLES = sorted(path for path in (ROOT / "examples").glob("*.py") if path.stem != "table")
 MOST_LINES = 40
-ENDS = ("RIGHT: ", "CANNOT BE TRUSTED: ")
+NIMBLE = os.environ.get("NIMBLE_PYTHON", str(ROOT / ".venv-nimble/bin/python"))
+ENDS = ("RIGHT: ", "NO GRADIENT GIVEN, ", "CANNOT BE TRUSTED: ")
 
 
 def libraries(text):
@@ -32,10 +37,21 @@ def test_an_example_is_short_and_says_what_it_is(path):
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_ends_in_a_report(path):
     missing = [name for name in sorted(libraries(path.read_text())) if importlib.util.find_spec(name) is None]
+    if path.stem == "nimble_ball":  # in a Python of its own
+        missing = [] if Path(NIMBLE).exists() else ["nimblephysics"]
     if missing:
         pytest.skip(f"not installed: {', '.join(missing)}")
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    words = [sys.executable, str(path), *(["mujoco"] if "sys.argv" in path.read_text() else [])]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NIMBLE_PYTHON": NIMBLE}
+    words = [sys.executable, str(path), *(["mujoco"] if path.stem == "mujoco_cube" else [])]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stderr
     assert any(line.startswith(ENDS) for line in done.stdout.splitlines()), done.stdout
+
+
+def test_the_table_has_a_row_of_each_example_and_names_what_is_missing():
+    table = runpy.run_path(str(ROOT / "examples" / "table.py"))
+    assert sorted(table["ORDER"]) == [path.stem for path in EXAMPLES]
+    (row,) = (
+        table["rows"]("drake_ball") if importlib.util.find_spec("pydrake") is None else [["", "not installed: pydrake"]]
+    )
+    assert row[1] == "not installed: pydrake"

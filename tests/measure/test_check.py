@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.measure.gradcheck import EPS, TRUSTED, UNTRUSTED, VERDICTS, Options, check, judge, worst
+from bench.measure.gradcheck import EPS, TRUSTED, UNTRUSTED, VERDICTS, Options, check, judge, roughness, worst
 from bench.measure.gradcheck.sampling import points, samples
 
 THETA = np.array([0.3, 1.2, -0.7])
@@ -161,6 +161,17 @@ def test_rounding_of_a_large_component_is_no_fault_of_a_small_one_but_an_exact_0
 def test_cost_that_has_decayed_below_the_smallest_number_is_no_fault():
     found = check(lambda x: 5e-320 * x[0] ** 2, lambda x: 1e-319 * x, np.array([1.0]))
     assert found.trusted, found.sentence()
+
+
+@pytest.mark.parametrize("slope", [5e-6, 1e-5, 2e-5])
+def test_amplified_rounding_on_a_slope_is_no_staircase(slope):
+    """Rounding a thousandth of the increments in size: some stand out of the others, by a little."""
+    steps = np.arange(roughness.SCAN)
+    for seed in range(200):
+        noise = 3e-9 * np.random.default_rng(seed).standard_normal(steps.size)
+        assert not roughness.treads(slope * steps + noise, 1e-15)
+    assert roughness.treads(slope * steps + 1e-7 * (steps // 7), 1e-15)
+    assert roughness.treads(slope * steps + 1e-7 * np.floor(steps / 4.3) + 1e-9 * np.sin(steps), 1e-15)
 
 
 def test_noise_of_the_cost_is_measured():

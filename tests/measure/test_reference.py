@@ -1,6 +1,7 @@
 """Certified references: against closed forms that they do not see, and how they draw, stop, and act on their checks."""
 
 import re
+from types import SimpleNamespace
 
 import bank
 import numpy as np
@@ -11,6 +12,7 @@ from bench.plugins.scenes.heaviside import Heaviside
 from bench.measure import noise, reference
 from bench.measure.batches import in_columns
 from bench.measure.jumps import largest_jump
+from bench.measure.quadrature import Integral
 from bench.measure.reference import BATCHES, certify
 from bench.model import compose
 from bench.model.problem import Problem
@@ -277,3 +279,31 @@ def test_largest_jump(cost, jump):
     draw = np.random.default_rng(0)
     starts, ends = draw.standard_normal((2, 2, 8))
     assert largest_jump(cost, starts, ends) == pytest.approx(jump, rel=1e-6)
+
+
+# ----------------------------------------------------------------------------------------------- which method it takes
+
+
+def test_jumps_that_no_list_holds_are_not_for_a_rule_in_the_plane():
+    law = SimpleNamespace(continuous=False)
+    listed = SimpleNamespace(contact=law, continuous=False, breakpoints=lambda: ((0.1,),))
+    assert reference._unlisted_jumps(listed), "a contact law jumps elsewhere than the scene"
+    assert not reference._unlisted_jumps(SimpleNamespace(contact=None, continuous=False, breakpoints=lambda: ((0.1,),)))
+    plane = ridge(bank.power(1), bank.step(0.5, 1.0), dim=2, says=False)
+    assert bank.certified(plane, SAMPLES).method.startswith("sampling")
+
+
+@pytest.mark.parametrize(("spread", "chosen"), [(0.0, "quadrature"), (0.01, "sampling"), (9.0, "quadrature")])
+def test_samples_without_any_spread_do_not_outdo_a_rule(monkeypatch, spread, chosen):
+    """A coarse rule gives way to samples that leave less, and never to ones that all missed the event."""
+    batches = 1.0 + spread * np.linspace(-1.0, 1.0, BATCHES)[:, None]
+    monkeypatch.setattr(reference, "_sampled", lambda *_: reference.Reference(batches, "sampling[n=64]", 0.0))
+    monkeypatch.setattr(reference, "integrate", lambda *_: Integral(np.array([1.0]), 0.5, 1, 1.0))
+    assert bank.certified(ridge(bank.power(1), dim=1), SAMPLES).method.startswith(chosen)
+
+
+def test_a_ramp_that_is_steep_and_resolved_is_no_jump():
+    """Six parts in 1e11 of the line wide: its last change is a sixteenth of the one before."""
+    start, end = np.zeros((1, 1)), np.ones((1, 1))
+    assert largest_jump(lambda x: np.clip((x[0] - 0.37) / 6e-11, 0.0, 1.0), start, end) == 0.0
+    assert largest_jump(lambda x: 1.0 * (x[0] > 0.37), start, end) == 1.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from bench.measure.statistics import Sampling, Summary, Truth, bias_interval, summarise, variance_interval
+from bench.measure.statistics import Sampling, Summary, Truth, bias_interval, heavy_tails, summarise, variance_interval
 
 # ---------------------------------------------------------------------------------------------- closed forms
 
@@ -456,6 +456,31 @@ def test_variance_interval_allows_for_kurtosis() -> None:
     # Normal: 2 * 1.97 * sqrt(2 / 255) = 0.349.
     assert widths["normal"] == pytest.approx(0.349, rel=0.1)
     assert widths["t5"] > 1.25 * widths["normal"]
+
+
+def test_ends_are_quantiles_of_the_chi_square_with_the_moments_of_the_square() -> None:
+    """The documented g, nu and q by hand, for a known covariance that is far from round."""
+    m, covariance = np.array([3.0, 0.4, -0.2]), np.diag([1.0, 0.3, 0.01])
+    _, low, high = bias_interval(m, *Truth.from_covariance(m, covariance).errors)
+    trace, square, total = np.trace(covariance), np.trace(covariance @ covariance), m @ m
+    once, twice = m @ covariance @ m, m @ covariance @ covariance @ m
+
+    def chance(beta: float) -> float:
+        q = min(max(once - square + twice / once * (beta**2 - total + trace), 0.0), trace * beta**2)
+        g = (square + 2.0 * q) / (trace + 2.0 * beta**2)
+        return float(scipy.stats.ncx2.cdf(total / g, trace / g, beta**2 / g))
+
+    # Sankaran's transform is good to a thousandth here
+    assert chance(low) == pytest.approx(0.975, abs=1e-3)
+    assert chance(high) == pytest.approx(0.025, abs=1e-3)
+
+
+@pytest.mark.parametrize(("largest", "heavy"), [(30.0, True), (20.0, True), (18.0, False), (1.0, False)])
+def test_tails_are_heavy_below_three_quarters_of_the_root_of_the_repeats(largest: float, heavy: bool) -> None:
+    """Sixteen repeats of which one has a square of ``largest``: (sum y)^2 / sum y^2 is 2.2, 2.95, 3.2 and 16."""
+    deviations = np.sqrt(np.array([largest, *[1.0] * 15]))[:, None]
+    share = largest / (largest + 15.0)
+    assert heavy_tails(deviations) == pytest.approx(share if heavy else 0.0)
 
 
 def test_variance_interval_allows_for_skewed_squares() -> None:

@@ -68,6 +68,7 @@ def test_ground_wall_initial_gradients(law, values, expected, _):
     assert found == pytest.approx(expected, rel=1e-4)  # five digits are given
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("law", "values", "_", "end"), THROWS.values(), ids=THROWS)
 def test_ground_wall_gradient_descent(law, values, _, end):
     made = program(GroundWall(), law, **values)

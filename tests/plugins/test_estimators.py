@@ -194,6 +194,7 @@ def test_sharing_takes_every_sample_for_both_orders():
     assert (alpha > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["action", "parameter"])
 def test_smoothing_gains_is_not_smoothing_actions(model):
     """Under action noise REINFORCE aims at grad J_sigma and smoothing of the gains at something else; under parameter noise not."""

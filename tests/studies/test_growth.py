@@ -80,6 +80,7 @@ def test_median_gradient_of_the_double_pendulum():
         assert median / 1.5 < found < median * 1.5
 
 
+@pytest.mark.slow
 def test_from_the_command_line(tmp_path, capsys):
     words = [
         "study=growth", "name=small", "scenes=[double_integrator,double_pendulum]", "integrators=[rk4]",

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 from bench.plugins.contacts.impulse import Impulse
 from bench.plugins.contacts.penalty import Penalty
@@ -16,7 +17,7 @@ import bench
 from bench.cli import main
 from bench.measure import performance
 from bench.measure.solve import solve
-from bench.studies.optimise import races
+from bench.studies.optimise import races, report
 from bench.studies.optimise.measure import compared
 from bench.sweep import config
 from bench.sweep.execute import store_of
@@ -365,3 +366,47 @@ def test_bootstrap_interval_of_a_mean_covers():
 def test_cells_differ_by_optimizer_parameters():
     made = cells(one("study=optimise", "sweep.rate=[0.1,0.2]"))
     assert len({cell.key for cell in made}) == 2
+
+
+def searches(finals: dict[tuple[str, str], list[float]]) -> races.Races:
+    """One problem's searches: final costs by method and tuning, one for each seed."""
+    rows = [
+        {"problem": "p", "method": method, "tuning": tuning, "seed": seed, "final_cost": cost, "status": "ok"}
+        for (method, tuning), costs in finals.items()
+        for seed, cost in enumerate(costs)
+    ]
+    return races.Races(pd.DataFrame(rows), ())
+
+
+def test_seeds_that_choose_a_tuning_do_not_score_it():
+    """A tuning that is lucky on the scored seeds is not taken, and one that is lucky on its own is scored without them."""
+    found = searches({("tuned", "1"): [1, 1, 9, 9, 9], ("tuned", "2"): [2, 2, 0, 0, 0], ("plain", ""): [5, 5, 5, 5, 5]})
+    assert found.tuning_seeds == (0, 1)
+    assert found.chosen == {("p", "tuned"): "1", ("p", "plain"): ""}
+    assert found.best.groupby("method")["final_cost"].mean().to_dict() == {"tuned": 9, "plain": 5}
+    assert sorted(found.best["seed"].unique()) == [2, 3, 4]  # the same for all methods, so that pairs remain
+    assert "seeds 0, 1, which score nothing" in " ".join(report.notes(found))
+
+
+@pytest.mark.parametrize("finals", [{("one", ""): [1, 2, 3, 4, 5]}, {("few", "1"): [1, 2, 3], ("few", "2"): [2, 3, 4]}])
+def test_few_seeds_or_nothing_tuned_use_all_seeds(finals):
+    found = searches(finals)
+    assert found.tuning_seeds == ()
+    assert len(found.best) == len(next(iter(finals.values())))
+
+
+def test_quality_along_the_path_is_summed_up_over_seeds():
+    found = searches({("one", ""): [1, 2, 3]})
+    rows = found.rows.assign(
+        path_quality_iteration=[[0, 10, 20], [0, 10, 20], [0, 12, 20]],
+        path_quality_rmse_rel=[[0.1, 0.2, 0.4], [0.1, 0.3, 0.8], [0.1, 0.4, 0.6]],
+        path_quality_cosine=[[1.0, 0.9, 0.5]] * 3,
+    )
+    lines = races.path_quality(races.Races(rows, ()))
+    error = lines[lines["quantity"] == "rmse_rel"]
+    assert error["iteration"].tolist() == [0, 10, 20]
+    assert error["value"].tolist() == pytest.approx([0.1, 0.3, 0.6])
+    assert error["low"].iloc[2] == pytest.approx(np.quantile([0.4, 0.8, 0.6], 0.2))
+    assert len(report.path_figure(races.Races(rows, ()), 4.0).axes) == 2
+    alone = rows.assign(path_quality_iteration=[[0]] * 3)
+    assert report.path_figure(races.Races(alone, ()), 4.0) is None

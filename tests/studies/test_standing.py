@@ -3,14 +3,14 @@
 import numpy as np
 import pandas as pd
 
-from bench.studies.bias_variance.standing import standing
+from bench.studies.bias_variance.standing import best, standing
 
 
 def cell(estimator, scene, bias, variance, **more):
     """A row whose bias and variance are known to 20%, against a gradient of norm 2."""
     row = {
         "estimator": estimator, "estimator_params": "", "scene": scene, "contact": "none", "status": "ok", "reference_norm": 2.0,
-        "bias_low": 0.8 * bias, "bias_high": 1.2 * bias, "variance_low": 0.8 * variance, "variance_high": 1.2 * variance,
+        "bias": bias, "variance": variance, "bias_low": 0.8 * bias, "bias_high": 1.2 * bias, "variance_low": 0.8 * variance, "variance_high": 1.2 * variance,
         "rmse": float(np.hypot(bias, variance**0.5)), "samples": 8, "rollouts": 8.0, "gradients": 0.0,
     }  # fmt: skip
     return row | {"rmse_rel": row["rmse"] / 2.0} | more
@@ -35,3 +35,19 @@ def test_swept_rows_and_single_problems_have_no_such_table():
     rows = [cell(e, "one", 0, 1) for e in "abc"]
     assert standing(pd.DataFrame(rows)).empty
     assert standing(pd.DataFrame([*rows, *rows])).empty
+
+
+def test_the_best_setting_is_chosen_at_equal_work():
+    """Four evaluations per sample leave a quarter of the samples: twice the standard deviation."""
+    rows = [
+        cell(name, scene, bias, variance, estimator_params=setting, rollouts=8.0 * work)
+        for scene in ("one", "two")
+        for name, setting, bias, variance, work in (
+            ("plain", "", 0.0, 0.09, 1), ("costly", "", 0.0, 0.04, 4), ("set", "a=1", 0.0, 0.25, 1), ("set", "a=2", 0.0, 0.08, 1),
+        )
+    ]  # fmt: skip
+    table = best(standing(pd.DataFrame(rows))).set_index(["estimator", "problem"])
+    assert table.loc[("set", "one"), "label"] == "set[a=2]"
+    assert np.isclose(table.loc[("costly", "one"), "equal"], (4 * 0.04) ** 0.5 / 2)
+    assert table.loc[("plain", "two"), "stands"] == "wins"
+    assert table.loc[("costly", "two"), "stands"] == ""

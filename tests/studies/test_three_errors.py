@@ -90,6 +90,7 @@ def test_a_wrong_derivative_is_seen():
     assert np.linalg.norm(found.gradient - found.difference) == pytest.approx(2 * np.linalg.norm(found.gradient))
 
 
+@pytest.mark.slow
 def test_from_the_command_line(tmp_path, capsys):
     words = [
         "study=three_errors", "name=small", "scenes=[bounce_once]", "contacts=[impulse,impulse[time_of_impact=false]]",

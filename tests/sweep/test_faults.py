@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import psutil
 import pytest
-from trees import Tree
+from trees import Tree, hear_signals
 
 from bench.errors import UserError
 from bench.sweep.workers import Limits, Pool
@@ -54,6 +54,10 @@ def make(name, fault):
 
 def bad_shape(self, gradient):
     return np.vstack([gradient, gradient])
+
+
+def bad_kind(self, gradient):
+    return gradient * 1j
 
 
 def bad_number(self, gradient):
@@ -107,7 +111,7 @@ def refuses(self, gradient):
 
 
 for function in (
-    bad_shape, bad_number, hangs, allocates, shouts, forks, forks_and_returns, forks_and_dies, leaves, refuses
+    bad_shape, bad_kind, bad_number, hangs, allocates, shouts, forks, forks_and_returns, forks_and_dies, leaves, refuses
 ):
     make(function.__name__, function)
 make("crashes", lambda self, gradient: ctypes.string_at(0))
@@ -128,6 +132,7 @@ Hidden = local()
 
 EXPECTED = {
     "bad_shape": ("error", "returned shape"),
+    "bad_kind": ("error", "complex numbers"),
     "bad_number": ("nonfinite", "theta"),
     "hangs": ("timeout", "no result within 5 s"),
     "allocates": ("crashed", "GiB of memory"),
@@ -170,7 +175,7 @@ def run(request, tree):
     names = [name for fault in EXPECTED for name in (fault, "fobg")]
     words = [
         f"estimators=[{','.join(dict.fromkeys(names))},reinforce]",
-        "sweep.samples=[8,16]",
+        *(["sweep.samples=[8,16]"] if request.param == 1 else []),
         f"name=of{request.param}",
     ]
     done = tree.run(*BASE, *words, *LIMITS, f"workers={request.param}", "results_dir=out")
@@ -183,18 +188,20 @@ def run(request, tree):
 def test_fault_has_its_status_and_reason(run, name):
     status, said = EXPECTED[name]
     rows = run[1][run[1]["estimator"] == name]
-    assert list(rows["status"]) == [status] * 2
+    assert len(rows)
+    assert set(rows["status"]) == {status}
     for reason in rows["reason"].fillna(""):
         assert said in reason
         assert "\n" not in reason
 
 
 def test_sound_cells_are_untouched(tree, run):
+    swept = ["sweep.samples=[8,16]"] if len(run[1]["samples"].unique()) > 1 else []
     done = tree.run(
-        *BASE, "estimators=[fobg,reinforce]", "sweep.samples=[8,16]", "name=sound", "workers=0", "results_dir=out"
+        *BASE, "estimators=[fobg,reinforce]", *swept, f"name=sound{len(swept)}", "workers=0", "results_dir=out"
     )
     assert done.returncode == 0, done.stderr
-    alone = pd.read_csv(tree.root / "out" / "sound" / "bias_variance.csv")
+    alone = pd.read_csv(tree.root / "out" / f"sound{len(swept)}" / "bias_variance.csv")
     among = run[1][run[1]["estimator"].isin(["fobg", "reinforce"])].reset_index(drop=True)
     pd.testing.assert_frame_equal(alone.drop(columns="experiment"), among.drop(columns="experiment"), check_exact=True)
 
@@ -247,7 +254,13 @@ def start(tree: Tree, *words: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "bench", *words]
     environment = {**os.environ, "PYTHONPATH": str(tree.packages)}
     return subprocess.Popen(
-        command, cwd=tree.root, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+        command,
+        cwd=tree.root,
+        env=environment,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        preexec_fn=hear_signals,
     )
 
 

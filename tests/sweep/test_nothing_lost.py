@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -9,6 +10,7 @@ import time
 import pandas as pd
 import psutil
 import pytest
+from trees import hear_signals
 
 from bench.cli import main
 from bench.errors import StorageError, UserError
@@ -271,20 +273,36 @@ def _no_handler(argument):
 @pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM", "SIGHUP"])
 @pytest.mark.parametrize("times", [1, 2])
 def test_signals_stop_a_run_in_peace(tmp_path, sent, times):
-    import signal
-
     seeds = ",".join(map(str, range(400)))
     words = [*FOBG[:-1], f"sweep.seed=[{seeds}]", "samples=20000", f"results_dir={tmp_path}"]
-    run = subprocess.Popen([sys.executable, "-m", "bench", *words], stderr=subprocess.PIPE, text=True)
-    for _ in range(600):
-        if list(tmp_path.glob("custom/pending/*.json")):
-            break
-        time.sleep(0.05)
-    for _ in range(times):
-        run.send_signal(getattr(signal, sent))
-        time.sleep(0.005)
-    said = run.communicate(timeout=30)[1]
+    command = [sys.executable, "-m", "bench", *words]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=hear_signals) as run:
+        for _ in range(600):
+            if list(tmp_path.glob("custom/pending/*.json")):
+                break
+            time.sleep(0.05)
+        for _ in range(times):
+            run.send_signal(getattr(signal, sent))
+            time.sleep(0.005)
+        try:
+            said = run.communicate(timeout=30)[1]
+        finally:
+            run.kill()
     assert run.returncode in ((130,) if times == 1 else (130, -getattr(signal, sent)))
     assert "Traceback" not in said
     assert "KeyboardInterrupt" not in said
     assert not Store(tmp_path / "custom", COLUMNS).load().empty
+
+
+def test_two_studies_that_start_at_once_in_an_empty_folder_do_not_mix(tmp_path):
+    first, second = (Store(tmp_path / "mine", COLUMNS, study) for study in ("bias_variance", "growth"))
+    for store in (first, second):
+        assert store.load().empty
+    first.prepare()
+    with pytest.raises(UserError, match="a run of study bias_variance has started"):
+        second.prepare()
+    first.append(COLUMNS.blank() | {"key": "1", "study": "bias_variance"})
+    first.compact()
+    assert not (tmp_path / "mine" / "pending").exists()
+    with pytest.raises(UserError, match="holds rows of study bias_variance"):
+        second.prepare()

@@ -305,18 +305,18 @@ def table(directory) -> pd.DataFrame:
     return pd.read_parquet(directory / "sweep" / "rows.parquet").drop(columns=["stored_at", "wall_s", "sequence"])
 
 
-def test_one_and_two_workers_give_the_same_bytes(tmp_path):
+def test_any_number_of_workers_gives_the_same_bytes(tmp_path):
     """References by quadrature and sampling too, on two backends, one of them compiling."""
     words = [
         "scenes=[bouncing_ball,pushing]", "contacts=[penalty]", "backends=[jax,numpy]", "estimators=[fobg,reinforce]",
         "scene.pushing.horizon=5", "scene.bouncing_ball.horizon=5", "samples=16", "repeats=4", "reference.samples=4096",
         "timing=false", "name=sweep", "--quiet",
     ]  # fmt: skip
-    for workers in (0, 1, 2):
+    for workers in (0, 2):
         assert main([*words, f"workers={workers}", f"results_dir={tmp_path / str(workers)}"]) == 0
-    csv = [(tmp_path / str(workers) / "sweep" / "bias_variance.csv").read_bytes() for workers in (0, 1, 2)]
-    assert csv[0] == csv[1] == csv[2]
-    assert table(tmp_path / "1")["time_s"].isna().all()
+    csv = [(tmp_path / str(workers) / "sweep" / "bias_variance.csv").read_bytes() for workers in (0, 2)]
+    assert csv[0] == csv[1]
+    assert table(tmp_path / "2")["time_s"].isna().all()
 
 
 @pytest.mark.slow

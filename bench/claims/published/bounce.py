@@ -52,7 +52,8 @@ class TimeOfImpact(Claim):
             figures,
             reservation=(
                 "the source's start is exactly on a boundary between two steps. Its df/dvy0 without the time of impact is that "
-                f"of an impact one step later, {late[1]:.5f}; half a step off the boundary it is {off[1]:.5f} here"
+                f"of an impact one step later, {late[1]:.5f}; half a step off the boundary it is {off[1]:.5f} here. By hand it is "
+                f"2 n / 480 - 1 for an impact in step n: {2 * 217 / 480 - 1:.5f} for 217, {2 * 216 / 480 - 1:.5f} for 216"
             ),
             series=series,
         )
@@ -87,7 +88,7 @@ class PenaltyPhase(Claim):
                 at = problem(scene, f"penalty[stiffness={k!r}]", backend="jax[mode=forward]")
                 slope = at.grad(theta, np.zeros((3, 256)))[0]
                 errors.append(float(np.sqrt(np.mean((slope + 1) ** 2))))
-                figures.append(Figure(f"k = {k:g}, dt = 1/{parts}", text, errors[-1], spread=0.02 * float(text)))
+                figures.append(Figure(f"k = {k:g}, dt = 1/{parts}", text, errors[-1]))
             series[str(parts)] = errors
         return Outcome(figures, series=series)
 

@@ -61,3 +61,4 @@ class Directions(Claim):
         """Draw both errors against the number of samples."""
         axes.loglog(series["n"], series["gauss"], "o-", label="Gaussian: (n + 1)/N")
         axes.loglog(series["n"], series["sphere"], "s--", label="sphere: (n - 1)/N")
+        axes.set_xticks(series["n"], [f"{n:g}" for n in series["n"]])

@@ -45,7 +45,7 @@ class FallingPivot(Claim):
     statement = "A first-order descent towards the best angle of a pivot walks over its edge; a zeroth-order one stops in front."
     source = "Suh et al. 2022, ICML"
     learned = "Near the edge the first-order gradient misses exactly the part that warns: the jump times its density."
-    labels = ("angle", "mean gradient")
+    labels = ("angle [rad]", "mean gradient")
 
     def measure(self) -> Outcome:
         """Integrate the missing part, and descend."""
@@ -82,4 +82,4 @@ class FallingPivot(Claim):
         """Draw both gradients around the edge."""
         axes.plot(series["x"], series["truth"], label="true")
         axes.plot(series["x"], series["first"], label="first-order mean")
-        axes.axvline(math.pi / 4, color="#404040", linewidth=0.6)
+        axes.axvline(math.pi / 4, color="#404040", linewidth=0.6, label="edge")

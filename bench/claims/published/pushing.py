@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,12 @@ if TYPE_CHECKING:
     from bench.model import Problem
 
 
+SMOOTHED, COARSE, FINE = 20_000, 20_000, 4096
+"""Samples of each variance."""
+TAILS = 0.25
+"""Relative error of a variance of 1,000 samples beyond which a few of them decide it."""
+
+
 def sampled(
     at: Problem, count: int, seed: int, zeroth: str = "reinforce"
 ) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -23,6 +30,14 @@ def sampled(
     w = np.random.default_rng(seed).standard_normal((at.program.n_noise, count))
     first, other = (terms(at, estimator(name), w) for name in ("fobg", zeroth))
     return spread(first, 20), spread(other, 20)
+
+
+def of_the_source(values: tuple[float, float], count: int) -> float:
+    """Return two standard errors of a variance from the source's 1,000 samples, from its error on ``count`` of them.
+
+    The sources give one number of about a thousand samples each, and no interval.
+    """
+    return 2 * values[1] * math.sqrt(count / 1000)
 
 
 class SmoothedPush(Claim):
@@ -48,13 +63,12 @@ class SmoothedPush(Claim):
         seeds = []
         for beta in first:
             at = problem("pushing[sigma=0.3]", f"softplus[stiffness=1e5,beta={float(beta)!r}]")
-            (v1, e1), (v0, e0) = sampled(at, 20_000, 16)
+            (v1, e1), (v0, e0) = sampled(at, SMOOTHED, 16)
+            once = of_the_source((v1, e1), SMOOTHED), of_the_source((v0, e0), SMOOTHED)
             series["beta"].append(float(beta))
             series["first"].append(v1)
             series["zeroth"].append(v0)
-            figures.append(
-                Figure(f"zeroth order, beta = {beta}", zeroth[beta], v0, e0, spread=0.1 * float(zeroth[beta]))
-            )
+            figures.append(Figure(f"zeroth order, beta = {beta}", zeroth[beta], v0, e0, spread=once[1]))
             if beta == "6.4e4":
                 seeds = [sampled(at, 1000, seed)[0][0] for seed in range(12)]
                 figures.append(
@@ -66,9 +80,7 @@ class SmoothedPush(Claim):
                     )
                 )
             else:
-                figures.append(
-                    Figure(f"first order, beta = {beta}", first[beta], v1, e1, spread=0.03 * float(first[beta]))
-                )
+                figures.append(Figure(f"first order, beta = {beta}", first[beta], v1, e1, spread=once[0]))
         low, high = min(seeds), max(seeds)
         return Outcome(
             figures,
@@ -109,17 +121,18 @@ class StiffPush(Claim):
         series: dict[str, list[float]] = {"k": list(coarse), "coarse": [], "fine": [], "zeroth": []}
         for k, text in coarse.items():
             at = problem(f"pushing[{values},horizon=200,dt=0.005]", f"penalty[stiffness={k!r}]")
-            (v1, e1), (v0, e0) = sampled(at, 4000, 17)
+            (v1, e1), (v0, e0) = sampled(at, COARSE, 17)
             series["coarse"].append(v1)
             series["zeroth"].append(v0)
-            figures.append(_heavy(f"first order, k = {k:g}", text, v1, e1))
-            figures.append(Figure(f"zeroth order, k = {k:g}", "1.3e7", v0, e0, spread=0.15e7))
+            figures.append(_heavy(f"first order, k = {k:g}", text, v1, e1, COARSE))
+            once = of_the_source((v0, e0), COARSE)
+            figures.append(Figure(f"zeroth order, k = {k:g}", "1.3e7", v0, e0, spread=once))
         for k, text in fine.items():
             at = problem(f"pushing[{finer}]", f"penalty[stiffness={k!r}]")
-            w = np.random.default_rng(171).standard_normal((200, 1024))
+            w = np.random.default_rng(171).standard_normal((200, FINE))
             v1, e1 = spread(terms(at, estimator("fobg"), w), 16)
             series["fine"].append(v1)
-            figures.append(_heavy(f"first order, k = {k:g}, step 20 times finer", text, v1, e1))
+            figures.append(_heavy(f"first order, k = {k:g}, step 20 times finer", text, v1, e1, FINE))
         ratio = series["coarse"][-1] / series["fine"][-1]
         return Outcome(
             figures,
@@ -137,8 +150,8 @@ class StiffPush(Claim):
         axes.loglog(series["k"], series["zeroth"], "s-", label="zeroth order")
 
 
-def _heavy(what: str, text: str, measured: float, error: float) -> Figure:
-    """Return a figure that is compared by its error while that is small, by a factor where tails rule."""
-    if error < 0.1 * measured:
-        return Figure(what, text, measured, error, spread=0.1 * float(text))
+def _heavy(what: str, text: str, measured: float, error: float, count: int) -> Figure:
+    """Return a figure compared by its errors and the source's, or by a factor where tails rule and no error is one."""
+    if error * math.sqrt(count / 1000) < TAILS * measured:
+        return Figure(what, text, measured, error, spread=of_the_source((measured, error), count))
     return Figure(what, text, measured, error, factor=10.0)

@@ -125,6 +125,7 @@ class ThreeEstimators(Claim):
         """Draw the variances against the frequency."""
         for name in ("pathwise", "score", "measure-valued"):
             axes.loglog(series["k"], series[name], "o-", label=name)
+        axes.set_xticks(series["k"], [f"{k:g}" for k in series["k"]])
 
 
 def _exact(text: str) -> str:

@@ -16,6 +16,8 @@ SCAN = 65
 """Points of a scan for the treads of a staircase."""
 EDGES = 3
 """Separate edges from which a run of treads counts as a staircase, and not as a jump or two."""
+APART = 3.0
+"""Least ratio of an edge to what the increments on the treads differ by."""
 
 
 def offsets(unit: float) -> np.ndarray:
@@ -68,13 +70,17 @@ def scans(scale: float, unit: float) -> np.ndarray:
 def treads(values: np.ndarray, rounding: float) -> bool:
     """Return whether equally spaced ``values (n,)`` lie on a staircase, perhaps one that is added to a straight line.
 
-    Most increments are then the same to within ``rounding``, and the others stand out of it one by one. A single jump
-    is no staircase, and neither is a slope with a flat part.
+    Most increments are then the same to within ``rounding``, and the others stand out of it one by one, by
+    :data:`APART` times what is left. A single jump is no staircase, neither is a slope with a flat part, and neither is
+    rounding that a rollout amplifies: its increments have every size.
     """
     if not np.isfinite(values).all():
         return False
     increments = np.diff(values)
     tread = float(np.median(increments))
-    edge = np.abs(increments - tread) > rounding + 1e-3 * np.abs(increments).max()
+    change = np.abs(increments - tread)
+    edge = change > rounding + 1e-3 * np.abs(increments).max()
+    if edge.all() or not edge.any() or change[edge].min() <= APART * change[~edge].max():
+        return False
     apart = edge & ~np.r_[False, edge[:-1]] & ~np.r_[edge[1:], False]
     return bool(apart.sum() >= EDGES and edge.sum() <= increments.size // 2 and apart.sum() >= 0.9 * edge.sum())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -96,12 +97,12 @@ class Estimates:
 
     def _explained(self, start: int, block: np.ndarray) -> np.ndarray:
         result, self.decided[start] = self._estimator.explained(self._problem, self._theta, block)
-        result = np.asarray(result, dtype=np.float64)
+        result = self._real(result)
         self._check(result, (block.shape[0], self._problem.dim))
         return result
 
     def _means(self, estimator: SampleMean, start: int, block: np.ndarray) -> np.ndarray:
-        terms = np.asarray(estimator.terms(self._problem, self._theta, columns(block)), dtype=np.float64)
+        terms = self._real(estimator.terms(self._problem, self._theta, columns(block)))
         self._check(terms, (self._problem.dim, block.shape[0] * block.shape[1]))
         split = per_repeat(terms, block)
         result: np.ndarray = split.mean(axis=1)
@@ -120,7 +121,7 @@ class Estimates:
                 part = next(drawn, None)
             if part is None:
                 break
-            terms = np.asarray(estimator.terms(self._problem, self._theta, part), dtype=np.float64)
+            terms = self._real(estimator.terms(self._problem, self._theta, part))
             self._check(terms, (self._problem.dim, part.shape[1]))
             total += terms.sum(axis=1)
             with self.pause:
@@ -138,6 +139,11 @@ class Estimates:
         with np.errstate(all="ignore"):
             rest = terms - self._centre[:, None]
             return rest.sum(axis=1), float(np.vdot(rest, rest))
+
+    def _real(self, result: Any) -> np.ndarray:
+        if np.iscomplexobj(result):  # a cast would drop the imaginary part without a word
+            raise TypeError(f"{self._estimator.name} returned complex numbers; gradients are real")
+        return np.asarray(result, dtype=np.float64)
 
     def _look(self, seen: Seen, terms: np.ndarray) -> Seen:
         """Count terms ``(d, b)`` that are exactly 0, and keep the norms of a repeat's first ones."""

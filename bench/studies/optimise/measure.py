@@ -153,7 +153,8 @@ def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
     kept = path.kept()
     start, final, best = path.cost[0], path.cost[-1], float(np.nanmin(path.cost))
     if settings.quality == "path" and stopped != "diverged":
-        found |= qualities(search, thetas[len(thetas) // 2], settings, (f"{path.iteration[len(thetas) // 2]}",))
+        for place in sorted({round(share * (len(thetas) - 1)) for share in PLACES} - {0}):
+            found |= qualities(search, thetas[place], settings, (f"{path.iteration[place]}",))
     result = {
         "status": "diverged" if stopped == "diverged" else "ok",
         "reason": f"the cost left {settings.limit:g} (|J0| + 1) or is not finite" if stopped == "diverged" else "",
@@ -187,6 +188,8 @@ def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
     return result
 
 
+PLACES = (0.25, 0.5, 0.75, 1.0)
+"""Where on a path the gradient's quality is measured, beside its start, as shares of the points kept."""
 PATHS = ("iteration", "cost", "rollouts", "gradients")
 
 

@@ -24,6 +24,8 @@ TARGETS = (10.0, 100.0, 1000.0)
 """A target is the first regret divided by one of these."""
 RESTARTS = 100
 """Simulated runs with restarts per problem and target."""
+FEWEST_SEEDS = 4
+"""Seeds from which some only choose tunings and the others only score: fewer are too few to be parted."""
 ROUNDING = 1e-12
 """Regret below this share of the first one is 0."""
 
@@ -51,11 +53,20 @@ class Races:
         return list(dict.fromkeys(self.rows["method"]))
 
     @cached_property
+    def tuning_seeds(self) -> tuple[int, ...]:
+        """The first third of the seeds, which choose tunings and score nothing; none where nothing is tuned or seeds are few."""
+        seeds = sorted(int(seed) for seed in self.rows["seed"].unique())
+        several = (self.rows.groupby(["problem", "method"])["tuning"].nunique() > 1).any()
+        return tuple(seeds[: math.ceil(len(seeds) / 3)]) if several and len(seeds) >= FEWEST_SEEDS else ()
+
+    @cached_property
     def chosen(self) -> dict[tuple[str, str], str]:
-        """The tuning of each problem and method with the best median final cost over seeds; a lost search counts as inf."""
+        """The tuning of each problem and method with the best median final cost over the tuning seeds, or all seeds where
+        there are none; a lost search counts as inf."""
         best: dict[tuple[str, str], tuple[float, str]] = {}
-        final = self.rows["final_cost"].where(self.rows["status"] == "ok", math.inf).fillna(math.inf)
-        for key, part in final.groupby([self.rows[n] for n in ("problem", "method", "tuning")], sort=False):
+        rows = self.rows[self.rows["seed"].isin(self.tuning_seeds)] if self.tuning_seeds else self.rows
+        final = rows["final_cost"].where(rows["status"] == "ok", math.inf).fillna(math.inf)
+        for key, part in final.groupby([rows[n] for n in ("problem", "method", "tuning")], sort=False):
             problem, method, tuning = (str(k) for k in key)
             # the lower of the two middle ones: a mean with a lost search would be infinite
             middle = float(np.sort(part.to_numpy())[(len(part) - 1) // 2])
@@ -65,9 +76,10 @@ class Races:
 
     @cached_property
     def best(self) -> pd.DataFrame:
-        """The rows of each method's best tuning on each problem."""
-        keys = zip(self.rows["problem"], self.rows["method"], self.rows["tuning"], strict=True)
-        return self.rows[[self.chosen[problem, method] == tuning for problem, method, tuning in keys]]
+        """The rows of each method's best tuning on each problem, of the seeds that did not choose it."""
+        rows = self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
+        keys = zip(rows["problem"], rows["method"], rows["tuning"], strict=True)
+        return rows[[self.chosen.get((problem, method)) == tuning for problem, method, tuning in keys]]
 
     def each(self, rows: pd.DataFrame | None = None) -> Iterator[tuple[str, str, pd.DataFrame]]:
         """Yield problem, method and rows of the best tuning, or of the rows given."""
@@ -309,6 +321,41 @@ def correlations(points: pd.DataFrame) -> pd.DataFrame:
                 "points": len(pooled), "problems": len(strata),
         })  # fmt: skip
     return pd.DataFrame(lines)
+
+
+def path_quality(found: Races) -> pd.DataFrame:
+    """Return median, 20% and 80% quantile over seeds of the gradient's relative error and cosine, by place on the path.
+
+    A row for each problem, method, quantity and place; empty where quality was measured at the start alone.
+    """
+    lines = []
+    for problem, method, part in found.each():
+        paths = [row for _, row in part.iterrows() if len(_listed(row["path_quality_iteration"])) > 1]
+        places = max((len(_listed(row["path_quality_iteration"])) for row in paths), default=0)
+        whole = [row for row in paths if len(_listed(row["path_quality_iteration"])) == places]
+        for quantity in ("rmse_rel", "cosine") if whole else ():
+            values = np.array([_listed(row[f"path_quality_{quantity}"]) for row in whole], dtype=float)
+            moments = np.median(
+                np.array([_listed(row["path_quality_iteration"]) for row in whole], dtype=float), axis=0
+            )
+            low, middle, high = np.quantile(values, [0.2, 0.5, 0.8], axis=0)
+            lines += [
+                {
+                    "problem": problem,
+                    "method": method,
+                    "quantity": quantity,
+                    "iteration": i,
+                    "value": m,
+                    "low": a,
+                    "high": b,
+                }
+                for i, m, a, b in zip(moments, middle, low, high, strict=True)
+            ]
+    return pd.DataFrame(lines, columns=["problem", "method", "quantity", "iteration", "value", "low", "high"])
+
+
+def _listed(value: object) -> list[float]:
+    return list(value) if isinstance(value, list | tuple | np.ndarray) else []
 
 
 def rates(found: Races) -> pd.DataFrame:

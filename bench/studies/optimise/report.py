@@ -30,7 +30,7 @@ NOTES = (
     "stratified by problem. beats fobg: chance of a lower final cost, paired by problem and seed. profile: integral of the "
     "share of targets reached within 1 to 4 times the best method's runtime. aRT: average runtime in rollouts (a gradient "
     "counts as many as it takes the time of): all that the searches spent, over the number that arrived; inf if none did. "
-    "Each method is shown at its best tuning on each problem, chosen by median final cost of the same seeds; the median "
+    "Each method is shown at its best tuning on each problem, chosen by median final cost of {seeds}; the median "
     "score over all its tunings stands beside it, and their number is what the tuning cost.",
 )
 
@@ -40,6 +40,15 @@ TITLE = 1.6
 """Inches of a line of a panel's title."""
 DEPTH = 1e-7
 """Regrets below this share of the largest are not drawn: one search reaches 0 where J* is the lowest cost of any."""
+
+
+def notes(found: Races) -> list[str]:
+    """Explain the columns, and say which seeds chose the tunings."""
+    chosen = found.tuning_seeds
+    seeds = (
+        f"seeds {', '.join(map(str, chosen))}, which score nothing" if chosen else "the same seeds that it is scored on"
+    )
+    return [text.format(seeds=seeds) for text in NOTES]
 
 
 def default_ratio(experiment: Experiment) -> float:
@@ -59,11 +68,12 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     contents["summary.csv"] = summed.to_csv(index=False, lineterminator="\n")
     texts = [f"# {experiment.name}: does a better gradient get there sooner?", *findings.sentences(found, default)]
     texts += ["## Methods", plain_markdown(methods(summed)), "## Times to targets", plain_markdown(arrivals(reached))]
-    texts += ["## Least costs", plain_markdown(optima(found)), *NOTES]
+    texts += ["## Least costs", plain_markdown(optima(found)), *notes(found)]
     contents["optimise.md"] = "\n\n".join(texts) + "\n"
     paths = write_all(experiment.directory, contents)
     drawings = {
         "quality_runtime": quality_figure, "anytime": anytime_figure, "targets": targets_figure, "learning_rates": rates_figure,
+        "path_quality": path_figure,
     }  # fmt: skip
     with styled():
         for stem, draw in drawings.items():
@@ -139,7 +149,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
             console.print(sentence)
     for reason in rows.loc[rows["reason"] != "", "reason"].unique():
         console.print(reason)
-    console.print(*NOTES)
+    console.print(*notes(found))
 
 
 # ------------------------------------------------------------------------------------------------------- charts
@@ -219,6 +229,43 @@ def quality_figure(found: Races, default: float) -> Figure | None:
     _legend(
         drawn, {name: {**style, "marker": "", "linestyle": "-"} for name, style in styles.items()}, (*shapes, hollow)
     )
+    return drawn
+
+
+def path_figure(found: Races, default: float) -> Figure | None:
+    """Draw the gradient's relative error and cosine along the path, a row of panels each: median and 20% to 80% of seeds.
+
+    None where quality was measured at the start alone.
+    """
+    lines = races.path_quality(found)
+    if lines.empty:
+        return None
+    names = list(dict.fromkeys(lines["problem"]))
+    drawn = Figure(figsize=(min(WIDTH, max(0.5 * WIDTH, 1.9 * len(names))), 4.9), layout="constrained")
+    FigureCanvasAgg(drawn)
+    drawn.suptitle("How good is the gradient on the way?", fontsize=9, fontweight="bold")
+    grid = drawn.subplots(2, len(names), squeeze=False)
+    styles = {name: style for name, style in looks(found).items() if name in set(lines["method"])}
+    labels = {"rmse_rel": "relative RMSE of the gradient", "cosine": "cosine with the reference"}
+    for row, (quantity, label) in zip(grid, labels.items(), strict=True):
+        for panel, problem in zip(row, names, strict=True):
+            part = lines[(lines["problem"] == problem) & (lines["quantity"] == quantity)]
+            for method, own in part.groupby("method", sort=False):
+                style = styles[str(method)]
+                panel.fill_between(
+                    own["iteration"], own["low"], own["high"], color=style["color"], alpha=0.15, linewidth=0
+                )
+                panel.plot(own["iteration"], own["value"], label=plain(str(method)), **style)
+            panel.set_xlabel("iteration")
+            if quantity == "rmse_rel":
+                known = part[(part["low"] > 0) & np.isfinite(part["high"])]
+                if len(known):
+                    log_axis(panel, "y", known["low"].min() / 2, known["high"].max() * 2)
+                panel.set_title(_wrapped(str(problem)), fontsize=7)
+            else:
+                panel.set_ylim(-1.05, 1.05)
+        row[0].set_ylabel(label)
+    _legend(drawn, styles)
     return drawn
 
 

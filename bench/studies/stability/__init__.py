@@ -36,6 +36,11 @@ class Stability(Study):
         Column("truth_error", "relative change of the truth on its last refinement"),
         text("verdict", "ok, or what is wrong", judged=Judged("verdict", "verdict", order=WORST_FIRST)),
         text("truth", "how the truth was computed: physical or refined"),
+        text(
+            "cause", "of a finite but wrong gradient, from the same law at a far finer step: step, law, both or unknown"
+        ),
+        Column("step_error", "norm of (gradient - that of the same law at a far finer step) / norm of the latter"),
+        Column("law_error", "norm of (gradient of the same law at a far finer step - truth) / norm of the truth"),
         numbers("state_at_first_bad_step", "the state at the first bad step"),
     )
 

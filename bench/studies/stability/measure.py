@@ -81,7 +81,12 @@ def _measured(cell: Cell, program: Rollout, session: Session, limits: Limits) ->
     if not error <= resolved:
         reason = f"halving the finest step moves the truth by {error:.1%}, more than {resolved:.0%}"
         return result | {"verdict": "unresolved", "reason": reason}
-    return result | compare(gradient, truth, limits.inaccurate)
+    judged = compare(gradient, truth, limits.inaccurate)
+    if judged["verdict"] == "ok":
+        return result | judged
+    if kind == "refined" or cell.contact is None:  # the truth is this very program's at a finer step
+        return result | judged | {"cause": "step", "step_error": judged["relative_error"], "law_error": 0.0}
+    return result | judged | cause_of(gradient, truth, *refined(cell, limits), limits.inaccurate)
 
 
 # ---------------------------------------------------------------------------------------------- trajectories
@@ -154,10 +159,33 @@ def truth_of(cell: Cell, limits: Limits) -> tuple[str, np.ndarray, float]:
     physical = program.physical_gradient()
     if physical is not None:
         return "physical", np.asarray(physical), 0.0
-    steps = max(limits.fine_steps, limits.finer * program.scene.horizon)
+    return "refined", *refined(cell, limits)
+
+
+def refined(cell: Cell, limits: Limits) -> tuple[np.ndarray, float]:
+    """Return the gradient ``(d,)`` of the same law at a far finer step, and its relative change on the last halving."""
+    steps = max(limits.fine_steps, limits.finer * rollout(cell.program()).scene.horizon)
     coarse, fine = _gradient_at(cell, steps // 2), _gradient_at(cell, steps)
     change = float(np.linalg.norm(fine - coarse))
-    return "refined", fine, change / float(np.linalg.norm(fine)) if change else 0.0
+    return fine, change / float(np.linalg.norm(fine)) if change else 0.0
+
+
+def cause_of(
+    gradient: np.ndarray, truth: np.ndarray, fine: np.ndarray, change: float, inaccurate: float
+) -> dict[str, Any]:
+    """Tell whether a wrong gradient is the step's doing or the law's, from the law's own at a far finer step, ``fine``.
+
+    ``law``: the law is as wrong however fine the step. ``step``: the law is right, this step is not. ``both``: each alone
+    is off by more than ``inaccurate``, or the two add up to it. ``unknown``: ``fine`` has not converged to half of that.
+    """
+    if not change <= inaccurate / 2:
+        return {"cause": "unknown"}
+    law = float(np.linalg.norm(fine - truth) / np.linalg.norm(truth))
+    size = float(np.linalg.norm(fine))
+    step = float(np.linalg.norm(gradient - fine)) / size if size else math.inf
+    by_law, by_step = law > inaccurate, step > inaccurate
+    cause = "both" if by_law == by_step else "law" if by_law else "step"
+    return {"cause": cause, "law_error": law, "step_error": step}
 
 
 def _gradient_at(cell: Cell, steps: int) -> np.ndarray:

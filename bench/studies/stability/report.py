@@ -51,6 +51,22 @@ VERDICTS = {
 """Per verdict: the letter in its cells, their colour, and its meaning, where the study's limits are filled in."""
 DARK = ("nonfinite", "diverged")
 """Verdicts whose cells take white letters."""
+WRONG = ("inaccurate", "wrong_sign", "zero")
+"""Verdicts of finite but wrong gradients, which the maps colour by their cause."""
+CAUSES = {
+    "step": (ORANGE, "wrong by the step: the same law is right at a far finer one"),
+    "law": (SKY, "wrong by the law, however fine the step"),
+    "both": (PINK, "wrong by step and law"),
+    "unknown": ("#a39bc8", "?: wrong, the cause is not resolved"),
+    "": ("#c9b458", "wrong, the cause was not recorded"),
+}
+"""Colour and meaning of each cause of a finite but wrong gradient."""
+FILLS = {
+    "ok": VERDICTS["ok"][1],
+    **{f"by {cause}": fill for cause, (fill, _) in CAUSES.items()},
+    **{name: fill for name, (_, fill, _) in VERDICTS.items() if name not in ("ok", *WRONG)},
+}
+"""Colours of cells and bars, by :func:`looks`."""
 LOST = ("diverged", "nonfinite")
 """Verdicts on the far side of the measured stability boundary."""
 GROWING = 1 + 1e-9
@@ -117,10 +133,30 @@ def unstable(rows: pd.DataFrame) -> pd.Series:
     return rows["verdict"].isin(LOST) | (rows["growth_factor"] > GROWING)
 
 
+def looks(rows: pd.DataFrame) -> pd.Series:
+    """Return what colours each cell: its verdict, and of a finite but wrong gradient the cause."""
+    verdict = rows["verdict"].where(rows["verdict"].isin(list(VERDICTS)), "")
+    return verdict.where(~verdict.isin(WRONG), "by " + rows["cause"].where(rows["cause"].isin(list(CAUSES)), ""))
+
+
+def swatches(rows: pd.DataFrame) -> list[Patch]:
+    """Return the legend of the cells' colours and letters."""
+    present = set(looks(rows))
+    named = {name: f"{VERDICTS[name][0]}: {meaning(name, rows)}" for name in VERDICTS if name not in (*WRONG, "", "ok")}
+    named |= {"ok": meaning("ok", rows), "": VERDICTS[""][2]}
+    named |= {f"by {cause}": text for cause, (_, text) in CAUSES.items()}
+    return [
+        Patch(facecolor=FILLS[name], edgecolor="#808080", linewidth=0.4, label=named[name])
+        for name in FILLS
+        if name in present
+    ]
+
+
 def placed(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
     """Arrange rows for reading, with every cell's step size and stiffness as stored, whatever else was swept."""
     shown = arranged(experiment, rows)
-    return replace(shown, rows=shown.rows.assign(**{name: rows[name] for name in PLACES}))
+    cause = rows["cause"].fillna("") if "cause" in rows else ""
+    return replace(shown, rows=shown.rows.assign(**{name: rows[name] for name in PLACES}, cause=cause))
 
 
 def panels(shown: Arranged) -> list[Panel]:
@@ -185,7 +221,7 @@ def meaning(verdict: str, rows: pd.DataFrame) -> str:
 
 def _same(a: pd.DataFrame, b: pd.DataFrame) -> bool:
     """Return whether two maps have the same cells and verdicts."""
-    named = ["dt", "stiffness", "verdict", "status"]
+    named = ["dt", "stiffness", "verdict", "cause", "status"]
     return a[named].reset_index(drop=True).equals(b[named].reset_index(drop=True))
 
 
@@ -344,13 +380,14 @@ def heat_map(integrator: str, maps: Sequence[Panel], axes: Sequence[Axis] = ()) 
             area.set_xlabel(named["dt"])
         else:
             area.set_xticklabels([])
-    present = [name for name in VERDICTS if name in set(rows["verdict"])]
-    legend: list[Any] = [_swatch(name, meaning(name, rows)) for name in present]
+    legend: list[Any] = swatches(rows)
+    letters = [f"{VERDICTS[name][0]}: {meaning(name, rows)}" for name in WRONG if name in set(rows["verdict"])]
+    legend += [Patch(facecolor="none", label=text) for text in letters]
     if (unstable(rows) & ~rows["verdict"].isin(LOST)).any():
         legend.append(Patch(label="striped: state grows, slowly", facecolor="white", **STRIPES))
     if any(area.lines for area in grid.flat[: len(maps)]):
         legend.append(Line2D([], [], **BOUNDARY, label="theory: spectral radius 1"))
-    figure.legend(handles=legend, loc="outside lower center", ncols=min(3, len(legend)), columnspacing=1.2)
+    figure.legend(handles=legend, loc="outside lower center", ncols=min(2, len(legend)), columnspacing=1.2)
     return figure
 
 
@@ -365,29 +402,23 @@ def _axis_name(column: str, axes: Sequence[Axis]) -> str:
     return axis_name(replace(axis, moves=()))
 
 
-def _swatch(name: str, text: str) -> Patch:
-    letter, colour, _ = VERDICTS[name]
-    label = text if letter in ("", "ok") else f"{letter}: {text}"
-    return Patch(facecolor=colour, edgecolor="#808080", linewidth=0.4, label=label)
-
-
 def _draw(axes: Axes, panel: Panel, steps: np.ndarray, levels: np.ndarray, common: bool) -> None:
     """Draw the cells with their letters, and the boundary."""
     x, y = _edges(steps), _edges(levels)
     whole = panel.rows["stiffness"].isna().all()
     heights = np.array([y[0], y[-1]]) if whole else y
-    names = list(VERDICTS)
+    names = list(FILLS)
     codes = np.full((len(heights) - 1, len(steps)), names.index(""))
-    for row in panel.rows.to_dict("records"):
+    for row in panel.rows.assign(look=looks(panel.rows)).to_dict("records"):
         column = int(np.searchsorted(steps, row["dt"]))
         line = 0 if whole else int(np.searchsorted(levels, row["stiffness"]))
-        codes[line, column] = names.index(row["verdict"] if row["verdict"] in VERDICTS else "")
+        codes[line, column] = names.index(row["look"])
         colour = "white" if row["verdict"] in DARK else "black"
         middle = math.sqrt(heights[line] * heights[line + 1])
-        letter, fill, _ = VERDICTS[names[codes[line, column]]]
-        halo = [patheffects.withStroke(linewidth=2.5, foreground=fill)]
+        letter = VERDICTS.get(row["verdict"], VERDICTS[""])[0]
+        halo = [patheffects.withStroke(linewidth=2.5, foreground=FILLS[row["look"]])]
         axes.text(steps[column], middle, letter, color=colour, path_effects=halo, **LETTER)
-    colours = ListedColormap([colour for _, colour, _ in VERDICTS.values()])
+    colours = ListedColormap(list(FILLS.values()))
     axes.pcolormesh(
         x, heights, codes, cmap=colours, vmin=-0.5, vmax=len(names) - 0.5, edgecolors="white", linewidth=0.4
     )

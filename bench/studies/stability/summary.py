@@ -9,18 +9,19 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.style import plain
 from bench.report.views import ran
-from bench.studies.stability.report import DARK, VERDICTS, Panel, meaning, panels, placed
+from bench.studies.stability.report import DARK, FILLS, Panel, looks, panels, placed, swatches
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import write_whole
 
-SHOWN = 0.12
-"""Least share of the cells whose letter is written into its bar."""
+SHORT = {"by step": "step", "by law": "law", "by both": "both", "by unknown": "?", "diverged": "D", "nonfinite": "N"}
+"""What is written into a bar, where it has the room."""
+LETTER = 0.055
+"""Share of the cells that is as wide as a letter."""
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
@@ -36,11 +37,11 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 
 def counted(maps: Sequence[Panel]) -> pd.DataFrame:
-    """Return the number of cells by integrator, problem (scene and law, without parameters) and verdict."""
+    """Return the number of cells by integrator, problem (scene and law, without parameters) and what colours them."""
     parts = [ran(panel.rows).assign(integrator=panel.kind[0], problem=_problem(*panel.kind[1:])) for panel in maps]
     cells = pd.concat(parts)
-    cells = cells[cells["verdict"] != ""]
-    return cells.groupby(["problem", "integrator", "verdict"], sort=False).size().rename("cells").reset_index()
+    cells = cells[cells["verdict"] != ""].assign(look=looks)
+    return cells.groupby(["problem", "integrator", "look"], sort=False).size().rename("cells").reset_index()
 
 
 def _problem(scene: str, contact: str) -> str:
@@ -50,34 +51,47 @@ def _problem(scene: str, contact: str) -> str:
 def headline(table: pd.DataFrame) -> str:
     """Write what share of all cells is right, and the integrator and problem with the largest and the smallest share."""
     totals = table.groupby(["problem", "integrator"], sort=False)["cells"].sum()
-    right = table[table["verdict"] == "ok"].groupby(["problem", "integrator"])["cells"].sum()
+    right = table[table["look"] == "ok"].groupby(["problem", "integrator"])["cells"].sum()
     shares = (right.reindex(totals.index).fillna(0) / totals).sort_values(ascending=False)
     (problem, integrator), best = shares.index[0], float(shares.iloc[0])
     never = int((shares == 0).sum())
-    text = f"The gradient is right in {right.sum() / totals.sum():.0%} of the cells; most often ({best:.0%}) with {integrator} on {problem}"
-    return text + (f"; never in {never} of {len(shares)} combinations" if never else "")
+    whole = table.groupby("look")["cells"].sum() / totals.sum()
+    wrong = [f"by the {name} in {whole[f'by {name}']:.0%}" for name in ("step", "law") if f"by {name}" in whole]
+    text = f"The gradient is right in {whole.get('ok', 0.0):.0%} of the cells" + (
+        f", wrong {', '.join(wrong)}" if wrong else ""
+    )
+    text += f"; right most often ({best:.0%}) with {integrator} on {problem}"
+    return text + (f", never in {never} of {len(shares)} combinations" if never else "")
 
 
 def figure(maps: Sequence[Panel]) -> Figure:
-    """Draw, for each problem, a bar per integrator: shares of its cells by verdict, right ones at the left."""
+    """Draw, for each problem, a bar per integrator: shares of its cells by verdict and cause, right ones at the left."""
     table = counted(maps)
-    names = [name for name in VERDICTS if name in set(table["verdict"]) and name]
+    names = [name for name in FILLS if name in set(table["look"])]
     problems, integrators = (list(dict.fromkeys(table[column])) for column in ("problem", "integrator"))
     drawn = Figure(figsize=(WIDTH, 1.35 + 0.21 * len(integrators)), layout="constrained")
     FigureCanvasAgg(drawn)
     grid = drawn.subplots(1, len(problems), squeeze=False, sharey=True)[0]
     for panel, problem in zip(grid, problems, strict=True):
-        mine = table[table["problem"] == problem].pivot(index="integrator", columns="verdict", values="cells").fillna(0)
+        mine = table[table["problem"] == problem].pivot(index="integrator", columns="look", values="cells").fillna(0)
         mine = mine.div(mine.sum(axis=1), axis=0)
         for integrator, shares in mine.iterrows():
             height, left = len(integrators) - 1 - integrators.index(str(integrator)), 0.0
             for name in names:
                 share = float(shares.get(name, 0.0))
-                letter, fill, _ = VERDICTS[name]
-                panel.barh(height, share, left=left, color=fill, edgecolor="white", linewidth=0.4)
-                if share >= SHOWN:
+                panel.barh(height, share, left=left, color=FILLS[name], edgecolor="white", linewidth=0.4)
+                said = SHORT.get(name, name)
+                if share >= LETTER * (len(said) + 1):
                     colour = "white" if name in DARK else "black"
-                    panel.text(left + share / 2, height, letter, ha="center", va="center", fontsize=6.5, color=colour)
+                    panel.text(
+                        left + share / 2,
+                        height,
+                        said,
+                        ha="center",
+                        va="center",
+                        fontsize=6.5,
+                        color=colour,
+                    )
                 left += share
         panel.set(xlim=(0, 1), ylim=(-0.6, len(integrators) - 0.4))
         panel.set_xticks([0, 0.5, 1], ["0", "50%", "100%"])
@@ -85,15 +99,6 @@ def figure(maps: Sequence[Panel]) -> Figure:
         panel.tick_params(axis="y", length=0)
         panel.set_title("\n".join(plain(problem).split(", ")), pad=4)
     rows = pd.concat([panel.rows for panel in maps])
-    legend = [
-        Patch(facecolor=VERDICTS[name][1], edgecolor="#808080", linewidth=0.4, label=_named(name, rows))
-        for name in names
-    ]
-    drawn.legend(handles=legend, loc="outside lower center", ncols=3, columnspacing=1.2)
+    drawn.legend(handles=swatches(rows), loc="outside lower center", ncols=2, columnspacing=1.2)
     drawn.suptitle("\n".join(textwrap.wrap(plain(headline(table)), 95)), fontsize=9, fontweight="bold")
     return drawn
-
-
-def _named(name: str, rows: pd.DataFrame) -> str:
-    letter = VERDICTS[name][0]
-    return f"{letter}: {meaning(name, rows)}"

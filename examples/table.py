@@ -1,0 +1,131 @@
+"""The engines' table: runs each example in a process of its own, and writes what its reports say as a table.
+
+    python examples/table.py [OUT.md] [NAME ...]
+
+An example whose libraries are missing is a row that names them. The reports' texts are written to standard error.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import re
+import runpy
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+ORDER = (
+    "nimble_ball", "newton_ball", "brax_ball", "drake_ball", "genesis_ball", "taichi_ball", "warp_kernel", "mujoco_cube",
+    "gymnasium_cartpole", "jax_rollout", "torch_module", "numpy_loop",
+)  # fmt: skip
+LIMIT = 1200
+"""Seconds for one example; the examples have budgets of their own."""
+PACKAGES = {
+    "brax": "brax", "drake": "drake", "genesis": "genesis-world", "gymnasium": "gymnasium", "jax": "jax", "mujoco": "mujoco",
+    "newton": "newton", "numpy": "numpy", "pydrake": "drake", "taichi": "taichi", "torch": "torch", "warp": "warp-lang",
+}  # fmt: skip
+HEAD = (
+    "what",
+    "version",
+    "its gradient",
+    "off by",
+    "jumps",
+    "bias, smaller sigma",
+    "bias, larger sigma",
+    "cost",
+    "gradient",
+    "spent",
+)
+MARK = "\x1eROWS "
+
+
+def imported(text: str) -> list[str]:
+    """Return the modules that an example imports, by their first names."""
+    return sorted(set(re.findall(r"^(?:import|from) (\w+)", text, re.MULTILINE)))
+
+
+def row(report: Any, version: str) -> list[str]:
+    """Return what a report says, as cells."""
+    from bench.report.text import duration, number
+
+    parts = [part for part in report.check.parts if math.isfinite(part.error)] if report.check else []
+    off = f"{number(100 * max(part.error for part in parts))}%" if parts and report.gradient else "-"
+    judged = "not checked" if not report.gradient else "right" if report.check and report.check.trusted else "wrong"
+    if report.gradient and report.cause in ("undecided", "unsettled", "nonfinite", "nondeterministic"):
+        judged = "cannot tell"
+    biases = []
+    for one in report.smoothed:
+        biases.append(report._bias(one).replace("the gradient ", "") if report.gradient else "-")
+    biases += ["-"] * (2 - len(biases))
+    jumps = sum(len(line.jumps) for line in report.lines)
+    said = f"{jumps} on {len(report.lines)} lines" if report.lines else "not looked for"
+    return [
+        report.name, version, f"{judged} ({report.cause})", off, said, *biases[:2], duration(report.cost_s),
+        duration(report.gradient_s) if math.isfinite(report.gradient_s) else "-", duration(report.seconds),
+    ]  # fmt: skip
+
+
+def record(path: Path) -> None:
+    """Run one example and print the rows of its reports."""
+    import bench
+
+    found, examine = [], bench.examine
+
+    def recorded(*words: Any, **settings: Any) -> Any:
+        report = examine(*words, **{"progress": False, **settings})
+        found.append(report)
+        return report
+
+    bench.examine = recorded
+    sys.argv = [str(path)]
+    runpy.run_path(str(path), run_name="__main__")
+    names = [name for name in imported(path.read_text()) if name in PACKAGES]
+    first = sorted(names, key=lambda name: (name in ("numpy", "jax", "torch"), name))[:1]
+    version = ", ".join(f"{PACKAGES[name]} {metadata.version(PACKAGES[name])}" for name in first) or "in its own Python"
+    print(MARK + json.dumps([row(report, version) for report in found]), flush=True)
+
+
+def rows(name: str) -> list[list[str]]:
+    """Return the rows of an example, or one that says why there are none."""
+    path = HERE / f"{name}.py"
+    missing = [one for one in imported(path.read_text()) if importlib.util.find_spec(one) is None]
+    if missing:
+        return [[name, f"not installed: {', '.join(missing)}", *["-"] * (len(HEAD) - 2)]]
+    words = [sys.executable, __file__, "--record", name]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, cwd=HERE.parent)
+    except subprocess.TimeoutExpired:
+        return [[name, f"no end after {LIMIT} s", *["-"] * (len(HEAD) - 2)]]
+    text, _, found = done.stdout.partition(MARK)
+    print(text, file=sys.stderr, flush=True)
+    if not found:
+        print(done.stderr, file=sys.stderr, flush=True)
+        last = (done.stderr.strip().splitlines() or ["no report"])[-1]
+        return [[name, f"failed: {last}", *["-"] * (len(HEAD) - 2)]]
+    return json.loads(found.splitlines()[0])
+
+
+def main(words: list[str]) -> int:
+    """Write the table of all examples, or of those named."""
+    if words[:1] == ["--record"]:
+        record(HERE / f"{words[1]}.py")
+        return 0
+    out = [word for word in words if word.endswith(".md")]
+    names = [word for word in words if word not in out] or ORDER
+    table = [HEAD, ["---"] * len(HEAD)]
+    for name in names:
+        table += rows(name)
+    text = "".join(f"| {' | '.join(cells)} |\n" for cells in table)
+    print(text)
+    for path in out:
+        Path(path).write_text(text)
+    return int(any("failed: " in cells[1] for cells in table))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
