@@ -214,7 +214,8 @@ def speed_accuracy(
     across = columns(len(problems), 2)
     figure, panels = page(
         problems, across, 2.3, ("relative RMSE",),
-        "\n".join(filter(None, [f"Relative RMSE of one estimate against {cost.name}", first])), [*shared(problems, "samples"), *notes],
+        f"Relative RMSE of one estimate against {cost.name}",
+        [*shared(problems, "samples"), *notes, *([first] if first else [])],
         (list(entries.values()), symbols),
     )  # fmt: skip
     for place, ((panel,), problem, curves) in enumerate(zip(panels, problems, drawn, strict=True)):
@@ -224,7 +225,7 @@ def speed_accuracy(
         _draw_scales(panel, cost.known(problem.rows), cost)
         _draw_guide(panel, cost.known(problem.rows), cost)
         _name_curves(panel, curves, cost, look, figure.get_figwidth() / across - MARGIN)
-        room = 150 // across
+        room = 132 // across
         told = ["\n".join(textwrap.wrap(text, room)) for text in said.get(place, "").splitlines()]
         panel.set_xlabel("\n".join([cost.label, *told]), fontsize=6.2)
     return figure
@@ -249,7 +250,7 @@ def _draw_curve(panel: Axes, line: Line, cost: Cost, style: Mapping[str, Any]) -
         floor = last["bias"] / last["reference_norm"]
         panel.axhline(floor, color=style["color"], linewidth=0.9, linestyle=":", zorder=0.6)
         panel.text(
-            0.01, floor, "bias", transform=panel.get_yaxis_transform(), color=style["color"], fontsize=NAME_SIZE - 0.5,
+            0.01 + 0.07 * sum(text.get_text() == "bias" for text in panel.texts), floor, "bias", transform=panel.get_yaxis_transform(), color=style["color"], fontsize=NAME_SIZE - 0.5,
             va="bottom", zorder=5,
         )  # fmt: skip
 
