@@ -58,7 +58,7 @@ def timed(what: str, call: Callable[[], Any], count: int, target: float = float(
 
 def backends(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
     """Measure every subject at every batch size, with memory where gradients are fast enough for the largest."""
-    found = set()
+    found: set[str] = set()
     for subject in settings["subjects"]:
         entry = registry.find("backends", subject["backend"])
         if not entry.available:

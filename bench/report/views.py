@@ -182,10 +182,8 @@ class Line:
     @cached_property
     def at(self) -> dict[float, dict[str, Any]]:
         """Return the rows by ``x``."""
-        values = self.rows.to_numpy(dtype=object)
-        return {
-            float(x): dict(zip(self.rows, row, strict=True)) for x, row in zip(self.rows.index, values, strict=True)
-        }
+        names, values = [str(name) for name in self.rows], self.rows.to_numpy(dtype=object)
+        return {float(x): dict(zip(names, row, strict=True)) for x, row in zip(self.rows.index, values, strict=True)}
 
     @property
     def label(self) -> str:

@@ -56,7 +56,8 @@ def parsed(rows: pd.DataFrame) -> list[Mapping[str, Any]]:
 
 @lru_cache(maxsize=20_000)
 def _parsed(text: str) -> Mapping[str, Any]:
-    return json.loads(text) if text else {}
+    given: Mapping[str, Any] = json.loads(text) if text else {}
+    return given
 
 
 def value_of(name: str, given: Mapping[str, Any]) -> Any:

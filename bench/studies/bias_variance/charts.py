@@ -102,7 +102,7 @@ def _said(problems: Sequence[Family], cost: Cost) -> tuple[dict[int, str], str]:
     """Return, for each problem by place, who reaches an error of 10% and of 1% first, and who leads over all."""
     kind = "rollouts" if cost is ROLLOUTS else "time"
     said = {}
-    every = []
+    every: list[dict[str, Any]] = []
     for place, problem in enumerate(problems):
         if problem.rows["x"].nunique() > 1:
             entries = [fastest.line(problem, target, kind, cost) for target in fastest.TARGETS]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -65,15 +66,15 @@ def charged(rows: pd.DataFrame) -> pd.DataFrame:
     keys = [name for name in PROGRAM if name in rows]
     program = rows.groupby(keys, dropna=False).ngroup()
     known = (rows["status"] == "ok") & (rows["time_s"] > 0)
-    ratios = {}
+    ratios: dict[Any, float] = {}
     narrow = rows.loc[known, ["samples", "gradients", "rollouts", "time_s"]]
-    for number, part in narrow.groupby(program[known]):
+    for place, part in narrow.groupby(program[known]):
         first = part[(part["gradients"] > 0) & (part["rollouts"] <= 0.01 * part["gradients"])]
         zeroth = part[(part["gradients"] == 0) & (part["rollouts"] > 0)]
         both = sorted(set(first["samples"]) & set(zeroth["samples"]))
         if both:
             a, b = (table[table["samples"] == both[-1]] for table in (first, zeroth))
-            ratios[number] = (a["time_s"] / a["gradients"]).min() / (b["time_s"] / b["rollouts"]).min()
+            ratios[place] = (a["time_s"] / a["gradients"]).min() / (b["time_s"] / b["rollouts"]).min()
     return rows.assign(**{RATIO: program.map(ratios).astype(float)})
 
 
