@@ -95,7 +95,8 @@ def entries() -> Table:
     stamps |= {point.module: point.dist.version if point.dist else "" for point in points}
     fatal = trial.fatal(stamps, {_package(path): path for path in _folders})
     for kind, module in modules:
-        _load_module(table, kind, module, fatal.get(module, ""))
+        with trial.guarded():
+            _load_module(table, kind, module, fatal.get(module, ""))
     for point in points:
         try:
             if point.module in fatal:
@@ -148,7 +149,7 @@ def _load_module(found: Table, kind: str, path: str, fatal: str) -> None:
     for name, plugin in list(vars(module).items()):
         try:
             own = isinstance(plugin, type) and str(plugin.__module__).startswith(module.__name__)
-            concrete = own and issubclass(plugin, Plugin) and plugin.kind and plugin.name
+            concrete = own and issubclass(plugin, Plugin) and plugin.kind and plugin.name != ""
         except Exception as error:
             _fail(found, kind if kind in found else "estimators", name, error, "cannot be used")
             continue
@@ -177,10 +178,11 @@ def _add(found: Table, plugin: type[Plugin]) -> None:
     try:
         faults = _faults(plugin)
     except Exception as error:
-        _fail(found, kind, where.rpartition(".")[2], error, "cannot be used")
+        _fail(found, kind, where, error, "cannot be used")
         return
     if faults:
-        table[where.rpartition(".")[2]] = Entry(kind, where, None, f"cannot be used: {faults}")
+        # by its place: what it calls itself may be no name, and classes of several files may be called alike
+        table[where] = Entry(kind, where, None, f"cannot be used: {faults}")
         return
     taken = table.get(plugin.name)
     if taken is not None and taken.plugin is not plugin:

@@ -1,7 +1,7 @@
-"""New plugin files are first imported in a process of their own: one that ends it is listed, and ends no command.
+"""New plugin files are first tried in a process of their own: one that ends it is listed, and ends no command.
 
-A crash, ``os._exit`` or an endless loop at import cannot be caught where it happens. A file that came through once is
-not tried again until its text changes: its hash stands in ``$XDG_CACHE_HOME/bench/imported`` (``~/.cache`` where that
+A crash, ``os._exit`` or an endless loop cannot be caught where it happens. So each file is imported there, and its plugins
+are built with their defaults and asked what a run asks while it is planned. A file that came through once is not tried again until its text changes: its hash stands in ``$XDG_CACHE_HOME/bench/imported`` (``~/.cache`` where that
 is not set). Where that folder cannot be written, each command tries again, which costs about a second.
 """
 
@@ -18,18 +18,20 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
 
 PATIENCE = 60.0
-"""Seconds that one import may take."""
+"""Seconds that one module may take."""
+STAGES = {b".": "when it was imported", b",": "when it was built with its defaults and asked what a plan asks"}
+"""What a module was at, by the last sign from its process."""
 CHILD = "import json, sys; given = json.load(sys.stdin); sys.path[:] = given['path']; import bench.model.trial as t; t.child(given)"
 
 
 def fatal(
-    modules: Mapping[str, str], packages: Mapping[str, Path] = MappingProxyType({}), patience: float = PATIENCE
+    modules: Mapping[str, str], packages: Mapping[str, Path] = MappingProxyType({}), patience: float | None = None
 ) -> dict[str, str]:
     """Return what happened to the process that imported a module, for each one that ended it or did not come back.
 
@@ -40,7 +42,7 @@ def fatal(
     waiting = [name for name, text in modules.items() if _digest(name, text) not in known]
     found: dict[str, str] = {}
     while waiting:
-        came, end = _import(waiting, packages, patience)
+        came, end = _import(waiting, packages, PATIENCE if patience is None else patience)
         passed = waiting[: came - 1] if end else waiting
         if end and not came:
             return found  # the process could not start: nothing can be told, and the import says why
@@ -61,7 +63,8 @@ def stamp(module: str) -> str:
 
 
 def child(given: Mapping[str, Any]) -> None:
-    """Import modules one by one and make their plugins; the pipe hears of each before it is tried, and of the end."""
+    """Try modules one by one; the pipe hears of each before it is imported, before its plugins are built, and of the end."""
+    own = os.getpid()
     pipe = os.dup(1)
     nowhere = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
@@ -71,14 +74,88 @@ def child(given: Mapping[str, Any]) -> None:
         package.__path__ = [folder]
     for name in given["modules"]:
         os.write(pipe, b".")
-        try:
-            for plugin in list(vars(importlib.import_module(name)).values()):
-                if isinstance(plugin, type) and plugin.__module__ == name and getattr(plugin, "kind", ""):
-                    plugin()  # every field of a plugin has a default
-        except BaseException:  # it is imported again where its error is listed
-            continue
+        with contextlib.suppress(BaseException):  # it is imported again where its error is listed
+            module = importlib.import_module(name)
+            os.write(pipe, b"," if os.getpid() == own else b"")
+            _ask(module)
+        end_copies(own)
+        end_children()
     os.write(pipe, b"!")
     os._exit(0)  # threads that a plugin has left running keep nothing waiting
+
+
+def _ask(module: ModuleType) -> None:
+    """Build the plugins of a module and ask each what a plan asks; an answer that raises is one of a cell."""
+    from bench.model.backend import CAPABILITIES
+    from bench.model.parameters import Plugin
+    from bench.model.program import compose
+    from bench.model.scene import FunctionScene
+
+    class Bowl(FunctionScene):
+        def theta0(self) -> Any:
+            return np.zeros(1)
+
+        def cost(self, xp: Any, x: Any) -> Any:
+            return x[0] * x[0]
+
+    import numpy as np
+
+    program = compose(Bowl(), None, None)
+    questions: dict[str, dict[str, tuple[Any, ...]]] = {
+        "scenes": {"theta0": (), "breakpoints": (), "closed_form_gradient": (None, None)},
+        "contacts": {"spring": ()},
+        "integrators": {"transition": (0.01, 1.0, 0.1, 1.0)},
+        "backends": {"lacks": (program,)},
+        "estimators": {"lacks": (program, CAPABILITIES, "numpy")},
+    }
+    for plugin in list(vars(module).values()):
+        with contextlib.suppress(Exception):
+            if isinstance(plugin, type) and issubclass(plugin, Plugin) and plugin.__module__ == module.__name__:
+                made = plugin()
+                for question, given in questions.get(plugin.kind, {}).items():
+                    with contextlib.suppress(Exception):
+                        getattr(made, question)(*given)
+
+
+def end_copies(own: int) -> None:
+    """End this process if a plugin has forked it from the one of that number, whose work it must not do again."""
+    if os.getpid() != own:
+        os._exit(0)
+
+
+@contextlib.contextmanager
+def guarded() -> Iterator[None]:
+    """Keep the process what it is while a plugin is at work: in its working folder, and no forked copy of it goes on."""
+    own, here = os.getpid(), _folder()
+    try:
+        yield
+    finally:
+        end_copies(own)
+        if here and _folder() != here:
+            os.chdir(here)
+
+
+def _folder() -> str:
+    try:
+        return os.getcwd()
+    except FileNotFoundError:  # it has been removed
+        return ""
+
+
+def end_children() -> None:
+    """Kill the processes that a plugin has started from this one and left running."""
+    try:
+        # raises without children, which spares the search through all processes
+        os.waitpid(-1, os.WNOHANG)
+    except ChildProcessError:
+        return
+    import psutil
+
+    for child in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):
+            child.kill()
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(child.pid, 0)
 
 
 def _import(names: Sequence[str], packages: Mapping[str, Path], patience: float) -> tuple[int, str]:
@@ -96,7 +173,7 @@ def _import(names: Sequence[str], packages: Mapping[str, Path], patience: float)
             process.stdin.close()
         except BrokenPipeError:
             return 0, "did not start"
-        came, said = 0, b""
+        came, said, stage = 0, b"", "when it was imported"
         try:
             with selectors.DefaultSelector() as selector:
                 selector.register(process.stdout, selectors.EVENT_READ)
@@ -104,14 +181,15 @@ def _import(names: Sequence[str], packages: Mapping[str, Path], patience: float)
                 while selector.select(max(0.0, until - time.monotonic())):
                     said = os.read(process.stdout.fileno(), 4096)
                     came += said.count(b".")
+                    stage = STAGES.get(said[-1:], stage)
                     if not said or said.endswith(b"!"):
                         break
                     until = time.monotonic() + patience
                 else:
-                    return came, f"did not come back within {patience:g} s"
+                    return came, f"did not come back within {patience:g} s {stage}"
         finally:
             _end(process)
-    return came, "" if said.endswith(b"!") else _how(process.returncode)
+    return came, "" if said.endswith(b"!") else f"{_how(process.returncode)} {stage}"
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -133,7 +211,7 @@ def _how(status: int) -> str:
 
 def _digest(name: str, text: str) -> str:
     """Return what is remembered of a module: its name's last part, its text, and the Python that imported it."""
-    return hashlib.sha256(f"{name.rpartition('.')[2]} {text} {sys.version}".encode()).hexdigest()[:24]
+    return hashlib.sha256(f"asked {name.rpartition('.')[2]} {text} {sys.version}".encode()).hexdigest()[:24]
 
 
 def _place() -> Path:

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 ATTEMPTS = 100
 """Times that a directory is read again while other runs change it."""
-CLAIM = ".study"
-"""File under ``pending/`` that names the study of the rows to come, while ``rows.parquet`` cannot say it yet."""
 LARGEST = 2.0**53
 """Larger counts than this are not kept exactly as float64, so no run has written them."""
 
@@ -46,32 +44,64 @@ class Store:
         self._columns = columns
         self._study = study
         self._last: int | None = None
+        self._seen: dict[Path, tuple[int, int]] = {}
         self._table = directory / "rows.parquet"
         self._pending = directory / "pending"
+        self._claim = self._pending / ".study"
 
     def prepare(self) -> None:
-        """Make the directory, make sure that it can be written, and claim it for this study."""
+        """Make the directory, and make sure that it can be written."""
         try:
             self._pending.mkdir(parents=True, exist_ok=True)
             probe = temporary(self._pending / "probe")
-            probe.write_text(self._study)
-            try:
-                _link(probe, self._pending / CLAIM)
-            except FileExistsError:
-                pass
-            finally:
-                probe.unlink(missing_ok=True)
-            claimed = ""
-            with suppress(FileNotFoundError):  # a run that has just ended takes its claim away, and its rows tell
-                claimed = (self._pending / CLAIM).read_text()
+            probe.write_text("")
+            probe.unlink()
         except OSError as error:
             raise StorageError(f"results directory '{self.directory}' cannot be written: {error.strerror}") from None
-        if self._study and claimed not in ("", self._study):
+        if self._study:
+            self._claim_it()
+
+    def _claim_it(self) -> None:
+        """Have the directory belong to this study before it has rows; raises :class:`UserError` if another has it.
+
+        The claim is made at once, like a file that is linked into place, and goes when there are rows, which say the same.
+        """
+        part = temporary(self._pending / "study")
+        try:
+            part.write_text(self._study)
+            _link(part, self._claim)
+        except FileExistsError:
+            with suppress(OSError):  # whoever removes it has stored rows
+                claimed = self._claim.read_text()
+                if claimed not in ("", self._study):
+                    raise UserError(
+                        f"a run of study {printable(claimed)} has started in '{self.directory}', and this is study {self._study}: "
+                        "choose another folder with name=..., or remove that one"
+                    ) from None
+        except OSError as error:
+            raise StorageError(f"'{self._claim}' cannot be made: {error.strerror}") from None
+        finally:
+            part.unlink(missing_ok=True)
+        if self._files() != self._seen:
+            try:
+                self.load()  # another run came and went since they were read
+            except UserError:
+                self._unclaim()
+                raise
+
+    def _unclaim(self) -> None:
+        with suppress(OSError):
+            if self._claim.read_text() == self._study:
+                self._claim.unlink()
+
+    def _refuse(self, studies: Iterable[str]) -> None:
+        """Raise :class:`UserError` if one of these is another study."""
+        others = sorted(set(studies) - {"", self._study}) if self._study else []
+        if others:
             raise UserError(
-                f"a run of study {printable(claimed)} has started in '{self.directory}', and this is study {self._study}: "
-                "choose another folder with name=..., or remove that one"
+                f"'{self.directory}' holds rows of study {', '.join(map(printable, others))}, and this is study {self._study}: "
+                "choose another folder with name=..."
             )
-        self.load()  # another study may have run to its end since the rows were read
 
     def append(self, *rows: dict[str, Any]) -> None:
         """Store finished cells: when this returns, they outlast a power cut."""
@@ -116,6 +146,7 @@ class Store:
                 continue
             # a file folded while others were read may have been missed in both places
             if files.items() <= self._files().items():
+                self._seen = dict(files)
                 return self._union(frames), files
         raise StorageError(f"'{self.directory}' changes faster than it can be read: too many runs write to it")
 
@@ -126,12 +157,7 @@ class Store:
             self._last = self._last or 0
             return pd.DataFrame(columns=self._columns.stored)
         table = pd.concat(frames, ignore_index=True)
-        others = sorted(set(table["study"]) - {"", self._study}) if self._study else []
-        if others:
-            raise UserError(
-                f"'{self.directory}' holds rows of study {', '.join(map(printable, others))}, and this is study {self._study}: "
-                "choose another folder with name=..."
-            )
+        self._refuse(table["study"])
         count = table["sequence"].where(table["sequence"].between(0, LARGEST), 0.0)
         self._last = max(self._last or 0, int(count.max()))
         # rows of older versions have no count: among them the clock decides, and any counted row is newer
@@ -190,9 +216,9 @@ class Store:
     def _tidy(self) -> None:
         """Remove half-written files of killed runs, and the directory of small files when it is empty."""
         tidy(self._pending)
+        if self._table.exists():
+            self._unclaim()
         with suppress(OSError):
-            if not any(self._pending.glob("[!.]*")):
-                (self._pending / CLAIM).unlink(missing_ok=True)
             self._pending.rmdir()
 
 

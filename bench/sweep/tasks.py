@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.errors import StorageError, failure, printable
-from bench.model import Backend
+from bench.model import Backend, trial
 from bench.sweep.cell import Cell
 from bench.sweep.experiment import Experiment
 from bench.sweep.keys import fingerprint
@@ -54,15 +54,20 @@ class Measure:
 
     def prepare(self, item: Task) -> None:
         """Have the backend import its libraries, as it does when it gets a program."""
-        try:
-            self._session.problems.of(item.backend, item.cell)
-        except KeyboardInterrupt:
-            raise
-        except BaseException:  # it will come again while the cell is measured, and is reported then
-            return
+        with trial.guarded():
+            try:
+                self._session.problems.of(item.backend, item.cell)
+            except KeyboardInterrupt:
+                raise
+            except BaseException:  # it will come again while the cell is measured, and is reported then
+                return
 
     def __call__(self, item: Task) -> dict[str, Any]:
         """Return the results of the cell, or the status and reason of its failure."""
+        with trial.guarded():
+            return self._result(item)
+
+    def _result(self, item: Task) -> dict[str, Any]:
         if not item.reference:
             return outcome(item.cell, self._session, self._study)
         try:

@@ -15,10 +15,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-import psutil
-
 from bench.errors import StorageError, failure
-from bench.model import registry
+from bench.model import registry, trial
 from bench.sweep.channel import Broken, Channel
 
 READY = b"ready"
@@ -82,9 +80,8 @@ def _serve(channel: Channel) -> None:
     while True:
         waiting = waiting or channel.receive()
         answer = _answered(channel, handle, waiting.pop(0))
-        if os.getpid() != own:
-            os._exit(0)  # a child that a plugin forked, which must not answer for its parent
-        _end_children()
+        trial.end_copies(own)
+        trial.end_children()
         with suppress(Exception):
             sys.stdout.flush()
         channel.send(answer)
@@ -104,21 +101,6 @@ def _answered(channel: Channel, handle: Handler, message: bytes) -> bytes:
     except StorageError as error:
         text = json.dumps({"storage": str(error)})
     except BaseException as error:
-        if os.getpid() != own:
-            os._exit(0)
+        trial.end_copies(own)
         text = json.dumps({"result": failure(error), "seconds": time.perf_counter() - started})
     return text.encode()
-
-
-def _end_children() -> None:
-    """Kill the processes that a plugin has started and left running."""
-    try:
-        # raises without children, which spares the search through all processes
-        os.waitpid(-1, os.WNOHANG)
-    except ChildProcessError:
-        return
-    for child in psutil.Process().children(recursive=True):
-        with suppress(psutil.Error):
-            child.kill()
-        with suppress(ChildProcessError):
-            os.waitpid(child.pid, 0)

@@ -11,8 +11,15 @@ from bench.model import registry, trial
 GOOD = "from bench.model import SampleMean\n"
 FATAL = {
     "exits": ("import os\nos._exit(0)\n", "ended the process (exit status 0)"),
-    "crashes": ("import ctypes\nctypes.string_at(0)\n", "ended the process by SIGSEGV"),
+    "crashes": ("import ctypes\nctypes.string_at(0)\n", "ended the process by SIGSEGV when it was imported"),
+    "leaves": (
+        "import os\nfrom dataclasses import dataclass\nfrom bench.plugins.scenes.linear import Linear\n"
+        "@dataclass(frozen=True)\nclass Leaves(Linear):\n    name = 'leaves'\n"
+        "    def theta0(self):\n        os._exit(3)\n",
+        "ended the process (exit status 3) when it was built with its defaults and asked what a plan asks",
+    ),
 }
+ODD = "from bench.model import SampleMean\nclass Odd(SampleMean):\n    name = 'odd'\n    requires = None\n"
 
 
 @pytest.fixture
@@ -35,6 +42,9 @@ def fatal(folder, names, patience=60.0):
 def test_listed_with_what_happened_and_the_others_are_listed_too(folder):
     for name, (text, _) in FATAL.items():
         (folder / f"{name}.py").write_text(text)
+    (folder / "forks.py").write_text("import os\nos.fork()\n")
+    for name in ("odd_one", "odd_two"):
+        (folder / f"{name}.py").write_text(ODD)
     (folder / "waits.py").write_text(
         "import threading, time\nthreading.Thread(target=time.sleep, args=(600,)).start()\n"
     )
@@ -46,14 +56,18 @@ def test_listed_with_what_happened_and_the_others_are_listed_too(folder):
         (line,) = [line for line in done.stdout.splitlines() if line.startswith(f"  {name} ")]
         assert "UNAVAILABLE" in line
         assert said in line
-    assert "  fobg " in done.stdout
+    assert done.stdout.count("  fobg ") == 1  # a forked copy does not go on
+    for name in ("odd_one", "odd_two"):  # their classes are called alike
+        assert f"{name}.Odd" in done.stdout
 
 
 def test_an_import_that_does_not_come_back(folder):
     (folder / "hangs.py").write_text("import time\nprint('x' * 100000)\nwhile True: time.sleep(1)\n")
     (folder / "raises.py").write_text("1 / 0\n")
     found = fatal(folder, ["good", "hangs", "raises"], patience=3.0)
-    assert {name.rpartition(".")[2]: said for name, said in found.items()} == {"hangs": "did not come back within 3 s"}
+    assert {name.rpartition(".")[2]: said for name, said in found.items()} == {
+        "hangs": "did not come back within 3 s when it was imported"
+    }
 
 
 def test_a_file_is_tried_once_until_its_text_changes(folder, monkeypatch):
@@ -71,3 +85,15 @@ def test_without_a_place_to_remember_each_command_tries_again(folder, monkeypatc
     monkeypatch.setattr(trial, "_import", lambda names, *_: (len(names), ""))
     assert fatal(folder, ["good"]) == {}
     assert trial._known() == frozenset()
+
+
+def test_a_plugin_at_work_moves_no_command_to_another_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with trial.guarded():
+        os.chdir("/")
+    assert os.getcwd() == str(tmp_path)
+    own = os.getpid()
+    with trial.guarded():
+        os.fork()
+    assert os.getpid() == own  # the copy has ended
+    assert os.wait()[1] == 0
