@@ -6,10 +6,11 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
-from bench.conformance.kit import Skipped, require, verifies
+from bench.conformance.kit import Failed, Skipped, require, verifies
 from bench.conformance.subjects import (
     COLUMNS,
     DIFFERENCED,
@@ -27,12 +28,32 @@ from bench.conformance.subjects import (
     rng,
     samples,
     sound_laws,
+    stepping,
     title,
 )
-from bench.model import ContactScene, EngineScene, ImpulseLaw, MechanicalScene, Program, Scene, compose
+from bench.model import (
+    ContactLaw,
+    ContactScene,
+    EngineScene,
+    HeldScene,
+    ImpulseLaw,
+    Integrator,
+    MechanicalScene,
+    Program,
+    Scene,
+    compose,
+)
 
 SCORED_STEPS = 8
 """Longest rollouts whose scores are compared with differences."""
+FINER = (4, 16)
+"""Factors by which steps are refined towards the physics."""
+SPAN, POINTS = 0.2, 65
+"""Reach in sigma of the costs, and their number, that tell the slope of the physics from the jumps between steps of a program."""
+LIMITING = 0.05
+"""Relative difference, of a coordinate, between two refinements that have settled, and between them and the physics."""
+ELSEWHERE = 6.0
+"""Distance in sigma of the other thetas through which lines are searched for jumps."""
 
 
 @verifies(Scene)
@@ -105,7 +126,10 @@ def backends_agree(scene: Scene) -> str:
 
 @verifies(Scene)
 def continuity_is_as_declared(scene: Scene) -> str:
-    """Verify jumps along lines through theta0: none if ``continuous`` (under a continuous law), one if not."""
+    """Verify jumps along lines through theta0 and thetas 6 sigma beside it: none if ``continuous``, one if not.
+
+    The contact law is a continuous one.
+    """
     subjects = [p for p in programs(scene) if p.contact is None or p.contact.continuous]
     runs = [p for p in subjects if plain_backend().lacks(p) is None] or subjects
     if not runs:
@@ -113,7 +137,9 @@ def continuity_is_as_declared(scene: Scene) -> str:
     jump = largest_jump(runs[0], lines=2)
     if scene.continuous:
         require(not jump, f"declares to be continuous, but jumps by {jump:.1e} of its range under {title(runs[0])}")
-        return "no jump within 4 sigma of theta0"
+        beside = max(largest_jump(runs[0], beside=side * ELSEWHERE) for side in (1, -1))
+        require(not beside, f"declares to be continuous, but jumps by {beside:.1e} of its range beside theta0")
+        return f"no jump within {ELSEWHERE + 4:g} sigma of theta0"
     require(jump, "declares to jump, but no jump was found within 4 sigma of theta0")
     return f"a jump of {jump:.2g} of the range"
 
@@ -203,6 +229,78 @@ def physical_gradient_is_finite(scene: Scene) -> str:
     require(gradient.shape == scene.theta0().shape, f"shape {gradient.shape}, not {scene.theta0().shape}")
     require(np.isfinite(gradient).all(), f"{gradient} is not finite")
     return f"norm {np.linalg.norm(gradient):.4g}"
+
+
+@verifies(Scene)
+def physical_gradient_is_the_limit(scene: Scene) -> str:
+    """Verify that the slope of the cost tends to the physical gradient as steps get finer, under one law at least.
+
+    Others may settle elsewhere, as a spring does that stands for a rigid impact. Where the slopes settle nowhere, a finer
+    step cannot tell.
+    """
+    if scene.physical_gradient() is None:
+        raise Skipped("has none")
+    apart: dict[str, float] = {}
+    for law, integrator in _towards_physics(scene):
+        ratios = []
+        for factor in FINER:
+            program = _refined(scene, factor, law, integrator)
+            physical = program.scene.physical_gradient()
+            if physical is None:
+                raise Failed(f"has a physical gradient at its own step, and none at one of a {factor}th")
+            ratios.append(_ratios(program, physical))
+        off = float(np.abs(ratios[1] - 1.0).max())
+        if off <= LIMITING:
+            return f"{title(program)} is {off:.1g} from it at a step finer by {FINER[1]}"
+        # a coordinate may count one step, and so change with it: what settles is its ratio to the physics' own
+        if np.isfinite(ratios).all() and np.abs(ratios[1] - ratios[0]).max() <= LIMITING:
+            apart[title(program)] = off
+    if not apart:
+        raise Skipped("no program's differences settle at finer steps")
+    nearest = min(apart, key=lambda name: apart[name])
+    raise Failed(
+        f"{', '.join(apart)} settle elsewhere as steps get finer, the nearest, {nearest}, {apart[nearest]:.0%} off"
+    )
+
+
+def _towards_physics(scene: Scene) -> Iterator[tuple[ContactLaw | None, Integrator | None]]:
+    """Yield the laws and integrators under which a scene's program may tend to its physics, the likeliest first."""
+    if not isinstance(scene, MechanicalScene):
+        yield None, None
+    elif scene.n_contacts:
+        laws = sorted(sound_laws(), key=lambda law: not issubclass(law, ImpulseLaw))
+        yield from ((law_for(scene, law), stepping()) for law in laws if not law.needs_root)
+    else:
+        explicit = [plugin() for plugin in available("integrators") if not plugin.needs_root]
+        yield None, max(explicit, key=lambda integrator: integrator.order)
+
+
+def _refined(scene: Scene, factor: int, law: ContactLaw | None, integrator: Integrator | None) -> Program:
+    """Compose the scene with a step finer by ``factor``, over the same time. Raises :class:`Skipped` if theta changes."""
+    if not isinstance(scene, MechanicalScene):
+        return compose(scene)
+    finer: dict[str, Any] = {"horizon": scene.horizon * factor, "dt": scene.dt / factor}
+    if isinstance(scene, HeldScene):
+        finer["hold"] = scene.hold * factor
+    fine = dataclasses.replace(scene, **finer)
+    if fine.theta0().shape != scene.theta0().shape:
+        raise Skipped("theta is longer at a finer step")
+    return compose(fine, law, integrator)
+
+
+def _ratios(program: Program, physical: np.ndarray) -> np.ndarray:
+    """Return the slopes of the cost at theta0 over the physical ones, ``(d,)``; 1 where both are 0 to rounding.
+
+    A slope is that of a cubic through costs on either side, so that the jumps of a program between steps average out.
+    """
+    problem, theta, d = able_backend(program).compile(program), program.theta0, program.dim
+    span = SPAN * program.scene.sigma
+    along = np.linspace(-1.0, 1.0, POINTS)
+    shifts = (np.eye(d)[:, :, None] * (span * along)).reshape(d, -1)
+    cost = problem.value(theta[:, None] + shifts, np.zeros((program.n_noise, d * POINTS))).reshape(d, POINTS)
+    slope = np.polynomial.polynomial.polyfit(along, cost.T, 3)[1] / span
+    none = np.maximum(np.abs(slope), np.abs(physical)) <= 1e-12 * np.abs(cost).max(axis=1) / span
+    return np.divide(slope, physical, out=np.where(none, 1.0, np.inf), where=~none & (physical != 0.0))
 
 
 @verifies(MechanicalScene)

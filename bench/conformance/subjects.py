@@ -213,14 +213,15 @@ class NewtonOps(LoopOps):
         return z
 
 
-def largest_jump(program: Program, lines: int = 1) -> float:
+def largest_jump(program: Program, lines: int = 1, beside: float = 0.0) -> float:
     """Return the largest jump of the cost along lines through theta0, relative to its range on them; 0 without one.
 
-    The eight intervals of largest change are cut into 64, again and again: across a slope the change falls with their
+    ``beside`` moves the lines, by so many sigma in every coordinate; rollouts that fail there show no jump. The eight
+    intervals of largest change are cut into 64, again and again: across a slope the change falls with their
     length, across a jump it stays.
     """
     problem = able_backend(program).compile(program)
-    theta, largest = program.theta0, 0.0
+    theta, largest = program.theta0 + beside * program.scene.sigma, 0.0
     for line in range(lines):
         e = 4 * program.scene.sigma * (np.ones(theta.size) if line == 0 else rng("line").uniform(-1, 1, theta.size))
         left, width = np.linspace(-1.0, 1.0, 8, endpoint=False), 0.25
@@ -229,6 +230,8 @@ def largest_jump(program: Program, lines: int = 1) -> float:
             nodes = left[:, None] + width * np.linspace(0.0, 1.0, 65)
             shifts = nodes.reshape(1, -1)
             cost = problem.value(theta[:, None] + e[:, None] * shifts, np.zeros((program.n_noise, shifts.size)))
+            if beside and not np.isfinite(cost).all():
+                return largest
             require(np.isfinite(cost).all(), f"{title(program)}: costs within 4 sigma of theta0 are not finite")
             span = max(span, float(np.ptp(cost)))
             change = np.abs(np.diff(cost.reshape(nodes.shape), axis=1))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.errors import STATUSES, UserError, unknown
-from bench.model import Decision, registry
+from bench.model import Decision, registry, trial
 from bench.model.identity import parse_identity
 from bench.model.parameters import build, coerce, remember, singular
 from bench.sweep.experiment import Budget, Choice, Execution, Experiment, Layout
@@ -386,5 +386,6 @@ def _choice(kind: str, text: Any) -> Choice:
     name, values = parse_identity(text)
     entry = registry.find(kind, name)
     if entry.plugin is not None:
-        build(entry.plugin, values)
+        with trial.guarded():  # a plugin that leaves the working folder would take relative paths with it
+            build(entry.plugin, values)
     return Choice(entry, tuple(sorted(values.items())))

@@ -14,6 +14,7 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.cubic import Cubic
 from bench.plugins.scenes.double_integrator import DoubleIntegrator
 from bench.plugins.scenes.heaviside import Heaviside
+from bench.plugins.scenes.mass_spring import MassSpring
 from bench.plugins.scenes.pushing import Pushing
 from bench.plugins.scenes.quadratic import Quadratic
 
@@ -278,6 +279,21 @@ class HalfStiffnessGradient(Faulty):
     faulty = SofterProblem
 
 
+class HomeProblem(NumpyProblem):
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        home = self.program.theta0[:, None]
+        near = np.clip(theta, home - self.sigma, home + self.sigma)
+        return super()._grad(near, w)
+
+
+@dataclass(frozen=True)
+class GradientOfItsOwnTheta(Faulty):
+    """Gradients that are right only near the scene's own theta."""
+
+    name = "gradient_of_its_own_theta"
+    faulty = HomeProblem
+
+
 class ForgetfulProblem(NumpyProblem):
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return np.broadcast_to(w.sum(axis=0) / self.sigma, (self.dim, w.shape[1]))
@@ -350,6 +366,27 @@ class ClaimsAJump(Cubic):
 
     name = "claims_a_jump"
     continuous = False
+
+
+@dataclass(frozen=True)
+class JumpsElsewhere(Cubic):
+    """A cubic with a step 7 sigma from theta, that claims to be continuous."""
+
+    name = "jumps_elsewhere"
+
+    def cost(self, xp: Any, x: Array) -> Array:
+        return super().cost(xp, x) + xp.where(x[0] > self.theta0()[0] + 7.0 * self.sigma, 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class WrongPhysics(MassSpring):
+    """A physical gradient that is finite, of the right shape, and half as long again in one coordinate."""
+
+    name = "wrong_physics"
+
+    def physical_gradient(self) -> np.ndarray | None:
+        gradient = super().physical_gradient()
+        return None if gradient is None else gradient * [1.0, 1.5]
 
 
 @dataclass(frozen=True)
@@ -569,6 +606,7 @@ PLANTED = {
     RefusesEverything: {"something_was_checked"},
     GradientOfAnotherLaw: {"gradient_is_that_of_value"},
     HalfStiffnessGradient: {"gradient_is_that_of_value"},
+    GradientOfItsOwnTheta: {"gradient_is_that_of_value"},
     WrongScore: {"score_is_that_of_actions"},
     LeakyColumns: {"columns_are_independent", "value_agrees"},
     ClaimsRoot: {"root_is_differentiated_implicitly"},
@@ -576,6 +614,8 @@ PLANTED = {
     WrongClosedForm: {"closed_form_is_right"},
     ClaimsContinuity: {"continuity_is_as_declared"},
     ClaimsAJump: {"continuity_is_as_declared"},
+    JumpsElsewhere: {"continuity_is_as_declared"},
+    WrongPhysics: {"physical_gradient_is_the_limit"},
     ClaimsControls: {"closed_form_is_right"},
     MixedColumns: {"costs_are_finite"},
     NumpyOnly: {"backends_agree"},
@@ -604,6 +644,11 @@ PLANTED = {
 def test_planted_fault_is_caught(plugin):
     failed = {result.check: result.detail for result in check(plugin, PLANTED[plugin]) if result.outcome == "fail"}
     assert PLANTED[plugin] <= failed.keys(), failed
+
+
+def test_a_wrong_physical_gradient_is_finite_and_of_the_right_shape():
+    (result,) = check(WrongPhysics, {"physical_gradient_is_finite"})
+    assert result.outcome == "pass"
 
 
 def test_line_per_check_and_exit_status(capsys):

@@ -5,11 +5,13 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.backends.numpy import Numpy
 from bench.plugins.contacts.impulse import Impulse
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.integrators.explicit_euler import ExplicitEuler
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.lqr import Lqr
+from bench.plugins.scenes.quadratic import Quadratic
 from bench.plugins.scenes.static_gain import StaticGain
 from bench.plugins.scenes.two_balls import TwoBalls
 
@@ -17,7 +19,9 @@ import bench
 from bench.cli import main
 from bench.measure import performance
 from bench.measure.solve import solve
+from bench.model import Problem, compose
 from bench.studies.optimise import races, report
+from bench.studies.optimise.abreast import side_by_side
 from bench.studies.optimise.measure import compared
 from bench.sweep import config
 from bench.sweep.execute import store_of
@@ -169,6 +173,66 @@ def test_the_same_search_twice(tmp_path):
     first, again = (measured(*words, folder=tmp_path) for _ in range(2))
     assert first["path_cost"] == again["path_cost"]
     assert measured(*words, "seed=1", folder=tmp_path)["path_cost"] != first["path_cost"]
+
+
+@pytest.mark.parametrize("optimizer", ["adam[rate=0.1]", "cem[population=20,elites=5]", "line_search"])
+def test_seeds_abreast_have_the_numbers_of_seeds_alone(tmp_path, optimizer, monkeypatch):
+    words = [
+        "scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", f"optimizers=[{optimizer}]", "samples=4", "repeats=4",
+        "study=optimise[iterations=12,quality_samples=64,scored=smoothed,evaluations=16]", "timing=false", f"results_dir={tmp_path}",
+    ]  # fmt: skip
+    together = config.load([*words, "sweep.seed=[0,1,2,3]"])
+    calls = []
+    own = Problem._blocks
+    monkeypatch.setattr(Problem, "_blocks", lambda self, *args: (calls.append(args[0].__name__), own(self, *args))[1])
+    session = Session(together)
+    rows = [study_of(together).measure(cell, session) for cell in cells(together)]
+    one_batch = len(calls)
+    calls.clear()
+    alone = []
+    for seed in range(4):
+        experiment = config.load([*words, f"seed={seed}"])
+        (cell,) = cells(experiment)
+        alone.append(study_of(experiment).measure(cell, Session(experiment)))
+    assert [row["path_cost"] for row in rows] == [row["path_cost"] for row in alone]
+    assert [row["theta"] for row in rows] == [row["theta"] for row in alone]
+    assert [row["rollouts"] for row in rows] == [row["rollouts"] for row in alone]
+    assert len({tuple(row["path_cost"]) for row in rows}) == 4
+    assert one_batch < 0.5 * len(calls)
+
+
+def test_a_seed_that_fails_among_others_fails_alone():
+    problem = Numpy().compile(compose(Quadratic(), None, None))
+    asked = []
+
+    def search(seed):
+        def run(lane):
+            first = lane.value(np.full(lane.dim, float(seed)), np.zeros((lane.program.n_noise, 2)))
+            if seed == 1:
+                raise ZeroDivisionError("seed 1")
+            asked.append(seed)
+            return {
+                "cost": float(first[0]),
+                "again": float(lane.value(np.zeros(lane.dim), np.zeros((lane.program.n_noise, 1)))[0]),
+            }
+
+        return run
+
+    found = side_by_side(problem, [search(seed) for seed in range(3)])
+    assert isinstance(found[1], ZeroDivisionError)
+    assert asked == [0, 2]
+    assert found[0]["cost"] != found[2]["cost"]
+    assert found[0]["again"] == found[2]["again"]
+
+
+def test_a_call_that_fails_for_one_seed_is_made_for_each_alone():
+    def search(width):
+        return lambda lane: {"cost": lane.value(np.zeros(lane.dim), np.zeros((width, 1)))}
+
+    problem = Numpy().compile(compose(Quadratic(), None, None))
+    good, bad = side_by_side(problem, [search(problem.program.n_noise), search(problem.program.n_noise + 1)])
+    assert isinstance(good, dict)
+    assert isinstance(bad, BaseException)
 
 
 def test_tables_charts_and_page(finished):

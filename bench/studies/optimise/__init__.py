@@ -72,10 +72,11 @@ class Optimise(Study):
     quality_samples: int = param(4096, "gradients of the reference of the quality", low=64)
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Search once."""
+        """Search once; without timing, together with the seeds that come after, so that their rollouts are one batch."""
+        from bench.studies.optimise.abreast import measure_abreast
         from bench.studies.optimise.measure import measure
 
-        return measure(cell, session, self)
+        return measure(cell, session, self) if cell.timing else measure_abreast(cell, session, self)
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
         """Leave out the estimator where the optimizer looks at costs only: all would give the same search."""

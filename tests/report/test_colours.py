@@ -1,0 +1,56 @@
+"""The palette as a reader without green cones sees it (deuteranopia), and estimators beyond its length."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+
+from bench.report.style import MARKERS, PALETTE, colour
+
+DEUTERANOPIA = np.array(
+    [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+)
+"""On linear RGB, at full severity (Machado, Oliveira, Fernandes 2009)."""
+D65 = np.array(
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+)
+DISTINCT = 10.0
+"""Distance in CIELAB from which two colours beside each other are plainly two: several times the just noticeable 2.3."""
+ESTIMATORS = 16
+"""Places that are looked at, twice the palette's length."""
+
+
+def lab(text: str, seen: np.ndarray) -> np.ndarray:
+    """CIELAB coordinates of a colour after a matrix on linear RGB."""
+    rgb = np.array(to_rgb(text))
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    xyz = D65 @ np.clip(seen @ linear, 0.0, 1.0) / D65.sum(axis=1)
+    f = np.where(xyz > 216 / 24389, np.cbrt(xyz), (24389 / 27 * xyz + 16) / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def apart(a: str, b: str, seen: np.ndarray) -> float:
+    return float(np.linalg.norm(lab(a, seen) - lab(b, seen)))
+
+
+def marker(place: int) -> str:
+    """The marker of an estimator without variants, as :class:`bench.report.style.Look` gives it."""
+    return MARKERS[(place + place // len(PALETTE)) % len(MARKERS)]
+
+
+@pytest.mark.parametrize("seen", [np.eye(3), DEUTERANOPIA], ids=["normal", "deuteranopia"])
+def test_the_palette_is_distinguished(seen):
+    assert min(apart(a, b, seen) for a, b in combinations(PALETTE, 2)) > DISTINCT
+
+
+def test_red_and_green_of_equal_lightness_would_be_caught():
+    assert apart("#b05000", "#6d6d00", np.eye(3)) > DISTINCT > apart("#b05000", "#6d6d00", DEUTERANOPIA)
+
+
+@pytest.mark.parametrize("seen", [np.eye(3), DEUTERANOPIA], ids=["normal", "deuteranopia"])
+def test_more_estimators_than_colours_differ_by_colour_or_marker(seen):
+    for a, b in combinations(range(ESTIMATORS), 2):
+        assert marker(a) != marker(b) or apart(colour(a), colour(b), seen) > DISTINCT, (a, b)

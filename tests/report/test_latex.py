@@ -1,0 +1,47 @@
+"""The LaTeX tables, compiled as a paper would: two columns, no scaling, nothing wider than its place."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+STANDARD = Path(__file__).parents[2] / "results" / "standard"
+PAPER = r"""\documentclass[10pt,twocolumn]{{article}}
+\usepackage[T1]{{fontenc}}\usepackage{{booktabs}}
+\setlength{{\textwidth}}{{7in}}\setlength{{\oddsidemargin}}{{-0.25in}}\setlength{{\columnsep}}{{0.25in}}
+\begin{{document}}Text.\clearpage {inputs}\clearpage\end{{document}}
+"""
+NEGLIGIBLE = 1.0
+"""Points that a box may be too wide without a reader seeing it: a third of a millimetre."""
+
+needs_latex = pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
+
+
+def overfull(folder: Path, tables: list[Path]) -> list[str]:
+    inputs = r"\clearpage ".join(rf"\input{{{path.as_posix()}}}" for path in tables)
+    (folder / "paper.tex").write_text(PAPER.format(inputs=inputs))
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "-draftmode", "paper.tex"]
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, errors="replace", timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stdout[-2000:]
+    widths = re.findall(
+        r"Overfull \\hbox \(([\d.]+)pt too wide\)[^\n]*", (folder / "paper.log").read_text(errors="replace")
+    )
+    return [width for width in widths if float(width) > NEGLIGIBLE]
+
+
+@needs_latex
+def test_tables_fit_a_paper_of_two_columns(tmp_path):
+    tables = [STANDARD / name / "bias_variance.tex" for name in ("stiffness_sweep", "estimators", "smoothing_sweep")]
+    assert overfull(tmp_path, tables) == []
+
+
+@needs_latex
+def test_a_table_too_wide_is_caught(tmp_path):
+    (tmp_path / "wide.tex").write_text(r"\begin{table*}\begin{tabular}{l}\rule{8in}{1pt}\end{tabular}\end{table*}")
+    assert overfull(tmp_path, [tmp_path / "wide.tex"]) != []
