@@ -33,5 +33,5 @@ def rollout(rows, slope=False):
 
 
 if __name__ == "__main__":
-    settings = {"sigma": [0.003, 0.05], "budget": "300s", "batch": "rows", "name": "Genesis rigid"}
+    settings = {"sigma": [0.003, 0.05], "budget": "180s", "batch": "rows", "name": "Genesis rigid"}
     print(bench.examine(rollout, theta, lambda x: rollout(x, True), **settings))

@@ -41,6 +41,8 @@ HEAD = (
     "gradient",
     "spent",
 )
+BEGIN, END = "<!-- engines -->\n", "<!-- end -->"
+"""What a page has around the table."""
 MARK = "\x1eROWS "
 
 
@@ -51,7 +53,7 @@ def imported(text: str) -> list[str]:
 
 def row(report: Any, version: str) -> list[str]:
     """Return what a report says, as cells."""
-    from bench.report.text import duration, number
+    from bench.report.text import counted, duration, number
 
     parts = [part for part in report.check.parts if math.isfinite(part.error)] if report.check else []
     off = f"{number(100 * max(part.error for part in parts))}%" if parts and report.gradient else "-"
@@ -63,7 +65,7 @@ def row(report: Any, version: str) -> list[str]:
         biases.append(report._bias(one).replace("the gradient ", "") if report.gradient else "-")
     biases += ["-"] * (2 - len(biases))
     jumps = sum(len(line.jumps) for line in report.lines)
-    said = f"{jumps} on {len(report.lines)} lines" if report.lines else "not looked for"
+    said = f"{jumps} on {counted(len(report.lines), 'line')}" if report.lines else "not looked for"
     return [
         report.name, version, f"{judged} ({report.cause})", off, said, *biases[:2], duration(report.cost_s),
         duration(report.gradient_s) if math.isfinite(report.gradient_s) else "-", duration(report.seconds),
@@ -122,8 +124,9 @@ def main(words: list[str]) -> int:
         table += rows(name)
     text = "".join(f"| {' | '.join(cells)} |\n" for cells in table)
     print(text)
-    for path in out:
-        Path(path).write_text(text)
+    for path in map(Path, out):
+        before, begin, rest = (path.read_text() if path.exists() else "").partition(BEGIN)
+        path.write_text(f"{before}{begin}{text}{END}{rest.partition(END)[2]}" if begin else text)
     return int(any("failed: " in cells[1] for cells in table))
 
 

@@ -37,4 +37,4 @@ def gradient(theta):
 
 
 if __name__ == "__main__":
-    print(bench.examine(cost, theta, grad=gradient, sigma=[0.01], budget="90s"))
+    print(bench.examine(cost, theta, grad=gradient, sigma=[0.01], budget="90s", name="Warp kernel"))

@@ -13,7 +13,7 @@ import numpy as np
 from bench.errors import UserError
 from bench.examine.lines import HALVINGS, PLACES, POINTS, Line, scan
 from bench.examine.report import Report
-from bench.examine.smoothing import PAIRS, Smoothed, directions, smoothed
+from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, smoothed
 from bench.measure.gradcheck import EPS, Check, Options, check
 from bench.simulator.clock import Clock, OutOfTime, seconds
 from bench.simulator.columns import Simulator
@@ -45,6 +45,8 @@ LOOKS = ((PLACES, HALVINGS), (3, 10), (1, 10))
 """Places looked at on a line and halvings of each, from the whole to the least."""
 FEWEST_POINTS = 17
 """Points without which a line is not scanned."""
+HELD = 20_000_000
+"""Numbers of theta in the pairs of one sigma, which are held in memory several times over."""
 OTHER_NOISE = 2
 """Draws of the simulator's own noise, besides the first, under which the gradient is checked along random directions."""
 
@@ -68,7 +70,7 @@ def examine(
     ``grad`` is ``"jax"``, ``"torch"`` or a function of theta; without it, differences alone. ``sigma`` are standard
     deviations of noise on theta. ``noise=n`` makes it ``cost(theta, w)`` with ``w (n,)`` standard normal, the
     simulator's own randomness, which is the same in costs that are compared. ``budget`` is the time for everything
-    (``60``, ``"2m"``); a single call that takes longer is not interrupted. ``batch`` says how several thetas are taken
+    (``60``, ``"2m"``); a call that it ends in is interrupted, compiled code when that returns. ``batch`` says how several thetas are taken
     at once: ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``; by default that is detected.
     ``scale`` is the size of each input, with theta's structure; by default its own size, and for 0 that of its array.
 
@@ -80,12 +82,16 @@ def examine(
     """
     clock = Clock(seconds(budget), progress)
     levels = _levels(sigma)
-    if not isinstance(noise, int) or noise < 0:
+    if not isinstance(noise, int | np.integer) or noise < 0:
         raise UserError(f"noise={noise} is the length of w in cost(theta, w), a whole number")
     layout = Layout(theta)
     scales = layout.scales() if scale is None else _scales(layout, scale)
     clock.stage("first call")
-    simulator = Simulator(cost, layout, grad, noise, batch, clock)
+    try:
+        simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
+    except OutOfTime:
+        took = f"budget={clock.budget:g} seconds ended in the first call of the cost: give more"
+        raise UserError(f"{took}, or a shorter rollout") from None
     try:
         return _Examination(simulator, layout, scales, levels, clock, seed, name or _called(cost)).run(_called(grad))
     finally:
@@ -93,9 +99,8 @@ def examine(
 
 
 def _levels(sigma: float | Sequence[float]) -> list[float]:
-    given = [sigma] if isinstance(sigma, int | float) else list(sigma)
     try:
-        levels = [float(one) for one in given]
+        levels = [float(one) for one in np.atleast_1d(np.asarray(sigma, dtype=np.float64)).ravel()]
     except (TypeError, ValueError):
         levels = [math.nan]
     if not all(one > 0 and math.isfinite(one) for one in levels):
@@ -195,13 +200,16 @@ class _Examination:
         """Return the cost at theta, and by how much equal calls differ; another theta stands between them."""
         self.clock.stage("repeating a call")
         other = self.theta + 1e-3 * self.scale
+        values: list[float] = []
         try:
-            values = [float(self._costs(at[:, None])[0]) for at in (self.theta, other, self.theta, other, self.theta)]
+            for at in (self.theta, other, self.theta, other, self.theta):
+                values.append(float(self._costs(at[:, None])[0]))
         except OutOfTime:
             self.left_out.append("repeating a call")
+        if not values:
             return math.nan, 0.0
         same = np.array(values[::2])
-        pairs = [same, np.array(values[1::2])]
+        pairs = [same, np.array(values[1::2] or [0.0])]
         return values[0], max(0.0 if np.isnan(one).all() else float(np.ptp(one)) for one in pairs)
 
     def _gradient_comes(self) -> bool:
@@ -215,9 +223,25 @@ class _Examination:
                 return True
         return not self.simulator.gradient_error
 
+    def _seconds_each(self) -> float:
+        """Return the seconds of one cost, as a check asks for them: as many at once as the cost takes."""
+        width = self.simulator.width
+        if width == 1:
+            return self.clock.per_cost()
+        columns = np.repeat(self.theta[:, None], width, axis=1)
+        taken = math.nan
+        try:
+            for _ in range(2):  # the first of this shape may compile
+                began = self.clock.spent
+                self._costs(columns)
+                taken = (self.clock.spent - began) / width
+        except OutOfTime:
+            return self.clock.per_cost()
+        return taken
+
     def _options(self) -> Options:
         """Return what can be looked at in the time that is left."""
-        each, slope = self.clock.per_cost(), self.clock.per_gradient()
+        each, slope = self._seconds_each(), self.clock.per_gradient()
         each = 0.0 if math.isnan(each) else each
         slope = 4 * each if math.isnan(slope) else slope
         for effort in EFFORTS[:-1]:
@@ -340,7 +364,8 @@ class _Examination:
         for index, level in enumerate(levels):
             self.clock.stage(f"noise of sigma {level:g}")
             self.clock.allow(1.0 / (len(levels) - index))
-            one = smoothed(self.simulator, self.theta, level, scale, plain, self.clock, self.seed, PAIRS)
+            pairs = min(PAIRS, max(FEWEST, HELD // self.theta.size))
+            one = smoothed(self.simulator, self.theta, level, scale, plain, self.clock, self.seed, pairs)
             self.clock.allow(1.0)
             if one is None:
                 self.left_out.append(f"noise of sigma {level:g}")

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
+import threading
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
 
 from bench.errors import UserError
 
@@ -13,8 +17,12 @@ UNITS = {"ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "": 1.0}
 """Units of a budget, in seconds."""
 
 
-class OutOfTime(Exception):
-    """Raised when the budget does not allow another call."""
+LEAST, AGAIN = 1e-3, 1.0
+"""Seconds of the alarm at least, and until it rings again."""
+
+
+class OutOfTime(BaseException):
+    """Raised when the budget is over, also inside a call: no Exception, which a simulator may catch."""
 
 
 def seconds(budget: float | str) -> float:
@@ -66,6 +74,30 @@ class Clock:
         """Raise :class:`OutOfTime` when the time is over."""
         if self.spent > min(self.budget, self._until):
             raise OutOfTime
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Raise :class:`OutOfTime` inside the block when the budget ends in it.
+
+        A call that runs compiled code is interrupted when that returns. Only the main thread can be interrupted, and only
+        where nobody else uses the alarm.
+        """
+        free = threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
+        if not (free and math.isfinite(self.budget) and signal.getsignal(signal.SIGALRM) in (signal.SIG_DFL, None)):
+            yield
+            return
+
+        def over(number: int, frame: FrameType | None) -> None:
+            raise OutOfTime
+
+        signal.signal(signal.SIGALRM, over)
+        try:
+            # the alarm repeats, in case what it raises is lost in a callback
+            signal.setitimer(signal.ITIMER_REAL, max(self.left, LEAST), AGAIN)
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, signal.SIG_DFL)
 
     def count(self, kind: str, calls: int, taken: float, warm: bool) -> None:
         """Count calls, and their time where they compiled nothing."""

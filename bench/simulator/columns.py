@@ -73,6 +73,11 @@ class Simulator:
         return max(float(np.finfo(name).eps) if name != "bfloat16" else 2.0**-7 for name in types)
 
     @property
+    def width(self) -> int:
+        """How many thetas are taken at once."""
+        return 1 if self.batch == "loop" else BLOCK if self.library == "jax" else CHUNK
+
+    @property
     def has_gradient(self) -> bool:
         """Whether there is a gradient to ask for."""
         return self._grad is not None
@@ -95,7 +100,7 @@ class Simulator:
     ) -> np.ndarray:
         count = thetas.shape[1]
         out = np.full((*lead, count), np.nan)
-        size = 1 if self.batch == "loop" else BLOCK if self.library == "jax" else CHUNK
+        size = self.width
         for start in range(0, count, size):
             self.clock.check()
             part = slice(start, min(start + size, count))
@@ -103,7 +108,8 @@ class Simulator:
             if self.library == "jax" and size > 1:
                 columns = np.r_[columns, np.repeat(columns[-1:], size - columns.size)]
             began = time.perf_counter()
-            found = function(thetas[:, columns], None if w is None else w[:, columns])
+            with self.clock.watched():
+                found = function(thetas[:, columns], None if w is None else w[:, columns])
             taken = time.perf_counter() - began
             warm = (kind, columns.size) in self._shapes
             self._shapes.add((kind, columns.size))
@@ -199,7 +205,8 @@ class Simulator:
         began = time.perf_counter()
         theta = self._theta(self._array(vector))
         try:
-            value = self._call(theta, None if w is None else self._array(w))
+            with self.clock.watched():
+                value = self._call(theta, None if w is None else self._array(w))
         except RuntimeError as error:
             if self.library != "torch" or "dtype" not in str(error) or not self._double:
                 raise
@@ -208,9 +215,16 @@ class Simulator:
             return self._first(vector, w)
         found = as_numpy(value)
         self.clock.count("costs", 1, time.perf_counter() - began, warm=False)
-        if not np.array_equal(self.layout.take(theta, "theta"), self._as_seen(vector)):
+        if self._changed(theta, vector):
             self.notes.append("the cost changes its argument in place: it is given a copy at each call")
         return found
+
+    def _changed(self, theta: Any, vector: np.ndarray) -> bool:
+        """Return whether theta is no longer what the cost was given."""
+        try:
+            return not np.array_equal(self.layout.take(theta, "theta"), self._as_seen(vector))
+        except UserError:
+            return True
 
     def _as_seen(self, vector: np.ndarray) -> np.ndarray:
         """Return the numbers that theta has once they are in the library's own type."""
@@ -232,7 +246,8 @@ class Simulator:
                 columns = np.repeat(vector[:, None], BLOCK, axis=1)
                 w = np.zeros((self.noise, BLOCK)) if self.noise else None
                 self._single = None
-                mapped = np.asarray(self._jax_values(columns, w, "vmap"), dtype=np.float64)
+                with self.clock.watched():
+                    mapped = np.asarray(self._jax_values(columns, w, "vmap"), dtype=np.float64)
                 tolerance = 1e3 * self.unit * max(abs(value), 1.0)
                 if np.allclose(mapped, value, rtol=1e3 * self.unit, atol=tolerance, equal_nan=True):
                     self._shapes.add(("costs", BLOCK))
@@ -257,7 +272,8 @@ class Simulator:
         w = np.zeros((self.noise, count)) if self.noise else None
         self._refusal = ""
         try:
-            found = as_numpy(self._batched(self._array(thetas), None if w is None else self._array(w), batch))
+            with self.clock.watched():
+                found = as_numpy(self._batched(self._array(thetas), None if w is None else self._array(w), batch))
         except Exception as error:
             self._refusal = failure(error)["reason"]
             return False

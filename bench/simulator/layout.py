@@ -15,6 +15,11 @@ import numpy as np
 
 from bench.errors import UserError
 
+ROUNDED = 1e-14
+"""Size of a number, relative to its array, that is a 0 which rounding has left."""
+MOST = 100_000
+"""Numbers of a theta at most: some thousand thetas are held at once."""
+
 
 @dataclass(frozen=True)
 class Leaf:
@@ -63,6 +68,10 @@ class Layout:
         if not start:
             raise UserError("theta has no numbers: give an array, or a dict of arrays, theta={'mass': 1.0}")
         self.vector = np.concatenate(values)
+        if start > MOST:
+            raise UserError(
+                f"theta has {start:,} numbers; up to {MOST:,} can be examined: give fewer, or a part of them"
+            )
         if not np.isfinite(self.vector).all():
             bad = self.names[int(np.argmin(np.isfinite(self.vector)))]
             raise UserError(f"{bad} is not finite: give a theta of finite numbers")
@@ -83,7 +92,7 @@ class Layout:
         for leaf in self.leaves:
             part = scale[leaf.start : leaf.start + leaf.size]
             typical = float(np.sqrt(np.mean(part[part > 0] ** 2))) if part.any() else 1.0
-            part[part <= 1e-8 * typical] = typical
+            part[part <= ROUNDED * typical] = typical
         return scale
 
     def build(self, vector: Any, convert: Any = None) -> Any:
@@ -96,20 +105,29 @@ class Layout:
 
     def take(self, value: Any, what: str = "the gradient") -> np.ndarray:
         """Return a value of theta's structure, or a vector ``(d,)``, as ``(d,)``; raises :class:`UserError` otherwise."""
-        size = self.vector.size
         try:
-            parts = [as_numpy(part) for _, part in _walk(value, "")]
+            found = [(path, as_numpy(part)) for path, part in _walk(value, "")]
         except UserError:
-            parts = []
-        if len(parts) == len(self.leaves):
-            fits = all(part.size == leaf.size for part, leaf in zip(parts, self.leaves, strict=True))
-            if fits:
-                return np.concatenate([part.ravel() for part in parts])
-        if len(parts) == 1 and parts[0].size == size:
-            return parts[0].ravel()
-        shapes = ", ".join(str(part.shape) for part in parts) or type(value).__name__
+            found = []
+        parts = self._in_order(value, found)
+        sizes = [leaf.size for leaf in self.leaves]
+        total = sum(part.size for part in parts)
+        # a list of single numbers is a vector, whatever library its numbers are of
+        flat = len(parts) == 1 or (len(self.leaves) == 1 and _sequence(value))
+        if total == self.vector.size and ([part.size for part in parts] == sizes or flat):
+            return np.concatenate([part.ravel() for part in parts])
+        shapes = ", ".join(f"{path} {part.shape}".strip() for path, part in found) or type(value).__name__
         wanted = ", ".join(f"{leaf.path or 'theta'} {leaf.shape}" for leaf in self.leaves)
         raise UserError(f"{what} has shape {shapes}; theta is {wanted}")
+
+    def _in_order(self, value: Any, found: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
+        """Return the parts in theta's order: by their names where they have some, since other libraries sort them."""
+        named = dict(found)
+        paths = [leaf.path for leaf in self.leaves]
+        if set(named) == set(paths):
+            return [named[path] for path in paths]
+        # names that are not theta's belong to other numbers
+        return [] if isinstance(value, Mapping) or _named_fields(value) else [part for _, part in found]
 
 
 def as_numpy(value: Any) -> np.ndarray:

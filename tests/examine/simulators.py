@@ -187,6 +187,100 @@ def numpy_cases():
     yield Case("own noise", "numpy", driven, START, complex_step(driven), settings={"noise": 20})
 
 
+def friction(x, steps=60, dt=0.01):
+    """A block pushed over a floor whose friction turns within 1 mm/s: stiff, and right beyond its steep part."""
+    q, v = 0.0, x[0]
+    for t in range(steps):
+        v = v + dt * (x[1] * (t < steps // 2) - np.tanh(v / 1e-3))
+        q = q + dt * v
+    return q * q
+
+
+def decay(x, steps=20, dt=0.1):
+    """Implicit Euler of y' = -k (y - cos y), k = 1e6: each step a Newton solve to the last digit."""
+    y = x[0]
+    for _ in range(steps):
+        z = y
+        for _ in range(8):
+            z = z - (z - y + dt * x[1] * (z - np.cos(z))) / (1 + dt * x[1] * (1 + np.sin(z)))
+        y = z
+    return y * y + 1e-3 * np.sin(x[0]) * y + 1e-7 * x[1]
+
+
+def lorenz(x, steps=150, dt=0.01):
+    """Lorenz' equations by Euler's method: theta is where it starts."""
+    a, b, c = x[0], x[1], x[2]
+    for _ in range(steps):
+        a, b, c = a + dt * 10 * (b - a), b + dt * (a * (28 - c) - b), c + dt * (a * b - 8 / 3 * c)
+    return a * a + c
+
+
+def conjugate(x, tolerance=1e-7, slope=False):
+    """x . A(x)^-1 b by conjugate gradients to a tolerance, and its derivative by the adjoint, as loose as the solve."""
+
+    def solve(matrix, right):
+        z, rest = np.zeros(3), right.copy()
+        way, size = rest, rest @ rest
+        while np.sqrt(size) > tolerance:
+            moved = matrix @ way
+            step = size / (way @ moved)
+            z, rest = z + step * way, rest - step * moved
+            way, size = rest + rest @ rest / size * way, rest @ rest
+        return z
+
+    matrix, b = MIX @ MIX.T + np.diag(np.array(x) ** 2), np.array([1.0, -2.0, 0.5])
+    z = solve(matrix, b)
+    if not slope:
+        return z @ z
+    return -solve(matrix, 2 * z) * 2 * np.array(x) * z
+
+
+def bounces(x, slope=False):
+    """A ball that bounces twice, by the times of impact: theta is height and speed up; kinks where a bounce is gained."""
+    state, left = (x[0], x[1]), 1.0
+    while True:
+        hit = (state[1] + np.sqrt(state[1] ** 2 + 2 * 9.81 * state[0])) / 9.81
+        if hit.real > left:
+            return state[0] + state[1] * left - 9.81 / 2 * left**2
+        state, left = (0.0, 0.8 * (9.81 * hit - state[1])), left - hit
+
+
+def network(x, slope=False):
+    """Two layers of rectifiers: kinks all about, none at theta."""
+    first = np.outer(np.arange(1, 9) / 8, [1.0, -2.0, 0.7]) + np.sin(np.arange(24).reshape(8, 3))
+    inside = first @ np.array(x) + np.cos(np.arange(8))
+    out = np.maximum(inside, 0) @ np.cos(np.arange(8))
+    return 2 * out * ((inside > 0) * np.cos(np.arange(8))) @ first if slope else out**2
+
+
+def right_cases():
+    """More right gradients: stiff, chaotic, kinked, loosely solved, and of very different sizes."""
+    spread = np.array([1e-6, 1e6, 1.0])
+    many = np.linspace(-3, 3, 40)
+    yield Case("friction within 1 mm/s", "numpy", friction, [0.8, 3.0], complex_step(friction))
+    yield Case("implicit, k = 1e6", "numpy", decay, [0.4, 1e6], complex_step(decay))
+    yield Case("Lorenz", "numpy", lorenz, [1.0, 2.0, 20.0], complex_step(lorenz))
+    yield Case(
+        "conjugate gradients to 1e-7", "numpy", conjugate, START, lambda x: conjugate(x, slope=True)
+    )  # fmt: skip
+    yield Case("two bounces", "numpy", bounces, [0.7, 0.4], complex_step(bounces))
+    yield Case("rectifiers", "numpy", network, START, lambda x: network(x, slope=True))
+    yield Case(
+        "1e-6 beside 1e6", "numpy", lambda x: swing(x / spread), np.array(START) * spread,
+        lambda x: complex_step(swing)(x / spread) / spread,
+    )  # fmt: skip
+    yield Case(
+        "40 inputs", "numpy", lambda x: np.sin(x @ many) + x @ x, many / 7, lambda x: np.cos(x @ many) * many + 2 * x
+    )
+    yield Case("at a minimum", "numpy", lambda x: np.sum((x - np.array(START)) ** 4 + (x - np.array(START)) ** 2),
+        START, lambda x: 4 * (x - np.array(START)) ** 3 + 2 * (x - np.array(START)))  # fmt: skip
+    yield Case("at the origin", "numpy", lambda x: np.expm1(x[0]) - np.sin(x[1]) * 1e-6, [0.0, 0.0],
+        lambda x: [np.exp(x[0]), -np.cos(x[1]) * 1e-6])  # fmt: skip
+    yield Case("cost of 1e15", "numpy", lambda x: 1e15 * swing(x), START, lambda x: 1e15 * complex_step(swing)(x))
+    yield Case("steep wall", "numpy", lambda x: np.log1p(np.exp(300 * (x[0] - x[1]))) / 300 + x[0] ** 2, [0.4, 0.38],
+        lambda x: np.array([1.0, -1.0]) / (1 + np.exp(-300 * (x[0] - x[1]))) + [2 * x[0], 0.0])  # fmt: skip
+
+
 def logistic(x, steps=25):
     """The chaotic logistic map: the derivative grows to some 1e5."""
     y = x[0]
@@ -329,7 +423,7 @@ def jax_cases():
     yield Case("kink beside theta", "jax", lambda x: jnp.sum(jnp.abs(x - 0.1003) * x), [1.0, 0.1], "jax")
 
 
-CASES = {"numpy": numpy_cases, "torch": torch_cases, "jax": jax_cases}
+CASES = {"numpy": numpy_cases, "right": right_cases, "torch": torch_cases, "jax": jax_cases}
 
 
 # ------------------------------------------------------------------------------------------ other checkers

@@ -28,6 +28,11 @@ def test_numpy_simulators_are_judged_rightly(case):
     judge(case)
 
 
+@pytest.mark.parametrize("case", list(simulators.right_cases()), ids=lambda c: c.name)
+def test_right_gradients_of_hard_simulators_pass(case):
+    judge(case)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [c for c in simulators.numpy_cases() if c.name in SLOW], ids=lambda c: c.name)
 def test_longer_numpy_simulators_are_judged_rightly(case):

@@ -1,7 +1,9 @@
 """`bench.examine`: right gradients pass, wrong ones are named, jumps are found, and the budget holds."""
 
+import contextlib
 import dataclasses
 import math
+import signal
 import time
 from collections import namedtuple
 
@@ -67,6 +69,37 @@ def test_theta_is_taken_apart_and_put_together(theta, names):
 def test_theta_without_real_numbers_is_bad_input(theta, match):
     with pytest.raises(UserError, match=match):
         Layout(theta)
+
+
+def test_gradients_are_matched_by_name_whatever_their_order():
+    """JAX sorts the keys of a dict: a gradient in its order is right."""
+    layout = Layout({"speed": 1.0, "mass": 2.0})
+    np.testing.assert_array_equal(layout.take({"mass": 20.0, "speed": 10.0}), [10.0, 20.0])
+    with pytest.raises(UserError, match=r"has shape mass .*, spin"):
+        layout.take({"mass": 20.0, "spin": 10.0})
+    report = bench.examine(
+        lambda p: p["speed"] ** 2 * p["mass"], {"speed": 1.0, "mass": 2.0},
+        grad=lambda p: {"mass": p["speed"] ** 2, "speed": 2 * p["speed"] * p["mass"]}, **QUICK,
+    )  # fmt: skip
+    assert report.status == 0, str(report)
+
+
+def test_list_of_numbers_of_any_library_is_a_vector():
+    layout = Layout([1.0, 2.0])
+    np.testing.assert_array_equal(layout.take([np.float32(3), np.array(4.0)]), [3.0, 4.0])
+    with pytest.raises(UserError, match="theta is theta"):
+        layout.take([np.float32(3)])
+
+
+def test_cost_that_takes_its_argument_apart_is_given_another_each_time():
+    report = bench.examine(lambda p: p.pop("mass") ** 2, {"mass": 2.0}, **QUICK)
+    assert report.status == 0
+    assert "changes its argument in place" in str(report)
+
+
+def test_theta_that_would_fill_the_memory_is_bad_input():
+    with pytest.raises(UserError, match="up to 100,000"):
+        Layout(np.zeros(100_001))
 
 
 def test_scale_of_zero_is_that_of_its_array():
@@ -215,6 +248,7 @@ def test_batches_are_told_from_the_result():
         ({"sigma": -1.0}, "above 0"),
         ({"budget": "soon"}, "is no time"),
         ({"noise": -1}, "whole number"),
+        ({"sigma": np.float32(-0.5)}, "above 0"),
     ],
 )
 def test_bad_settings_say_what_is_allowed(settings, match):
@@ -236,6 +270,48 @@ def test_budget_bounds_everything():
     report = bench.examine(slow, [1.0, 0.5], grad=slope, sigma=[0.01, 0.1], progress=False, budget="1s")
     assert time.perf_counter() - began < 2.0  # a second, and room for a busy machine
     assert "not done, for the budget" in str(report)
+
+
+def test_cost_that_hangs_is_interrupted_when_the_budget_ends():
+    calls = []
+
+    def hangs(x):
+        calls.append(1)
+        while len(calls) > 3:
+            with contextlib.suppress(Exception):  # as a simulator may that tries again
+                time.sleep(60)
+        return bowl(x)
+
+    began = time.perf_counter()
+    report = bench.examine(hangs, [1.0, 0.5], progress=False, budget=0.3)
+    assert time.perf_counter() - began < 3.0  # 0.3 s, and room for a busy machine
+    assert (report.status, report.cause) == (1, "undecided")
+    assert report.cost == bowl([1.0, 0.5])
+    with pytest.raises(UserError, match="ended in the first call"):
+        bench.examine(lambda x: time.sleep(60), [1.0], progress=False, budget=0.1)
+
+
+def test_alarm_of_someone_else_is_left_alone():
+    def mine(*ignored):
+        raise RuntimeError("not this one")
+
+    signal.signal(signal.SIGALRM, mine)
+    try:
+        assert bench.examine(bowl, [1.0, 0.5], grad=slope, **QUICK).status == 0
+        assert signal.getsignal(signal.SIGALRM) is mine
+    finally:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+
+
+def test_batches_are_planned_by_the_time_of_a_batch():
+    """A call takes 4 ms, however many thetas it has: planned as if each took that, the whole check would be left out."""
+
+    def columns(x):
+        time.sleep(0.004)
+        return (x**2).sum(axis=0)
+
+    report = bench.examine(columns, [1.0, 2.0], batch="columns", progress=False, budget=4)
+    assert not any("the whole check" in what for what in report.left_out)
 
 
 def test_budget_is_read_with_its_unit():

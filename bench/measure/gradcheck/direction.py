@@ -88,8 +88,10 @@ class Sample:
         costs = costs + float(np.finfo(np.float64).tiny) / unit
         if self.noise is None:
             return np.asarray(GUARD * unit * (costs + self.slope * self.scale) / self.step)
-        # what was measured has more in it than the guess above, and no word of the program's
-        return np.asarray(MEASURED * unit * (costs + np.abs(self.differences) * self.scale) / self.step)
+        # what was measured has more in it than the guess above, and no word of the program's; a rounded theta moves the
+        # cost by its slope where it is asked for, which at a minimum is that of one side
+        slopes = np.maximum(np.abs(self.left), np.abs(self.right))
+        return np.asarray(MEASURED * unit * (costs + slopes * self.scale) / self.step)
 
     @property
     def uncertainty(self) -> np.ndarray:
