@@ -25,6 +25,8 @@ LONGEST = 20.0
 AGREEMENT = 1e-9
 """Largest relative difference allowed for the native gradient."""
 NATIVE_COLUMNS = 1024
+CPU = "cpu"
+"""The device of a problem that names none."""
 
 
 def problem(
@@ -56,6 +58,7 @@ def timed(what: str, call: Callable[[], Any], count: int, target: float = float(
 
 def backends(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
     """Measure every subject at every batch size, with memory where gradients are fast enough for the largest."""
+    found: set[str] = set()
     for subject in settings["subjects"]:
         entry = registry.find("backends", subject["backend"])
         if not entry.available:
@@ -63,18 +66,23 @@ def backends(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
             continue
         compiled = problem(settings, subject["backend"], subject["contact"])
         theta = compiled.program.theta0
+        device = str(getattr(compiled, "device", CPU))
+        found |= {device} - {CPU}
         for count in QUICK_SIZES if quick else SIZES:
             w = batch(compiled, count)
             call = getattr(compiled, subject["call"])
             name = f"{subject['backend']} {subject['call']}, {subject['contact']}, {count:g} rollouts"
             timing.reset_peak_memory()
-            line = timed(name, partial(call, theta, w), count, subject["target_us"] if count in SIZES else math.nan)
+            target = subject["target_us"] if count in SIZES else math.nan
+            line = timed(name, partial(call, theta, w), count, target, "" if device == CPU else f"on {device}")
             peak = timing.peak_memory_mb() - _own_mb(w, subject["call"] == "grad", compiled.dim)
             yield line
             if count in MEMORY_SIZES:
                 yield Line(f"{name}: peak memory", peak, "MB", note="without the noise given and the result returned")
             if line.value * count * 10e-6 > LONGEST:
                 break
+    if not found:
+        yield Line("rollouts on an accelerator", math.nan, "us", note="no device: every line is of the processor")
 
 
 def _own_mb(w: np.ndarray, gradient: bool, dim: int) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import pandas as pd
@@ -136,6 +137,7 @@ def plain(text: str) -> str:
     return f" {text}" if text.startswith("_") else text
 
 
+@cache
 def inches(text: str) -> float:
     """Return the width of a text as printed."""
     from matplotlib.textpath import TextPath

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from bench.errors import UserError
@@ -50,11 +51,13 @@ class Axis:
 
 def parsed(rows: pd.DataFrame) -> list[Mapping[str, Any]]:
     """Return the parameters of each row; empty where a row has none."""
-    cache: dict[str, Mapping[str, Any]] = {}
-    texts = rows["parameters"] if "parameters" in rows else [""] * len(rows)
-    return [
-        cache[text] if text in cache else cache.setdefault(text, json.loads(text) if text else {}) for text in texts
-    ]
+    return [_parsed(text) for text in rows["parameters"]] if "parameters" in rows else [{} for _ in range(len(rows))]
+
+
+@lru_cache(maxsize=20_000)
+def _parsed(text: str) -> Mapping[str, Any]:
+    given: Mapping[str, Any] = json.loads(text) if text else {}
+    return given
 
 
 def value_of(name: str, given: Mapping[str, Any]) -> Any:

@@ -168,4 +168,17 @@ def test_charts_name_curves_floors_and_the_first_at_a_glance(tmp_path):
     )
     assert slope == pytest.approx(-0.5)
     cells = [text.get_text() for text in drawn["at_a_glance"].axes[0].texts]
-    assert cells == ["400 ms\nb", "1.2 s\nother", "bias"]
+    assert cells == ["400 ms\nb", "1.2 s\nother", "bias", "3.0 times\n(2.3 to 3.9)"]
+
+
+def test_names_stay_within_their_panel_and_the_leader_is_named(tmp_path):
+    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
+    long = rows(estimator="an_estimator_with_a_long_name").assign(time_s=lambda r: 9 * r["time_s"])
+    every = with_intervals(pd.concat([rows(), long], ignore_index=True), 1.2)
+    figure = figures(given, every.assign(reason="", dim=1.0))["speed_accuracy"]
+    figure.draw_without_rendering()
+    (panel,) = figure.axes
+    name = next(text for text in panel.texts if text.get_text() == "an_estimator_with_a_long_name")
+    assert name.get_window_extent().x1 <= panel.get_window_extent().x1 + 2  # pixels of padding
+    told = [text.get_text() for part in figure.subfigs for text in part.texts]
+    assert any("first to 10%, of 1: e on b in 1" in " ".join(text.split()) for text in told)

@@ -38,8 +38,8 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     paths = []
     with styled():
         for name, figure in figures(experiment, rows).items():
-            figure.canvas.draw()
-            figure.set_layout_engine("none")
+            figure.draw_without_rendering()  # places everything, once
+            figure.set_layout_engine(None)
             paths += save(figure, experiment.directory / name, experiment.formats)
     return paths
 
@@ -84,8 +84,10 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
             curves = [problem for problem in costed if ran(problem.rows)["x"].nunique() > 1]
             chosen, held = choose(curves or costed)
             if chosen and (cost is not ROLLOUTS or good["samples"].nunique() > 1):
-                drawings[name] = speed_accuracy(chosen, held + merged, look, cost, _said(experiment, chosen, cost))
-        raced = problems(SAMPLES, lambda part: ran(part)["x"].nunique() > 1)
+                said, first = _said(chosen, cost)
+                drawings[name] = speed_accuracy(chosen, held + merged, look, cost, said, first)
+        swept = good["samples"].nunique() > 1
+        raced = problems(SAMPLES, lambda part: ran(part)["x"].nunique() > 1) if swept else []
         if raced:
             costs = [TIME, ROLLOUTS] if good["time_s"].notna().any() else [ROLLOUTS]
             drawings["at_a_glance"] = glance(choose(raced, 2 * ROOM)[0], costs)
@@ -96,15 +98,17 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
     return drawings
 
 
-def _said(experiment: Experiment, problems: Sequence[Family], cost: Cost) -> dict[int, str]:
-    """Return, for each problem by place, who reaches an error of 10% and of 1% first."""
+def _said(problems: Sequence[Family], cost: Cost) -> tuple[dict[int, str], str]:
+    """Return, for each problem by place, who reaches an error of 10% and of 1% first, and who leads over all."""
     kind = "rollouts" if cost is ROLLOUTS else "time"
     said = {}
+    every: list[dict[str, Any]] = []
     for place, problem in enumerate(problems):
         if problem.rows["x"].nunique() > 1:
             entries = [fastest.line(problem, target, kind, cost) for target in fastest.TARGETS]
             said[place] = "\n".join(map(fastest.sentence, entries))
-    return said
+            every += entries
+    return said, fastest.leaders(every)
 
 
 def _costed(cost: Cost, rows: pd.DataFrame) -> bool:

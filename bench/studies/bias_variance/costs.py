@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -63,19 +63,19 @@ def charged(rows: pd.DataFrame) -> pd.DataFrame:
     It is the ratio of seconds per gradient to seconds per rollout, from the fastest rows that use gradients alone and
     costs alone, at the largest number of samples that has both; NaN where nothing was measured.
     """
-    rows = rows.assign(**{RATIO: math.nan})
-    known = rows[(rows["status"] == "ok") & (rows["time_s"] > 0)]
     keys = [name for name in PROGRAM if name in rows]
-    for _, part in known.groupby(keys, dropna=False):
+    program = rows.groupby(keys, dropna=False).ngroup()
+    known = (rows["status"] == "ok") & (rows["time_s"] > 0)
+    ratios: dict[Any, float] = {}
+    narrow = rows.loc[known, ["samples", "gradients", "rollouts", "time_s"]]
+    for place, part in narrow.groupby(program[known]):
         first = part[(part["gradients"] > 0) & (part["rollouts"] <= 0.01 * part["gradients"])]
         zeroth = part[(part["gradients"] == 0) & (part["rollouts"] > 0)]
         both = sorted(set(first["samples"]) & set(zeroth["samples"]))
         if both:
             a, b = (table[table["samples"] == both[-1]] for table in (first, zeroth))
-            ratio = (a["time_s"] / a["gradients"]).min() / (b["time_s"] / b["rollouts"]).min()
-            same = (rows[keys].eq(part[keys].iloc[0]) | (rows[keys].isna() & part[keys].iloc[0].isna())).all(axis=1)
-            rows.loc[same, RATIO] = ratio
-    return rows
+            ratios[place] = (a["time_s"] / a["gradients"]).min() / (b["time_s"] / b["rollouts"]).min()
+    return rows.assign(**{RATIO: program.map(ratios).astype(float)})
 
 
 def _rollouts(rows: pd.DataFrame) -> pd.Series:

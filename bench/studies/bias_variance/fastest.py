@@ -7,6 +7,7 @@ the largest one it is extrapolated by that law, and only to errors above what is
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from bench.measure.statistics import unexplained
-from bench.report.tables import plain_markdown
+from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import axis_value, number
 from bench.report.views import Family, Line, along, arranged, families, lines
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost, charged
@@ -97,6 +98,8 @@ def _beyond(row: Any, samples: float, price: float, target: float) -> Reached:
 
 def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     """Return a line per problem, kind of cost and target; empty where samples were not swept."""
+    if rows["samples"].nunique() < 2:
+        return pd.DataFrame()
     shown = arranged(experiment, charged(rows))
     costs = (("time", TIME), ("rollouts", ROLLOUTS))
     timed = bool(np.isfinite(shown.rows["time_s"]).any())
@@ -182,6 +185,28 @@ def sentence(entry: Any) -> str:
     return f"{what}: {entry['fastest']}, {number(entry['factor'])} times ({low} to {high}) before {entry['next']}"
 
 
+def in_words(best: pd.DataFrame) -> list[str]:
+    """Return a sentence per problem: who reaches each error first in time (rollouts where no time is known)."""
+    kind = "time" if (best["by"] == "time").any() else "rollouts"
+    chosen = best[best["by"] == kind].to_dict("records")
+    told: dict[str, list[str]] = {}
+    for entry in chosen:
+        told.setdefault(entry["problem"], []).append(sentence(entry))
+    return [f"{problem}: {'; '.join(sentences)}." for problem, sentences in told.items()]
+
+
+def leaders(entries: Sequence[Any]) -> str:
+    """Return who is certainly first in how many problems: ``first to 10%: a on b in 2 of 6, undecided in 4``."""
+    said = []
+    for target in dict.fromkeys(entry["relative error"] for entry in entries):
+        asked = [entry for entry in entries if entry["relative error"] == target]
+        clear = [e["fastest"] for e in asked if e["fastest"] != "-" and (e["next"] == "-" or e["factor_low"] > 1.0)]
+        parts = [f"{name} in {count}" for name, count in Counter(clear).most_common()]
+        parts += [f"undecided in {len(asked) - len(clear)}"] if len(clear) < len(asked) else []
+        said.append(f"first to {target:.0%}, of {len(asked)}: {', '.join(parts)}")
+    return "; ".join(said)
+
+
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``fastest`` (.csv, .md), where samples were swept."""
     best = table(experiment, rows)
@@ -192,7 +217,10 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         experiment.directory,
         {
             "fastest.csv": best.to_csv(index=False, lineterminator="\n"),
-            "fastest.md": "\n\n".join([title, plain_markdown(texts(best)), *NOTES]) + "\n",
+            "fastest.md": "\n\n".join(
+                [title, *map(escape_markdown, in_words(best)), plain_markdown(texts(best)), *NOTES]
+            )
+            + "\n",
         },
     )
 

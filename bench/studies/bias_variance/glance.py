@@ -27,34 +27,35 @@ SHADES = (
 """Largest factor over the first of a column, with the colours of cell and text."""
 WHY = {"never": "bias", "unknown": "bias?"}
 """What stands in a cell without a number."""
+LEGEND = (
+    "Dark and bold: the first of its column; lighter: up to 3, and up to 30 times as much. Lead: the first over the next "
+    "estimator, with its 95%\ninterval; open where that reaches 1. bias: its bias is larger than the error. bias?: no bias known to be below the error."
+)
+LEAD = "lead over the next"
 
 
 def glance(problems: Sequence[Family], costs: Sequence[Cost]) -> Figure:
-    """Draw, per cost and error, estimators down and problems across: the cost on the best backend, coloured by factor."""
+    """Draw, per cost and error, estimators down and problems across: the cost on the best backend, coloured by factor.
+
+    The last row is the factor between the first and the second estimator, with its 95% interval.
+    """
     found = {
-        (cost.label, target): [_best(methods(problem, target, cost)) for problem in problems]
+        (cost, target): [_best(methods(problem, target, cost)) for problem in problems]
         for cost in costs
         for target in TARGETS
     }
     names = list(dict.fromkeys(name for columns in found.values() for column in columns for name in column))
-    wide, tall = max(7.0, 1.6 + 0.95 * len(problems) * len(TARGETS)), 0.75 + (0.8 + 0.26 * len(names)) * len(costs)
-    room = ConstrainedLayoutEngine(rect=(0.02, 0.0, 0.98, 1.0))  # for the labels of the first column
-    figure = Figure(figsize=(wide, tall), layout=room)
+    size = max(6.0, 1.5 + 0.93 * len(problems)), 0.9 + (0.45 + 0.27 * (len(names) + 1)) * len(found)
+    figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(rect=(0.01, 0.0, 0.98, 1.0)))
     FigureCanvasAgg(figure)
-    figure.suptitle(
-        "What one estimate needs for an error: the first in each column is dark, and bold",
-        fontsize=9,
-        fontweight="bold",
-    )
-    grid = figure.subplots(len(costs), len(TARGETS), squeeze=False)
-    for row, cost in zip(grid, costs, strict=True):
-        for i, (panel, target) in enumerate(zip(row, TARGETS, strict=True)):
-            _matrix(panel, found[cost.label, target], names, cost)
-            panel.set_title(f"{target:.0%} error, {cost.label}", fontsize=8)
-            panel.set_xticks(range(len(problems)), [plain(p.title().partition(",")[0]) for p in problems], fontsize=6.5)
-            panel.set_yticks(
-                range(len(names)), [plain(name) for name in names] if i == 0 else [""] * len(names), fontsize=7
-            )
+    figure.suptitle("What one estimate needs for an error, on its best backend", fontsize=9, fontweight="bold")
+    figure.supxlabel(LEGEND, fontsize=6.5)
+    panels = figure.subplots(len(found), 1, squeeze=False)[:, 0]
+    for panel, ((cost, target), columns) in zip(panels, found.items(), strict=True):
+        _matrix(panel, columns, names, cost)
+        panel.set_title(f"{target:.0%} error: {cost.label}", fontsize=8, loc="left", fontweight="bold")
+        panel.set_xticks(range(len(problems)), [plain(p.title().partition(",")[0]) for p in problems], fontsize=6.5)
+        panel.set_yticks(range(len(names) + 1), [*map(plain, names), LEAD], fontsize=7)
     return figure
 
 
@@ -71,7 +72,7 @@ def _best(reached: Mapping[str, Reached]) -> dict[str, tuple[Reached, str]]:
 
 def _matrix(panel: Any, columns: Sequence[Mapping[str, tuple[Reached, str]]], names: Sequence[str], cost: Cost) -> None:
     panel.set_xlim(-0.5, len(columns) - 0.5)
-    panel.set_ylim(len(names) - 0.5, -0.5)
+    panel.set_ylim(len(names) + 0.5, -0.5)
     panel.tick_params(length=0)
     for spine in panel.spines.values():
         spine.set_visible(False)
@@ -90,3 +91,15 @@ def _matrix(panel: Any, columns: Sequence[Mapping[str, tuple[Reached, str]]], na
             panel.text(
                 x, y, text, ha="center", va="center", fontsize=5.5, color=front, fontweight=weight, linespacing=0.95
             )
+        panel.text(x, len(names), _lead(column), ha="center", va="center", fontsize=5.5, linespacing=0.95)
+
+
+def _lead(column: Mapping[str, tuple[Reached, str]]) -> str:
+    """Return the factor between the first and the second, or that their intervals do not tell them apart."""
+    ways = sorted((way for way, _ in column.values() if math.isfinite(way.cost)), key=lambda way: way.cost)
+    if len(ways) < 2:
+        return "alone" if ways else ""
+    factor, width = ways[1].cost / ways[0].cost, math.exp(math.hypot(ways[0].spread, ways[1].spread))
+    if not factor > width:
+        return "open"
+    return f"{number(factor)} times\n({number(factor / width)} to {number(factor * width)})"

@@ -17,8 +17,22 @@ from matplotlib.transforms import Transform
 
 from bench.report.page import columns, page, shared
 from bench.report.scales import above, extent, log_axis, mark_values, scale_x, scale_y, shifts
-from bench.report.style import CROSS, DEVIANT, GREY, MARKS, SHADE, TICK, Look, axis_name, plain, quantity, twin
-from bench.report.views import Family, Line, lines, pareto, resolved, rmse_interval
+from bench.report.style import (
+    CROSS,
+    DEVIANT,
+    GREY,
+    MARKS,
+    SHADE,
+    SIZE,
+    TICK,
+    Look,
+    axis_name,
+    inches,
+    plain,
+    quantity,
+    twin,
+)
+from bench.report.views import Family, Line, lines, pareto, resolved
 from bench.studies.bias_variance.costs import Cost
 from bench.studies.bias_variance.findings import headline
 from bench.sweep.axes import Axis
@@ -80,12 +94,13 @@ def _deviation(line: Line, curves: Sequence[Line]) -> dict[str, Any]:
 def _estimates(rows: pd.DataFrame, column: str, power: int) -> pd.DataFrame:
     """Return rows with an RMSE, bias or variance: value and interval relative to |grad J|, and whether it is a limit."""
     scale = _scale(rows, power)
-    ends = {"value": "", "low": "_low", "high": "_high"}
     if column == "rmse":
-        table = pd.DataFrame([rmse_interval(row) for row in rows.to_dict("records")], rows.index, ["low", "high"])
-        table = table.assign(value=rows["rmse"] / scale)
+        norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
+        ends = {end: np.hypot(rows[f"bias_{end}"], np.sqrt(rows[f"variance_{end}"])) / norm for end in ("low", "high")}
+        table = pd.DataFrame({"value": rows["rmse"] / scale, **ends})
     else:
-        table = pd.DataFrame({name: rows[column + end] / scale for name, end in ends.items()})
+        named = {"value": "", "low": "_low", "high": "_high"}
+        table = pd.DataFrame({name: rows[column + end] / scale for name, end in named.items()})
     limit = ~resolved(rows) & (column == "bias")
     table["value"] = table["value"].where(~limit, table["high"])
     floor = FLOOR**power
@@ -177,13 +192,13 @@ BACKENDS = ("solid", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)), (0, (8, 2)
 
 
 def speed_accuracy(
-    problems: Sequence[Family], notes: Sequence[str], look: Look, cost: Cost, said: Mapping[int, str]
+    problems: Sequence[Family], notes: Sequence[str], look: Look, cost: Cost, said: Mapping[int, str], first: str
 ) -> Figure:
     """Draw relative RMSE of one estimate against its cost, a panel per problem, a curve per estimator and backend.
 
     Colour and marker are the estimator, the line style the backend; the best backend's curve has the estimator's name at
     its end. Along a thin grey guide the error falls as N^-1/2; a dotted line is a bias that no samples remove. ``said``
-    are sentences by problem.
+    are sentences by problem, ``first`` one over all of them.
     """
     drawn = [lines(problem.rows, close=None) for problem in problems]
     every = [line for curves in drawn for line in curves]
@@ -196,9 +211,11 @@ def speed_accuracy(
         Line2D([], [], color=GREY, linewidth=0.9, linestyle=":", label="bias, which samples do not remove"),
         Patch(label="worse than answering zero", **SHADE),
     ]
+    across = columns(len(problems), 2)
     figure, panels = page(
-        problems, columns(len(problems), 3), 2.7, ("relative RMSE",),
-        f"Relative RMSE of one estimate against {cost.name}", [*shared(problems, "samples"), *notes],
+        problems, across, 2.3, ("relative RMSE",),
+        f"Relative RMSE of one estimate against {cost.name}",
+        [*shared(problems, "samples"), *notes, *([first] if first else [])],
         (list(entries.values()), symbols),
     )  # fmt: skip
     for place, ((panel,), problem, curves) in enumerate(zip(panels, problems, drawn, strict=True)):
@@ -207,13 +224,17 @@ def speed_accuracy(
             _draw_curve(panel, line, cost, style)
         _draw_scales(panel, cost.known(problem.rows), cost)
         _draw_guide(panel, cost.known(problem.rows), cost)
-        _name_curves(panel, curves, cost, look)
-        room = 150 // columns(len(problems), 3)
+        _name_curves(panel, curves, cost, look, figure.get_figwidth() / across - MARGIN)
+        room = 132 // across
         told = ["\n".join(textwrap.wrap(text, room)) for text in said.get(place, "").splitlines()]
         panel.set_xlabel("\n".join([cost.label, *told]), fontsize=6.2)
     return figure
 
 
+NAME_SIZE = 6
+"""Points of the names beside curves."""
+MARGIN = 0.75
+"""Inches beside a panel that its labels take, at most."""
 GUIDE: dict[str, Any] = {"color": "#b0b0b0", "linewidth": 0.8, "zorder": 0.4}
 
 
@@ -228,6 +249,10 @@ def _draw_curve(panel: Axes, line: Line, cost: Cost, style: Mapping[str, Any]) -
     if last["bias_low"] > 0 and last["bias"] > 0.5 * last["rmse"]:
         floor = last["bias"] / last["reference_norm"]
         panel.axhline(floor, color=style["color"], linewidth=0.9, linestyle=":", zorder=0.6)
+        panel.text(
+            0.01 + 0.07 * sum(text.get_text() == "bias" for text in panel.texts), floor, "bias", transform=panel.get_yaxis_transform(), color=style["color"], fontsize=NAME_SIZE - 0.5,
+            va="bottom", zorder=5,
+        )  # fmt: skip
 
 
 def _draw_guide(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
@@ -240,8 +265,8 @@ def _draw_guide(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
     )
 
 
-def _name_curves(panel: Axes, curves: Sequence[Line], cost: Cost, look: Look) -> None:
-    """Write each estimator's name at the end of its cheapest curve, names apart from each other."""
+def _name_curves(panel: Axes, curves: Sequence[Line], cost: Cost, look: Look, width: float) -> None:
+    """Write each estimator's name at the end of its cheapest curve, names apart and within the ``width`` in inches."""
     ends: dict[str, tuple[float, float, Line]] = {}
     for line in curves:
         rows = cost.known(line.rows)
@@ -257,9 +282,9 @@ def _name_curves(panel: Axes, curves: Sequence[Line], cost: Cost, look: Look) ->
         height = max(height, taken[-1] + 0.075) if taken else max(height, 0.04)
         taken.append(height)
         left, right = np.log(panel.get_xlim())
-        x = min((np.log(at) - left) / (right - left) + 0.03, 0.74)
+        x = min((np.log(at) - left) / (right - left) + 0.03, 1.0 - inches(label) * NAME_SIZE / SIZE / width)
         panel.text(
-            x, height, plain(label), transform=panel.transAxes, color=look.line(line)["color"], fontsize=6, va="center",
+            x, height, plain(label), transform=panel.transAxes, color=look.line(line)["color"], fontsize=NAME_SIZE, va="center",
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.3, "alpha": 0.75}, zorder=5,
         )  # fmt: skip
 
@@ -271,7 +296,7 @@ def _draw_scales(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
     spread = np.minimum(cost.spread(rows), at / 2)
     first, last = (at - spread).min(), (at + spread).max()
     tall, wide = max(high / low, 4.0) ** 0.08, max(last / first, 4.0) ** 0.08
-    log_axis(panel, "x", first / wide, last * wide**3, text=cost.text)
+    log_axis(panel, "x", first / wide, last * wide * (last / first) ** 0.3, text=cost.text)
     log_axis(panel, "y", low / tall, high * tall)
     if high * tall > 1:
         panel.axhspan(1.0, high * tall, zorder=0, **SHADE)
