@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m bench
 
-.PHONY: run test lint slow gallery clean
+.PHONY: run test lint slow gallery examples clean
 
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
@@ -23,6 +23,15 @@ lint: $(VENV)/.installed
 gallery: $(VENV)/.installed
 	for file in conf/experiment/*.yaml; do $(RUN) +experiment=$$(basename $$file .yaml) results_dir=results/standard || exit 1; done
 	$(BIN)/python -m bench.gallery docs/gallery.md results/standard
+
+# The examples on other people's engines, in environments of their own: their pins and ours do not live together.
+examples: .venv-engines/.installed .venv-nimble/.installed
+	.venv-engines/bin/python examples/table.py docs/examine.md
+
+.venv-engines/.installed .venv-nimble/.installed: .venv-%/.installed: examples/requirements-%.txt
+	$(PYTHON) -m venv .venv-$*
+	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	touch $@
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -164,3 +164,13 @@ def test_an_estimator_that_exits_ends_its_own_cell_in_this_process_too(tmp_path,
     assert rows["status"].to_dict() == {"fobg": "ok", "mine": "error"}
     assert "SystemExit" in rows["reason"]["mine"]
     assert os.getpid()
+
+
+@pytest.mark.parametrize("fault", ["raise BaseException('no')", "sys.exit(0)", "raise ValueError('two\\nlines')"])
+def test_a_plugin_that_cannot_be_made_is_refused_in_one_line(tmp_path, capsys, fault):
+    made = HEAD.replace("    def terms", f"    def __post_init__(self):\n        {fault}\n    def terms")
+    (tmp_path / "mine.py").write_text(made)
+    assert main(["plan", *BASE, f"plugins=[{tmp_path}]", "estimators=[fobg,mine]"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "estimator 'mine' cannot be made" in said
+    assert len(said.splitlines()) == 1
