@@ -1,5 +1,6 @@
 """The same tasks, the same rows: on this machine, on a Ray cluster that loses a node, and as jobs of Slurm."""
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -101,7 +102,8 @@ def test_groups_are_cut_only_as_far_as_all_slots_get_a_part():
 
 
 def test_the_job_script_asks_for_what_was_set(tmp_path, capsys):
-    pytest.importorskip("submitit")
+    if importlib.util.find_spec("submitit") is None:
+        pytest.skip("submitit is not installed")
     words = ["slurm.partition=short", "slurm.constraint=epyc", "slurm.minutes=30", "slurm.cpus=2", "memory=2g"]
     given = [*WORDS, "estimators=[fobg]", "launcher=slurm", *words, f"results_dir={tmp_path}"]
     assert main(["plan", *given, "timing=true"]) == 0
@@ -119,6 +121,19 @@ def test_the_job_script_asks_for_what_was_set(tmp_path, capsys):
     assert "export PYTHONPATH=" in script
     assert main(["plan", *given, "timing=false"]) == 0
     assert "--exclusive" not in capsys.readouterr().out
+
+
+@pytest.mark.skipif(importlib.util.find_spec("submitit") is None, reason="submitit is not installed")
+def test_submitit_leaves_other_peoples_logging_alone(tmp_path):
+    """It sets logging up when it is imported, which closes every handler there is, and some close their streams."""
+    code = (
+        "import logging, sys\n"
+        f"handler = logging.FileHandler({str(tmp_path / 'log')!r}); handler.acquire(); stream = handler.stream\n"
+        "from bench.sweep.launchers import slurm\n"
+        "slurm._imported()\n"
+        "sys.exit(stream.closed)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_every_row_says_which_kind_of_machine_made_it(tmp_path):
@@ -161,7 +176,8 @@ def test_a_job_on_another_kind_of_machine_measures_nothing(tmp_path):
 
 @pytest.mark.slow
 def test_jobs_of_submitit_give_the_rows_of_a_local_run(tmp_path):
-    pytest.importorskip("submitit")
+    if importlib.util.find_spec("submitit") is None:
+        pytest.skip("submitit is not installed")
     words = [
         *WORDS,
         "estimators=[fobg,alpha_order]",

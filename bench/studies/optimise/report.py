@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -299,7 +300,8 @@ def anytime_figure(found: Races, default: float) -> Figure:
             panel.set_xlabel(unit)
         first = rows.iloc[0]
         panels[0].set_title(
-            f"{_wrapped(problem)}\nJ* = {first['least']:.6g},\n{short(first['least_status'])}", fontsize=7
+            f"{_wrapped(problem)}\nJ* = {first['least']:.6g},\n{textwrap.fill(short(first['least_status']), 22)}",
+            fontsize=7,
         )
     for line in grid:
         line[0].set_ylabel("J - J*")

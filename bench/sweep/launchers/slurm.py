@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import math
+import os
 import pickle
 import shlex
 import shutil
@@ -26,12 +28,23 @@ LOST = 2
 """Times that a job may be lost before its first unanswered task is blamed."""
 
 
+def _imported() -> Any:
+    """Import submitit without its set-up of logging, which closes every handler there is, and some close their streams."""
+    name, given = "SUBMITIT_LOG_LEVEL", os.environ.get("SUBMITIT_LOG_LEVEL")
+    os.environ[name] = given or "NOCONFIG"
+    try:
+        return importlib.import_module("submitit")
+    finally:
+        if given is None:
+            del os.environ[name]
+
+
 class SlurmLauncher:
     """Jobs by submitit; timed ones run one after the other, each with a node to itself, all on one kind of machine."""
 
     def __init__(self, experiment: Experiment, timed: bool, kind: str) -> None:
         try:
-            import submitit
+            submitit = _imported()
         except ImportError as error:
             raise jobs.unavailable("slurm", error) from None
         self._submitit, self._experiment, self._timed, self._kind = submitit, experiment, timed, kind
@@ -151,6 +164,7 @@ def parameters(experiment: Experiment, timed: bool, cluster: str = "slurm") -> d
 def script(experiment: Experiment) -> str:
     """Return the job script that would be sent; raises :class:`UserError` where submitit is not there."""
     try:
+        _imported()
         from submitit.slurm.slurm import SlurmExecutor, _make_sbatch_string
     except ImportError as error:
         raise jobs.unavailable("slurm", error) from None
