@@ -155,6 +155,7 @@ def test_own_plugins_and_experiments_from_folders(tmp_path):
     assert bench("report", *words[:-1], cwd=tmp_path).returncode == 0
 
 
+@pytest.mark.slow
 def test_a_study_of_ones_own_from_a_folder_and_from_an_entry_point(tmp_path):
     words = [
         "study=cost_at",

@@ -89,6 +89,7 @@ def test_a_failing_cell_is_a_row_and_exit_status_1(tmp_path):
     assert "at least 4 samples" in table.loc["inverse_variance", "reason"]
 
 
+@pytest.mark.slow
 def test_unsupported_combinations_are_rows(tmp_path):
     words = [
         "scenes=[pushing]", "contacts=[penalty,complementarity]", "integrators=[semi_implicit_euler,explicit_euler]",
@@ -235,6 +236,7 @@ def test_a_scene_has_to_be_named(verb, capsys):
     assert "pushing" in message
 
 
+@pytest.mark.slow
 def test_files_are_written_before_anything_is_printed(tmp_path):
     """A reader that goes away at once, as ``head`` does, costs no file."""
     words = [sys.executable, "-m", "bench", *TINY, f"results_dir={tmp_path}", "--quiet"]

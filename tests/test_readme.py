@@ -193,6 +193,7 @@ def test_the_kit_runs_in_pytest(folder):
     assert " passed" in done
 
 
+@pytest.mark.slow
 def test_examples_run_together(folder, tmp_path):
     printed = python(
         folder, "-m", "bench", "name=mine", "plugins=my_plugins", "scenes=[sliding_mass]", "backends=[numpy,jax]",

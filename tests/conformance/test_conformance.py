@@ -740,6 +740,7 @@ def items(*arguments, **options):
     return {item.id: item for item in mark.args[1]}
 
 
+@pytest.mark.slow
 def test_every_check_of_every_variant_is_an_item():
     made = items([Penalty])
     assert {item.split("-")[0] for item in made} == set(variants(Penalty))

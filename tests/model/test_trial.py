@@ -87,13 +87,21 @@ def test_without_a_place_to_remember_each_command_tries_again(folder, monkeypatc
     assert trial._known() == frozenset()
 
 
-def test_a_plugin_at_work_moves_no_command_to_another_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with trial.guarded():
-        os.chdir("/")
-    assert os.getcwd() == str(tmp_path)
-    own = os.getpid()
-    with trial.guarded():
-        os.fork()
-    assert os.getpid() == own  # the copy has ended
-    assert os.wait()[1] == 0
+def test_a_plugin_at_work_moves_no_command_to_another_folder(tmp_path):
+    """In a process of its own, since this one has threads, and must not fork."""
+    code = """if True:
+        import os
+        from bench.model import trial
+        before, own = os.getcwd(), os.getpid()
+        with trial.guarded():
+            os.chdir("/")
+        assert os.getcwd() == before
+        with trial.guarded():
+            os.fork()
+        assert os.getpid() == own  # the copy has ended
+        assert os.wait()[1] == 0
+        print("both")
+    """
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.stdout == "both\n", done.stderr

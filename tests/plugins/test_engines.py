@@ -255,6 +255,7 @@ def test_study_is_found():
     assert registry.find("studies", "twins").available
 
 
+@pytest.mark.slow
 def test_without_the_library_everything_else_is_listed_and_runs(tmp_path):
     words = ["scenes=[double_integrator]", "backends=[numpy,mujoco,mjx]", "estimators=[fobg]", "samples=4", "repeats=2",
              "name=mine", f"results_dir={tmp_path}"]  # fmt: skip

@@ -321,6 +321,7 @@ def test_event_driven_gradient_is_the_physical_one(scene, law):
         assert gradient(problem) == pytest.approx(scene.physical_gradient(), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_boundary_steps_have_another_gradient():
     """What event_driven is for: semi-implicit Euler with the same law is wrong by more than the gradient at every dt."""
     for horizon in (100, 400, 1600):

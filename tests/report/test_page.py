@@ -171,6 +171,7 @@ def stored(directory, name):
     return Store(directory / name, COLUMNS).load().set_index("key")
 
 
+@pytest.mark.slow
 def test_command_in_the_page_gives_the_same_numbers_of_that_cell_alone(ran, tmp_path):
     found = data_of((ran / "mine" / "report.html").read_text())
     place = column(found, "status").index("ok")

@@ -212,6 +212,7 @@ def curves(panel):
     return found
 
 
+@pytest.mark.slow
 def test_charts_are_written_as_pictures_and_data(tmp_path):
     made = experiment(tmp_path, formats=("png", "svg", "pdf"))
     made.directory.mkdir()
@@ -231,6 +232,7 @@ def test_charts_are_written_as_pictures_and_data(tmp_path):
             assert len(content) > 10_000
 
 
+@pytest.mark.slow
 def test_one_line_per_estimator_and_one_colour_everywhere():
     figures = drawn(stiffness_rows(), ["sigma", "stiffness"])
     panels = figures["bias_variance_stiffness"].axes

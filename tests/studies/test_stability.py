@@ -88,6 +88,7 @@ def test_semi_implicit_euler_diverges_within_a_cell_of_its_limit(tmp_path, facto
     assert panel.boundary["agrees"].all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["implicit_euler", "implicit_midpoint"])
 def test_implicit_steps_never_diverge(tmp_path, integrator):
     _, rows = swept(tmp_path, integrator, "scene.mass_spring.mass=0.001")

@@ -236,6 +236,7 @@ def test_bad_number_can_be_repeated(run):
     assert "theta [" in reason
 
 
+@pytest.mark.slow
 def test_first_failure_can_end_the_run(tree):
     words = [*BASE, "estimators=[fobg,refuses,reinforce]", "name=stops", "workers=1", "results_dir=out"]
     done = tree.run(*words, "on_error=stop")

@@ -305,6 +305,7 @@ def table(directory) -> pd.DataFrame:
     return pd.read_parquet(directory / "sweep" / "rows.parquet").drop(columns=["stored_at", "wall_s", "sequence"])
 
 
+@pytest.mark.slow
 def test_any_number_of_workers_gives_the_same_bytes(tmp_path):
     """References by quadrature and sampling too, on two backends, one of them compiling."""
     words = [
