@@ -6,13 +6,13 @@ import sys
 import threading
 
 from bench.cli import main
-from bench.model import trial
+from bench.model import guard
 
 if __name__ == "__main__":
     own = os.getpid()
     status = main()
-    trial.end_copies(own)
-    trial.end_children()
+    guard.end_copies(own)
+    guard.end_children()
     if any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread()):
         # a thread that a plugin left running must not keep the finished command waiting
         atexit._run_exitfuncs()

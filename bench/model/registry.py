@@ -26,7 +26,7 @@ from types import ModuleType
 from typing import Any
 
 from bench.errors import UserError, printable, unknown
-from bench.model import trial
+from bench.model import guard, trial
 from bench.model.parameters import Plugin, build, parameters, remember, singular
 
 CORE = "bench.studies"
@@ -95,7 +95,7 @@ def entries() -> Table:
     stamps |= {point.module: point.dist.version if point.dist else "" for point in points}
     fatal = trial.fatal(stamps, {_package(path): path for path in _folders})
     for kind, module in modules:
-        with trial.guarded():
+        with guard.guarded():
             _load_module(table, kind, module, fatal.get(module, ""))
     for point in points:
         try:

@@ -1,8 +1,8 @@
 """New plugin files are first tried in a process of their own: one that ends it is listed, and ends no command.
 
 A crash, ``os._exit`` or an endless loop cannot be caught where it happens. So each file is imported there, and its plugins
-are built with their defaults and asked what a run asks while it is planned. A file that came through once is not tried again until its text changes: its hash stands in ``$XDG_CACHE_HOME/bench/imported`` (``~/.cache`` where that
-is not set). Where that folder cannot be written, each command tries again, which costs about a second.
+are built with their defaults and asked what a run asks while it is planned. A file that came through once is not tried
+again until its text changes: its hash stands in ``$XDG_CACHE_HOME/bench/imported`` (``~/.cache`` where that is not set). Where that folder cannot be written, each command tries again, which costs about a second.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any
+
+from bench.model import guard
 
 PATIENCE = 60.0
 """Seconds that one module may take."""
@@ -78,14 +80,16 @@ def child(given: Mapping[str, Any]) -> None:
             module = importlib.import_module(name)
             os.write(pipe, b"," if os.getpid() == own else b"")
             _ask(module)
-        end_copies(own)
-        end_children()
+        guard.end_copies(own)
+        guard.end_children()
     os.write(pipe, b"!")
     os._exit(0)  # threads that a plugin has left running keep nothing waiting
 
 
 def _ask(module: ModuleType) -> None:
     """Build the plugins of a module and ask each what a plan asks; an answer that raises is one of a cell."""
+    import numpy as np
+
     from bench.model.backend import CAPABILITIES
     from bench.model.parameters import Plugin
     from bench.model.program import compose
@@ -97,8 +101,6 @@ def _ask(module: ModuleType) -> None:
 
         def cost(self, xp: Any, x: Any) -> Any:
             return x[0] * x[0]
-
-    import numpy as np
 
     program = compose(Bowl(), None, None)
     questions: dict[str, dict[str, tuple[Any, ...]]] = {
@@ -115,47 +117,6 @@ def _ask(module: ModuleType) -> None:
                 for question, given in questions.get(plugin.kind, {}).items():
                     with contextlib.suppress(Exception):
                         getattr(made, question)(*given)
-
-
-def end_copies(own: int) -> None:
-    """End this process if a plugin has forked it from the one of that number, whose work it must not do again."""
-    if os.getpid() != own:
-        os._exit(0)
-
-
-@contextlib.contextmanager
-def guarded() -> Iterator[None]:
-    """Keep the process what it is while a plugin is at work: in its working folder, and no forked copy of it goes on."""
-    own, here = os.getpid(), _folder()
-    try:
-        yield
-    finally:
-        end_copies(own)
-        if here and _folder() != here:
-            os.chdir(here)
-
-
-def _folder() -> str:
-    try:
-        return os.getcwd()
-    except FileNotFoundError:  # it has been removed
-        return ""
-
-
-def end_children() -> None:
-    """Kill the processes that a plugin has started from this one and left running."""
-    try:
-        # raises without children, which spares the search through all processes
-        os.waitpid(-1, os.WNOHANG)
-    except ChildProcessError:
-        return
-    import psutil
-
-    for child in psutil.Process().children(recursive=True):
-        with contextlib.suppress(psutil.Error):
-            child.kill()
-        with contextlib.suppress(ChildProcessError):
-            os.waitpid(child.pid, 0)
 
 
 def _import(names: Sequence[str], packages: Mapping[str, Path], patience: float) -> tuple[int, str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.errors import STATUSES, UserError, printable, unknown
-from bench.model import Decision, registry, trial
+from bench.model import Decision, guard, registry
 from bench.model.identity import parse_identity
 from bench.model.parameters import build, coerce, remember, singular
 from bench.sweep.experiment import Budget, Choice, Execution, Experiment, Layout
@@ -387,7 +387,7 @@ def _choice(kind: str, text: Any) -> Choice:
     entry = registry.find(kind, name)
     if entry.plugin is not None:
         try:
-            with trial.guarded():  # a plugin that leaves the working folder would take relative paths with it
+            with guard.guarded():  # a plugin that leaves the working folder would take relative paths with it
                 build(entry.plugin, values)
         except (UserError, KeyboardInterrupt):
             raise

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.errors import StorageError, failure, printable
-from bench.model import Backend, trial
+from bench.model import Backend, guard
 from bench.sweep.cell import Cell
 from bench.sweep.experiment import Experiment
 from bench.sweep.keys import fingerprint
@@ -54,7 +54,7 @@ class Measure:
 
     def prepare(self, item: Task) -> None:
         """Have the backend import its libraries, as it does when it gets a program."""
-        with trial.guarded():
+        with guard.guarded():
             try:
                 self._session.problems.of(item.backend, item.cell)
             except KeyboardInterrupt:
@@ -64,7 +64,7 @@ class Measure:
 
     def __call__(self, item: Task) -> dict[str, Any]:
         """Return the results of the cell, or the status and reason of its failure."""
-        with trial.guarded():
+        with guard.guarded():
             return self._result(item)
 
     def _result(self, item: Task) -> dict[str, Any]:

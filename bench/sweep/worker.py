@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bench.errors import StorageError, failure
-from bench.model import registry, trial
+from bench.model import guard, registry
 from bench.sweep.channel import Broken, Channel
 
 READY = b"ready"
@@ -80,8 +80,8 @@ def _serve(channel: Channel) -> None:
     while True:
         waiting = waiting or channel.receive()
         answer = _answered(channel, handle, waiting.pop(0))
-        trial.end_copies(own)
-        trial.end_children()
+        guard.end_copies(own)
+        guard.end_children()
         with suppress(Exception):
             sys.stdout.flush()
         channel.send(answer)
@@ -101,6 +101,6 @@ def _answered(channel: Channel, handle: Handler, message: bytes) -> bytes:
     except StorageError as error:
         text = json.dumps({"storage": str(error)})
     except BaseException as error:
-        trial.end_copies(own)
+        guard.end_copies(own)
         text = json.dumps({"result": failure(error), "seconds": time.perf_counter() - started})
     return text.encode()

@@ -22,6 +22,11 @@ FATAL = {
 ODD = "from bench.model import SampleMean\nclass Odd(SampleMean):\n    name = 'odd'\n    requires = None\n"
 
 
+@pytest.fixture(autouse=True)
+def untried():
+    """Here files are tried."""
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A folder of plugins, and an empty memory of what was imported."""
@@ -91,12 +96,12 @@ def test_a_plugin_at_work_moves_no_command_to_another_folder(tmp_path):
     """In a process of its own, since this one has threads, and must not fork."""
     code = """if True:
         import os
-        from bench.model import trial
+        from bench.model import guard, trial
         before, own = os.getcwd(), os.getpid()
-        with trial.guarded():
+        with guard.guarded():
             os.chdir("/")
         assert os.getcwd() == before
-        with trial.guarded():
+        with guard.guarded():
             os.fork()
         assert os.getpid() == own  # the copy has ended
         assert os.wait()[1] == 0

@@ -9,6 +9,7 @@ is measured as well, so that an instability too slow to show within the rollout 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -178,15 +179,16 @@ def _refined(cell: Cell, steps: int) -> Cell:
 def _gradient_at(cell: Cell, steps: int) -> np.ndarray:
     """Return the cell's gradient with its duration cut into ``steps`` steps."""
     fine = _refined(cell, steps)
-    if fine.program_key not in _fine_gradients:
-        _keep(fine.program_key, _gradient(next(reference_backends(fine)), fine.program()))
-    return _fine_gradients[fine.program_key]
+    return _kept(fine.program_key, lambda: _gradient(next(reference_backends(fine)), fine.program()))
 
 
-def _keep(key: str, gradient: np.ndarray) -> None:
-    if len(_fine_gradients) >= KEPT:
-        del _fine_gradients[next(iter(_fine_gradients))]
-    _fine_gradients[key] = gradient
+def _kept(key: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+    """Return the gradient kept under a key, made where there is none."""
+    if key not in _fine_gradients:
+        if len(_fine_gradients) >= KEPT:
+            del _fine_gradients[next(iter(_fine_gradients))]
+        _fine_gradients[key] = make()
+    return _fine_gradients[key]
 
 
 KEPT = 4096
@@ -261,8 +263,8 @@ def law_gradient(cell: Cell, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
 def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
     """Return central differences ``(d,)`` of the cell's cost with its duration cut into ``steps`` steps."""
     fine = _refined(cell, steps)
-    key = f"{fine.program_key} {span}"
-    if key not in _fine_gradients:
+
+    def differences() -> np.ndarray:
         program = fine.program()
         problem = next(reference_backends(fine)).compile(program)
         theta, still = program.theta0, np.zeros((program.n_noise, 1))
@@ -270,8 +272,9 @@ def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
         ends = [
             (problem.value(theta + e, still)[0], problem.value(theta - e, still)[0]) for e in h * np.eye(len(theta))
         ]
-        _keep(key, np.array([(after - before) / (2 * h) for after, before in ends]))
-    return _fine_gradients[key]
+        return np.array([(after - before) / (2 * h) for after, before in ends])
+
+    return _kept(f"{fine.program_key} {span}", differences)
 
 
 # --------------------------------------------------------------------------------------------------- theory

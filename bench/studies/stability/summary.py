@@ -14,11 +14,13 @@ from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.style import plain
 from bench.report.views import ran
-from bench.studies.stability.report import DARK, FILLS, Panel, looks, panels, placed, swatches
+from bench.studies.stability.report import DARK, FILLS, LOST, VERDICTS, Panel, looks, panels, placed, swatches
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import write_whole
 
-SHORT = {"by step": "step", "by law": "law", "by both": "both", "by unknown": "?", "diverged": "D", "nonfinite": "N"}
+SHORT = {"by step": "step", "by law": "law", "by both": "both", "by unknown": "?"} | {
+    name: VERDICTS[name][0] for name in LOST
+}
 """What is written into a bar, where it has the room."""
 LETTER = 0.055
 """Share of the cells that is as wide as a letter."""
