@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -41,7 +40,17 @@ class Tree:
         )
 
 
-def hear_signals() -> None:
-    """A shell ignores interrupts in its background jobs and nohup hang-ups, and what they start inherits that."""
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-        signal.signal(getattr(signal, name), signal.SIG_DFL)
+HEARD = """
+import os, signal, sys
+for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+    signal.signal(getattr(signal, name), signal.SIG_DFL)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+
+
+def hearing_signals(*words: str) -> list[str]:
+    """``python -m bench`` with these words, as a command that hears signals.
+
+    A shell ignores interrupts in its background jobs and nohup hang-ups, and what they start inherits that.
+    """
+    return [sys.executable, "-c", HEARD, sys.executable, "-m", "bench", *words]

@@ -3,14 +3,13 @@
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pandas as pd
 import psutil
 import pytest
-from trees import Tree, hear_signals
+from trees import Tree, hearing_signals
 
 from bench.errors import UserError
 from bench.sweep.workers import Limits, Pool
@@ -252,16 +251,14 @@ def test_first_failure_can_end_the_run(tree):
 
 
 def start(tree: Tree, *words: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "bench", *words]
     environment = {**os.environ, "PYTHONPATH": str(tree.packages)}
     return subprocess.Popen(
-        command,
+        hearing_signals(*words),
         cwd=tree.root,
         env=environment,
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         text=True,
-        preexec_fn=hear_signals,
     )
 
 

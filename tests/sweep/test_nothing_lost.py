@@ -10,7 +10,7 @@ import time
 import pandas as pd
 import psutil
 import pytest
-from trees import hear_signals
+from trees import hearing_signals
 
 from bench.cli import main
 from bench.errors import StorageError, UserError
@@ -312,8 +312,7 @@ def _no_handler(argument):
 def test_signals_stop_a_run_in_peace(tmp_path, sent, times):
     seeds = ",".join(map(str, range(400)))
     words = [*FOBG[:-1], f"sweep.seed=[{seeds}]", "samples=20000", f"results_dir={tmp_path}"]
-    command = [sys.executable, "-m", "bench", *words]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=hear_signals) as run:
+    with subprocess.Popen(hearing_signals(*words), stderr=subprocess.PIPE, text=True) as run:
         for _ in range(600):
             if list(tmp_path.glob("custom/pending/*.json")):
                 break
