@@ -6,6 +6,8 @@ import contextlib
 import os
 from collections.abc import Iterator
 
+from bench.errors import INTERRUPTED
+
 
 def end_copies(own: int) -> None:
     """End this process if a plugin has forked it from the one of that number, whose work it must not do again."""
@@ -15,14 +17,28 @@ def end_copies(own: int) -> None:
 
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
-    """Keep the process what it is while a plugin is at work: in its working folder, and no forked copy of it goes on."""
+    """Keep the process what it is while a plugin is at work: in its working folder, and no forked copy of it goes on.
+
+    An interrupt that was swallowed meanwhile is raised when it is over.
+    """
     own, here = os.getpid(), _folder()
     try:
         yield
+    except KeyboardInterrupt:
+        INTERRUPTED.clear()
+        raise
     finally:
         end_copies(own)
         if here and _folder() != here:
             os.chdir(here)
+    heed_interrupts()
+
+
+def heed_interrupts() -> None:
+    """Raise the KeyboardInterrupt that a plugin, a callback from C or a finaliser has swallowed."""
+    if INTERRUPTED.is_set():
+        INTERRUPTED.clear()
+        raise KeyboardInterrupt
 
 
 def _folder() -> str:

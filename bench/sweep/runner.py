@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
+from bench.model import guard
 from bench.sweep import launchers
 from bench.sweep.cell import Cell
 from bench.sweep.experiment import Experiment
@@ -94,6 +95,7 @@ class _Run:
 
     def _answers(self, tasks: list[Task], pool: Launcher) -> Iterator[list[Answer]]:
         for answers in pool.run(grouped(tasks)):
+            guard.heed_interrupts()
             if answers:
                 yield answers
             self._tell("; ".join(str(item) for item in pool.current))

@@ -13,9 +13,10 @@ from __future__ import annotations
 import io
 import json
 import os
+import random
 import time
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,8 +28,10 @@ from bench.sweep.files import replace_file, sync, temporary, tidy
 if TYPE_CHECKING:
     import pandas as pd
 
-ATTEMPTS = 100
-"""Times that a directory is read again while other runs change it."""
+PATIENCE_S = 60.0
+"""Seconds for which a directory is read again while other runs change it."""
+PAUSE_S = 0.05
+"""Longest pause between two tries; pauses are random, so that runs in each other's way part."""
 LARGEST = 2.0**53
 """Larger counts than this are not kept exactly as float64, so no run has written them."""
 
@@ -51,13 +54,9 @@ class Store:
 
     def prepare(self) -> None:
         """Make the directory, and make sure that it can be written."""
-        try:
-            self._pending.mkdir(parents=True, exist_ok=True)
-            probe = temporary(self._pending / "probe")
-            probe.write_text("")
-            probe.unlink()
-        except OSError as error:
-            raise StorageError(f"results directory '{self.directory}' cannot be written: {error.strerror}") from None
+        probe = temporary(self._pending / "probe")
+        self._in_pending(lambda: probe.write_text(""), f"results directory '{self.directory}' cannot be written")
+        probe.unlink(missing_ok=True)
         if self._study:
             self._claim_it()
 
@@ -67,21 +66,25 @@ class Store:
         The claim is made at once, like a file that is linked into place, and goes when there are rows, which say the same.
         """
         part = temporary(self._pending / "study")
-        try:
-            part.write_text(self._study)
-            _link(part, self._claim)
-        except FileExistsError:
+
+        def claim() -> bool:
+            try:
+                part.write_text(self._study)
+                _link(part, self._claim)
+                return True
+            except FileExistsError:
+                return False
+            finally:
+                part.unlink(missing_ok=True)
+
+        if not self._in_pending(claim, f"'{self._claim}' cannot be made"):
             with suppress(OSError):  # whoever removes it has stored rows
                 claimed = self._claim.read_text()
                 if claimed not in ("", self._study):
                     raise UserError(
                         f"a run of study {printable(claimed)} has started in '{self.directory}', and this is study {self._study}: "
                         "choose another folder with name=..., or remove that one"
-                    ) from None
-        except OSError as error:
-            raise StorageError(f"'{self._claim}' cannot be made: {error.strerror}") from None
-        finally:
-            part.unlink(missing_ok=True)
+                    )
         if self._files() != self._seen:
             try:
                 self.load()  # another run came and went since they were read
@@ -118,7 +121,7 @@ class Store:
 
     def compact(self, order: Sequence[str] = ()) -> None:
         """Fold the small files into ``rows.parquet``, rows of the keys in ``order`` last and in that order."""
-        for _ in range(ATTEMPTS):
+        for _ in _tries():
             table, files = self._read_all()
             mark = files.pop(self._table, None)
             if not files or self._fold(ordered(table, order), list(files), mark):
@@ -129,23 +132,28 @@ class Store:
 
     def _files(self) -> dict[Path, tuple[int, int]]:
         """Return the files that hold rows, each with a mark that distinguishes it from another file of its name."""
-        pending = sorted(self._pending.glob("[!.]*")) if self._pending.is_dir() else []
+        names: list[str] = []
+        try:
+            names = sorted(name for name in os.listdir(self._pending) if not name.startswith("."))
+        except (FileNotFoundError, NotADirectoryError):
+            pass  # another run removes it when it is empty
+        except OSError as error:
+            raise StorageError(f"'{self._pending}' cannot be read: {error.strerror}") from None
         marks = {}
-        for path in [self._table, *pending]:
+        for path in [self._table, *(self._pending / name for name in names)]:
             with suppress(FileNotFoundError, NotADirectoryError):
                 marks[path] = _mark(path)
         return marks
 
     def _read_all(self) -> tuple[pd.DataFrame, dict[Path, tuple[int, int]]]:
         """Read all rows, and return the files they came from; read again if another run folds files meanwhile."""
-        for _ in range(ATTEMPTS):
+        for _ in _tries():
             files = self._files()
             try:
                 frames = [_typed(self._columns, frame, path) for path, frame in _frames(files)]
             except FileNotFoundError:
                 continue
-            # a file folded while others were read may have been missed in both places
-            if files.items() <= self._files().items():
+            if _whole(files, self._files()):
                 self._seen = dict(files)
                 return self._union(frames), files
         raise StorageError(f"'{self.directory}' changes faster than it can be read: too many runs write to it")
@@ -169,18 +177,19 @@ class Store:
     # ------------------------------------------------------------------------------------------- writing
 
     def _add(self, suffix: str, content: bytes) -> Path:
-        """Add a file under ``pending/``, a folder that another run may be removing because it is empty."""
         path = self._pending / f"{uuid.uuid4().hex}.{suffix}"
-        for _ in range(ATTEMPTS):
+        self._in_pending(lambda: replace_file(path, content), f"'{self._pending}' cannot be made")
+        return path
+
+    def _in_pending(self, act: Callable[[], Any], failed: str) -> Any:
+        """Act in ``pending/``, a folder that another run may be removing because it is empty."""
+        for last in _tries():
             try:
-                self._pending.mkdir(exist_ok=True)
-                replace_file(path, content)
-            except FileNotFoundError:
-                continue
+                self._pending.mkdir(parents=True, exist_ok=True)
+                return act()
             except OSError as error:
-                raise StorageError(f"'{self._pending}' cannot be made: {error.strerror}") from None
-            return path
-        raise StorageError(f"'{self._pending}' cannot be made")
+                if last or not _removed(error, self._pending):
+                    raise StorageError(f"{failed}: {error.strerror}") from None
 
     def _fold(self, table: pd.DataFrame, read: list[Path], mark: tuple[int, int] | None) -> bool:
         """Write the rows of the files that were read into one, and make it ``rows.parquet``.
@@ -203,8 +212,8 @@ class Store:
                     return False
             _link(part, self._table)
             sync(self.directory)
-        except FileExistsError:
-            return False
+        except (FileExistsError, FileNotFoundError):
+            return False  # another run was faster, or has folded this very file into its own
         except OSError as error:
             raise StorageError(
                 f"'{self._table}' cannot be written: {error.strerror}; its rows are in '{part}'"
@@ -220,6 +229,35 @@ class Store:
             self._unclaim()
         with suppress(OSError):
             self._pending.rmdir()
+
+
+def _tries() -> Iterator[bool]:
+    """Yield at once and then after pauses, until patience is at its end: True for the last time."""
+    until, pause = time.monotonic() + PATIENCE_S, PAUSE_S / 64
+    while time.monotonic() < until:
+        yield False
+        time.sleep(random.uniform(0.0, pause))
+        pause = min(2 * pause, PAUSE_S)
+    yield True
+
+
+def _removed(error: OSError, folder: Path) -> bool:
+    """Whether a folder was removed between two steps, so that they can be tried again.
+
+    ``mkdir`` says that it exists when it did, though it may be gone by the time that one looks what it is.
+    """
+    gone = isinstance(error, FileNotFoundError) or (isinstance(error, FileExistsError) and not os.path.lexists(folder))
+    return gone and folder.parent.is_dir()
+
+
+def _whole(before: Mapping[Path, tuple[int, int]], after: Mapping[Path, tuple[int, int]]) -> bool:
+    """Whether all rows stood in the files listed before they were read, judged by those there are now.
+
+    What was folded meanwhile may have been missed in both places: a listing shows a folder at no one moment. Either a
+    file has gone then, or there is a new table; small files that came since are rows stored since.
+    """
+    came = after.keys() - before.keys()
+    return before.items() <= after.items() and not any(path.suffix == ".parquet" for path in came)
 
 
 def ordered(table: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:

@@ -184,6 +184,84 @@ def test_writers_readers_and_compactions_side_by_side(tmp_path):
     assert table["key"].is_unique
 
 
+def once(act):
+    """Return a function that acts the first time that it is called."""
+    left = [act]
+    return lambda: left.pop()() if left else None
+
+
+@pytest.mark.parametrize("name", ["listdir", "scandir"])
+def test_the_folder_of_small_files_may_go_while_it_is_listed(tmp_path, monkeypatch, name):
+    store, real = Store(tmp_path, COLUMNS), getattr(os, name)
+    store.append(row(1))
+    store.compact()
+    (tmp_path / "pending").mkdir()
+    remove = once((tmp_path / "pending").rmdir)
+    monkeypatch.setattr(os, name, lambda path: (str(path).endswith("pending") and remove(), real(path))[1])
+    assert keys(store) == [1]
+
+
+@pytest.mark.parametrize("moment", ["it was there", "it has just been made"])
+@pytest.mark.parametrize("act", ["append", "prepare"])
+def test_the_folder_of_small_files_may_go_while_a_file_is_added(tmp_path, monkeypatch, act, moment):
+    store, real = Store(tmp_path, COLUMNS, "mine"), os.mkdir
+    store.load()
+    (tmp_path / "pending").mkdir()
+    remove = once((tmp_path / "pending").rmdir)
+
+    def mkdir(path, *more):
+        if not str(path).endswith("pending"):
+            return real(path, *more)
+        if moment == "it was there":
+            try:
+                return real(path, *more)
+            finally:
+                remove()
+        remove()
+        real(path, *more)
+        gone()
+
+    gone = once((tmp_path / "pending").rmdir)
+    monkeypatch.setattr(os, "mkdir", mkdir)
+    store.append(row(1, study="mine")) if act == "append" else store.prepare()
+    assert keys(store) == [1] * (act == "append")
+    assert (tmp_path / "pending").is_dir()
+
+
+def test_a_file_folded_by_another_run_before_it_is_in_place_is_no_fault(tmp_path, monkeypatch):
+    """Both fold: the one that is slow finds its own file gone, into that of the other."""
+    store, other, real = Store(tmp_path, COLUMNS), Store(tmp_path, COLUMNS), os.link
+    store.append(row(1))
+    overtake = once(other.compact)
+    monkeypatch.setattr(os, "link", lambda *words: (overtake(), real(*words))[1])
+    store.compact()
+    assert keys(store) == [1]
+    assert [path.name for path in tmp_path.iterdir()] == ["rows.parquet"]
+
+
+def test_rows_that_a_listing_has_missed_in_both_places_are_read_again(tmp_path, monkeypatch):
+    """A folder is listed while it changes: an old file may be gone already, and the new one not be there yet."""
+    store, real = Store(tmp_path, COLUMNS), os.listdir
+    store.append(row(1))
+    old = [path.name for path in (tmp_path / "pending").iterdir()]
+    store._add("parquet", pd.DataFrame(store.load()).to_parquet(index=False))
+    (tmp_path / "pending" / old[0]).unlink()
+    first = [[]]
+    monkeypatch.setattr(os, "listdir", lambda path: first.pop() if first else real(path))
+    assert keys(store) == [1]
+
+
+def test_a_folder_that_may_not_be_read_is_not_taken_for_an_empty_one(tmp_path, monkeypatch):
+    def refuse(path):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    Store(tmp_path, COLUMNS).append(row(1))
+    monkeypatch.setattr(os, "listdir", refuse)
+    monkeypatch.setattr(os, "scandir", refuse)
+    with pytest.raises(StorageError, match="cannot be read: Permission denied"):
+        Store(tmp_path, COLUMNS).load()
+
+
 def test_a_file_system_without_hard_links(tmp_path, monkeypatch):
     monkeypatch.setattr(
         store_module.os, "link", lambda *_: (_ for _ in ()).throw(OSError(errno.EPERM, "not permitted"))
