@@ -32,6 +32,13 @@ def test_differences_that_agree_only_to_their_own_size_show_nothing(ripple, trus
     assert found.verdict in (TRUSTED if trusted else ("unsettled",))
 
 
+@pytest.mark.parametrize("factor", [1.0, 0.5, 0.0])
+def test_differences_that_scatter_do_not_pass_half_of_the_derivative(factor):
+    differences = SLOPE * (1.0 + 0.045 * (-1.0) ** np.arange(EPS.size))
+    found = judge(of_differences(differences, EPS, factor * SLOPE, unit=1e-36, noise=0.0))
+    assert found.verdict in (TRUSTED if factor == 1.0 else ("unsettled", "disconnected"))
+
+
 @pytest.mark.parametrize(("finite", "told"), [(7, True), (6, False)])
 def test_seven_steps_with_numbers_are_enough(finite, told):
     differences = np.full(EPS.size, SLOPE)
