@@ -192,7 +192,7 @@ FAULTS = [
     Fault(GC, "random *= self.scale[:, None] / np.linalg.norm(random, axis=0)", "random /= np.linalg.norm(random, axis=0)", OF_CHECKS),
     Fault(GC, "np.where(program != 0.0, np.sqrt(self.unit) * whole.max(axis=0) / lengths, 0.0)", "np.sqrt(self.unit) * whole.max(axis=0) / lengths", OF_CHECKS),
     Fault(GC, "doubts += np.where(program != 0.0,", "doubts += 0.0 * np.where(program != 0.0,", OF_CHECKS),
-    Fault(GC, "right = coarse.verdict in TRUSTED and", "right =", OF_CHECKS),
+    Fault(GC, '"precision" if coarse.verdict in TRUSTED', '"precision" if True', OF_CHECKS),
     Fault(GD, "apart <= min(tolerance, alike + rounding + sample.doubt)", "apart <= tolerance", OF_CHECKS),
     Fault(GC, "if still and at_draws[0].any() and not here:", "if False:", OF_CHECKS),
     Fault(GC, "roundoff=max(self.unit, noise / size if size else 0.0)", "roundoff=self.unit", OF_CHECKS),

@@ -63,7 +63,7 @@ def test_measured_noise_explains_eight_of_its_standard_deviations_and_no_more():
         crossing = np.zeros(NARROW.size, bool)
         right = judge(Sample(*given, SLOPE, crossing, noise=size))
         assert right.verdict in (*TRUSTED, "unsettled"), right
-        wrong = judge(Sample(*given, SLOPE * 1.005, crossing, noise=size))
+        wrong = judge(Sample(*given, SLOPE * 1.002, crossing, noise=size))
         assert wrong.verdict == "wrong_adjoint", wrong
 
 

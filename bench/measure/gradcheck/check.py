@@ -362,8 +362,7 @@ class _Checker:
         if GUARD * float(self.unit) * abs(sample.centre) >= tread:
             return finding
         coarse = judge(replace(sample, noise=max(sample.noise or 0.0, tread)))
-        right = coarse.verdict in TRUSTED and sample.derivative != 0.0
-        return replace(coarse, verdict="precision" if right else "staircase")
+        return replace(coarse, verdict="precision" if coarse.verdict in TRUSTED else "staircase")
 
     def _explained(
         self, parts: list[Part], draws: list[Part], around: np.ndarray, at_draws: list[np.ndarray]
