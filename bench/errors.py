@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Literal, get_args
@@ -15,6 +16,8 @@ if sys.platform == "win32":
 
 Status = Literal["ok", "nonfinite", "diverged", "timeout", "crashed", "unsupported", "unavailable", "error"]
 STATUSES: tuple[str, ...] = get_args(Status)
+INTERRUPTED = threading.Event()
+"""Set from the moment the command is told to stop until its KeyboardInterrupt has arrived: code in between may swallow it."""
 
 
 class UserError(Exception):

@@ -8,7 +8,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 
-from bench.errors import printable
+from bench.errors import INTERRUPTED, printable
 
 HEARD = 300
 """Letters that are told of what a plugin has printed."""
@@ -22,14 +22,28 @@ def end_copies(own: int) -> None:
 
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
-    """Keep the process what it is while a plugin is at work: in its working folder, and no forked copy of it goes on."""
+    """Keep the process what it is while a plugin is at work: in its working folder, and no forked copy of it goes on.
+
+    An interrupt that was swallowed meanwhile is raised when it is over.
+    """
     own, here = os.getpid(), _folder()
     try:
         yield
+    except KeyboardInterrupt:
+        INTERRUPTED.clear()
+        raise
     finally:
         end_copies(own)
         if here and _folder() != here:
             os.chdir(here)
+    heed_interrupts()
+
+
+def heed_interrupts() -> None:
+    """Raise the KeyboardInterrupt that a plugin, a callback from C or a finaliser has swallowed."""
+    if INTERRUPTED.is_set():
+        INTERRUPTED.clear()
+        raise KeyboardInterrupt
 
 
 @contextlib.contextmanager

@@ -98,6 +98,7 @@ class _Run:
         with guard.quiet("a plugin"), guard.guarded():
             groups = grouped(tasks)
         for answers in pool.run(groups):
+            guard.heed_interrupts()
             if answers:
                 yield answers
             self._tell("; ".join(str(item) for item in pool.current))
