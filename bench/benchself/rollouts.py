@@ -39,6 +39,7 @@ def problem(
     integrator = registry.make("integrators", settings["integrator"])
     if scale:
         scene = replace(scene, sigma=scene.sigma * scale.get("sigma", 1.0))
+    if scale and law is not None:
         law = replace(law, **{name: getattr(law, name) * factor for name, factor in scale.items() if name != "sigma"})
     compiled: Problem = registry.make("backends", backend).compile(compose(scene, law, integrator))
     return compiled
