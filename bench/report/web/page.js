@@ -396,7 +396,21 @@ function pointFigure(chart, panel, range) {
     annotations.push({ x: chart.xAxis.log ? Math.log10(value) : value, yref: "paper", y: 1, yanchor: "bottom",
       text: plotted(name), showarrow: false, font: { size: 10 } });
   }
+  annotations.push(...backendNames(chart, panel, joined));
   return [traces, { ...frame(chart.xAxis, chart.yAxis, range), shapes, annotations }];
+}
+
+/* Colour and symbol are the estimator, so a backend is told by its name: beside points, or at the ends of those lines of
+   one estimator that differ by more than can be seen. */
+function backendNames(chart, panel, joined) {
+  const read = reader("rows", "backend");
+  const all = [...panel.lines.values()].map((points) => (joined ? points.slice(-1) : points)).flat();
+  if (new Set(all.map((p) => read(p.row))).size < 2) return [];
+  const differs = (p) => all.some((q) => q.series === p.series && Math.abs(q.y - p.y) > 0.03 * Math.abs(p.y));
+  return all.filter((p) => !joined || differs(p)).map((p) => ({
+    x: chart.xAxis.log ? Math.log10(p.x) : p.x, y: chart.yAxis.log ? Math.log10(p.y) : p.y, xanchor: "left", xshift: 4,
+    yanchor: "bottom", showarrow: false, text: plotted(read(p.row)), font: { size: 9, color: colour(p.series) },
+  }));
 }
 
 function trace(chart, points, joined) {
@@ -675,8 +689,9 @@ function buildTheme() {
   });
 }
 
+/* At once: Plots.resize waits, and paper does not. */
 function fitCharts() {
-  for (const plot of document.querySelectorAll(".plot")) Plotly.Plots.resize(plot);
+  for (const plot of document.querySelectorAll(".plot")) if (plot.data) Plotly.relayout(plot, { autosize: true });
 }
 
 // --------------------------------------------------------------------------------------------------------- start
