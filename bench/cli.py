@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.errors import UserError, printable, unknown
+from bench.errors import INTERRUPTED, UserError, printable, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -101,6 +101,7 @@ def _stopped_by_signals() -> Iterator[None]:
     def stop(*_: object) -> None:
         for name in names:
             signal.signal(name, signal.SIG_DFL)
+        INTERRUPTED.set()
         raise KeyboardInterrupt
 
     before = {name: signal.getsignal(name) for name in names}
@@ -110,6 +111,7 @@ def _stopped_by_signals() -> Iterator[None]:
     try:
         yield
     finally:
+        INTERRUPTED.clear()
         for name, handler in before.items():
             if signal.getsignal(name) is stop:
                 signal.signal(name, handler)

@@ -15,6 +15,9 @@ ERRORS = 3.5
 """Standard errors by which a measured figure may miss a published one: with some hundred figures one in twenty full runs
 would otherwise fail by chance."""
 
+SEEN = 0.05
+"""The relative error of a published number that a figure should notice; one that cannot says so, and why."""
+
 REPRODUCED = "reproduced"
 RESERVED = "reproduced with a reservation"
 NOT_REPRODUCED = "not reproduced"
@@ -73,6 +76,25 @@ class Figure:
         return (self.slack + abs(self.measured - self.value)) / abs(self.value)
 
     @property
+    def sees(self) -> bool:
+        """Whether a published number that is 5% too large or too small would have failed."""
+        return self.resolution < SEEN / (1 + SEEN)
+
+    @property
+    def limit(self) -> str:
+        """What keeps the figure from seeing an error of 5%; empty where it sees one."""
+        if self.sees:
+            return ""
+        if self.factor:
+            return f"heavy tails, compared by a factor of {self.factor:g}"
+        parts = {
+            "the printed digits": last_digit(self.published) / 2,
+            "the source's own spread": self.spread,
+            "the measurement's error": ERRORS * self.error,
+        }
+        return max(parts, key=lambda name: parts[name])
+
+    @property
     def decides(self) -> bool:
         """Whether the figure could have failed by its sign, or against 0."""
         return self.resolution < 1.0 or bool(self.factor)
@@ -101,12 +123,12 @@ class Outcome:
 
 
 def verdict(figures: Sequence[Figure], reservation: str = "") -> str:
-    """Return one of :data:`VERDICTS`."""
+    """Return one of :data:`VERDICTS`; where no figure sees an error of 5%, that is a reservation too."""
     if any(not figure.agrees for figure in figures):
         return NOT_REPRODUCED
     if not any(figure.decides for figure in figures):
         return UNDECIDED
-    return RESERVED if reservation else REPRODUCED
+    return RESERVED if reservation or not any(figure.sees for figure in figures) else REPRODUCED
 
 
 class Claim(ABC):

@@ -90,6 +90,20 @@ def resolution_text(figure: Figure) -> str:
     return f"{figure.resolution:.1%}" if figure.resolution < 1 else f"factor {1 + figure.resolution:.1f}"
 
 
+def sight(figure: Figure) -> str:
+    """Write whether the figure sees an error of 5%, and what keeps it from that."""
+    return f"no: {figure.limit}" if figure.limit else "yes"
+
+
+def blind(figures: Sequence[Figure]) -> str:
+    """Write how many figures cannot see an error of 5%, and why; empty where all do."""
+    limits = [figure.limit for figure in figures if figure.limit]
+    if not limits:
+        return ""
+    reasons = ", ".join(f"{limits.count(limit)} for {limit}" for limit in dict.fromkeys(limits))
+    return f"{len(limits)} of {counted(len(figures), 'figure')} cannot see an error of 5%: {reasons}"
+
+
 def figures_table(found: Found) -> pd.DataFrame:
     """Return one row per figure, with every digit."""
     rows = [
@@ -97,6 +111,7 @@ def figures_table(found: Found) -> pd.DataFrame:
             "claim": claim.name, "lesson": claim.lesson, "source": claim.source, "figure": figure.what,
             "published": figure.published, "measured": figure.measured, "standard_error": figure.error,
             "slack": figure.slack, "agrees": figure.agrees, "resolution": figure.resolution,
+            "sees_5_percent": figure.sees, "limited_by": figure.limit,
             "verdict": result.verdict, "seconds": round(result.seconds, 2),
         }
         for claim, result in found
@@ -128,15 +143,20 @@ def markdown(found: Found) -> str:
         for claim, result in own:
             parts.append(f"### {claim.name}: {result.verdict}\n\n{claim.statement} ({claim.source})\n")
             if result.figures:
-                lines = ["| figure | published | measured | agrees | would fail at |", "|---|---|---|---|---|"]
+                lines = [
+                    "| figure | published | measured | agrees | would fail at | sees 5% |",
+                    "|---|---|---|---|---|---|",
+                ]
                 lines += [
                     f"| {escape_markdown(f.what)} | {f.published} | {measured_text(f)} | {'yes' if f.agrees else '**no**'} "
-                    f"| {resolution_text(f)} |"
+                    f"| {resolution_text(f)} | {sight(f)} |"
                     for f in result.figures
                 ]
                 parts.append("\n".join(lines) + "\n")
             if result.remark:
                 parts.append(f"*{escape_markdown(result.remark)}*\n")
+            if said := blind(result.figures):
+                parts.append(f"{said}.\n")
             parts.append(
                 f"Learned: {claim.learned} `python -m bench claims {claim.name}`, {duration(result.seconds)}.\n"
             )
@@ -177,10 +197,12 @@ def page(found: Found, charts: dict[str, Path]) -> str:
                 rows = "".join(_row(figure) for figure in result.figures)
                 body.append(
                     "<table><tr><th>figure</th><th>published</th><th>measured (95%)</th><th>agrees</th>"
-                    f"<th>would fail at</th></tr>{rows}</table>"
+                    f"<th>would fail at</th><th>sees 5%</th></tr>{rows}</table>"
                 )
             if result.remark:
                 body.append(f"<p><b>Reservation:</b> {escape(result.remark)}</p>")
+            if said := blind(result.figures):
+                body.append(f"<p>{escape(said)}.</p>")
             if claim.name in charts:
                 picture = base64.b64encode(charts[claim.name].read_bytes()).decode()
                 body.append(f'<img alt="{escape(claim.statement)}" src="data:image/png;base64,{picture}" width="525">')
@@ -202,8 +224,9 @@ def _row(figure: Figure) -> str:
         measured_text(figure),
         "yes" if figure.agrees else "no",
         resolution_text(figure),
+        sight(figure),
     ]
-    kinds = ("", "n", "n", "", "n")
+    kinds = ("", "n", "n", "", "n", "")
     line = "".join(f'<td class="{kind}">{escape(cell)}</td>' for kind, cell in zip(kinds, cells, strict=True))
     return f'<tr class="{"" if figure.agrees else "bad"}">{line}</tr>'
 
@@ -217,6 +240,8 @@ def lines(claim: type[Claim], result: Result, again: bool) -> Iterator[str]:
         yield f"       {figure.what}: published {figure.published}, measured {measured_text(figure)}"
     if result.remark:
         yield f"       {result.remark}"
+    if said := blind(result.figures):
+        yield f"       {said}"
 
 
 def listed(claims: Sequence[type[Claim]]) -> Iterator[str]:

@@ -68,7 +68,7 @@ def averages(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     lines = []
     for key, part in wide.groupby(keys, sort=False, dropna=False):
         shown = dict(zip(keys, key, strict=True))
-        lines += [shown | {"quantity": name} | _moments(part[name].to_numpy(float)) for name in numbers]
+        lines += [shown | {"quantity": name} | summary(part[name].to_numpy(float)) for name in numbers]
         if {"mean_estimate", "reference_gradient"} <= set(part):
             lines.append(shown | {"quantity": SIGNED} | _signed(part))
     table = pd.DataFrame(lines)
@@ -83,7 +83,8 @@ def _meant(axis: Axis, wanted: tuple[str, ...]) -> bool:
     return bool(names & set(wanted))
 
 
-def _moments(values: np.ndarray) -> dict[str, float]:
+def summary(values: np.ndarray) -> dict[str, float]:
+    """Return points, mean, its standard error, RMS, least and largest of the finite values."""
     values = values[np.isfinite(values)]
     n = len(values)
     if not n:
@@ -105,7 +106,7 @@ def _signed(part: pd.DataFrame) -> dict[str, float]:
         return {"points": 0}
     apart = np.array([mean - truth for mean, truth in pairs])
     apart = apart[np.isfinite(apart).all(axis=1)]
-    lengths = _moments(np.linalg.norm(apart, axis=1))
+    lengths = summary(np.linalg.norm(apart, axis=1))
     if not lengths["points"]:
         return lengths
     n = len(apart)

@@ -16,6 +16,8 @@ from .jax import Jax, JaxProblem
 
 FORWARD_UP_TO = 8
 """Length of theta up to which forward mode is cheaper: reverse mode costs as much as that many directions."""
+LARGEST = 1e10
+"""Largest number of a state; MuJoCo calls what is beyond it bad and gives up (``mjMAXVAL``)."""
 
 
 @dataclass(frozen=True)
@@ -119,8 +121,9 @@ class MjxProgram(Rollout):
         return bound
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
-        """Take one step of MJX in each column."""
+        """Take one step of MJX in each column; a state beyond MuJoCo's own limit becomes NaN, as MuJoCo would give up there."""
         import jax
+        import jax.numpy as jnp
 
         mjx, kind = _library(), state.q.dtype
         data = jax.tree.map(lambda leaf: leaf.astype(kind) if leaf.dtype.kind == "f" else leaf, self._data)
@@ -131,7 +134,10 @@ class MjxProgram(Rollout):
 
         # numbers that MJX makes itself are of JAX's default precision
         with jax.enable_x64(kind == np.float64):
-            return jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)
+            after = jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)
+            largest = jnp.maximum(jnp.abs(after.q).max(axis=0), jnp.abs(after.v).max(axis=0))
+            factor = jnp.where(largest <= LARGEST, 1.0, jnp.nan).astype(kind)  # as a factor it reaches the gradient too
+            return State(after.q * factor, after.v * factor)
 
 
 def _library() -> Any:

@@ -14,6 +14,8 @@ from bench.claims.claim import NOT_REPRODUCED, REPRODUCED, RESERVED, UNDECIDED, 
 
 CHEAP = ("C5", "C19", "L4")
 """Claims that take a second or two."""
+BLIND = {"C2": 6, "C8": 1, "C10": 1, "C14": 2, "C16": 6, "C17": 12, "C20": 3}
+"""Figures that cannot see an error of 5%, since what is published is rounded or spread by more: none may join them."""
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +33,11 @@ def planted(figure):
     """The same figure with a wrong published number: off by 5%, by its sign, by a square."""
     value = figure.value
     wrongs = [value**2] if not 0.5 < abs(value) < 2 and figure.factor == 0 else []
-    if figure.resolution < 0.047:
+    if figure.sees:
         wrongs += [1.05 * value, 0.95 * value]
-    return [replace(figure, published=f"{wrong:.9g}") for wrong in [*wrongs, -value]]
+    # a wrong number is printed as coarsely as the right one
+    coarse = figure.spread + last_digit(figure.published) / 2
+    return [replace(figure, published=f"{wrong:.9e}", spread=coarse) for wrong in [*wrongs, -value]]
 
 
 def unnoticed(result):
@@ -57,6 +61,36 @@ def test_every_claim_holds_and_would_fail_with_a_wrong_figure(name):
     result = results.measured(shelf.claims()[name])
     assert result.verdict in (REPRODUCED, RESERVED), (result.remark, [f for f in result.figures if not f.agrees])
     assert unnoticed(result) == []
+    assert sum(not figure.sees for figure in result.figures) == BLIND.get(name, 0)
+
+
+def test_a_figure_that_cannot_see_5_percent_says_so_and_why():
+    assert Figure("x", "1.00", 1.0, spread=0.02).sees
+    for figure, why in (
+        (Figure("x", "7", 7.0), "the printed digits"),
+        (Figure("x", "1.00", 1.0, spread=0.1), "the source's own spread"),
+        (Figure("x", "1.00", 1.0, error=0.02), "the measurement's error"),
+        (Figure("x", "1e10", 2e10, factor=10.0), "heavy tails, compared by a factor of 10"),
+    ):
+        assert not figure.sees
+        assert figure.limit == why
+        # and so it is with a number that is wrong by 5%
+        assert replace(figure, published=f"{1.05 * figure.value:g}", spread=figure.spread + figure.slack).agrees
+    assert not Figure("x", "0.00", 0.0).limit
+
+
+def test_a_claim_none_of_whose_figures_sees_5_percent_is_reserved_and_says_so(toy, tmp_path, monkeypatch, capsys):
+    coarse = [Figure("one", "1.0", 1.0, spread=0.2), Figure("seven", "7", 7.0)]
+    assert verdict(coarse) == RESERVED
+    assert verdict([*coarse, Figure("fine", "2.000", 2.0)]) == REPRODUCED
+    monkeypatch.setattr(toy, "measure", lambda self: Outcome(coarse))
+    assert cli.main(["claims", f"results_dir={tmp_path}"]) == 0
+    said = "2 of 2 figures cannot see an error of 5%: 1 for the source's own spread, 1 for the printed digits"
+    assert said in capsys.readouterr().out
+    made = tmp_path / "claims"
+    assert said in (made / "claims.md").read_text()
+    assert "no: the printed digits" in (made / "claims.html").read_text()
+    assert "the printed digits" in (made / "claims.csv").read_text()
 
 
 def test_a_figure_agrees_within_its_digits_its_spread_and_its_errors():

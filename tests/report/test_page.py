@@ -67,13 +67,13 @@ def test_finding_names_the_estimators_and_their_errors_where_each_is_to_be_used(
     rows += [row(**given | {"stiffness": k, "estimator": "other", "rmse_rel": 0.5}) for k in (10.0, 100.0)]
     rows += [row(**given | {"stiffness": 1000.0, "estimator": "other", "rmse_rel": 0.04})]
     text = page(table(rows), sweep={"stiffness": [10.0, 100.0, 1000.0]}, marks={})
-    assert "Use good: lowest relative RMSE in 2 of 3 settings (0.10)" in finding(text)
+    assert "Use good: lowest relative RMSE at equal rollouts in 2 of 3 settings (0.10)" in finding(text)
     assert "one, penalty, stiffness at 1000: use other (0.040, where good has 0.10)" in finding(text)
 
 
 def test_finding_says_when_nothing_beats_zero_and_when_nothing_ran():
     rows = table([row(stiffness=k, rmse_rel=3.0) for k in (10.0, 100.0)])
-    assert "Nothing beats answering zero" in finding(page(rows))
+    assert "nothing beats answering zero" in finding(page(rows))
     rows["status"], rows["reason"] = "error", "it broke"
     assert "No cell gave a result" in finding(page(rows))
 
@@ -204,7 +204,7 @@ def test_gallery_has_the_finding_and_keeps_what_it_cannot_make_anew(ran, tmp_pat
     assert text.startswith("before ")
     assert text.endswith(" after")
     assert "### `absent`\n\nkept\n" in text
-    assert "lowest relative RMSE in" in text
+    assert "at equal rollouts" in text
     assert "bias_variance_stiffness.png" in text
     gallery.main(readme, ran)
     assert readme.read_text() == text

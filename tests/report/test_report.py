@@ -155,7 +155,7 @@ def test_terminal_output_fits_and_says_what_matters(rows, capsys, monkeypatch):
     assert f"{len(rows)} cells: " in text
     for status, count in rows["status"].value_counts().items():
         assert f"{count} {status}" in text
-    assert "lowest error" in text
+    assert "lowest error at equal rollouts" in text
 
 
 def families(rows, column, **given):

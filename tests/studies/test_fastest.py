@@ -10,8 +10,17 @@ from helpers import described_by
 from bench.measure.statistics import UNEXPLAINED
 from bench.report.views import Line
 from bench.studies.bias_variance.charts import figures
-from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, charged
+from bench.studies.bias_variance.costs import (
+    EQUAL_ROLLOUTS,
+    EQUAL_TIME,
+    ROLLOUTS,
+    TIME,
+    TIME_COMPILED,
+    at_equal_cost,
+    charged,
+)
 from bench.studies.bias_variance.fastest import reach, sentence, table
+from bench.studies.bias_variance.findings import winners
 from bench.sweep import config
 
 SAMPLES = (16, 64, 256)
@@ -75,6 +84,32 @@ def test_a_gradient_costs_what_it_takes():
     zeroth = rows(gradients=0.0, estimator="z")
     found = charged(pd.concat([first, zeroth, rows(estimator="both"), rows(backend="other")], ignore_index=True))
     assert ROLLOUTS.of(found).tolist()[::3] == pytest.approx([48, 16, 64, 32])
+
+
+def test_findings_rank_at_equal_rollouts_and_at_equal_time_not_at_equal_samples():
+    """Pairs leave 5/8 of the variance for twice the rollouts: better by samples, worse by rollouts; and slow, by time."""
+    single = {"gradients": 0.0, "estimator": "single"}
+    pairs = {"estimator": "pairs", "gradients": 0.0, "variance": 4 * 0.625 * VARIANCE / 16}
+    table = pd.concat([rows(**single), rows(**pairs)], ignore_index=True)
+    table = table[table["samples"] == 16].reset_index(drop=True)
+    table.loc[1, ["rollouts", "rmse_rel", "time_s"]] = [32.0, math.sqrt(0.625 * VARIANCE / 16), 4 * 0.016]
+    found = at_equal_cost(table)
+    assert found[EQUAL_ROLLOUTS].tolist() == pytest.approx([0.5, 0.5 * math.sqrt(1.25)])
+    assert found[EQUAL_TIME].tolist() == pytest.approx([0.5, 0.5 * math.sqrt(2.5)])
+    lines = [
+        Line(n, "", {"b": True}, one.set_index("samples"), {}, frozenset(), 0) for n, one in found.groupby("estimator")
+    ]
+    assert winners(lines) == {16: ["pairs"]}
+    assert winners(lines, EQUAL_ROLLOUTS) == winners(lines, EQUAL_TIME) == {16: ["single"]}
+    assert at_equal_cost(table.assign(time_s=math.nan))[EQUAL_TIME].isna().all()
+
+
+def test_an_estimator_is_timed_on_its_fastest_backend_and_its_bias_stays():
+    slow, fast = rows(bias=0.3).assign(time_s=8e-3), rows(bias=0.3, backend="fast").assign(time_s=4e-3)
+    other = rows(estimator="other").assign(time_s=1e-3)
+    found = at_equal_cost(pd.concat([slow, fast, other], ignore_index=True))[EQUAL_TIME]
+    worse = [math.sqrt(0.3**2 + 4 * VARIANCE / n) for n in SAMPLES]
+    assert found.tolist() == pytest.approx([*worse, *worse, *(math.sqrt(VARIANCE / n) for n in SAMPLES)])
 
 
 def test_without_times_only_rollouts_are_ranked_and_numbers_are_numbers(tmp_path):

@@ -51,6 +51,14 @@ def make(name, fault):
     globals()[title] = dataclass(frozen=True)(type(title, (Faulty,), values))
 
 
+def swallows(self, gradient):
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5)
+    except BaseException:
+        return gradient
+
+
 def bad_shape(self, gradient):
     return np.vstack([gradient, gradient])
 
@@ -110,7 +118,8 @@ def refuses(self, gradient):
 
 
 for function in (
-    bad_shape, bad_kind, bad_number, hangs, allocates, shouts, forks, forks_and_returns, forks_and_dies, leaves, refuses
+    bad_shape, bad_kind, bad_number, hangs, allocates, shouts, forks, forks_and_returns, forks_and_dies, leaves, refuses,
+    swallows,
 ):
     make(function.__name__, function)
 make("crashes", lambda self, gradient: ctypes.string_at(0))
@@ -287,6 +296,15 @@ def test_stopping_a_run_leaves_rows_and_no_process(tree, sent, status):
     wait_for(lambda: not descendants_of(tree), 10.0)
     done = tree.run("plan", *words)
     assert "2 cells, 1 stored, 1 to run" in done.stdout
+
+
+def test_an_interrupt_that_a_plugin_swallows_still_stops_the_run(tree):
+    words = [*BASE, "estimators=[swallows,fobg]", "name=swallowed", "results_dir=out", "workers=0"]
+    process = start(tree, *words)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert "0 of 2 cells are stored" in said
+    assert "Traceback" not in said
 
 
 def nothing_starts(argument):

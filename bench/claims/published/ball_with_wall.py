@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 GRAVITY, WALL, HEIGHT, SIGMA = 9.81, 0.06, 0.02, 0.1
 JUMPS = (0.69320, 1.19935)
-RUNS = 20
+RUNS = 60
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
 from bench.claims.pieces import problem
+from bench.report.averages import summary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,20 +51,20 @@ class Missed(Claim):
         inside = slice(360, -360)
         smooth_cost = np.convolve(found["plain"][2], weights, "same")
         truth = np.gradient(smooth_cost, step)[inside]
-        size = float(np.sqrt(np.mean(truth**2)))
+        size = summary(truth)["rms"]
         bias, means = {}, {}
         for name, (_, everywhere, _) in found.items():
             means[name] = np.convolve(everywhere, weights, "same")[inside]
-            bias[name] = float(np.sqrt(np.mean((means[name] - truth) ** 2))) / size
+            bias[name] = summary(means[name] - truth)["rms"] / size
         plain, surrogate = found["plain"][0], found["surrogate"][0]
         hits = np.abs(u[plain != 0]).max()
         missed = np.abs(wide[inside]) > 2.6
         pushes = {name: float(np.mean(np.abs(mean[missed]) > 1e-3)) for name, mean in means.items()}
         figures = [
             # 2,000 values of u0 are 0.005 apart: a share is known to one of them, and so is the widest hit
-            Figure("share of exact zeros", "0.562", float(np.mean(plain == 0)), spread=1 / u.size),
+            Figure("share of exact zeros", "0.562", summary(plain == 0)["mean"], spread=1 / u.size),
             Figure("widest hit", "2.189", float(hits), spread=float(u[1] - u[0])),
-            Figure("share of exact zeros with contacts from distance", "0.0000", float(np.mean(surrogate == 0))),
+            Figure("share of exact zeros with contacts from distance", "0.0000", summary(surrogate == 0)["mean"]),
             Figure(
                 "largest difference of the costs",
                 "0.000000000000",
@@ -75,7 +76,7 @@ class Missed(Claim):
             reservation=(
                 f"the surrogate is not the derivative of the program: smoothed with sigma {SIGMA:g} its mean is off by "
                 f"{bias['surrogate']:.0%} of the true gradient's root mean square, the plain one's by {bias['plain']:.1%}; "
-                f"beyond |u0| = 2.6, where the true gradient is 0, it pushes at {pushes['surrogate']:.0%} of the angles"
+                f"beyond |u0| = 2.6, where the true gradient is 0, it pushes at {pushes['surrogate']:.0%} of the forces"
             ),
             series={
                 "u": wide[inside][::8].tolist(),

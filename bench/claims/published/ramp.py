@@ -45,8 +45,9 @@ class Ramp(Claim):
         at = problem(f"soft_heaviside[nu={NU},sigma={SIGMA}]")
         draw = np.random.default_rng(2)
         batches = 40_000
-        gradient = at.grad(np.zeros(1), draw.standard_normal((1, 100 * batches)))
-        missed = (gradient.reshape(batches, 100) == 0).all(axis=1)
+        # in parts, to keep the memory small
+        parts = [at.grad(np.zeros(1), draw.standard_normal((1, 100 * batches))) == 0 for _ in range(5)]
+        missed = np.concatenate([part.reshape(batches, 100).all(axis=1) for part in parts])
         figures = [
             Figure("crossing of the variances, in sigma", "1.517", (low + high) / 2 / SIGMA, (high - low) / SIGMA),
             Figure("chance that 100 samples all have gradient 0", "0.1334", *centre(missed.astype(float))),

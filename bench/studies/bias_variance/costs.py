@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from bench.report.text import axis_value, duration
+from bench.studies.bias_variance.tables import problem
 
 
 @dataclass(frozen=True)
@@ -90,3 +91,30 @@ ROLLOUTS = Cost(
     lambda rows: 0.0 * rows["rollouts"],
     axis_value,
 )
+
+EQUAL_ROLLOUTS, EQUAL_TIME = "rmse_equal_rollouts", "rmse_equal_time"
+
+
+def at_equal_cost(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with the relative RMSE that each estimator would have for the same rollouts, and for the same time.
+
+    An estimate from c times fewer samples has the same bias and c times the variance. ``rmse_equal_rollouts`` is for as
+    many rollouts as there are samples, a gradient at its measured cost (:func:`charged`); ``rmse_equal_time`` for the time
+    of the fastest estimate from as many samples on the same problem, each estimator on its fastest backend.
+    """
+    rows = charged(rows)
+    good = rows["status"] == "ok"
+    setting = [problem(rows), rows["samples"], rows["seed"]]
+    label = rows["estimator"] + "[" + rows["estimator_params"] + "]"
+    time = rows["time_s"].where(good & (rows["time_s"] > 0))
+    fastest = time.groupby([*setting, label]).transform("min")
+    factors = {
+        EQUAL_ROLLOUTS: _rollouts(rows) / rows["samples"],
+        EQUAL_TIME: fastest / time.groupby(setting).transform("min"),
+    }
+    variance = rows["variance"] / rows["reference_norm"] ** 2
+    errors = {
+        name: np.sqrt((rows["rmse_rel"] ** 2 + (factor - 1.0) * variance).clip(lower=0.0))
+        for name, factor in factors.items()
+    }
+    return rows.assign(**{name: error.where(good) for name, error in errors.items()})

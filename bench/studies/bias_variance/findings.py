@@ -32,19 +32,22 @@ def problems(shown: Arranged) -> list[tuple[Axis | None, Family]]:
     return parts
 
 
-def lowest(curves: Sequence[Line]) -> dict[float, float]:
-    """Return the lowest relative RMSE at each ``x`` where there is one, in increasing order."""
+def lowest(curves: Sequence[Line], error: str = "rmse_rel") -> dict[float, float]:
+    """Return the lowest error at each ``x`` where there is one, in increasing order."""
     rows = pd.concat([line.rows for line in curves])
-    good = rows[(rows["status"] == "ok") & np.isfinite(rows["rmse_rel"])]
-    return good.groupby(level=0)["rmse_rel"].min().to_dict()
+    good = rows[(rows["status"] == "ok") & np.isfinite(rows[error])]
+    return good.groupby(level=0)[error].min().to_dict()
 
 
-def winners(curves: Sequence[Line]) -> dict[float, list[str]]:
-    """Return, at each ``x``, the estimators whose error is lowest or not distinguishable from the lowest."""
+def winners(curves: Sequence[Line], error: str = "rmse_rel") -> dict[float, list[str]]:
+    """Return, at each ``x``, the estimators whose error is lowest or not distinguishable from the lowest.
+
+    ``error`` is a column: ``rmse_rel`` compares at equal samples, those of :func:`~.costs.at_equal_cost` at equal cost.
+    """
     named = {}
-    for x, low in lowest(curves).items():
+    for x, low in lowest(curves, error).items():
         good = [line for line in curves if x in line.at and line.at[x]["status"] == "ok"]
-        named[x] = list(dict.fromkeys(line.label for line in good if line.at[x]["rmse_rel"] <= TIE * low))
+        named[x] = list(dict.fromkeys(line.label for line in good if line.at[x][error] <= TIE * low))
     return named
 
 

@@ -39,6 +39,7 @@ from bench.report.web.content import (
     nothing_ran,
     titled,
 )
+from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, at_equal_cost
 from bench.studies.bias_variance.findings import lowest, problems, span, winners
 from bench.studies.bias_variance.panels import FLOOR
 from bench.studies.bias_variance.tables import problem
@@ -77,7 +78,7 @@ EXCEPTIONS = 2
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the finding, what to use where, and the charts."""
-    shown = arranged(experiment, rows)
+    shown = arranged(experiment, at_equal_cost(rows))
     summaries = [ProblemSummary(axis, family) for axis, family in problems(shown)]
     table_ = derived(rows)
     labelled = derived(shown.rows)
@@ -114,8 +115,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         )
     )
     return Content(
-        finding=nothing_ran(rows)
-        or "; ".join(filter(None, [failing(rows), finding(summaries), fastest(rows), refused(rows)])) + ".",
+        finding=nothing_ran(rows) or _joined(failing(rows), finding(summaries), fastest(rows), refused(rows)),
         rows=table_,
         columns=[*identity_columns(rows)[:IN_SIGHT], TIME, *STATUS, *RESULTS, *identity_columns(rows)[IN_SIGHT:]],
         charts=charts,
@@ -197,19 +197,19 @@ def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
 
 
 class ProblemSummary:
-    """One problem along an axis: which estimators are best, and where."""
+    """One problem along an axis: which estimators have the lowest error at equal rollouts, and where."""
 
     def __init__(self, axis: axes.Axis | None, family: Family) -> None:
         self.axis, self.title = axis, family.title()
         self.kind = ", ".join(str(value) for name, value in family.identity.items() if name in CATEGORIES)
         self.lines = lines(family.rows)
-        self.lowest = lowest(self.lines)
-        self.winners = winners(self.lines)
+        self.lowest = lowest(self.lines, EQUAL_ROLLOUTS)
+        self.winners = winners(self.lines, EQUAL_ROLLOUTS)
 
     def errors(self, label: str, places: Iterable[float]) -> list[float]:
-        """Return the relative RMSEs of an estimator at some places, on every backend whose numbers differ."""
+        """Return an estimator's relative RMSEs at equal rollouts at some places, on every backend whose numbers differ."""
         rows = [line.at[x] for x in places for line in self.lines if line.label == label and x in line.at]
-        return [row["rmse_rel"] for row in rows if row["status"] == "ok" and math.isfinite(row["rmse_rel"])]
+        return [row[EQUAL_ROLLOUTS] for row in rows if row["status"] == "ok" and math.isfinite(row[EQUAL_ROLLOUTS])]
 
     def where(self, places: Sequence[float]) -> str:
         """Write where this holds: ``stiffness >=1e4``, or nothing for everywhere."""
@@ -265,8 +265,14 @@ def failing(rows: pd.DataFrame) -> str:
     return "; ".join(text for _, text in found[:NAMED])
 
 
+def _joined(*parts: str) -> str:
+    """Join the parts that say something; a capital stands only at the start."""
+    said = [part for part in parts if part]
+    return "; ".join([*said[:1], *(part[0].lower() + part[1:] for part in said[1:])]) + "."
+
+
 def finding(summaries: Sequence[ProblemSummary]) -> str:
-    """Write one sentence: the estimator that has the lowest error most often, and where to use another."""
+    """Write one sentence: the estimator that most often has the lowest error at equal rollouts, and where to use another."""
     settings = [(one, x) for one in summaries for x in one.lowest]
     if not settings:
         return "No cell has an error that could be compared"
@@ -277,9 +283,9 @@ def finding(summaries: Sequence[ProblemSummary]) -> str:
     share = f"{len(errors)} of {counted(len(settings), 'setting')}"
     if len(errors) == len(settings):
         share = f"all {counted(len(settings), 'setting')}" if len(settings) > 1 else "the one setting"
-    text = f"Use {main}: lowest relative RMSE in {share} ({between(errors)})"
+    text = f"Use {main}: lowest relative RMSE at equal rollouts in {share} ({between(errors)})"
     if min(errors) >= 1:
-        text = f"Nothing beats answering zero: even {main}, lowest in {share}, has a relative RMSE of {between(errors)}"
+        text = f"Nothing beats answering zero: even {main}, lowest in {share}, has a relative RMSE of {between(errors)} at equal rollouts"
     others = elsewhere(summaries, main)
     left = counted(len(others) - EXCEPTIONS, "further exception") if len(others) > EXCEPTIONS else ""
     return "; ".join(filter(None, [text, *(other.sentence(main) for other in others[:EXCEPTIONS]), left]))
@@ -349,7 +355,7 @@ def answers(summaries: Sequence[ProblemSummary]) -> pd.DataFrame:
                     "problem": one.title,
                     "where": one.where(places) or "everywhere",
                     "use": ", ".join(labels),
-                    "relative RMSE": between(one.lowest[x] for x in places),
+                    "relative RMSE at equal rollouts": between(one.lowest[x] for x in places),
                     "next best": f"{following} ({number(rest[following])})" if following else "-",
                     "worse than answering zero": ", ".join(useless) or "-",
                 }

@@ -26,12 +26,14 @@ from bench.report.views import (
     resolved,
     unsteady,
 )
+from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, EQUAL_TIME, at_equal_cost
 from bench.studies.bias_variance.findings import TIE, lowest, problems, span, winners
 from bench.sweep.axes import Axis
 from bench.sweep.experiment import Experiment
 
 GOALS = (0.3, 0.1, 0.03)
 """Relative RMSEs for which the fastest method is named."""
+COSTS = {"rollouts": EQUAL_ROLLOUTS, "time": EQUAL_TIME}
 NEGLIGIBLE = 0.01
 """Relative bias too small for a remark."""
 WIDTH = 100
@@ -47,7 +49,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
     console.print(f"{len(rows)} cells: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
-    parts = problems(arranged(experiment, rows))
+    parts = problems(arranged(experiment, at_equal_cost(rows)))
     condensed = len(rows) > FULL_ROWS
     for axis, group in parts:
         if condensed and axis is not None:
@@ -163,7 +165,7 @@ def _show_legend(console: Console, condensed: bool) -> None:
     )
     console.print(
         f"\nbias: |mean - reference| / |grad J|, {bias} (95%). rmse: error of one estimate / |grad J|, above 1 worse than "
-        "answering zero; * lowest, within 10%. A ? is explained below. Backends on one line agree to 1e-6, with ~ to 1%. "
+        "answering zero; * lowest from as many samples, within 10%. A ? is explained below. Backends on one line agree to 1e-6, with ~ to 1%. "
         f"A time marked {UNSTEADY} was unsteady: the interquartile range of its calls is over 20% of it."
         + (" Under each estimator: backends and their time per estimate. fail: cells not ok." if condensed else "")
     )
@@ -190,7 +192,10 @@ def _show_verdict(console: Console, group: Family, axis: Axis | None) -> None:
     """Print, for one problem, the estimators of lowest error, those whose error is bias, useless ones, and where."""
     console.print(f"  {group.title()}" + (f", by {axis.title}" if axis else ""), style="bold")
     curves = lines(group.rows)
-    _print_wrapped(console, f"lowest error: {_winners(curves)}", 4)
+    ranked = {f"lowest error at equal {cost}": _winners(curves, error) for cost, error in COSTS.items()}
+    for text, names in ranked.items():
+        if names:
+            _print_wrapped(console, f"{text}: {names}", 4)
     for text, test in (
         ("mostly bias, more samples do not help", _biased),
         (f"a bias where none is declared, {UNEXPLAINED}", _unexplained),
@@ -212,9 +217,9 @@ def _show_verdict(console: Console, group: Family, axis: Axis | None) -> None:
         _print_wrapped(console, f"first to a relative RMSE of {'; '.join(parts)}", 4)
 
 
-def _winners(curves: Sequence[Line]) -> str:
-    """Write the estimators of lowest error, and where along the axis they are."""
-    named = {x: ", ".join(labels) for x, labels in winners(curves).items()}
+def _winners(curves: Sequence[Line], error: str) -> str:
+    """Write the estimators of lowest error, and where along the axis they are; nothing where the cost is not known."""
+    named = {x: ", ".join(labels) for x, labels in winners(curves, error).items()}
     ranges = {text: span({x: names == text for x, names in named.items()}) for text in named.values()}
     return "; ".join(f"{where}: {text}" if where else text for text, where in ranges.items())
 
