@@ -4,13 +4,20 @@ import atexit
 import os
 import sys
 import threading
+import traceback
 
 from bench.cli import main
 from bench.model import guard
 
-if __name__ == "__main__":
+
+def command() -> None:
+    """Run one command and end the process with its status, whatever plugins have left running in it."""
     own = os.getpid()
-    status = main()
+    try:
+        status = main()
+    except Exception:  # a fault of this package: told in full, and the command ends all the same
+        traceback.print_exc()
+        status = 1
     guard.end_copies(own)
     guard.end_children()
     if any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread()):
@@ -20,3 +27,7 @@ if __name__ == "__main__":
             stream.flush()
         os._exit(status)
     sys.exit(status)
+
+
+if __name__ == "__main__":
+    command()

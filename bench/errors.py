@@ -38,7 +38,13 @@ def printable(text: object) -> str:
     >>> printable("a\\nb\\x1b[31m")
     'a b [31m'
     """
-    return " ".join("".join(c if c.isprintable() else " " for c in str(text)).split())
+    try:
+        said = str(text)
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # the message of a plugin's own kind of error is code of the plugin
+        said = "(a message that cannot be printed)"
+    return " ".join("".join(c if c.isprintable() else " " for c in said).split())
 
 
 def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:
@@ -53,14 +59,11 @@ def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:
 def failure(error: BaseException) -> dict[str, str]:
     """Return status and reason of a plugin's exception: its message and the last lines of its traceback."""
     if isinstance(error, Unsupported):
-        return {"status": "unsupported", "reason": str(error)}
+        return {"status": "unsupported", "reason": printable(error)}
     lines, step = [], error.__traceback__
     while step is not None:
         code = step.tb_frame.f_code
         lines.append(f"{os.path.basename(code.co_filename)}:{step.tb_lineno} in {code.co_name}")
         step = step.tb_next
-    try:
-        said = printable(error)[:1000]
-    except Exception:
-        said = "(a message that cannot be printed)"
+    said = printable(error)[:1000]
     return {"status": "error", "reason": f"{type(error).__name__}: {said} ({' < '.join(reversed(lines[-3:]))})"}

@@ -40,5 +40,6 @@ def measure(quick: bool) -> Iterator[lines.Line]:
     settings = yaml.safe_load((config_dir() / "bench_self.yaml").read_text())
     yield from rollouts.backends(settings, quick)
     yield from rollouts.references(settings, quick)
+    yield from rollouts.compared(settings, quick)
     yield from sweep.lines(settings)
     yield from harness.lines(quick)

@@ -25,19 +25,21 @@ LONGEST = 20.0
 AGREEMENT = 1e-9
 """Largest relative difference allowed for the native gradient."""
 NATIVE_COLUMNS = 1024
+COMPARED_SIZES = (1_000, 100_000)
 CPU = "cpu"
 """The device of a problem that names none."""
 
 
 def problem(
-    settings: Mapping[str, Any], backend: str, contact: str, scale: Mapping[str, float] | None = None
+    settings: Mapping[str, Any], backend: str, contact: str | None, scale: Mapping[str, float] | None = None
 ) -> Problem:
-    """Compile the settings' scene with a contact law; ``scale`` multiplies sigma and the law's parameters."""
+    """Compile the settings' scene with a contact law or none; ``scale`` multiplies sigma and the law's parameters."""
     scene = registry.make("scenes", settings["scene"], settings["values"])
-    law = registry.make("contacts", contact, settings["contacts"].get(contact))
+    law = None if contact is None else registry.make("contacts", contact, settings["contacts"].get(contact))
     integrator = registry.make("integrators", settings["integrator"])
     if scale:
         scene = replace(scene, sigma=scene.sigma * scale.get("sigma", 1.0))
+    if scale and law is not None:
         law = replace(law, **{name: getattr(law, name) * factor for name, factor in scale.items() if name != "sigma"})
     compiled: Problem = registry.make("backends", backend).compile(compose(scene, law, integrator))
     return compiled
@@ -110,9 +112,39 @@ def references(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
     wanted, native_ = compiled.grad(theta, w), kernel(theta, w)
     difference = float(np.abs(native_ - wanted).max() / np.abs(wanted).max())
     yield Line("native C kernel: largest relative difference", difference, "", AGREEMENT)
+    rival = settings["native"]["rival"]
+    other = problem(settings, rival, subject["contact"]) if registry.find("backends", rival).available else None
     for count in sizes:
         w = batch(compiled, count)
         columns = blocks.size(count, NATIVE_COLUMNS, native.LANES, 1)
 
         call = partial(blocks.evaluate, kernel, theta[:, None], w, columns, 1, (compiled.dim,))
-        yield timed(f"native C kernel, one thread, {count:g} rollouts", call, count)
+        line = timed(f"native C kernel, one thread, {count:g} rollouts", call, count)
+        yield line
+        if other is not None:
+            found = timed("", partial(other.grad, theta, w), count)
+            share = found.value * blocks.cores() / line.value
+            target = settings["native"]["target"] if count in SIZES else math.nan
+            yield Line(f"{rival} on each core over the C kernel, {count:g} rollouts", share, "", target, found.spread)
+
+
+def compared(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
+    """Measure the gradients of two backends on several scenes, and the time of the second over that of the first."""
+    given = settings["compared"]
+    missing = [name for name in given["backends"] if not registry.find("backends", name).available]
+    if missing:
+        yield Line("gradients of two backends", math.nan, note=f"unavailable: {', '.join(missing)}", unit="")
+        return
+    for one in given["scenes"][:1] if quick else given["scenes"]:
+        own = {**settings, "scene": one["scene"], "values": one.get("values", {})}
+        problems = [problem(own, name, one.get("contact")) for name in given["backends"]]
+        for count in QUICK_SIZES[:1] if quick else COMPARED_SIZES:
+            took = []
+            for name, compiled in zip(given["backends"], problems, strict=True):
+                call = partial(compiled.grad, compiled.program.theta0, batch(compiled, count))
+                call()
+                line = timed(f"{name} grad, {one['scene']}, {count:g} rollouts", call, count)
+                took.append(line.value)
+                yield replace(line, note=f"compiled in {compiled.usage.compile_s:.1f} s")
+            share = f"{given['backends'][1]} over {given['backends'][0]}, {one['scene']}, {count:g} rollouts"
+            yield Line(share, took[1] / took[0], "", math.nan if quick else given["target"])

@@ -54,7 +54,7 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
         else _differenced(program, full, w)
     )
     scene, (horizon, m, count) = program.scene, path.controls.shape
-    noisy = full if program.action_noise else full + scene.sigma * w
+    noisy = full if program.action_noise else full + scene.sigma * w[: program.dim]
     before, controls = _flat(path.states[:-1]), _flat(path.controls)
     repeated = np.tile(noisy, (1, horizon))
 

@@ -1,12 +1,17 @@
-"""Keeps a process what it is while plugins are at work in it: its working folder, its number, its children."""
+"""Keeps a process what it is while plugins are at work in it: its working folder, its number, its children, its terminal."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import sys
+import tempfile
 from collections.abc import Iterator
 
-from bench.errors import INTERRUPTED
+from bench.errors import INTERRUPTED, printable
+
+HEARD = 300
+"""Letters that are told of what a plugin has printed."""
 
 
 def end_copies(own: int) -> None:
@@ -39,6 +44,39 @@ def heed_interrupts() -> None:
     if INTERRUPTED.is_set():
         INTERRUPTED.clear()
         raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def quiet(who: str) -> Iterator[None]:
+    """Keep what a plugin prints from the terminal, raw as it is, and tell the beginning of it on one line of stderr.
+
+    Descriptors are turned aside, not ``sys.stdout``: what libraries print goes there too, and a plugin may keep the stream.
+    """
+    _flush()
+    with contextlib.ExitStack() as stack:
+        try:
+            aside = stack.enter_context(tempfile.TemporaryFile())
+        except OSError:  # no place for it
+            aside = stack.enter_context(open(os.devnull, "w+b"))
+        for descriptor in (1, 2):
+            with contextlib.suppress(OSError):  # it is closed
+                kept = os.dup(descriptor)
+                stack.callback(os.close, kept)
+                os.dup2(aside.fileno(), descriptor)
+                stack.callback(os.dup2, kept, descriptor)
+        try:
+            yield
+        finally:
+            _flush()
+            said = os.pread(aside.fileno(), 4 * HEARD, 0).decode(errors="replace")
+    if said.strip():
+        print(f"bench: {who} printed: {printable(said)[:HEARD]}", file=sys.stderr)
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):  # a plugin may have closed or replaced it
+            stream.flush()
 
 
 def _folder() -> str:

@@ -19,7 +19,7 @@ from bench.model.dynamics import Dynamics
 from bench.model.integrator import Integrator
 from bench.model.ops import Array, Ops, State
 from bench.model.parameters import Plugin, traced
-from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, MechanicalScene, Scene
+from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, GustyScene, MechanicalScene, Scene
 
 SURROGATE = "the gradient is a surrogate, not the derivative of the program"
 """What rows, tables and charts say where :attr:`Program.surrogate` holds."""
@@ -360,8 +360,13 @@ class Rollout(Program):
 
     @property
     def n_noise(self) -> int:
-        """n_w: one number per control, or one per coordinate of theta."""
-        return self.scene.controls * self.scene.n_u if self.action_noise else self.dim
+        """n_w: one number per control, or one per coordinate of theta and the gusts."""
+        return self.scene.controls * self.scene.n_u if self.action_noise else self.dim + self.exogenous
+
+    @property
+    def exogenous(self) -> int:
+        """Count of the numbers of a scene's gusts: one per step and control."""
+        return self.scene.horizon * self.scene.n_u if isinstance(self.scene, GustyScene) else 0
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
         """Return the stage costs and the terminal cost of the rollout."""
@@ -388,9 +393,10 @@ class Rollout(Program):
         """Return program, theta and noise with the parameters named by theta filled in; unchanged if it names none."""
         if not self._named:
             return self, theta, w
-        bound, own = self._own_theta(ops.xp, theta, w)
+        bound, own = self._own_theta(ops.xp, theta, w[: self.dim])
         assert isinstance(bound, Rollout)
-        return bound, own, ops.xp.zeros((bound.n_noise, own.shape[1]), dtype=own.dtype)
+        still = ops.xp.zeros((bound.n_noise - self.exogenous, own.shape[1]), dtype=own.dtype)
+        return bound, own, ops.xp.concat([still, w[self.dim :]], axis=0) if self.exogenous else still
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
         """Take one step of the map."""
@@ -410,14 +416,19 @@ class Rollout(Program):
         yield state, u
 
     def start(self, ops: Ops, theta: Array, w: Array) -> tuple[Array, State, tuple[Array, ...]]:
-        """Return theta with parameter noise, the initial state, and the control law's per-step inputs (plan, noise)."""
+        """Return theta with parameter noise, the initial state, and the control law's per-step inputs.
+
+        Those are the plan, and the noise on actions or the gusts.
+        """
         scene, xp = self.scene, ops.xp
         shape = (scene.horizon, scene.n_u, w.shape[1])
         scanned = []
         if self.action_noise:
             scanned.append(scene.held(xp, xp.reshape(w, (scene.controls, *shape[1:]))))
         else:
-            theta = theta + scene.sigma * w
+            theta = theta + scene.sigma * (w[: self.dim] if self.exogenous else w)
+        if isinstance(scene, GustyScene):
+            scanned.append(scene.gust * xp.reshape(w[self.dim :], shape))
         planned = scene.planned_controls(xp, theta)
         if planned is not None:
             scanned.insert(0, xp.broadcast_to(planned, shape))
@@ -427,7 +438,7 @@ class Rollout(Program):
         return theta, state, tuple(scanned)
 
     def control(self, ops: Ops, theta: Array, state: State, slices: tuple[Array, ...]) -> Array:
-        """Return u_t = plan + feedback + sigma w_t, ``(n_u, B)``."""
+        """Return u_t = plan + feedback + sigma w_t, or the scene's gusts for the latter, ``(n_u, B)``."""
         scene, xp = self.scene, ops.xp
         parts = list(slices)
         if self.action_noise:

@@ -95,13 +95,14 @@ def entries() -> Table:
     stamps |= {point.module: point.dist.version if point.dist else "" for point in points}
     fatal = trial.fatal(stamps, {_package(path): path for path in _folders})
     for kind, module in modules:
-        with guard.guarded():
+        with guard.quiet(f"{module}, while it was imported,"), guard.guarded():
             _load_module(table, kind, module, fatal.get(module, ""))
     for point in points:
         try:
             if point.module in fatal:
                 raise ImportError(fatal[point.module])
-            plugin = point.load()
+            with guard.quiet(f"{point.module}, while it was imported,"), guard.guarded():
+                plugin = point.load()
             if not (isinstance(plugin, type) and issubclass(plugin, Plugin) and plugin.kind):
                 raise TypeError(f"{point.value} is not a plugin class")
         except KeyboardInterrupt:
@@ -162,10 +163,7 @@ def _guessed_kind(name: str) -> str:
 
 
 def _fail(found: Table, kind: str, name: str, error: BaseException, what: str = "import failed") -> None:
-    try:
-        said = printable(error)[:LONGEST]
-    except Exception:
-        said = "(a message that cannot be printed)"
+    said = printable(error)[:LONGEST]
     while name in found[kind]:  # a sound plugin keeps its name
         name += " (another)"
     found[kind][name] = Entry(kind, name, None, f"{what}: {type(error).__name__}: {said}")

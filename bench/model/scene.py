@@ -172,6 +172,24 @@ class DampedScene(MechanicalScene):
 
 
 @dataclass(frozen=True)
+class GustyScene(MechanicalScene):
+    """A role: noise from outside on every control of every step, beside the noise on theta.
+
+    ``u_t = plan + feedback + gust e_t`` with ``horizon * n_u`` normal numbers e, which follow the d numbers on theta, so
+    that J averages over both. No estimator smoothes over e by shifting it, and no score takes it. What u does is the
+    scene's own: a channel may be a force of the wind, or a share by which a mass or a stiffness is off in that step.
+    """
+
+    noise: str = param("parameter", "what sigma perturbs; the gusts come beside it", choices=("parameter",))
+    gust: float = param(0.1, "standard deviation of the noise from outside on each control", low=0.0)
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if not cls.n_u:
+            raise TypeError(f"{cls.__name__} has gusts on its controls: set n_u")
+
+
+@dataclass(frozen=True)
 class HeldScene(MechanicalScene):
     """A role: each control of an open loop, and its noise, is held over ``hold`` steps (zero-order hold).
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
 
-from bench.errors import Unsupported, UserError, failure
+from bench.errors import Unsupported, UserError, failure, printable
 from bench.model import (
     Backend,
     ContactLaw,
@@ -193,7 +193,7 @@ class Cell:
         try:
             program = self.program()
         except (Unsupported, UserError) as error:  # other scenes of the sweep may have this theta
-            return "unsupported", str(error)
+            return "unsupported", printable(error)
         backend, estimator = self.backend, self.parts.get("estimator")
         if reason := backend.lacks(program):
             return "unsupported", reason

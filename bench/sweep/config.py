@@ -387,7 +387,8 @@ def _choice(kind: str, text: Any) -> Choice:
     entry = registry.find(kind, name)
     if entry.plugin is not None:
         try:
-            with guard.guarded():  # a plugin that leaves the working folder would take relative paths with it
+            # a plugin that leaves the working folder would take relative paths with it
+            with guard.quiet(f"{singular(kind)} {name}"), guard.guarded():
                 build(entry.plugin, values)
         except (UserError, KeyboardInterrupt):
             raise

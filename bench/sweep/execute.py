@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from bench.errors import StorageError
 from bench.measure import timing
-from bench.model import guard
 from bench.sweep import progress, runner
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import tidy
@@ -47,8 +46,7 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     # asked now, before the run itself loads the machine
     timing.load_at_start()
     store = store_of(experiment)
-    with guard.guarded():
-        planned = plan(experiment, store)
+    planned = plan(experiment, store)
     progress.print_versions(planned, experiment.execution.versions)
     progress.print_machines(planned, experiment.execution.launcher)
     store.prepare()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
-from bench.model import Backend, Plugin
+from bench.model import Backend, Plugin, guard
 from bench.model.parameters import remember
 from bench.sweep.cell import Cell
 from bench.sweep.experiment import Experiment
@@ -43,7 +43,8 @@ def plan(experiment: Experiment, store: Store) -> list[Planned]:
     rows = store.load()
     facts = zip(rows["status"], rows["versions"], rows["machine"], strict=True)
     stored = dict(zip(rows["key"], facts, strict=True))
-    return [_planned(experiment, cell, stored) for cell in cells(experiment)]
+    with guard.quiet("a plugin"), guard.guarded():
+        return [_planned(experiment, cell, stored) for cell in cells(experiment)]
 
 
 def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, str, str]]) -> Planned:

@@ -25,7 +25,8 @@ class References:
 
     def __init__(self, experiment: Experiment, problems: Problems) -> None:
         self._problems = problems
-        self._directory = experiment.results_dir / "references"
+        # absolute: a plugin at work may leave the working folder
+        self._directory = experiment.results_dir.absolute() / "references"
         self._budget = experiment.reference
         self._known: dict[str, Reference] = {}
 

@@ -55,7 +55,8 @@ class _Run:
         if refused:
             self._finish([(cell, result | {"machine": kind_of_machine()}) for cell, result in refused])
         waiting = [item.cell for item in todo if item.refusal is None]
-        references = self._missing_references(waiting)
+        with guard.quiet("a plugin"), guard.guarded():  # backends are asked whether they can give references
+            references = self._missing_references(waiting)
         if not self._experiment.timing:
             with launchers.of(self._experiment) as pool:
                 self._measure(self._referenced(waiting, references, pool), pool)
@@ -94,7 +95,9 @@ class _Run:
             self._finish([result for answer, result in done if answer.stored], stored=True)
 
     def _answers(self, tasks: list[Task], pool: Launcher) -> Iterator[list[Answer]]:
-        for answers in pool.run(grouped(tasks)):
+        with guard.quiet("a plugin"), guard.guarded():
+            groups = grouped(tasks)
+        for answers in pool.run(groups):
             guard.heed_interrupts()
             if answers:
                 yield answers

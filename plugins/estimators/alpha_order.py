@@ -62,8 +62,8 @@ class AlphaOrder(Estimator):
         # with both variances 0 any weight is right
         alpha = np.divide(v0, total, out=np.ones_like(total), where=total > 0)
         distance = np.linalg.norm(fobg - zobg, axis=-1)
-        room = np.maximum(gamma - eps, 0.0)
+        room = np.maximum(gamma - eps, 0.0)  # none where the zeroth order is not known to within gamma
         cap = np.divide(room, distance, out=np.full_like(distance, np.inf), where=distance > 0)
-        alpha = np.where(eps > gamma, 0.0, np.minimum(alpha, cap))
+        alpha = np.minimum(alpha, cap)
         weight = alpha[:, None]
         return weight * fobg + (1 - weight) * zobg, {"alpha": alpha, "eps": eps}

@@ -50,7 +50,8 @@ class Orthogonal(Estimator):
 
 
 def _rotated(normal: np.ndarray) -> np.ndarray:
-    """Return orthonormal vectors, uniform over rotations, from normal ones ``(R, m, d)`` with m <= d."""
-    q, r = np.linalg.qr(np.moveaxis(normal, 1, 2))
-    # the sign of R's diagonal is the factorisation's own choice; with it the rotation is uniform
-    return np.moveaxis(q * np.sign(np.einsum("rii->ri", r))[:, None, :], 2, 1)
+    """Return orthonormal vectors, uniform over rotations but for their signs, from normal ones ``(R, m, d)``, m <= d.
+
+    The signs are the factorisation's own choice, and a central difference times its direction does not see them.
+    """
+    return np.moveaxis(np.linalg.qr(np.moveaxis(normal, 1, 2))[0], 2, 1)

@@ -6,7 +6,11 @@ import sys
 
 import pytest
 
+from bench.errors import failure, printable
 from bench.model import registry, trial
+
+INHERITED = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+"""For commands in another folder."""
 
 GOOD = "from bench.model import SampleMean\n"
 FATAL = {
@@ -107,6 +111,66 @@ def test_a_plugin_at_work_moves_no_command_to_another_folder(tmp_path):
         assert os.wait()[1] == 0
         print("both")
     """
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=INHERITED, capture_output=True, text=True)
     assert done.stdout == "both\n", done.stderr
+
+
+LOUD = '''
+"""Prints whatever is done with it."""
+
+import os, subprocess, warnings
+from dataclasses import dataclass
+from bench.plugins.estimators.fobg import Fobg
+
+print("\\x1b[31mred at import", flush=True)
+os.write(2, b"\\x1b]0;title\\x07 " + b"y" * 100000)
+subprocess.Popen(["echo", "from a child"]).wait()
+warnings.warn("loudly")
+
+@dataclass(frozen=True)
+class Loud(Fobg):
+    "Prints when it is made."
+    name = "loud"
+    def __post_init__(self):
+        print("made\\x1b[2J")
+    def lacks(self, *given):
+        print("asked\\x07")
+        return super().lacks(*given)
+'''
+
+
+def test_what_plugins_print_reaches_no_terminal_raw(tmp_path):
+    (tmp_path / "loud.py").write_text(LOUD)
+    place = f"plugins={tmp_path}"
+    words = ["estimators=[loud]", "scenes=[heaviside]", "backends=[numpy]", place, f"results_dir={tmp_path}"]
+    for verb in (["list", place], ["plan", *words]):
+        command = [sys.executable, "-m", "bench", *verb]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=INHERITED)
+        assert done.returncode == 0, done.stderr
+        assert not [c for c in done.stdout + done.stderr if ord(c) < 32 and c != "\n"]
+        assert "loud, while it was imported, printed: [31mred at import" in done.stderr
+        assert max(map(len, done.stderr.splitlines())) < 500
+        assert "red at import" not in done.stdout
+    assert "estimator loud printed: made [2J" in done.stderr
+    assert "asked" in done.stderr
+
+
+def test_a_thread_and_a_fault_of_ones_own_hold_no_command(tmp_path):
+    """An unexpected error is told in full, and what a plugin has left running does not keep it waiting."""
+    code = """if True:
+        import sys, threading, time
+        import bench.__main__ as command
+        threading.Thread(target=time.sleep, args=(600,)).start()
+        command.main = lambda: 1 / 0
+        command.command()
+    """
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, env=INHERITED, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "ZeroDivisionError" in done.stderr
+
+
+def test_an_error_that_cannot_be_printed_is_one_of_its_plugin():
+    silent = type("Silent", (Exception,), {"__str__": lambda self: sys.exit(0)})()
+    assert printable(silent) == "(a message that cannot be printed)"
+    assert "Silent: (a message" in failure(silent)["reason"]

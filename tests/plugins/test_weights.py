@@ -3,10 +3,19 @@
 import numpy as np
 import pytest
 from bench.plugins.backends.numpy import Numpy
+from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.estimators.alpha_order import AlphaOrder
+from bench.plugins.estimators.clipped import Clipped
+from bench.plugins.estimators.control_variate import ControlVariate
 from bench.plugins.estimators.inverse_variance import InverseVariance
+from bench.plugins.estimators.measure_valued import MeasureValued
 from bench.plugins.estimators.reinforce import Reinforce
+from bench.plugins.estimators.sphere_smoothing import SphereSmoothing
+from bench.plugins.estimators.total_propagation import TotalPropagation
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.cubic import Cubic
+from bench.plugins.scenes.two_balls import TwoBalls
+from scipy.special import ndtri
 
 from bench.model import compose
 
@@ -64,3 +73,76 @@ def test_reinforce_by_hand(halves, baseline):
             ]
             total = total + (costs[n] - b) * noise[r, n] / 0.4
         assert found[r] == pytest.approx(total / SAMPLES, rel=1e-11)  # sums of terms 10 times the result
+
+
+@pytest.mark.parametrize("by", ["sample", "element"])
+def test_clipped_by_hand(halves, by):
+    """Of 11 gradients of two coordinates, each is cut to the batch's quantile: its norm, or each coordinate alone."""
+    problem, theta, noise, *_ = halves
+    found = Clipped(by=by, quantile=0.5).estimate(problem, theta, noise)
+    for r in range(REPEATS):
+        terms = problem.grad(theta, noise[r].T)
+        sizes = np.abs(terms) if by == "element" else np.sqrt(terms[0] ** 2 + terms[1] ** 2)[None]
+        limit = np.median(sizes, axis=1)
+        cut = [
+            [t * min(1.0, limit[i % len(sizes)] / s) for t, s in zip(terms[i], sizes[i % len(sizes)], strict=True)]
+            for i in range(2)
+        ]
+        assert found[r] == pytest.approx(np.mean(cut, axis=1), rel=EXACT)
+
+
+def test_control_variate_by_hand(halves):
+    """Each half takes the regression coefficient of the other one, which it has no part in."""
+    problem, theta, noise, *_ = halves
+    found, said = ControlVariate().explained(problem, theta, noise)
+    g = problem.grad(theta, np.zeros((2, 1)))[:, 0]
+    centre = problem.value(theta, np.zeros((2, 1)))[0]
+    for r in range(REPEATS):
+        w = noise[r]
+        values = np.array([(problem.value(theta, x[:, None])[0] - centre) * x / 0.4 for x in w])
+        control = np.array([(g @ x) * x for x in w])
+        slopes = []
+        for part in (slice(5, None), slice(0, 5)):
+            spread = control[part] - control[part].mean(axis=0)
+            slopes.append((spread * values[part]).sum() / (spread**2).sum())
+        left = [v - slopes[n >= 5] * (c - g) for n, (v, c) in enumerate(zip(values, control, strict=True))]
+        assert found[r] == pytest.approx(np.mean(left, axis=0), rel=1e-10)
+        assert said["coefficient"][r] == pytest.approx(np.mean(slopes), rel=1e-10)
+
+
+def test_measure_valued_gradient_of_a_cubic():
+    """The gradient of the smoothed cubic is theta^2 + sigma^2: the radius is Rayleigh's, drawn here at even levels."""
+    problem = Numpy().compile(compose(Cubic(dimension=1, sigma=0.4)))
+    theta, count = problem.program.theta0, 100_000
+    levels = (np.arange(count) + 0.5) / count
+    noise = ndtri(levels)[None, :, None]
+    found = MeasureValued().estimate(problem, theta, noise)[0]
+    assert found == pytest.approx(theta**2 + 0.4**2, rel=1e-4)
+
+
+def test_the_default_sphere_smoothes_a_cubic_as_the_normal_does():
+    """Ball and normal have the same covariance then, so that the gradient is theta^2 + sigma^2 too."""
+    problem = Numpy().compile(compose(Cubic(dimension=2, sigma=0.4)))
+    angles = 2.0 * np.pi * (np.arange(64) + 0.5) / 64
+    noise = np.stack([np.cos(angles), np.sin(angles)], axis=1)[None]
+    found = SphereSmoothing().estimate(problem, problem.program.theta0, noise)[0]
+    assert found == pytest.approx(problem.program.theta0**2 + 0.4**2, rel=1e-10)
+
+
+@pytest.mark.parametrize("per", ["step", "control"])
+def test_total_propagation_by_hand(per):
+    """The two controls of a step are weighted together, or each by itself."""
+    problem = Numpy().compile(compose(TwoBalls(horizon=3, dt=0.1, sigma=2.0), Penalty(), SemiImplicitEuler()))
+    theta = problem.program.theta0
+    noise = np.random.default_rng(1).standard_normal((2, 7, theta.size))
+    found, said = TotalPropagation(per=per).explained(problem, theta, noise)
+    centre = problem.value(theta, np.zeros((theta.size, 1)))[0]
+    for r in range(2):
+        w = noise[r].T
+        first, zeroth = problem.grad(theta, w), (problem.value(theta, w) - centre) * w / problem.sigma
+        for i in range(theta.size):
+            mine = [i] if per == "control" else [i - i % 2, i - i % 2 + 1]
+            v1, v0 = (sum(np.var(terms[j], ddof=1) for j in mine) for terms in (first, zeroth))
+            weight = v0 / (v0 + v1)
+            assert said["weight"][r, i] == pytest.approx(weight, rel=1e-9)
+            assert found[r, i] == pytest.approx(weight * first[i].mean() + (1 - weight) * zeroth[i].mean(), rel=1e-9)

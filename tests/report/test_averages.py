@@ -69,3 +69,19 @@ def test_an_axis_that_is_not_swept_is_refused():
         loaded(*WORDS[:-1], "average=[theta]", "sweep.theta0=[0]")
     with pytest.raises(UserError, match="nothing is swept"):
         loaded(*WORDS)
+
+
+def test_an_average_over_starts_is_the_mean_error_that_a_claim_takes(tmp_path):
+    """C14 at five starts: a sweep with ``average``, and the claim's own gradients."""
+    from bench.claims.published.soft_wall import _mean_error
+
+    starts = [0.5, 0.504, 0.508, 0.512, 0.516]
+    words = [
+        "name=wall", "scenes=[wall_penalty_1d[dt=0.02,horizon=100]]", "contacts=[penalty]", "backends=[numpy]",
+        "estimators=[fobg]", "samples=8", "repeats=4", "timing=false", "workers=0", "reference.samples=256",
+        f"sweep.start={starts}".replace(" ", ""), "average=[start]", f"results_dir={tmp_path}",
+    ]  # fmt: skip
+    rows = run(words)
+    line = averages(loaded(*words)[0], rows).set_index("quantity").loc["model_error"]
+    # 1e-5: the claim has the exact slope with six digits
+    assert line["mean"] == pytest.approx(_mean_error(0.02, (np.array(starts) - 0.02) / 1.48), abs=1e-5)

@@ -1,9 +1,15 @@
-"""Kills runs at random moments and looks for what is lost: ``python tests/sweep/kill.py COUNT [SEED]``.
+"""Kills runs at random moments of every phase and looks for what is lost: ``python tests/sweep/kill.py COUNT [SEED]``.
 
-Each kill takes a victim (the run, a worker, the run's process group), a signal and a moment; the sweep goes on until it is
-whole and then starts afresh. Counted are kills that found their victim alive. Prints one line; status 1 for any loss.
+A round starts in an empty folder and goes through the phases of a run: its references, its cells, its tables, its page, and
+then a comparison with the sweep that nobody killed. In each it is killed a few times and started again. A kill takes a
+victim (the run, a child of it, its process group), a signal and a moment that is drawn within the phase, and counts if it
+found its victim alive; by the phase that the run was in then. Prints one line; status 1 for any loss.
 """
 
+from __future__ import annotations
+
+import itertools
+import json
 import os
 import random
 import shutil
@@ -12,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 
 import pandas as pd
@@ -21,19 +28,81 @@ from bench.studies.bias_variance.columns import COLUMNS
 from bench.sweep.files import TEMPORARY
 from bench.sweep.store import Store
 
-CELLS = 60
+KILLS = {"references": 4, "cells": 5, "tables": 2, "page": 3, "compare": 3}
+"""Kills of each phase in a round."""
+CELLS = 64
 WORDS = [
-    "scenes=[heaviside,soft_heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "repeats=4", "samples=2048",
-    "timing=false", "workers=2", "--quiet", "name=sweep", f"sweep.seed=[{','.join(map(str, range(CELLS // 4)))}]",
+    "scenes=[soft_heaviside,pushing]", "backends=[numpy]", "estimators=[fobg,reinforce]", "repeats=4", "samples=1024",
+    "timing=false", "workers=2", "--quiet", "name=sweep", "reference.samples=4096", "results_dir=.",
+    "sweep.sigma=[0.1,0.11,0.12,0.13]", "sweep.seed=[0,1,2,3]",
 ]  # fmt: skip
+START = """
+import os, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it in its background jobs
+signal.signal(signal.SIGTERM, signal.SIG_DFL)
+def mark(phase):
+    with open(os.environ["PHASES"], "a") as file:
+        file.write(f"{phase} {time.time()}\\n")
+def marked(owner, name, phase):
+    real = getattr(owner, name)
+    def call(*given, **more):
+        mark(phase)
+        return real(*given, **more)
+    setattr(owner, name, call)
+from bench import compare
+from bench.report import finish, web
+from bench.sweep import execute, runner
+answers = runner._Run._answers
+def told(self, tasks, pool):
+    if tasks:
+        mark("references" if tasks[0].reference else "cells")
+    return answers(self, tasks, pool)
+runner._Run._answers = told
+marked(execute, "_compact", "folding")
+marked(finish, "write", "tables")
+marked(web, "write", "page")
+marked(compare, "main", "compare")
+import runpy
+try:
+    runpy.run_module("bench", run_name="__main__")
+finally:
+    mark("end")
+"""
+"""The command, which notes when it comes to a phase and is else what it always is."""
 WHERE = ["stored_at", "sequence", "wall_s"]
 
 
-def start(folder: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "bench", *WORDS, f"results_dir={folder}"]
-    return subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True, cwd=folder
-    )
+class Run:
+    """A command in a folder, and the phase that it is in."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        self.folder, self._phases = folder, folder.with_name("phases.txt")
+        self._phases.write_text("")
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", START, *words], cwd=folder, env=os.environ | {"PHASES": str(self._phases)},
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        )  # fmt: skip
+
+    def phases(self) -> list[tuple[str, float]]:
+        """Return the phases that it came to, and when."""
+        lines = [line.split() for line in self._phases.read_text().splitlines()]
+        return [(line[0], float(line[1])) for line in lines if len(line) == 2]
+
+    def reaches(self, phase: str) -> bool:
+        """Wait for a phase; False if the command ends without it."""
+        while phase not in dict(self.phases()):
+            if self.process.poll() is not None:
+                return phase in dict(self.phases())
+            time.sleep(0.005)
+        return True
+
+    def end(self) -> str:
+        """Wait for its end; returns what it said."""
+        return self.process.communicate(timeout=600)[1]
+
+
+def words_of(phase: str) -> list[str]:
+    return ["compare", "sweep", "../whole/sweep"] if phase == "compare" else WORDS
 
 
 def left_in(folder: Path) -> list[psutil.Process]:
@@ -52,56 +121,131 @@ def rows_of(folder: Path) -> pd.DataFrame:
     return rows.drop(columns=WHERE).sort_values("key").reset_index(drop=True)
 
 
+def same(one: pd.DataFrame, other: pd.DataFrame) -> bool:
+    """Whether two tables hold the same to the last bit; columns without a value may be of any kind."""
+    if one.empty or other.empty:
+        return len(one) == len(other)
+    return set(one) == set(other) and all(one[name].astype(object).equals(other[name].astype(object)) for name in one)
+
+
+def broken(path: Path) -> bool:
+    """Whether a file is not the whole of one."""
+    ends = {".png": b"IEND\xaeB\x60\x82", ".html": b"</html>", ".csv": b"\n", ".md": b"\n"}
+    try:
+        content = path.read_bytes()
+        if path.suffix == ".json":
+            json.loads(content)
+        elif path.suffix == ".parquet":
+            pd.read_parquet(path)
+    except FileNotFoundError:
+        return False
+    except Exception:
+        return True
+    end = ends.get(path.suffix, b"")
+    return not (content.endswith(end) or content.rstrip().endswith(end))
+
+
+class Kills:
+    """Kills so many times and counts what went wrong."""
+
+    def __init__(self, place: Path, seed: int) -> None:
+        self.whole, self.cut, self.dice = place / "whole", place / "cut", random.Random(seed)
+        self.done: Counter[str] = Counter()
+        self.by: Counter[str] = Counter()
+        self.rounds = 0
+        names = ("lost", "changed", "orphans", "temporary", "half files", "tracebacks", "failed")
+        self.faults = dict.fromkeys(names, 0)
+        self.whole.mkdir()
+        self._lasts: dict[str, float] = {}
+        for phase in ("cells", "compare"):
+            run = Run(self.whole, *(["compare", "sweep", "sweep"] if phase == "compare" else WORDS))
+            said = run.end()
+            assert run.process.returncode == 0, said
+            came = run.phases()
+            self._lasts |= {one: end - start for (one, start), (_, end) in itertools.pairwise(came)}
+        self.truth = rows_of(self.whole)
+        assert len(self.truth) == CELLS
+
+    def fault(self, what: str, more: str) -> None:
+        """Count a fault and say what it was."""
+        self.faults[what] += 1
+        print(f"{what}: {more[-1500:]}", flush=True)
+
+    def round(self, count: int) -> None:
+        """Kill in every phase, then see that the sweep comes to what it is without."""
+        self.cut.mkdir()
+        for phase, times in KILLS.items():
+            for _ in range(times):
+                if self.done.total() < count:
+                    self.kill(phase)
+        for phase in ("cells", "compare"):  # folds, and tidies what a kill has left
+            run = Run(self.cut, *words_of(phase))
+            said = run.end()
+            if run.process.returncode not in (0, 1):
+                self.fault("failed", f"{phase} {run.process.returncode} {said}")
+        if not same(rows_of(self.cut), self.truth):
+            self.fault("changed", "the whole sweep is another")
+        for path in self.cut.rglob(".*"):
+            if TEMPORARY.fullmatch(path.name):
+                self.fault("temporary", str(path))
+        shutil.rmtree(self.cut)
+        self.rounds += 1
+
+    def kill(self, phase: str) -> None:
+        """Kill once, if the command comes to the phase."""
+        run = Run(self.cut, *words_of(phase))
+        if run.reaches(phase):
+            time.sleep(self.dice.uniform(0.0, 0.6 * self._lasts.get(phase, 0.5)))  # the next run has less to do
+        before, process = rows_of(self.cut), run.process
+        children = psutil.Process(process.pid).children() if process.poll() is None else []
+        victim = self.dice.choice(["run", "child", "group"] if children else ["run", "group"])
+        sent = self.dice.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGSTOP])
+        at, alive = (run.phases() or [("start", 0.0)])[-1][0], process.poll() is None
+        try:
+            if victim == "run":
+                process.send_signal(sent)
+            elif victim == "group":
+                os.killpg(process.pid, sent)
+            else:
+                self.dice.choice(children).send_signal(sent)
+        except (ProcessLookupError, psutil.Error):
+            alive = False
+        if sent == signal.SIGSTOP and victim != "child":
+            time.sleep(0.3)
+            process.kill()
+        said = run.end()
+        what = f"{sent.name} to {victim} in {at}"
+        if alive and at != "end":
+            self.done[at] += 1
+            self.by[f"{sent.name[3:]} {victim}"] += 1
+        if "Traceback" in said:
+            self.fault("tracebacks", f"{what}: {said}")
+        after = rows_of(self.cut)
+        lost = set(before["key"]) - set(after["key"])
+        if lost:
+            self.fault("lost", f"{what}: {len(lost)} rows")
+        if not same(self.truth[self.truth["key"].isin(after["key"])].reset_index(drop=True), after):
+            self.fault("changed", what)
+        until = time.monotonic() + 5.0
+        while left_in(self.cut) and time.monotonic() < until:
+            time.sleep(0.05)
+        for orphan in left_in(self.cut):
+            self.fault("orphans", f"{what}: {orphan}")
+        for path in self.cut.rglob("[!.]*"):
+            if path.is_file() and broken(path):
+                self.fault("half files", f"{what}: {path}")
+
+
 def main(count: int, seed: int) -> int:
-    dice, faults = random.Random(seed), {"lost": 0, "changed": 0, "orphans": 0, "temporary": 0, "tracebacks": 0}
     with tempfile.TemporaryDirectory() as place:
-        whole, cut = Path(place) / "whole", Path(place) / "cut"
-        whole.mkdir()
-        start(whole).communicate(timeout=300)
-        truth, kills, rounds = rows_of(whole), 0, 0
-        while kills < count:
-            cut.mkdir(exist_ok=True)
-            run = start(cut)
-            time.sleep(dice.uniform(0.5, 4.0))
-            before = rows_of(cut)
-            children = psutil.Process(run.pid).children() if run.poll() is None else []
-            victim = dice.choice(["run", "worker", "group"])
-            sent = dice.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGSTOP])
-            alive = run.poll() is None
-            try:
-                if victim == "run":
-                    run.send_signal(sent)
-                elif victim == "group":
-                    os.killpg(run.pid, sent)
-                elif children:
-                    dice.choice(children).send_signal(sent)
-            except (ProcessLookupError, psutil.Error):
-                alive = False
-            kills += alive
-            if sent == signal.SIGSTOP and victim != "worker":
-                time.sleep(0.3)
-                run.kill()
-            said = run.communicate(timeout=300)[1]
-            faults["tracebacks"] += "Traceback" in said
-            after = rows_of(cut)
-            faults["lost"] += len(set(before["key"]) - set(after["key"]))
-            both = truth.merge(after, on="key", suffixes=("", "_after"))
-            faults["changed"] += int(
-                (both["bias"] != both["bias_after"]).sum() + (both["status"] != both["status_after"]).sum()
-            )
-            for _ in range(100):
-                if not left_in(cut):
-                    break
-                time.sleep(0.05)
-            faults["orphans"] += len(left_in(cut))
-            if len(after) == CELLS:
-                rounds += 1
-                start(cut).communicate(timeout=300)  # folds, and tidies what a kill has left
-                faults["temporary"] += sum(bool(TEMPORARY.fullmatch(path.name)) for path in cut.rglob(".*"))
-                faults["changed"] += not rows_of(cut).equals(truth)
-                shutil.rmtree(cut)
-        print(f"{kills} kills, {rounds} whole sweeps: {faults}")
-    return 1 if any(faults.values()) else 0
+        kills = Kills(Path(place).resolve(), seed)
+        while kills.done.total() < count:
+            kills.round(count)
+            print(f"{kills.done.total()} kills", flush=True)
+        print(
+            f"{kills.done.total()} kills ({dict(kills.done)}; {dict(kills.by)}), {kills.rounds} rounds: {kills.faults}"
+        )
+        return 1 if any(kills.faults.values()) else 0
 
 
 if __name__ == "__main__":

@@ -330,6 +330,42 @@ def test_signals_stop_a_run_in_peace(tmp_path, sent, times):
     assert not Store(tmp_path / "custom", COLUMNS).load().empty
 
 
+MOVES = """
+import os
+from dataclasses import dataclass
+from bench.plugins.backends.numpy import Numpy
+
+@dataclass(frozen=True)
+class Moves(Numpy):
+    "Leaves the working folder, and a copy of the process, wherever it is asked."
+    name = "moves"
+    def __post_init__(self):
+        os.fork()
+    def refuses(self, *given):
+        os.chdir({elsewhere!r})
+        return super().refuses(*given)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_backend_asked_for_references_moves_and_doubles_nothing(tmp_path, workers):
+    for name in ("mine", "here", "elsewhere"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "mine" / "moves.py").write_text(MOVES.format(elsewhere=str(tmp_path / "elsewhere")))
+    words = ["scenes=[soft_heaviside]", *TINY[1:-2], f"workers={workers}", "reference.samples=4096", "results_dir=out"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, "-m", "bench", *words, f"plugins={tmp_path / 'mine'}", "estimators=[fobg]"],
+        cwd=tmp_path / "here", env=environment, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("Written:") == 1
+    assert (tmp_path / "here" / "out" / "custom" / "rows.parquet").exists()
+    assert list((tmp_path / "here" / "out" / "references").glob("*.parquet"))
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
 def test_two_studies_that_start_at_once_in_an_empty_folder_do_not_mix(tmp_path):
     first, second = (Store(tmp_path / "mine", COLUMNS, study) for study in ("bias_variance", "growth"))
     for store in (first, second):

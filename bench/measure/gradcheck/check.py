@@ -336,9 +336,17 @@ class _Checker:
     def _scanned(
         self, thetas: np.ndarray, vectors: np.ndarray, found: list[Sample], judged: list[Finding]
     ) -> list[Finding]:
-        """Look for staircases in the cost along the directions that are not plainly right."""
+        """Look for staircases in the cost along the directions that are not plainly right.
+
+        A derivative of exactly 0 is not where differences are not: it may be that of a tread.
+        """
         plain = ("smooth", "nonlinear", "mode_crossing", "zero", "nonfinite", "nondeterministic")
-        asked = [m for m, finding in enumerate(judged) if finding.verdict not in plain][: self.options.scanned]
+        asked = [
+            m
+            for m, (sample, finding) in enumerate(zip(found, judged, strict=True))
+            if finding.verdict not in plain
+            or (finding.verdict == "nonlinear" and sample.derivative == 0.0 and sample.differences.any())
+        ][: self.options.scanned]
         along = roughness.scans(1.0, self.unit)
         for m in asked:
             at = thetas[:, m : m + 1] + vectors[:, m : m + 1] * along.reshape(1, -1)
@@ -358,8 +366,7 @@ class _Checker:
         if GUARD * float(self.unit) * abs(sample.centre) >= tread:
             return finding
         coarse = judge(replace(sample, noise=max(sample.noise or 0.0, tread)))
-        right = coarse.verdict in TRUSTED and sample.derivative != 0.0
-        return replace(coarse, verdict="precision" if right else "staircase")
+        return replace(coarse, verdict="precision" if coarse.verdict in TRUSTED else "staircase")
 
     def _explained(
         self, parts: list[Part], draws: list[Part], around: np.ndarray, at_draws: list[np.ndarray]

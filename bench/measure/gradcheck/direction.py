@@ -175,8 +175,10 @@ def _judge(sample: Sample) -> Finding:
     # ten times the spread, since the best of many spreads is a lucky one
     tolerance = 10.0 * spread + float(noise[index]) + _resolution(sample, index) + sample.doubt
     apart = abs(float(sample.differences[index]) - sample.derivative)
-    resolved = uncertainty <= max(ALIKE * sample.size(index), GUARD * float(sample.rounding(sample.unit)[index]))
-    if apart <= tolerance and resolved:
+    alike, rounding = ALIKE * sample.size(index), GUARD * float(sample.rounding(sample.unit)[index])
+    resolved = uncertainty <= max(alike, rounding)
+    # a tolerance as wide as the derivative would pass half of it
+    if apart <= min(tolerance, alike + rounding + sample.doubt) and resolved:
         return _at(sample, _ends(sample, index, still), index, uncertainty)
     if sample.crossing[index]:
         return _at(sample, _sided(sample, noise), index, uncertainty)

@@ -83,4 +83,4 @@ def treads(values: np.ndarray, rounding: float) -> bool:
     if edge.all() or not edge.any() or change[edge].min() <= APART * change[~edge].max():
         return False
     apart = edge & ~np.r_[False, edge[:-1]] & ~np.r_[edge[1:], False]
-    return bool(apart.sum() >= EDGES and edge.sum() <= increments.size // 2 and apart.sum() >= 0.9 * edge.sum())
+    return bool(apart.sum() >= EDGES and apart.sum() >= 0.9 * edge.sum())

@@ -1,0 +1,66 @@
+"""A cart pushed against the wind: noise from outside, wider than theta."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.model import Array, ContactLaw, GustyScene, Plugin, State, param
+
+
+@dataclass(frozen=True)
+class GustyCart(GustyScene):
+    """A constant force theta (d = 1) pushes a cart from rest; a gust adds to it at every step; f = max(0, q_N - edge)^2.
+
+    q_N = c (theta + sigma u) + b . gust e, with b_i = dt^2 (N - i) / mass for semi-implicit and dt^2 (N - i - 1) / mass
+    for explicit Euler, and c the sum of b. So q_N is normal with mean m = c theta and variance s^2 = c^2 sigma^2 + gust^2
+    |b|^2, and grad J = 2 c s (z Phi(z) + phi(z)) at z = (m - edge) / s. Without gusts the cart hardly ever passes the edge
+    and the gradient is near 0: the reference has to average over them.
+    """
+
+    name = "gusty_cart"
+    leaves_out: ClassVar[str] = "friction, wind that lasts longer than a step"
+    n_q: ClassVar[int] = 1
+    n_u: ClassVar[int] = 1
+
+    sigma: float = param(0.05, "standard deviation of the noise on the force", "N", positive=True)
+    gust: float = param(2.0, "standard deviation of each step's gust", "N", low=0.0)
+    horizon: int = param(20, "number of time steps", "steps", positive=True)
+    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    mass: float = param(1.0, "mass of the cart", "kg", positive=True)
+    force: float = param(1.0, "force at theta", "N")
+    edge: float = param(0.75, "position beyond which the cart should not come", "m")
+
+    def theta0(self) -> np.ndarray:
+        """Return the force."""
+        return np.array([self.force])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Start at rest at 0."""
+        return State(0.0 * theta[:1], 0.0 * theta[:1])
+
+    def planned_controls(self, xp: Any, theta: Array) -> Array:
+        """Return the force at every step."""
+        return xp.broadcast_to(theta[None, :1], (self.horizon, 1, theta.shape[1]))
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return the force and the gust over the mass."""
+        return u / self.mass
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return the squared distance beyond the edge."""
+        return xp.maximum(q[0] - self.edge, 0.0 * q[0]) ** 2
+
+    def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray | None:
+        """Return 2 c s (z Phi(z) + phi(z)), or None for an integrator without a formula here."""
+        steps = {"semi_implicit_euler": 0, "explicit_euler": 1}
+        if integrator is None or integrator.name not in steps:
+            return None
+        b = self.dt**2 * (self.horizon - steps[integrator.name] - np.arange(self.horizon)) / self.mass
+        c = float(b.sum())
+        s = math.hypot(c * self.sigma, self.gust * float(np.linalg.norm(b)))
+        z = (c * self.force - self.edge) / s
+        below = 0.5 * math.erfc(-z / math.sqrt(2.0))
+        density = math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+        return np.array([2.0 * c * s * (z * below + density)])
