@@ -23,6 +23,7 @@ from bench.report.style import Look, plain, symbol
 from bench.report.views import CATEGORIES, Family, along, arranged, families, ran
 from bench.studies.bias_variance import fastest
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost, charged
+from bench.studies.bias_variance.course import FEWEST, course
 from bench.studies.bias_variance.fastest import SAMPLES
 from bench.studies.bias_variance.glance import glance
 from bench.studies.bias_variance.panels import bias_variance, overview, speed_accuracy
@@ -44,9 +45,9 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     return paths
 
 
-def file_name(axis: Axis) -> str:
+def file_name(axis: Axis, kind: str = "bias_variance") -> str:
     """Return the file name of the chart along an axis, without ending."""
-    return "bias_variance_" + re.sub(r"\W", "_", axis.column)
+    return f"{kind}_" + re.sub(r"\W", "_", axis.column)
 
 
 def along_longest(experiment: Experiment, rows: pd.DataFrame) -> list[str]:
@@ -75,6 +76,12 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
             drawings[file_name(axis)] = bias_variance(chosen, held + merged, look, axis, shown.marks(axis))
     nothing_swept = not drawings
     good = rows[rows["status"] == "ok"]
+    swept = shown.swept()
+    longest = max(swept, key=lambda axis: swept[axis], default=None)
+    if longest is not None and good["samples"].nunique() < 2 and good["time_s"].notna().any():
+        chosen, held = choose(problems(longest, lambda part: TIME.known(part)["x"].nunique() >= FEWEST))
+        if chosen:
+            drawings[file_name(longest, "time")] = course(chosen, held + merged, look, longest)
     if good["samples"].nunique() > 1 or good["backend"].nunique() > 1:
         for name, cost in (
             ("speed_accuracy", TIME_COMPILED if experiment.compile_time else TIME),
@@ -86,8 +93,7 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
             if chosen and (cost is not ROLLOUTS or good["samples"].nunique() > 1):
                 said, first = _said(chosen, cost)
                 drawings[name] = speed_accuracy(chosen, held + merged, look, cost, said, first)
-        swept = good["samples"].nunique() > 1
-        raced = problems(SAMPLES, lambda part: ran(part)["x"].nunique() > 1) if swept else []
+        raced = problems(SAMPLES, lambda part: ran(part)["x"].nunique() > 1) if good["samples"].nunique() > 1 else []
         if raced:
             costs = [TIME, ROLLOUTS] if good["time_s"].notna().any() else [ROLLOUTS]
             drawings["at_a_glance"] = glance(choose(raced, 2 * ROOM)[0], costs)

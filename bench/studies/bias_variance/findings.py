@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -10,12 +11,18 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from bench.report.text import axis_value
+from bench.report.text import axis_value, number
 from bench.report.views import Arranged, Family, Line, along, families, ran
 from bench.sweep.axes import Axis
 
 TIE = 1.1
 """Relative RMSEs within this factor of the lowest share the first place: R repeats do not resolve less."""
+
+
+FLAT = 1.5
+"""An axis along which no error changes by more than this factor is said to change none."""
+NAMED = 2
+"""Most problems that a title names one by one."""
 
 
 def problems(shown: Arranged) -> list[tuple[Axis | None, Family]]:
@@ -82,11 +89,22 @@ def headline(
     broken = [name for name in names if name not in (*sound, *useless)]
     families = [family for family, _ in parts]
     clauses = [f"{broken[0]} fails {_where(bad[broken[0]], families, axis, marks)}"] if broken else []
+    change = max((_change(line) for _, curves in parts for line in curves), default=math.inf)
+    flat = not broken and change < FLAT
+    if flat:
+        clauses.append(f"{axis.column} changes no error by more than a factor of {number(change)}")
     if useless and not broken:
         clauses.append(f"{' and '.join(useless[:2])} no better than zero")
-    if sound:
+    if sound and not flat:
         clauses.append(f"{' and '.join(sound[:2])} better than zero everywhere")
     return "; ".join(clauses) or f"No estimator is better than zero anywhere along {axis.column}"
+
+
+def _change(line: Line) -> float:
+    """Return the ratio of a line's largest to its smallest error; 1 where it has fewer than two."""
+    rows = line.rows[line.rows["status"] == "ok"]
+    errors = rows.loc[np.isfinite(rows["rmse_rel"]), "rmse_rel"]
+    return float(errors.max() / errors.min()) if len(errors) > 1 and errors.min() > 0 else 1.0
 
 
 def _failures(curves: Sequence[Line], name: str) -> dict[float, bool]:
@@ -99,16 +117,19 @@ def _failures(curves: Sequence[Line], name: str) -> dict[float, bool]:
     return dict(sorted(where.items()))
 
 
+def _spoken(where: str, axis: Axis) -> str:
+    """Write a :func:`span` as it is said: ``from stiffness 1e4``, ``everywhere``."""
+    sign = "from" if where.startswith(">=") else "up to" if where.startswith("<=") else "at"
+    return f"{sign} {axis.column} {where.removeprefix('at ').lstrip('<>=')}" if where else "everywhere"
+
+
 def _where(
     bad: Sequence[Mapping[float, bool]], families: Sequence[Family], axis: Axis, marks: Mapping[str, float]
 ) -> str:
     """Write where along an axis something fails, and in which of several problems."""
     failing = [i for i, where in enumerate(bad) if any(where.values())]
     spans = list(dict.fromkeys(span(bad[i]) for i in failing))
-    text = ""
-    if len(spans) == 1 and spans[0]:
-        sign = "from" if spans[0].startswith(">=") else "up to" if spans[0].startswith("<=") else "at"
-        text = f"{sign} {axis.column} {spans[0].removeprefix('at ').lstrip('<>=')}"
+    text = _spoken(spans[0], axis) if len(spans) == 1 and spans[0] else ""
     ends = [
         (max((x for x, b in bad[i].items() if not b), default=0.0), min(x for x, b in bad[i].items() if b))
         for i in failing
@@ -119,10 +140,12 @@ def _where(
     for key in ("scene", "contact", "integrator"):
         mine = {str(families[i].identity.get(key, "")) for i in failing}
         others = {str(f.identity.get(key, "")) for i, f in enumerate(families) if i not in failing and bad[i]}
-        if others and not mine & others:
+        if others and not mine & others and not {"", "none"} & (mine | others):
             return f"{text} with {' and '.join(sorted(mine))}, not with {' and '.join(sorted(others))}".strip()
+    ran = sum(map(bool, bad))
+    if not beyond and len(failing) < ran and len(failing) <= NAMED:
+        return " and ".join(f"{_spoken(span(bad[i]), axis)} on {families[i].title()}" for i in failing)
     if not text and len(spans) == 1:
         text = "everywhere"
-    ran = sum(map(bool, bad))
     where = "" if len(failing) == ran else f" in {len(failing)} of {ran} problems"
     return (text + where).strip() or "at some values"

@@ -9,14 +9,14 @@ import pandas as pd
 from bench.report.views import arranged
 from bench.report.web import anything
 from bench.report.web.content import Content, nothing_ran
-from bench.studies.identify.report import findings, flat, readable
+from bench.studies.identify.report import failing, findings, flat, readable
 from bench.sweep.experiment import Experiment
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the findings, a chart of any two numbers, and the table of fits."""
+    """Return what fails, a chart of any two numbers, and the table of fits."""
     made, shown = anything.content(experiment, rows), arranged(experiment, rows)
-    said = nothing_ran(rows) or "; ".join(sentence.rstrip(".").replace("; ", ", ") for sentence in findings(shown))
-    return replace(
-        made, finding=said, answers=readable(flat(shown)), answers_title="What the records tell, and how fits did"
-    )
+    lines = flat(shown)
+    sentences = failing(lines) if len(lines) else findings(shown)
+    said = nothing_ran(rows) or "; ".join(sentence.rstrip(".").replace("; ", ", ") for sentence in sentences)
+    return replace(made, finding=said, answers=readable(lines), answers_title="What the records tell, and how fits did")

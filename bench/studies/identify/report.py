@@ -97,28 +97,33 @@ def _interval(row: dict[str, float], name: str) -> str:
 
 
 def findings(shown: Arranged) -> list[str]:
-    """Say for each problem what its record tells and whether it holds for its step, and which intervals fail."""
+    """Say which fits and intervals fail; then for each problem what its record tells, and whether for its step only."""
     lines = flat(shown)
     if not len(lines):
         return ["No fit gave a result: the table has the reason of each."]
+    parts = lines.groupby("problem", sort=False).first()
+    return [*failing(lines), *(f"{name}: {one['words']}; {one['step_note']}." for name, one in parts.iterrows())]
+
+
+def failing(lines: pd.DataFrame) -> list[str]:
+    """Say which fits do not converge, which intervals cover too little, and how many hide what the record lacks."""
     said = []
-    for name, part in lines.groupby("problem", sort=False):
-        first = part.iloc[0]
-        said.append(f"{name}: {first['words']}; {first['step_note']}.")
+    lost = lines[lines["converged_high"] < 0.9]
+    if len(lost):
+        where = "; ".join(
+            f"{name} ({', '.join(f'{way} {number(share)}' for way, share in zip(part['shooting'], part['converged'], strict=True))})"
+            for name, part in lost.groupby("problem", sort=False)
+        )
+        said.append(
+            f"Fits fail in {counted(len(lost), 'case')} of {len(lines)}: their residuals are not the noise, since the model is "
+            f"wrong or the fit ended elsewhere. Share of fits that converged: {where}."
+        )
     short = lines[lines["coverage_high"] < 0.95]
     if len(short):
         worst = short.sort_values("coverage").iloc[0]
         said.append(
             f"Intervals cover too little in {counted(len(short), 'case')}; the worst is {worst['problem']} by {worst['shooting']}, "
             f"{number(worst['coverage'])} [{number(worst['coverage_low'])}, {number(worst['coverage_high'])}] instead of 0.95."
-        )
-    lost = lines[lines["converged_high"] < 0.9]
-    if len(lost):
-        where = ", ".join(
-            f"{row['problem']} by {row['shooting']} ({number(row['converged'])})" for row in lost.to_dict("records")
-        )
-        said.append(
-            f"Residuals are not the noise, since the model is wrong or the fit ended elsewhere (share of fits that converged): {where}."
         )
     hidden = int(lines["hidden"].sum())
     said.append(f"{hidden} of {int(lines['fits'].sum())} fits hide a direction that the record does not see.")
