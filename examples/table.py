@@ -10,10 +10,12 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import os
 import re
 import runpy
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,8 @@ PACKAGES = {
     "brax": "brax", "drake": "drake", "genesis": "genesis-world", "gymnasium": "gymnasium", "jax": "jax", "mujoco": "mujoco",
     "newton": "newton", "numpy": "numpy", "pydrake": "drake", "taichi": "taichi", "torch": "torch", "warp": "warp-lang",
 }  # fmt: skip
+ELSEWHERE = {"nimble_ball": ("nimblephysics", "NIMBLE_PYTHON", ".venv-nimble/bin/python")}
+"""Packages that live in a Python of their own: name, variable and default of that Python."""
 HEAD = (
     "what",
     "version",
@@ -49,6 +53,14 @@ MARK = "\x1eROWS "
 def imported(text: str) -> list[str]:
     """Return the modules that an example imports, by their first names."""
     return sorted(set(re.findall(r"^(?:import|from) (\w+)", text, re.MULTILINE)))
+
+
+def foreign(name: str) -> str:
+    """Return the package and version of an example whose engine has a Python of its own."""
+    package, variable, default = ELSEWHERE[name]
+    words = [os.environ.get(variable, default), "-m", "pip", "show", package]
+    shown = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    return f"{package} {re.search(r'^Version: (.*)$', shown, re.MULTILINE)[1]}"
 
 
 def row(report: Any, version: str) -> list[str]:
@@ -88,7 +100,7 @@ def record(path: Path) -> None:
     runpy.run_path(str(path), run_name="__main__")
     names = [name for name in imported(path.read_text()) if name in PACKAGES]
     first = sorted(names, key=lambda name: (name in ("numpy", "jax", "torch"), name))[:1]
-    version = ", ".join(f"{PACKAGES[name]} {metadata.version(PACKAGES[name])}" for name in first) or "in its own Python"
+    version = ", ".join(f"{PACKAGES[name]} {metadata.version(PACKAGES[name])}" for name in first) or foreign(path.stem)
     print(MARK + json.dumps([row(report, version) for report in found]), flush=True)
 
 
@@ -112,21 +124,30 @@ def rows(name: str) -> list[list[str]]:
     return json.loads(found.splitlines()[0])
 
 
+def as_text(table: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in table)
+
+
+def write(path: Path, table: Sequence[Sequence[str]]) -> None:
+    """Put the table into a page, in place of the one that it has, or into a file of its own."""
+    before, begin, rest = (path.read_text() if path.exists() else "").partition(BEGIN)
+    path.write_text(f"{before}{begin}{as_text(table)}{END}{rest.partition(END)[2]}" if begin else as_text(table))
+
+
 def main(words: list[str]) -> int:
     """Write the table of all examples, or of those named."""
     if words[:1] == ["--record"]:
         record(HERE / f"{words[1]}.py")
         return 0
-    out = [word for word in words if word.endswith(".md")]
-    names = [word for word in words if word not in out] or ORDER
+    out = [Path(word) for word in words if word.endswith(".md")]
+    names = [word for word in words if not word.endswith(".md")] or ORDER
     table = [HEAD, ["---"] * len(HEAD)]
     for name in names:
         table += rows(name)
-    text = "".join(f"| {' | '.join(cells)} |\n" for cells in table)
-    print(text)
-    for path in map(Path, out):
-        before, begin, rest = (path.read_text() if path.exists() else "").partition(BEGIN)
-        path.write_text(f"{before}{begin}{text}{END}{rest.partition(END)[2]}" if begin else text)
+        for path in out:  # after each example, so that what is done is kept
+            write(path, table)
+    print(as_text(table))
     return int(any("failed: " in cells[1] for cells in table))
 
 

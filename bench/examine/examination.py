@@ -247,12 +247,10 @@ class _Examination:
         for effort in EFFORTS[:-1]:
             chosen = min(effort.components, self.theta.size) + effort.directions
             calls = chosen * POINTS_EACH + effort.draws * effort.directions * POINTS_EACH // 2
-            # what a wrong gradient asks for besides: scans, and ratios at other thetas
-            calls += (
-                effort.scanned * SCAN
-                + min(effort.draws, 4) * min(effort.components, self.theta.size) * POINTS_EACH // 2
-            )
-            if calls * each + (effort.draws + 3) * slope < SHARES["check"] * self.clock.left:
+            # what a wrong gradient asks for besides: scans, ratios at other thetas, and a look at thetas farther away
+            calls += effort.scanned * SCAN + effort.draws * POINTS_EACH
+            calls += min(effort.draws, 4) * min(effort.components, self.theta.size) * POINTS_EACH // 2
+            if calls * each + (3 * effort.draws + 3) * slope < SHARES["check"] * self.clock.left:
                 break
         else:
             effort = EFFORTS[-1]

@@ -29,6 +29,8 @@ class Scene(Plugin):
     """Names of the backends that it runs on; empty for all whose array namespace its code is written for."""
     continuous: ClassVar[bool] = True
     """Whether the cost is continuous in theta (given a continuous contact law)."""
+    identifies: ClassVar[bool] = False
+    """Whether theta are parameters of the scene, to be found from a record that the cost compares it with."""
 
     sigma: float = param(0.1, "standard deviation of the Gaussian noise in J", positive=True)
     noise: str = param(

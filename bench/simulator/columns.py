@@ -22,6 +22,19 @@ CHUNK = 256
 """Columns of a batch that a cost takes at once without compiling."""
 
 
+def _kept(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of the user's that cannot end the process: a test that did would pass with status 0."""
+
+    def kept(*arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except SystemExit as error:
+            given = "" if error.code is None else error.code
+            raise RuntimeError(f"it ended the process by sys.exit({given})") from None
+
+    return kept
+
+
 class Simulator:
     """A cost f(theta) or f(theta, w) and perhaps its gradient, both in NumPy columns.
 
@@ -57,7 +70,7 @@ class Simulator:
         """What the gradient raised, empty where it never did."""
         self.precision = "float64"
         """Floating-point type of what the cost returns."""
-        self._cost, self._grad = cost, grad
+        self._cost, self._grad = _kept(cost), _kept(grad) if callable(grad) else grad
         self._shapes: set[Any] = set()
         self._single: Callable[..., Any] | None = None
         self._double = True
@@ -234,6 +247,8 @@ class Simulator:
         """Note the precision of a cost; raise :class:`UserError` for one that is no real number."""
         if found.dtype.kind == "c":
             raise UserError(f"the cost is complex ({found.dtype}): it has to be one real number")
+        if found.dtype.kind == "O" and found.size == 1 and found.ravel()[0] is None:
+            raise UserError("the cost returned nothing: does it end in return?")
         if found.dtype.kind not in "fiub" and str(found.dtype) != "bfloat16":
             raise UserError(f"the cost is of type {found.dtype}: it has to be one real number")
         if found.dtype.kind == "f" or str(found.dtype) == "bfloat16":

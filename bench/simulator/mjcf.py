@@ -94,9 +94,22 @@ class Mjcf:
 
     def _begun(self, data: Any, theta: Any) -> Any:
         self._mujoco.mj_resetData(self.model, data)
-        for name, value in self._start(self.model, data, theta).items():
+        for name, value in self._fields(data, theta).items():
             getattr(data, name)[:] = value
         return data
+
+    def _fields(self, data: Any, theta: Any) -> Mapping[str, Any]:
+        """Return the fields that ``start`` sets."""
+        found = self._start(self.model, data, theta)
+        if not isinstance(found, Mapping):
+            what = 'return {"qvel": theta}'
+            raise UserError(
+                f"start returned {found!r}: it returns fields of the data by name, such as {what}, and sets none"
+            )
+        for name in found:
+            if not hasattr(data, name):
+                raise unknown("field of the data", name, [one for one in dir(data) if not one.startswith("_")])
+        return found
 
     def _controlled(self, data: Any, theta: Any, t: int) -> None:
         if self._control is not None:
@@ -166,7 +179,7 @@ class _Mjx:
 
         def rollout(theta: Any) -> Any:
             data = _raised(mjx.make_data(model))
-            data = data.replace(**own._start(model, data, theta))
+            data = data.replace(**own._fields(data, theta))
 
             def step(data: Any, t: Any) -> Any:
                 if own._control is not None:

@@ -59,6 +59,11 @@ def load(place: str) -> ModuleType:
         sys.path.append(folder)
     try:
         spec.loader.exec_module(module)
+    except SystemExit:
+        del sys.modules[name]
+        raise UserError(
+            f"'{place}' ends the process when it is imported: put that under if __name__ == \"__main__\""
+        ) from None
     except Exception as error:
         del sys.modules[name]
         raise UserError(f"'{place}' cannot be imported: {failure(error)['reason']}") from None

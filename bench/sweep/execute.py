@@ -7,13 +7,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from bench.errors import StorageError
+from bench.errors import StorageError, UserError
 from bench.measure import timing
 from bench.sweep import progress, runner
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import tidy
 from bench.sweep.plan import Planned, plan
 from bench.sweep.store import Store
+from bench.sweep.study import study_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +40,15 @@ def store_of(experiment: Experiment) -> Store:
 def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     """Run the missing cells of an experiment and fold their rows into ``rows.parquet``.
 
-    Raises :class:`runner.Stopped` after a failed cell where the experiment says so, and KeyboardInterrupt when
-    interrupted; every cell finished by then is stored.
+    Raises :class:`runner.Stopped` after a failed cell where the experiment says so, KeyboardInterrupt when interrupted
+    (every cell finished by then is stored), and :class:`UserError` where the study refuses every cell.
     """
     started = time.time()
     # asked now, before the run itself loads the machine
     timing.load_at_start()
     store = store_of(experiment)
     planned = plan(experiment, store)
+    refuse_nothing(experiment, planned)
     progress.print_versions(planned, experiment.execution.versions)
     progress.print_machines(planned, experiment.execution.launcher)
     store.prepare()
@@ -58,6 +60,15 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
         finally:
             _compact(store, planned)
     return Finished(experiment, store, planned, time.time() - started)
+
+
+def refuse_nothing(experiment: Experiment, planned: Sequence[Planned]) -> None:
+    """Raise :class:`UserError` where the study refuses every cell: then it is the experiment that is wrong, not a cell."""
+    if any(item.refusal is None for item in planned):
+        return
+    reasons = dict.fromkeys(study_of(experiment).refuses(item.cell) for item in planned)
+    if reasons and None not in reasons:
+        raise UserError(f"no cell can be run: {'; '.join(map(str, reasons))}")
 
 
 def _compact(store: Store, planned: Sequence[Planned]) -> None:

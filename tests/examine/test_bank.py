@@ -5,9 +5,8 @@ import simulators
 
 SLOW = ("contact", "missing contact term", "missing damper")
 """Cases whose rollouts take long in Python; the quick tests have others of their kind."""
-UNNAMED = ("missing contact term", "last step forgotten", "noise reused shifted", "in-place clamp of data", "rounded")
-"""Faults that are caught and called by a wider or another name: `wrong_adjoint` or `wrong_factor`, and
-`unsettled` where the budget ends before a staircase is looked for."""
+UNNAMED = ("rounded",)
+"""A fault that is caught, and called `unsettled` where the budget ends before a staircase is looked for."""
 
 MISSED = "argmin of a grid"
 """Not caught: treads of 5e-6 on a smooth slope are 1% of the cost's change, which only warns."""

@@ -339,6 +339,8 @@ def mysim(tmp_path):
         "def named(p): return p['mass'] ** 2\n"
         "def right(x): return [2 * x[0] * x[1], x[0] ** 2]\n"
         "def wrong(x): return [2 * x[0] * x[1], -x[0] ** 2]\n"
+        "def leaves(x): raise SystemExit(0)\n"
+        "def nothing(x): pass\n"
     )
     return path
 
@@ -365,6 +367,10 @@ def test_command_gives_text_and_status(mysim, capsys, words, status, said):
         (["{}:cost", "thta=1"], "did you mean 'theta'"),
         (["{}:cost", "theta=1,x"], "has to be numbers"),
         ([], "name one cost"),
+        (["{}:leaves"], "it ended the process by sys.exit"),
+        (["{}:nothing"], "the cost returned nothing"),
+        (["{}:cost", "sigma=0"], "numbers above 0"),
+        (["{}:cost", "theta=1"], "index 1 is out of bounds"),
     ],
 )
 def test_command_says_what_is_wrong_with_its_words(mysim, capsys, words, said):
@@ -442,3 +448,24 @@ def test_python_number_from_torch_is_disconnected_in_double_precision():
     pytest.importorskip("torch")
     report = bench.examine(lambda x: (x**2).sum().item(), [1.0, 2.0], grad="torch", **QUICK)
     assert (report.status, report.cause) == (1, "disconnected")
+
+
+def test_gradient_that_ends_the_process_is_no_success(mysim, capsys):
+    assert cli.main(["examine", f"{mysim}:cost", "grad=leaves", "--quiet"]) == 1
+    assert "raised: the gradient could not be computed" in capsys.readouterr().out
+
+
+def test_cost_that_ends_the_process_beside_theta_is_not_trusted():
+    def leaves(x):
+        if x[0] > 1.0:
+            raise SystemExit(0)
+        return x[0] ** 2
+
+    assert bench.examine(leaves, [1.0], grad=lambda x: 2 * x, **QUICK).cause == "nonfinite"
+
+
+def test_file_that_ends_the_process_is_bad_input(tmp_path, capsys):
+    path = tmp_path / "script.py"
+    path.write_text("def cost(x): return x[0]\nraise SystemExit(0)\n")
+    assert cli.main(["examine", f"{path}:cost", "theta=1"]) == 2
+    assert "ends the process when it is imported" in capsys.readouterr().err

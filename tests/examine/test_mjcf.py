@@ -79,3 +79,13 @@ def test_mjx_gives_the_gradient_of_its_own_cube():
         np.testing.assert_allclose(toss.gradient(theta), differences, atol=1e-4 * np.abs(differences).max())
     finally:
         jax.config.update("jax_enable_x64", before)
+
+
+def test_start_that_sets_fields_itself_is_told_to_return_them():
+    def start(model, data, theta):
+        data.qvel[:] = theta
+
+    with pytest.raises(UserError, match="start returned None: it returns fields of the data by name"):
+        bench.Mjcf(CUBE, start, away, steps=1)(np.zeros(6))
+    with pytest.raises(UserError, match="did you mean 'qvel'"):
+        bench.Mjcf(CUBE, lambda model, data, theta: {"qvell": theta}, away, steps=1)(np.zeros(6))

@@ -63,6 +63,10 @@ FAULTS = {
     "sign of one component": ("wrong_factor", cost, lambda x: gradient(x) * [-1.0, 1.0, 1.0]),
     "coupling left out": ("missing_term", cost, lambda x: np.cos(x) + 0.2 * x),
     "term of one component left out": ("missing_term", cost, lambda x: gradient(x) - first(np.cos(x[0]))),
+    "little left out": ("missing_term", cost, lambda x: gradient(x) - 0.004 * np.cos(x) * [1.0, 0.7, 0.9]),
+    "term that acts only here": (
+        "missing_term", lambda x: cost(x) - 40.0 * np.maximum(0.6 - x[0], 0.0) ** 2 * (x[1] + 3.0 * x[2]), gradient
+    ),
     "wrong beside theta": ("missing_term", cost, lambda x: gradient(x) + 0.3 * (x - THETA)),
     "components in another order": ("wrong_adjoint", cost, lambda x: gradient(x)[[1, 2, 0]] * [-1.0, 3.0, 4.0]),
     "jump": ("jump", lambda x: cost(x) + 0.1 * (x[0] > 0.3), gradient),

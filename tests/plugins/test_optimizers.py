@@ -15,6 +15,7 @@ from bench.plugins.optimizers.lbfgs import Lbfgs
 from bench.plugins.optimizers.line_search import LineSearch
 from bench.plugins.optimizers.momentum import Momentum
 from bench.plugins.optimizers.mppi import Mppi
+from bench.plugins.optimizers.ppo import Ppo
 from scipy.stats import norm
 
 from bench.conformance import optimizers as kit
@@ -137,6 +138,35 @@ def test_mppi_at_a_high_temperature_is_a_gradient_step():
     assert after["theta"] == pytest.approx([1.0 - 0.09 / 100 * 10.0], abs=6 * 0.3 / math.sqrt(SAMPLES))
 
 
+def test_slope_of_ppo_is_that_of_its_loss():
+    """The clipped surrogate as written in the paper, differentiated by torch at a policy that has moved from the old one."""
+    torch = pytest.importorskip("torch")
+    rng = np.random.default_rng(0)
+    old, moved = (np.stack([rng.standard_normal(3), rng.uniform(-0.5, 0.5, 3)]) for _ in range(2))
+    points = old[0][:, None] + np.exp(old[1])[:, None] * rng.standard_normal((3, 50))
+    advantage = rng.standard_normal(50)
+    policy = torch.tensor(moved, requires_grad=True)
+    x, gain = torch.tensor(points), torch.tensor(advantage)
+    before, after = (
+        torch.distributions.Normal(p[0][:, None], torch.exp(p[1])[:, None]) for p in (torch.tensor(old), policy)
+    )
+    ratio = torch.exp(after.log_prob(x) - before.log_prob(x))
+    torch.minimum(ratio * gain, torch.clip(ratio, 0.8, 1.2) * gain).mean(dim=1).sum().backward()
+    assert (abs(ratio - 1) > 0.2).any()
+    assert (abs(ratio - 1) < 0.2).any()
+    assert Ppo().slope(moved, old, points, advantage) == pytest.approx(policy.grad.numpy(), rel=1e-10)
+
+
+def test_first_step_of_ppo_follows_the_zeroth_order_gradient():
+    """Nothing is clipped at the old policy: the slope by the mean is that of the mean cost, over its standard deviation."""
+    optimizer = Ppo(population=SAMPLES, width=0.3)
+    policy = optimizer.start(np.array([1.0, -2.0]))["policy"]
+    points = policy[0][:, None] + 0.3 * np.random.default_rng(0).standard_normal((2, SAMPLES))
+    slope = optimizer.slope(policy, policy, points, -(np.array([3.0, 1.0]) @ points))
+    # six standard errors of the mean of A z / deviation
+    assert slope[0] == pytest.approx([-3.0, -1.0], abs=6 * 4.0 / 0.3 / math.sqrt(SAMPLES))
+
+
 def test_noise_floor_of_gradient_descent():
     """E J - J* = a v / (2 (2 - a k)) on k theta^2 / 2 with gradient variance v: variance too sets the final cost."""
     rate, k, v, rng = 0.3, 2.0, 0.5, np.random.default_rng(3)
@@ -229,7 +259,7 @@ def test_gauss_newton_where_only_a_ratio_is_known():
 
 
 def test_nothing_finite_is_no_step():
-    for optimizer in (Cem(population=4, elites=2), Mppi(population=4), CmaEs(population=4)):
+    for optimizer in (Cem(population=4, elites=2), Mppi(population=4), CmaEs(population=4), Ppo(population=4)):
         state = optimizer.start(np.zeros(2))
         points = optimizer.ask(state, np.random.default_rng(0).standard_normal((2, 4)))
         after = optimizer.tell(state, points, Answer(value=np.full(4, np.nan)))

@@ -22,7 +22,7 @@ from bench.measure.solve import solve
 from bench.model import Problem, compose
 from bench.studies.optimise import races, report
 from bench.studies.optimise.abreast import side_by_side
-from bench.studies.optimise.measure import compared
+from bench.studies.optimise.measure import compared, scene_class
 from bench.sweep import config
 from bench.sweep.execute import store_of
 from bench.sweep.grid import cells
@@ -119,6 +119,34 @@ def test_newton_on_a_soft_push():
     assert solve(problem).cost == pytest.approx(1126.585263, rel=CHECKED)
 
 
+def test_valleys_of_a_record():
+    """Frequencies D apart differ by 1 - sin(DT) / (DT): downhill is towards the record until D = 4.4934 / T, then away from it."""
+    problem = bench.problem("spring_record[stiffness=100,damping=0,dt=0.01,horizon=1200]", backend="numpy")
+    ways = np.array([0.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0])  # D T, with T = 12
+    theta = np.stack([(10.0 + ways / 12.0) ** 2, 0.0 * ways])
+    costs = problem.value(theta, np.zeros((2, ways.size)))
+    assert costs[0] == 0.0
+    # apart from terms at twice the frequency, whose mean is below 1 / (10 T), and (dt omega)^2 / 24 in the frequencies
+    assert costs == pytest.approx(1 - np.sinc(ways / np.pi), abs=0.02)
+    assert (np.diff(costs[:4]) > 0).all()
+    assert (np.diff(costs[4:]) < 0).all()
+    assert problem.program.scene.optimum(None, ExplicitEuler())[0] == 0.0
+
+
+def test_classes_of_problems():
+    def class_of(*words):
+        made = config.load(["study=optimise", "backends=[numpy]", "estimators=[fobg]", "optimizers=[adam]", *words])
+        (cell,) = cells(made)
+        return scene_class(cell, Session(made).problem(cell))
+
+    assert class_of("scenes=[spring_record[horizon=4]]") == "identification"
+    assert class_of("scenes=[quadratic]", "theta=[condition]") == "identification"
+    assert class_of("scenes=[quadratic]") == "smooth"
+    assert class_of("scenes=[heaviside]") == "discontinuous"
+    assert class_of("scenes=[bouncing_ball[horizon=4]]", "contacts=[penalty]") == "stiff"
+    assert class_of("scenes=[bouncing_ball[horizon=4]]", "contacts=[impulse]") == "discontinuous"
+
+
 def test_a_cost_without_lower_bound_has_no_optimum():
     found = solve(bench.problem("linear", backend="numpy"), steps=2)
     assert not found.certified
@@ -132,6 +160,9 @@ WORDS = [
     "estimators=[fobg,reinforce]", "optimizers=[gradient_descent,cem[population=20,elites=5]]", "sweep.rate=[0.01,0.1]",
     "sweep.seed=[0,1]", "samples=8", "repeats=4", "workers=0",
 ]  # fmt: skip
+
+
+BARE = ["name=none", "scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "optimizers=[adam]", "workers=0"]
 
 
 @pytest.fixture(scope="module")
@@ -302,6 +333,21 @@ class CostOnly(Estimator):
         """No."""
         raise NotImplementedError
 '''
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["study=optimise", "optimizers=[gauss_newton]"], "gauss_newton needs jacobian and residual"),
+        (["study=optimise[target=10]", "scenes=[lqr]"], "target=10 is below the least cost 10.98868364 of scene lqr"),
+        (["study=identify", "optimizers=[gauss_newton]"], "scene quadratic is a plain function"),
+    ],
+)
+def test_an_experiment_of_which_nothing_can_run_is_bad_input(words, message, tmp_path, capsys):
+    assert main([*BARE, *words, f"results_dir={tmp_path}"]) == 2
+    assert "no cell can be run: " in (said := capsys.readouterr().err)
+    assert message in said
+    assert not list(tmp_path.rglob("*.csv"))
 
 
 @pytest.mark.parametrize(

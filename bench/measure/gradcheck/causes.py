@@ -2,28 +2,44 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 CONSTANT = 1e-3
-"""Relative spread within which a ratio counts as constant."""
+"""Spread within which a ratio counts as constant, relative to the smaller of itself and its distance from 1."""
 MOSTLY = 0.8
 """Share of ratios that may decide for all."""
+KNOWN = 10.0
+"""Errors of a difference by which its ratio may be off."""
 ENOUGH = 3
 """Ratios without which none counts as constant."""
 
 
-def of_ratios(components: dict[int, list[float]], directions: list[float], some_right: bool) -> dict[int | None, str]:
+@dataclass(frozen=True)
+class Ratio:
+    """A derivative of the program over its difference, and the error that the difference leaves it."""
+
+    value: float
+    error: float
+
+
+def of_ratios(
+    components: dict[int, list[Ratio]], directions: list[Ratio], some_right: bool, right_elsewhere: bool = False
+) -> dict[int | None, str]:
     """Return the cause of each wrong component, and under None that of wrong directions.
 
     ``components`` are the ratios of each wrong component to its difference at several thetas, ``directions`` those of
-    the random directions that are wrong, and ``some_right`` says whether other components are right.
+    the random directions that are wrong. ``some_right`` says whether other components are right, ``right_elsewhere``
+    whether the whole gradient is at other thetas.
 
     - ``wrong_factor``: the ratio is the same at all thetas.
-    - ``missing_term``: it changes, while other components are right, or while it lies between 0 and 2: the gradient has
-      part of the derivative.
+    - ``missing_term``: it changes, while other components are right, or the gradient is right where the term does not
+      act, or while the ratio lies between 0 and 2: the gradient has part of the derivative.
     - ``wrong_adjoint``: neither, or too few ratios to say.
     """
     causes: dict[int | None, str] = {}
+    some_right = some_right or right_elsewhere
     for component, ratios in components.items():
         causes[component] = _of(ratios, some_right)
     every = [ratio for ratios in components.values() for ratio in ratios]
@@ -37,19 +53,27 @@ def of_ratios(components: dict[int, list[float]], directions: list[float], some_
     return causes
 
 
-def _of(ratios: list[float], some_right: bool) -> str:
+def _of(ratios: list[Ratio], some_right: bool) -> str:
     if _constant(ratios):
         return "wrong_factor"
-    if len(ratios) < ENOUGH or not np.isfinite(ratios).all():
+    values = [ratio.value for ratio in ratios]
+    if len(values) < ENOUGH or not np.isfinite(values).all():
         return "wrong_adjoint"
-    partly = np.mean([0.0 < ratio < 2.0 for ratio in ratios]) >= MOSTLY
+    partly = np.mean([0.0 < value < 2.0 for value in values]) >= MOSTLY
     return "missing_term" if some_right or partly else "wrong_adjoint"
 
 
-def _constant(ratios: list[float]) -> bool:
-    """Return whether there are enough ratios and all are the same, up to one in five that a kink or noise may spoil."""
-    if len(ratios) < ENOUGH or not np.isfinite(ratios).all():
+def _constant(ratios: list[Ratio]) -> bool:
+    """Return whether there are enough ratios and all are the same, up to one in five that a kink or noise may spoil.
+
+    A gradient that misses a little has ratios near 1 everywhere: they have to agree by far better than they differ from
+    1, or as well as the differences are known.
+    """
+    values, errors = np.array([ratio.value for ratio in ratios]), np.array([ratio.error for ratio in ratios])
+    if len(ratios) < ENOUGH or not np.isfinite(values).all():
         return False
-    middle = float(np.median(ratios))
-    near = np.abs(np.array(ratios) - middle) <= CONSTANT * abs(middle)
+    middle = float(np.median(values))
+    apart = CONSTANT * min(abs(middle), abs(middle - 1.0))
+    allowed = np.clip(KNOWN * errors, apart, CONSTANT * abs(middle))
+    near = np.abs(values - middle) <= allowed
     return bool(near.mean() >= MOSTLY and abs(middle) > 0.0)

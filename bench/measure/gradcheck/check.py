@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from . import roughness
-from .causes import of_ratios
+from .causes import Ratio, of_ratios
 from .direction import EPS, GUARD, Finding, Sample, judge
 from .sampling import order, points, samples
 from .verdicts import FAULTS, MEANING, TRUSTED, worst
@@ -26,6 +26,10 @@ SUSPICIOUS = 4
 """Directions at most that are scanned for a staircase."""
 ELSEWHERE = 4
 """Other thetas at which a wrong component's ratio is taken."""
+FAR = (1.0, 3.0)
+"""Standard deviations, in units of each input's scale, of thetas at which a term may not act, as a contact in flight."""
+PLAINLY = ("smooth", "nonlinear", "mode_crossing")
+"""Verdicts by which a gradient counts as right at such a theta."""
 
 
 @dataclass(frozen=True)
@@ -376,7 +380,7 @@ class _Checker:
         if still and at_draws[0].any() and not here:
             return parts, [_named(part, "stale_gradient", ("wrong_adjoint",)) for part in draws]
         guilty = [part.component for part in parts if any(part is one for one in wrong) and part.component is not None]
-        ratios = {i: [part.ratio for part in parts if part.component == i] for i in guilty}
+        ratios = {i: [_ratio(part) for part in parts if part.component == i] for i in guilty}
         count, few = len(guilty), min(len(at_draws), ELSEWHERE)
         again = self._parts(
             np.repeat(around[:, :few], count, axis=1),
@@ -390,12 +394,39 @@ class _Checker:
         )
         for part in again:
             if part.component is not None and part.verdict in ("wrong_adjoint", *TRUSTED):
-                ratios[part.component].append(part.ratio)
+                ratios[part.component].append(_ratio(part))
         whole = [part for part in (*parts, *draws) if part.component is None and part.verdict == "wrong_adjoint"]
         right = any(part.verdict in TRUSTED and part.verdict != "zero" for part in parts if part.component is not None)
-        cause = of_ratios(ratios, [part.ratio for part in whole], right)
+        along = [_ratio(part) for part in whole]
+        cause = of_ratios(ratios, along, right)
+        if "wrong_adjoint" in cause.values() and self._right_far_away():
+            cause = of_ratios(ratios, along, right, right_elsewhere=True)
         renamed = [_named(part, cause.get(part.component, cause[None]), ("wrong_adjoint",)) for part in parts]
         return renamed, [_named(part, cause[None], ("wrong_adjoint",)) for part in draws]
+
+    def _right_far_away(self) -> bool:
+        """Return whether the gradient is right at some theta farther away, so that what it misses acts only near this one.
+
+        Two random directions have to agree there, since one may by chance. A slope of exactly 0 says nothing.
+        """
+        count = self.options.draws
+        away = np.repeat(FAR, count) * self.scale[:, None]
+        thetas = self.theta[:, None] + away * self.random.standard_normal((self.theta.size, len(FAR) * count))
+        gradients = np.stack([np.zeros(self.theta.size), *(self.gradient(theta) for theta in thetas.T)], axis=1)[:, 1:]
+        for _ in range(2):
+            vectors = self.scale[:, None] * self.random.standard_normal(thetas.shape)
+            names, none = [""] * thetas.shape[1], [None] * thetas.shape[1]
+            doubt = np.zeros(self.theta.size)
+            parts = self._parts(thetas, gradients, vectors, np.ones(len(names)), names, none, doubt, twice=False)
+            right = [k for k, part in enumerate(parts) if part.verdict in PLAINLY and part.program != 0.0]
+            thetas, gradients = thetas[:, right], gradients[:, right]
+        return thetas.shape[1] > 0
+
+
+def _ratio(part: Part) -> Ratio:
+    """Return a part's ratio, and the error that the difference leaves it."""
+    size = abs(part.difference)
+    return Ratio(part.ratio, abs(part.ratio) * part.uncertainty / size if size > 0.0 else 0.0)
 
 
 def _part(

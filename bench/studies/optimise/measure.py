@@ -267,7 +267,7 @@ def scene_class(cell: Cell, problem: Problem) -> str:
     Where gradients vary more than zeroth-order terms do, a problem with dynamics is chaotic, a function stiff.
     """
     program = problem.program
-    if cell.decision.names:
+    if cell.decision.names or cell.scene.identifies:
         return "identification"
     if not program.continuous:
         return "discontinuous"

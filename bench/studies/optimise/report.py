@@ -32,7 +32,8 @@ NOTES = (
     "share of targets reached within 1 to 4 times the best method's runtime. aRT: average runtime in rollouts (a gradient "
     "counts as many as it takes the time of): all that the searches spent, over the number that arrived; inf if none did. "
     "Each method is shown at its best tuning on each problem, chosen by median final cost of {seeds}; the median "
-    "score over all its tunings stands beside it, and their number is what the tuning cost.",
+    "score over all its tunings stands beside it, and their number is what the tuning cost. Methods that look at costs only "
+    "(dashed in charts) are context: no gradient is judged by them.",
 )
 
 ACROSS = 4
@@ -157,10 +158,11 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
 
 
 def looks(found: Races) -> dict[str, dict[str, Any]]:
-    """Return a colour, marker and line style for each method."""
+    """Return a colour, marker and line style for each method; those that look at costs only, the context, are dashed."""
+    costs_only = {method for method in found.methods if ", " not in method}
     return {
         method: {
-            "color": colour(i), "marker": MARKERS[i % len(MARKERS)], "linestyle": VARIANTS[(i // len(PALETTE)) % len(VARIANTS)]
+            "color": colour(i), "marker": MARKERS[i % len(MARKERS)], "linestyle": "--" if method in costs_only else VARIANTS[(i // len(PALETTE)) % len(VARIANTS)]
         }
         for i, method in enumerate(found.methods)
     }  # fmt: skip
@@ -191,17 +193,19 @@ def quality_figure(found: Races, default: float) -> Figure | None:
     if points.empty:
         return None
     rho = races.correlations(points).set_index("scene_class")
+    styles = {name: style for name, style in looks(found).items() if name in set(points["method"])}
+    marked = points["problem"] if points["problem"].nunique() <= len(MARKERS) else points["problem"].map(_scene)
+    marks = {mark: MARKERS[i % len(MARKERS)] for i, mark in enumerate(dict.fromkeys(marked))}
+    points = points.assign(mark=marked)
     groups = list(points.groupby("scene_class", sort=False))
     drawn, panels = _grid(len(groups), 3, 2.3, "Does the better gradient arrive sooner?")
-    styles = {name: style for name, style in looks(found).items() if name in set(points["method"])}
-    marks = {problem: MARKERS[i % len(MARKERS)] for i, problem in enumerate(dict.fromkeys(points["problem"]))}
     for panel, (name, part) in zip(panels, groups, strict=True):
         reached = part[np.isfinite(part["art"])]
         missed = part[~np.isfinite(part["art"])]
         # a search that never arrives is drawn at the upper edge, hollow
         top = 3.0 * max([*reached["art"], *missed["most"], 1.0])
         for row in part.to_dict("records"):
-            style = {**styles[row["method"]], "marker": marks[row["problem"]], "linestyle": "none"}
+            style = {**styles[row["method"]], "marker": marks[row["mark"]], "linestyle": "none"}
             arrived = math.isfinite(row["art"])
             panel.plot(
                 [max(row["rmse_rel"], 1e-6)], [max(row["art"], 1.0) if arrived else top], label=plain(row["method"]),
@@ -221,8 +225,8 @@ def quality_figure(found: Races, default: float) -> Figure | None:
         panel.set_xlabel("relative error of a gradient, at the start")
         panel.set_ylabel("aRT to regret/10 [rollouts]")
     shapes = tuple(
-        Line2D([], [], label=plain(problem), color="#808080", marker=mark, linestyle="none")
-        for problem, mark in marks.items()
+        Line2D([], [], label=plain(name), color="#808080", marker=mark, linestyle="none")
+        for name, mark in marks.items()
     )
     hollow = Line2D(
         [], [], label="never arrived", color="#808080", marker="o", markerfacecolor="#ffffff", linestyle="none"
@@ -307,6 +311,11 @@ def anytime_figure(found: Races, default: float) -> Figure:
         line[0].set_ylabel("J - J*")
     _legend(drawn, {name: {**style, "marker": ""} for name, style in styles.items()})
     return drawn
+
+
+def _scene(problem: str) -> str:
+    """Return the scene's bare name, for charts of more problems than there are markers."""
+    return problem.partition(",")[0].partition("[")[0]
 
 
 def _wrapped(name: str) -> str:

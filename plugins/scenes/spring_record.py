@@ -1,0 +1,61 @@
+"""A spring and a damper fitted to a record of their motion: a cost with many valleys, more of them in longer records."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.model import Array, ContactLaw, KnownOptimum, MechanicalScene, Plugin, State, param
+
+
+@dataclass(frozen=True)
+class SpringRecord(KnownOptimum, MechanicalScene):
+    """x'' = -k x - c x' from rest at 1; theta = (k, c) is to be found; f = mean of (x - record)^2 over the steps.
+
+    The record is the same motion with ``stiffness`` and ``damping`` in the same steps, so that J* = 0: it is q[1], beside x
+    in q[0]. theta starts with ``guess`` times the stiffness and no damping. Without damping two frequencies D apart differ
+    by 1 - sin(DT) / (DT) on average over a record of length T: from further apart than D = 4.4934 / T a descent ends in a
+    false valley.
+    """
+
+    name = "spring_record"
+    leaves_out = "noise in the record, an unknown mass or start (a record tells k/m and c/m only)"
+    identifies: ClassVar[bool] = True
+    n_q: ClassVar[int] = 2
+    n_u: ClassVar[int] = 2
+
+    sigma: float = param(0.1, "standard deviation of the noise on k and c", "1/s^2 and 1/s", positive=True)
+    horizon: int = param(100, "number of time steps", "steps", positive=True)
+    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    stiffness: float = param(4.0, "k of the record", "1/s^2", positive=True)
+    damping: float = param(0.2, "c of the record", "1/s", low=0.0)
+    guess: float = param(1.3, "k at theta over that of the record", positive=True)
+
+    def theta0(self) -> np.ndarray:
+        """Return the guessed stiffness and no damping."""
+        return np.array([self.guess * self.stiffness, 0.0])
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Start both motions at rest at 1."""
+        zero = 0.0 * theta[:2]
+        return State(zero + 1.0, zero)
+
+    def planned_controls(self, xp: Any, theta: Array) -> Array:
+        """Return theta for each step."""
+        return xp.zeros((self.horizon, 1, 1), dtype=theta.dtype) + theta
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return spring and damper of theta, then those of the record."""
+        return xp.stack([-u[0] * q[0] - u[1] * v[0], -self.stiffness * q[1] - self.damping * v[1]])
+
+    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return the step's share of the mean squared distance."""
+        return (q[0] - q[1]) ** 2 / self.horizon
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return nothing: the end is no more than the steps before it."""
+        return 0.0 * q[0]
+
+    def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str]:
+        """Return 0, whatever the integrator."""
+        return 0.0, "the record's own parameters"
