@@ -396,21 +396,31 @@ function pointFigure(chart, panel, range) {
     annotations.push({ x: chart.xAxis.log ? Math.log10(value) : value, yref: "paper", y: 1, yanchor: "bottom",
       text: plotted(name), showarrow: false, font: { size: 10 } });
   }
-  annotations.push(...backendNames(chart, panel, joined));
+  annotations.push(...backendNames(chart, panel, joined, range));
   return [traces, { ...frame(chart.xAxis, chart.yAxis, range), shapes, annotations }];
 }
 
-/* Colour and symbol are the estimator, so a backend is told by its name: beside points, or at the ends of those lines of
-   one estimator that differ by more than can be seen. */
-function backendNames(chart, panel, joined) {
+/* Colour and symbol are the estimator, so a backend is told by its name: beside points, or where those lines of one
+   estimator are farthest apart that differ by more than can be seen. Names that would overlap share a place. */
+function backendNames(chart, panel, joined, range) {
   const read = reader("rows", "backend");
-  const all = [...panel.lines.values()].map((points) => (joined ? points.slice(-1) : points)).flat();
-  if (new Set(all.map((p) => read(p.row))).size < 2) return [];
-  const differs = (p) => all.some((q) => q.series === p.series && Math.abs(q.y - p.y) > 0.03 * Math.abs(p.y));
-  return all.filter((p) => !joined || differs(p)).map((p) => ({
-    x: chart.xAxis.log ? Math.log10(p.x) : p.x, y: chart.yAxis.log ? Math.log10(p.y) : p.y, xanchor: "left", xshift: 4,
-    yanchor: "bottom", showarrow: false, text: plotted(read(p.row)), font: { size: 9, color: colour(p.series) },
-  }));
+  const every = [...panel.lines.values()].flat();
+  if (new Set(every.map((p) => read(p.row))).size < 2) return [];
+  const apart = (p) => Math.max(1, ...every.filter((q) => q.series === p.series && q.x === p.x)
+    .map((q) => Math.max(q.y / p.y, p.y / q.y)));
+  const farthest = (points) => points.reduce((best, p) => (apart(p) > apart(best) ? p : best));
+  const told = joined ? [...panel.lines.values()].map(farthest).filter((p) => apart(p) > 1.03) : every;
+  const scaled = (value, axis) => (axis.log ? Math.log10(value) : value);
+  const near = (a, b, [low, high], share) => Math.abs(a - b) < share * (high - low);
+  const names = [];
+  for (const p of told.sort((one, other) => one.x - other.x)) {
+    const [x, y, name] = [scaled(p.x, chart.xAxis), scaled(p.y, chart.yAxis), read(p.row)];
+    const place = names.find((one) => near(one.x, x, range.x, 0.12) && near(one.y, y, range.y, 0.07));
+    if (place) place.told.add(name);
+    else names.push({ x, y, told: new Set([name]), color: colour(p.series) });
+  }
+  return names.map(({ x, y, told: here, color }) => ({ x, y, xanchor: "left", xshift: 4, yanchor: "bottom",
+    showarrow: false, text: plotted([...here].join(", ")), font: { size: 9, color } }));
 }
 
 function trace(chart, points, joined) {
