@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.measure.gradcheck import EPS, TRUSTED, Sample, check, judge, roughness
-from bench.measure.gradcheck.causes import of_ratios
+from bench.measure.gradcheck.causes import Ratio, of_ratios
 
 SLOPE = 2.0
 WIDE = np.logspace(-2, -5, 7)
@@ -76,9 +76,10 @@ def test_wide_differences_that_smaller_steps_contradict_are_not_believed():
 
 
 def test_a_part_of_the_derivative_is_a_missing_term():
-    assert of_ratios({0: [0.5, 0.7, 0.9, 1.2]}, [], some_right=False)[0] == "missing_term"
-    assert of_ratios({0: [-3.0, 5.0, 2.5, -0.2]}, [], some_right=False)[0] == "wrong_adjoint"
-    assert of_ratios({0: [-3.0, 5.0, 2.5, -0.2]}, [], some_right=True)[0] == "missing_term"
+    partly, beyond = ([Ratio(v, 1e-9) for v in values] for values in ([0.5, 0.7, 0.9, 1.2], [-3.0, 5.0, 2.5, -0.2]))
+    assert of_ratios({0: partly}, [], some_right=False)[0] == "missing_term"
+    assert of_ratios({0: beyond}, [], some_right=False)[0] == "wrong_adjoint"
+    assert of_ratios({0: beyond}, [], some_right=True)[0] == "missing_term"
 
 
 def test_noise_is_the_standard_deviation_of_independent_normal_numbers():
