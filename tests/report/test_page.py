@@ -270,6 +270,42 @@ def test_status_reason_and_time_are_in_sight_on_a_laptop(browser, tmp_path):
     browser.size(*WIDE)
 
 
+def test_print_fills_the_page_with_charts_and_tables_that_fit_it(browser, tmp_path):
+    """What is wider than A4 between its margins would make a browser print everything smaller."""
+    path = tmp_path / "report.html"
+    path.write_text(page(stiffness_rows()))
+    browser.size(718, 1000)
+    browser.open(path)
+    browser.send("Emulation.setEmulatedMedia", media="print")
+    browser.do("dispatchEvent(new Event('beforeprint'))")
+    assert browser.do("document.documentElement.scrollWidth") <= 718
+    widths = "[...document.querySelectorAll('.plot')].map((p) => p.querySelector('.main-svg').getBoundingClientRect().width - p.clientWidth)"
+    assert max(map(abs, browser.do(widths))) <= 2
+    right = "Math.max(...[...document.querySelectorAll('.panels > div')].map((p) => p.getBoundingClientRect().right))"
+    assert browser.do(right) > 0.9 * 680
+    assert browser.send("Page.printToPDF", paperWidth=8.27, paperHeight=11.69)["data"]
+    browser.do("dispatchEvent(new Event('afterprint'))")
+    browser.send("Emulation.setEmulatedMedia", media="")
+    browser.size(*WIDE)
+    assert browser.said == []
+
+
+def test_backends_are_told_apart_by_name(browser, tmp_path):
+    """Beside points stands their backend; at the ends of lines only where an estimator's backends differ."""
+    rows = pd.concat(
+        [table([row(stiffness=k, backend=name, estimator=estimator, rmse_rel=error, bias=error, bias_low=error / 2, bias_high=2 * error, time_s=time) for k in (1.0, 10.0)])
+         for estimator, name, error, time in (("fobg", "one", 0.1, 1e-3), ("fobg", "two", 5.0, 2e-3), ("reinforce", "one", 0.5, 3e-3), ("reinforce", "two", 0.5, 4e-3))],
+        ignore_index=True,
+    )  # fmt: skip
+    path = tmp_path / "report.html"
+    path.write_text(page(rows, sweep={"stiffness": [1.0, 10.0]}, marks={}))
+    browser.open(path)
+    names = "[...charts[%d].panels.querySelectorAll('.plot')].map((p) => p.layout.annotations.map((a) => a.text).filter((t) => /one|two/.test(t)).sort())"
+    assert browser.do(names % 0) == [["one", "one", "two", "two"]] * 2
+    assert browser.do(names % 1) == [["one", "two"]]
+    assert browser.said == []
+
+
 def test_charts_are_drawn_and_a_filter_takes_points_away(shown):
     rows = small_rows()
     before = shown.do(MARKS)

@@ -396,7 +396,31 @@ function pointFigure(chart, panel, range) {
     annotations.push({ x: chart.xAxis.log ? Math.log10(value) : value, yref: "paper", y: 1, yanchor: "bottom",
       text: plotted(name), showarrow: false, font: { size: 10 } });
   }
+  annotations.push(...backendNames(chart, panel, joined, range));
   return [traces, { ...frame(chart.xAxis, chart.yAxis, range), shapes, annotations }];
+}
+
+/* Colour and symbol are the estimator, so a backend is told by its name: beside points, or where those lines of one
+   estimator are farthest apart that differ by more than can be seen. Names that would overlap share a place. */
+function backendNames(chart, panel, joined, range) {
+  const read = reader("rows", "backend");
+  const every = [...panel.lines.values()].flat();
+  if (new Set(every.map((p) => read(p.row))).size < 2) return [];
+  const apart = (p) => Math.max(1, ...every.filter((q) => q.series === p.series && q.x === p.x)
+    .map((q) => Math.max(q.y / p.y, p.y / q.y)));
+  const farthest = (points) => points.reduce((best, p) => (apart(p) > apart(best) ? p : best));
+  const told = joined ? [...panel.lines.values()].map(farthest).filter((p) => apart(p) > 1.03) : every;
+  const scaled = (value, axis) => (axis.log ? Math.log10(value) : value);
+  const near = (a, b, [low, high], share) => Math.abs(a - b) < share * (high - low);
+  const names = [];
+  for (const p of told.sort((one, other) => one.x - other.x)) {
+    const [x, y, name] = [scaled(p.x, chart.xAxis), scaled(p.y, chart.yAxis), read(p.row)];
+    const place = names.find((one) => near(one.x, x, range.x, 0.12) && near(one.y, y, range.y, 0.07));
+    if (place) place.told.add(name);
+    else names.push({ x, y, told: new Set([name]), color: colour(p.series) });
+  }
+  return names.map(({ x, y, told: here, color }) => ({ x, y, xanchor: "left", xshift: 4, yanchor: "bottom",
+    showarrow: false, text: plotted([...here].join(", ")), font: { size: 9, color } }));
 }
 
 function trace(chart, points, joined) {
@@ -675,8 +699,9 @@ function buildTheme() {
   });
 }
 
+/* At once: Plots.resize waits, and paper does not. */
 function fitCharts() {
-  for (const plot of document.querySelectorAll(".plot")) Plotly.Plots.resize(plot);
+  for (const plot of document.querySelectorAll(".plot")) if (plot.data) Plotly.relayout(plot, { autosize: true });
 }
 
 // --------------------------------------------------------------------------------------------------------- start
