@@ -71,6 +71,7 @@ def test_an_axis_that_is_not_swept_is_refused():
         loaded(*WORDS)
 
 
+@pytest.mark.slow
 def test_an_average_over_starts_is_the_mean_error_that_a_claim_takes(tmp_path):
     """C14 at five starts: a sweep with ``average``, and the claim's own gradients."""
     from bench.claims.published.soft_wall import _mean_error
