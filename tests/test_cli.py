@@ -275,6 +275,7 @@ def test_nothing_raw_reaches_the_terminal(tmp_path, capsys):
         assert letter not in answer.err
 
 
+@pytest.mark.slow
 def test_theta_from_the_command_line(tmp_path):
     words = [
         "scenes=[pushing]", "backends=[numpy]", "estimators=[fobg,reinforce]", "scene.pushing.horizon=5", "samples=8",

@@ -167,6 +167,7 @@ def test_readme_example_runs(folder):
     assert "\nrandomized_smoothing 16 estimates: bias" in printed
 
 
+@pytest.mark.slow
 def test_examples_of_the_python_page_run(folder):
     printed = python(folder, "-c", "\n".join(python_blocks(DOCS["python.md"])))
     assert "randomized_smoothing" in printed
@@ -203,6 +204,7 @@ def test_examples_run_together(folder, tmp_path):
     assert "clipped_fobg[limit=0.5]" in printed
 
 
+@pytest.mark.slow
 def test_the_study_of_the_example_writes_its_table(folder, tmp_path):
     (words,) = (words for page, words in COMMANDS if page == "extending.md" and "study=gradient_norm" in words)
     python(folder, "-m", "bench", *words, f"results_dir={tmp_path}")

@@ -130,6 +130,7 @@ def test_failing_plugin_fails_the_kit_for_itself_alone(tree):
     assert all("no theta today" in line for line in failed)
 
 
+@pytest.mark.slow
 def test_added_plugins_conform_and_survive_a_spawned_process(tree):
     done = tree.run("check", "half_step", "third_name")
     assert done.returncode == 0, done.stdout + done.stderr

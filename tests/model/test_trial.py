@@ -70,6 +70,7 @@ def test_listed_with_what_happened_and_the_others_are_listed_too(folder):
         assert f"{name}.Odd" in done.stdout
 
 
+@pytest.mark.slow
 def test_an_import_that_does_not_come_back(folder):
     (folder / "hangs.py").write_text("import time\nprint('x' * 100000)\nwhile True: time.sleep(1)\n")
     (folder / "raises.py").write_text("1 / 0\n")

@@ -270,6 +270,7 @@ def test_status_reason_and_time_are_in_sight_on_a_laptop(browser, tmp_path):
     browser.size(*WIDE)
 
 
+@pytest.mark.slow
 def test_print_fills_the_page_with_charts_and_tables_that_fit_it(browser, tmp_path):
     """What is wider than A4 between its margins would make a browser print everything smaller."""
     path = tmp_path / "report.html"

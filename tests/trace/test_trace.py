@@ -63,6 +63,7 @@ def test_adjoints_give_the_programs_gradient(name):
     assert error < 1e-9
 
 
+@pytest.mark.slow
 def test_adjoints_give_the_programs_gradient_through_solved_steps():
     problem = compiled(Pushing(), Complementarity(stiffness=1e3), Implicit())
     assert trace(problem, drawn(problem))[1] < 1e-9
