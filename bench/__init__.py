@@ -3,6 +3,11 @@
 The Python face (:func:`run`, :func:`load`, :func:`problem`, :func:`estimate`, :func:`examine`) and the contracts that plugin authors import.
 """
 
+# ruff: noqa: E402
+from bench.starting import heed_interrupts
+
+heed_interrupts()  # before the imports that take a second
+
 from bench.errors import StorageError, UserError
 from bench.examine import Report, examine
 from bench.face import Estimates, estimate, load, problem, run

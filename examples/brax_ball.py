@@ -36,5 +36,5 @@ if __name__ == "__main__":
     import bench
 
     for engine in sys.argv[1:] or ["generalized", "positional", "spring"]:
-        settings = {"grad": "jax", "sigma": [0.003, 0.05], "budget": "300s", "name": f"Brax {engine}"}
+        settings = {"grad": "jax", "sigma": [0.003, 0.05], "budget": "560s", "name": f"Brax {engine}"}
         print(bench.examine(rollout(engine), theta, **settings), end="\n\n")

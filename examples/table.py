@@ -25,7 +25,7 @@ ORDER = (
     "nimble_ball", "newton_ball", "brax_ball", "drake_ball", "genesis_ball", "taichi_ball", "warp_kernel", "mujoco_cube",
     "gymnasium_cartpole", "jax_rollout", "torch_module", "numpy_loop",
 )  # fmt: skip
-LIMIT = 1200
+LIMIT = 1800
 """Seconds for one example; the examples have budgets of their own."""
 PACKAGES = {
     "brax": "brax", "drake": "drake", "genesis": "genesis-world", "gymnasium": "gymnasium", "jax": "jax", "mujoco": "mujoco",

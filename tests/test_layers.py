@@ -12,7 +12,7 @@ from bench import model
 ROOT = Path(__file__).resolve().parents[1]
 BENCH = ROOT / "bench"
 LAYERS = [
-    ["errors"],
+    ["errors", "starting"],
     ["simulator"],
     ["model"],
     ["measure", "conformance", "plugins"],

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
+from textwrap import fill
 
 import pandas as pd
 
@@ -17,7 +18,9 @@ from bench.sweep.files import write_all
 
 Found = Sequence[tuple[type[Claim], Result]]
 WIDE = 26
-"""Letters of the longest label with which two fit beside each other above a chart."""
+"""Letters of the longest label with which two fit beside each other below a chart."""
+BOLD_LETTERS, LETTERS = 48, 54
+"""Letters of a line above a chart 3.5 inches wide, bold and small."""
 CSS = """body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
 table{border-collapse:collapse;font-size:14px;margin:.6rem 0}td,th{padding:.15rem .8rem .15rem 0;text-align:left}
 td.n{text-align:right;font-variant-numeric:tabular-nums}th{border-bottom:1px solid #888}img{max-width:100%}
@@ -51,11 +54,11 @@ def chart(directory: Path, claim: type[Claim], result: Result) -> list[Path]:
     from matplotlib.ticker import NullFormatter
 
     from bench.report.figures import save, styled
-    from bench.report.style import PALETTE
+    from bench.report.style import GREY, PALETTE
 
     with styled():
         rcParams["axes.prop_cycle"] = cycler(color=[PALETTE[i] for i in (2, 0, 3, 4)])
-        picture = Picture(figsize=(3.5, 2.9), layout="constrained")
+        picture = Picture(figsize=(3.5, 3.3), layout="constrained")
         FigureCanvasAgg(picture)
         axes = picture.add_subplot()
         claim().draw(axes, result.series)
@@ -65,12 +68,13 @@ def chart(directory: Path, claim: type[Claim], result: Result) -> list[Path]:
                 axis.set_minor_formatter(NullFormatter())
         axes.set_xlabel(claim.labels[0])
         axes.set_ylabel(claim.labels[1])
-        axes.set_title(f"{claim.name}: {result.verdict}", fontsize=8)
-        # above the axes, where no line is
+        picture.suptitle(fill(claim.learned, BOLD_LETTERS), x=0.02, ha="left", fontsize=8.5, fontweight="bold")
+        origin = f"{claim.name}, {claim.source.partition(';')[0]}: {result.verdict}"
+        axes.set_title(fill(origin, LETTERS), loc="left", fontsize=7, color=GREY)
         labels = axes.get_legend_handles_labels()[1]
         if labels:
             columns = 2 if max(map(len, labels)) <= WIDE else 1
-            picture.legend(loc="outside upper center", ncols=columns, fontsize=7, frameon=False)
+            picture.legend(loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
         return save(picture, directory / claim.name)[:1]
 
 

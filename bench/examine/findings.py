@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.examine.lines import Line
+from bench.examine.lines import ALIKE, Line
 from bench.examine.smoothing import WANTED, Smoothed
 from bench.measure.gradcheck import FAULTS, MEANING, Check, Part
 from bench.report.text import counted, duration, number
@@ -105,7 +105,7 @@ class Findings:
         if self.check is None:
             return "undecided"
         bad = [one.cause for one in (self.check, *self.more) if not one.trusted]
-        if not bad and any(line.steps for line in self.lines):
+        if not bad and (any(line.steps for line in self.lines) or self.tread):
             return "staircase"
         if not bad and self.missed > WANTED:
             return "jumps"
@@ -133,6 +133,12 @@ class Findings:
             found.append(
                 "staircase: the cost is constant between jumps, here and on a line: its derivative is 0 and says nothing, with "
                 "or without a gradient; smooth it, as sigma= does"
+            )
+        elif not found and self.tread:
+            found.append(
+                f"staircase: jumps of one height, {number(self.tread)}, at even distances on every line: a part of the cost "
+                "is rounded, cast to int or looked up on a grid, and the gradient misses it, "
+                f"{number(100 * self.missed)}% of the cost's change on a line"
             )
         if not found:
             missed = self.missed
@@ -193,6 +199,13 @@ class Findings:
     def missed(self) -> float:
         """Largest share of the cost's change along a line that the integral of the gradient misses, 0 where unknown."""
         return max((line.missed for line in self.lines if math.isfinite(line.missed)), default=0.0)
+
+    @property
+    def tread(self) -> float:
+        """Height of the jumps where all lines have equal ones, evenly apart, that the gradient is seen to miss; else 0."""
+        treads = [line.tread for line in self.lines] or [0.0]
+        alike = min(treads) > (1 - ALIKE) * max(treads)
+        return max(treads) if alike and self.missed > SEEN else 0.0
 
     @property
     def resolution(self) -> str:

@@ -30,6 +30,7 @@ body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem aut
 h1 {{ font-size: 1.4rem; margin-bottom: .3rem; }} h2 {{ font-size: 1.1rem; margin-top: 2rem; }}
 .verdict {{ padding: .6rem .9rem; border-left: 5px solid {colour}; background: #f6f6f6; }}
 pre {{ overflow-x: auto; background: #f6f6f6; padding: .8rem; font-size: 12.5px; }}
+.said {{ white-space: pre-wrap; overflow-wrap: anywhere; }}
 img {{ max-width: 100%; }}
 table {{ border-collapse: collapse; font-size: 13px; }} .wide {{ overflow-x: auto; }}
 th, td {{ padding: .2rem .6rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap; }}
@@ -64,11 +65,17 @@ def write(report: Findings, directory: Path) -> list[Path]:
         colour="#D55E00" if report.status else "#009E73",
         verdict=escape(" ".join(report.problems) or report.conclusion),
         charts="\n".join(pictures),
-        text=escape(str(report)),
+        text=_wrapping(str(report)),
         table=report.frame.to_html(index=False, float_format=lambda x: number(x, 5), border=0),
     )
     write_whole(directory / "report.html", page.encode())
     return [*paths, directory / "report.html"]
+
+
+def _wrapping(text: str) -> str:
+    """Return a text as HTML in which sentences wrap and rows of aligned columns keep their shape."""
+    lines = [(escape(line), "  " in line.strip()) for line in text.splitlines()]
+    return "\n".join(line if row else f'<span class="said">{line}</span>' for line, row in lines)
 
 
 def charts(report: Findings) -> dict[str, tuple[str, Figure]]:
@@ -107,7 +114,10 @@ def _steps(report: Findings) -> Figure:
         )  # fmt: skip
     left.set_xlabel("step, in units of the input")
     left.set_ylabel("relative error of the gradient")
-    left.set_title("A right gradient: falls with the step squared,\nuntil rounding takes over", fontsize=8)
+    left.set_title(
+        "Falls with the step squared until rounding where the\ngradient is right; levels off where it is wrong",
+        fontsize=8,
+    )
     if components:
         left.legend(fontsize=7, loc="best", frameon=True, framealpha=0.8, edgecolor="none")
     whole = [part for part in report.check.parts if part.component is None]

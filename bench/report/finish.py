@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from bench.errors import UserError, printable
+from bench.model import guard
 from bench.report import averages, web
 from bench.report.views import latest
 from bench.sweep.execute import Finished, store_of
@@ -37,8 +38,9 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write the study's tables and charts, and the page; raises :class:`UserError` where there are no rows."""
     if rows.empty:
         raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
-    written = study_of(experiment).write(experiment, rows)
-    return [*written, *averages.write(experiment, rows), web.write(experiment, rows)]
+    with guard.quiet("a plugin"), guard.guarded():  # the commands that repeat a cell are made from its plugins
+        written = study_of(experiment).write(experiment, rows)
+        return [*written, *averages.write(experiment, rows), web.write(experiment, rows)]
 
 
 def shown(rows: pd.DataFrame) -> pd.DataFrame:

@@ -191,6 +191,10 @@ class Line:
         return f"{self.estimator}[{self.params}]" if self.params else self.estimator
 
 
+RUN = ("estimator", "estimator_params", "backend", "dtype")
+"""Columns that tell the runs of one family along an axis apart."""
+
+
 def lines(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Line]:
     """Return the lines of one family, in order of appearance; cells that were never run are left out.
 
@@ -198,12 +202,14 @@ def lines(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Line]:
     """
     rows = ran(rows)
     several = rows["dtype"].nunique() > 1
+    tidy = rows.drop_duplicates([*RUN, "x"], keep="last").sort_values("x", kind="stable").set_index("x")
+    parts: dict[Any, pd.DataFrame] = dict(list(tidy.groupby(list(RUN), sort=False)))
+    every: dict[tuple[str, str], dict[str, pd.DataFrame]] = {}
+    for estimator, params, backend, dtype in rows[list(RUN)].drop_duplicates().itertuples(index=False, name=None):
+        name = f"{backend} {dtype}" if several else str(backend)
+        every.setdefault((estimator, params), {})[name] = parts[estimator, params, backend, dtype]
     result = []
-    for (estimator, params), part in rows.groupby(["estimator", "estimator_params"], sort=False):
-        runs: dict[str, pd.DataFrame] = {}
-        for (backend, dtype), run in part.groupby(["backend", "dtype"], sort=False):
-            name = f"{backend} {dtype}" if several else str(backend)
-            runs[name] = run.drop_duplicates("x", keep="last").set_index("x").sort_index()
+    for (estimator, params), runs in every.items():
         while runs:
             first, mine = next(iter(runs.items()))
             alike = [n for n, run in runs.items() if n == first or (close is not None and _agree(mine, run, close))]

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -166,11 +168,25 @@ class Columns:
         """Return the table with its columns typed and in order, followed by unknown columns as they are."""
         import pandas as pd
 
-        unknown = [name for name in table if name not in self.by_name]
-        table = table.reindex(columns=[*self.stored, *unknown]).copy()
-        for column in self.all:
-            if column.kind == "text":
-                table[column.name] = table[column.name].astype(object).fillna("").astype(str)
-            elif column.kind == "number":
-                table[column.name] = pd.to_numeric(table[column.name], errors="coerce").astype("float64")
-        return table
+        known = {column.name: _typed(table.get(column.name), column.kind, len(table)) for column in self.all}
+        unknown = {name: table[name] for name in table if name not in self.by_name}
+        return pd.DataFrame({**known, **unknown}, index=table.index)
+
+
+def _typed(values: pd.Series | None, kind: Kind, count: int) -> Any:
+    """Return a column in the type of its kind, as it is where it has that type; missing values where there is no column."""
+    import pandas as pd
+
+    if values is None:
+        return pd.array([""] * count, dtype="str") if kind == "text" else np.full(count, math.nan)
+    if kind == "number":
+        return values if values.dtype == np.float64 else pd.to_numeric(values, errors="coerce").astype("float64")
+    if kind == "text" and not (str(values.dtype) == "str" and values.notna().all()):
+        return values.astype(object).fillna("").astype(str)
+    return values.map(_numbers) if kind == "list" else values
+
+
+def _numbers(listed: Any) -> Any:
+    """Return a list as it was stored: Parquet writes one of nothing but NaN as a list of nothing."""
+    nothing = isinstance(listed, np.ndarray) and listed.dtype == object and len(listed) > 0
+    return np.full(len(listed), math.nan) if nothing and all(one is None for one in listed) else listed

@@ -73,7 +73,7 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
             config = compose("config", overrides=prepared)
         plain = OmegaConf.to_container(config, resolve=False, throw_on_missing=True)
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # ValueError: a name as the index of a list
         raise UserError(str(error).strip().splitlines()[0]) from None
     assert isinstance(plain, dict)
     return experiment({str(k): v for k, v in plain.items()})
@@ -120,8 +120,9 @@ def _prepared(override: str, config_dirs: Sequence[Path]) -> str:
         return f"study={_quoted(value)[1:-1]}"
     if head in map(singular, kinds) or head in ("sweep", "marks", "ray", "slurm"):
         return f"++{bare}={value}"
-    if bare != head and head not in ("reference", "table"):
-        raise UserError(f"'{bare}' is not a setting: '{head}' has no parts")
+    if bare != head and (head not in ("reference", "table") or bare.count(".") > 1):
+        whole = bare.rpartition(".")[0]
+        raise UserError(f"'{bare}' is not a setting: '{whole}' has no parts")
     return f"{bare}={value}"
 
 

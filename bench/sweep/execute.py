@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from bench.errors import StorageError, UserError
+from bench.errors import StorageError, Unsupported, UserError
 from bench.measure import timing
 from bench.sweep import progress, runner
 from bench.sweep.experiment import Experiment
@@ -66,7 +66,11 @@ def refuse_nothing(experiment: Experiment, planned: Sequence[Planned]) -> None:
     """Raise :class:`UserError` where the study refuses every cell: then it is the experiment that is wrong, not a cell."""
     if any(item.refusal is None for item in planned):
         return
-    reasons = dict.fromkeys(study_of(experiment).refuses(item.cell) for item in planned)
+    study = study_of(experiment)
+    try:
+        reasons = dict.fromkeys(study.refuses(item.cell) for item in planned)
+    except (Unsupported, UserError):
+        return  # a cell without a program says so in its row, and no study is asked about it
     if reasons and None not in reasons:
         raise UserError(f"no cell can be run: {'; '.join(map(str, reasons))}")
 

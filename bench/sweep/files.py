@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import fcntl
 import hashlib
 import os
@@ -19,6 +21,10 @@ from bench.model.parameters import remember
 
 STALE_S = 3600.0
 """Age at which a half-written file of another machine belongs to no run."""
+AT_FDCWD, RENAME_NOREPLACE = -100, 1
+"""Of renameat2(2), Linux: paths from the working folder, and nothing is overwritten."""
+RENAME_EXCL = 4
+"""Of renamex_np(2), macOS: nothing is overwritten."""
 TEMPORARY = re.compile(r"\..+-bench-([0-9a-f]{8})-(\d+)-[0-9a-f]{32}")
 """Names of files that are being written: the machine, the process, and a number of their own."""
 
@@ -90,6 +96,35 @@ def replace_file(path: Path, content: bytes) -> None:
     except OSError as error:
         part.unlink(missing_ok=True)
         raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
+
+
+def place(path: Path, name: Path) -> None:
+    """Give a file a name that nothing has; raises FileExistsError where something has it, and leaves both as they are.
+
+    Where the file system has hard links, the file keeps its old name as well.
+    """
+    try:
+        os.link(path, name)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links
+        _rename_new(path, name)
+
+
+def _rename_new(path: Path, name: Path) -> None:
+    """Rename to a name that nothing has, in one step where the system can: ``os.rename`` overwrites what another run put there."""
+    system, names = ctypes.CDLL(None, use_errno=True), (os.fsencode(path), os.fsencode(name))
+    failed = errno.ENOSYS
+    if hasattr(system, "renameat2"):
+        failed = ctypes.get_errno() if system.renameat2(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_NOREPLACE) else 0
+    elif hasattr(system, "renamex_np"):
+        failed = ctypes.get_errno() if system.renamex_np(*names, RENAME_EXCL) else 0
+    if failed in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):  # the file system cannot: a look, and then the step
+        failed = errno.EEXIST if os.path.lexists(name) else 0
+        if not failed:
+            os.rename(path, name)
+    if failed:
+        raise OSError(failed, os.strerror(failed), str(path), None, str(name))
 
 
 def sync(directory: Path) -> None:

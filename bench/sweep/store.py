@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from bench.errors import StorageError, UserError, printable
 from bench.sweep.columns import Columns
-from bench.sweep.files import replace_file, sync, temporary, tidy
+from bench.sweep.files import place, replace_file, sync, temporary, tidy
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -70,7 +70,7 @@ class Store:
         def claim() -> bool:
             try:
                 part.write_text(self._study)
-                _link(part, self._claim)
+                place(part, self._claim)
                 return True
             except FileExistsError:
                 return False
@@ -210,7 +210,7 @@ class Store:
                 os.rename(self._table, aside)
                 if _mark(aside) != mark:
                     return False
-            _link(part, self._table)
+            place(part, self._table)
             sync(self.directory)
         except (FileExistsError, FileNotFoundError):
             return False  # another run was faster, or has folded this very file into its own
@@ -265,16 +265,6 @@ def ordered(table: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:
     place = {key: index for index, key in enumerate(keys)}
     position = table["key"].map(lambda key: place.get(key, -1))
     return table.iloc[position.argsort(kind="stable")].reset_index(drop=True)
-
-
-def _link(path: Path, name: Path) -> None:
-    """Give a file a second name; raises FileExistsError if that is taken, where a rename would overwrite it."""
-    try:
-        os.link(path, name)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without hard links
-        os.rename(path, name)
 
 
 def _mark(path: Path) -> tuple[int, int]:

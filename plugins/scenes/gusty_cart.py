@@ -59,6 +59,8 @@ class GustyCart(GustyScene):
             return None
         b = self.dt**2 * (self.horizon - steps[integrator.name] - np.arange(self.horizon)) / self.mass
         c = float(b.sum())
+        if c == 0.0:  # one explicit step moves by the velocity before it, which is 0
+            return np.zeros(1)
         s = math.hypot(c * self.sigma, self.gust * float(np.linalg.norm(b)))
         z = (c * self.force - self.edge) / s
         below = 0.5 * math.erfc(-z / math.sqrt(2.0))

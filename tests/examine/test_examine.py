@@ -184,6 +184,25 @@ def test_lines_find_jump_and_kink_where_they_are():
     assert line.jumps[0].size == pytest.approx(0.2, rel=1e-3)
 
 
+def test_equal_jumps_at_even_distances_are_treads_and_others_are_not():
+    def tread(cost):
+        return scan(cost, np.zeros(1), np.ones(1), noise=1e-15).tread
+
+    assert tread(lambda x: np.sin(x[0]) + 1e-3 * np.floor(1.3 * x[0] + 0.4)) == pytest.approx(1e-3, rel=1e-2)
+    assert tread(lambda x: np.sin(x[0]) + 1e-3 * (np.floor(1.3 * x[0] + 0.4) + np.floor(0.9 * x[0]))) == 0
+    assert tread(lambda x: np.sin(x[0]) + 1e-3 * np.floor(0.8 * (x[0] + 4) ** 1.5)) == 0
+    assert tread(lambda x: np.sin(x[0]) + 1e-3 * (x[0] > 0.1) + 1e-3 * (x[0] > 1.1) + 1e-3 * (x[0] > 2.1)) == 0
+
+
+def test_treads_that_a_gradient_misses_are_a_staircase_though_they_are_small():
+    def cost(x):
+        return float(np.sin(x[0]) * x[1] + 2e-4 * np.floor(1000 * x[0] + 0.5))
+
+    report = bench.examine(cost, [0.5, 0.7], grad=lambda x: [np.cos(x[0]) * x[1], np.sin(x[0])], **QUICK)
+    assert report.cause == "staircase"
+    assert "at even distances" in str(report)
+
+
 def test_smooth_line_has_no_breaks():
     assert not scan(lambda x: np.tanh(30 * x[0]) + x[0] ** 3, np.zeros(1), np.ones(1), noise=1e-16).breaks
 
@@ -328,6 +347,8 @@ def test_page_has_text_tables_and_charts(tmp_path):
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/png;base64") == 3
     assert "RIGHT: the gradient is the derivative of its cost" in page
+    assert '<span class="said">not checked: thetas far from this one</span>' in page  # a sentence wraps,
+    assert "\n  theta[0] " in page  # and a row keeps its columns
 
 
 @pytest.fixture

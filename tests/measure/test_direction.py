@@ -82,6 +82,16 @@ def test_a_part_of_the_derivative_is_a_missing_term():
     assert of_ratios({0: beyond}, [], some_right=True)[0] == "missing_term"
 
 
+def test_a_factor_is_named_only_where_ratios_agree_within_their_errors():
+    same, nearly, other = (
+        [Ratio(v, 1e-9) for v in r] for r in ([0.5] * 4, [0.5, 0.5001, 0.5002, 0.4999], [0.1, 0.9, 0.5])
+    )
+    assert of_ratios({0: same}, [], some_right=False)[0] == "wrong_factor"
+    assert of_ratios({0: nearly}, [], some_right=False)[0] == "missing_term"
+    assert of_ratios({0: [Ratio(r.value, 1e-4) for r in nearly]}, [], some_right=False)[0] == "wrong_factor"
+    assert of_ratios({0: same, 1: other}, [], False) == dict.fromkeys([0, 1, None], "missing_term")
+
+
 def test_noise_is_the_standard_deviation_of_independent_normal_numbers():
     values = 3e-7 * np.random.default_rng(2).standard_normal((1, 100_000))
     smooth = np.linspace(0.0, 1.0, values.size) ** 2

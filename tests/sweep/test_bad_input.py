@@ -174,3 +174,25 @@ def test_a_plugin_that_cannot_be_made_is_refused_in_one_line(tmp_path, capsys, f
     said = capsys.readouterr().err.strip()
     assert "estimator 'mine' cannot be made" in said
     assert len(said.splitlines()) == 1
+
+
+@pytest.mark.parametrize("word", ["table.rows.sigma=[estimator]", "reference.samples.x=300"])
+def test_parts_of_what_has_none_are_no_settings(word, capsys):
+    assert main(["plan", "scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg]", word]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "is not a setting" in said
+    assert len(said.splitlines()) == 1
+
+
+def test_a_study_is_not_asked_about_cells_without_a_program(tmp_path, capsys):
+    words = [
+        "study=identify",
+        "scenes=[hopper]",
+        "contacts=[impulse]",
+        "integrators=[stormer_verlet]",
+        "backends=[numpy]",
+    ]
+    status = main([*words, "theta=[body_mass]", "optimizers=[adam]", "workers=0", "--quiet", f"results_dir={tmp_path}"])
+    said = capsys.readouterr()
+    assert status in (0, 2)
+    assert "no place for the impulses of contact law impulse" in said.out + said.err

@@ -306,6 +306,35 @@ def _no_handler(argument):
     raise RuntimeError("no handler today")
 
 
+INTERRUPTS = """
+import os, signal, sys
+
+class Interrupts:
+    "Sends Ctrl-C when a module is about to be imported."
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupts())
+"""
+
+
+@pytest.mark.parametrize("module", ["bench.errors", "bench.sweep.study", "bench.cli"])
+def test_an_interrupt_while_the_command_is_imported_is_quiet(tmp_path, module):
+    (tmp_path / "sitecustomize.py").write_text(INTERRUPTS.format(module=module))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    done = subprocess.run(hearing_signals("list"), env=environment, capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr == "\nbench: stopped\n"
+
+
+def test_a_library_leaves_the_signals_of_its_program_alone():
+    code = "import signal, bench; assert signal.getsignal(signal.SIGINT) is signal.default_int_handler"
+    subprocess.run(
+        [sys.executable, "-c", f"import signal; signal.signal(2, signal.default_int_handler); {code}"], check=True
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM", "SIGHUP"])
 @pytest.mark.parametrize("times", [1, 2])

@@ -18,10 +18,10 @@ import pytest
 from helpers import loaded
 
 from bench.cli import main
-from bench.errors import StorageError
+from bench.errors import StorageError, UserError
 from bench.model.parameters import values
 from bench.studies.bias_variance.columns import COLUMNS
-from bench.sweep import files
+from bench.sweep import files, tasks
 from bench.sweep import store as store_module
 from bench.sweep.runner import blank
 from bench.sweep.store import Store
@@ -35,6 +35,19 @@ def row(number: int, **values) -> dict:
 
 def keys(store: Store) -> list[int]:
     return sorted(int(key, 16) for key in store.load()["key"])
+
+
+def test_lists_of_missing_numbers_come_back_as_numbers(tmp_path):
+    """In a column where every list holds NaN alone, Parquet has no type for them."""
+    name = COLUMNS.named("list")[0]
+    store = Store(tmp_path, COLUMNS)
+    store.append(row(1, **{name: [math.nan, math.nan]}), row(2, **{name: []}))
+    for _ in range(2):
+        found = dict(zip(keys(store), store.load().sort_values("key")[name], strict=True))
+        assert np.asarray(found[1], dtype=float).shape == (2,)
+        assert all(math.isnan(one) for one in found[1])
+        assert len(found[2]) == 0
+        store.compact()
 
 
 def test_rows_come_back_to_the_last_bit(tmp_path):
@@ -262,16 +275,45 @@ def test_a_folder_that_may_not_be_read_is_not_taken_for_an_empty_one(tmp_path, m
         Store(tmp_path, COLUMNS).load()
 
 
-def test_a_file_system_without_hard_links(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        store_module.os, "link", lambda *_: (_ for _ in ()).throw(OSError(errno.EPERM, "not permitted"))
-    )
+@pytest.fixture(params=["with exclusive renames", "without"])
+def no_hard_links(request, monkeypatch):
+    """A file system that has no hard links, and perhaps no renames that refuse to overwrite."""
+
+    def refuse(*_):
+        raise OSError(errno.EPERM, "not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    if request.param == "without":
+        monkeypatch.setattr(files.ctypes, "CDLL", lambda *_, **more: object())
+
+
+def test_a_file_system_without_hard_links(tmp_path, no_hard_links):
     store = Store(tmp_path, COLUMNS)
     store.append(row(1))
     store.compact()
     store.append(row(2))
     store.compact()
     assert len(pd.read_parquet(tmp_path / "rows.parquet")) == 2
+
+
+def test_without_hard_links_nothing_of_another_run_is_overwritten(tmp_path, no_hard_links):
+    mine, other = tmp_path / "part", tmp_path / "rows.parquet"
+    mine.write_text("mine")
+    other.write_text("other")
+    with pytest.raises(FileExistsError, match="File exists"):
+        files.place(mine, other)
+    assert (mine.read_text(), other.read_text()) == ("mine", "other")
+    with pytest.raises(FileNotFoundError):
+        files.place(tmp_path / "gone", tmp_path / "new")
+    files.place(mine, tmp_path / "new")
+    assert (tmp_path / "new").read_text() == "mine"
+
+
+def test_without_hard_links_one_of_two_studies_is_refused_too(tmp_path, no_hard_links):
+    first, second = (Store(tmp_path, COLUMNS, study) for study in ("bias_variance", "growth"))
+    first.prepare()
+    with pytest.raises(UserError, match="a run of study bias_variance has started"):
+        second.prepare()
 
 
 # ------------------------------------------------------------------------------------------------ commands
@@ -298,6 +340,7 @@ def test_unreadable_file_is_named_and_left_alone(tmp_path, capsys, place, conten
 @pytest.mark.parametrize("after", [0, 1, 2])
 def test_disk_that_fills(tmp_path, capsys, monkeypatch, after):
     """The disk is full after so many files of rows: exit status 2, what was stored stays, and the run goes on later."""
+    monkeypatch.setattr(tasks, "TOGETHER_S", 0.0)  # a file per row
     words = [*TINY, "name=tiny", "sweep.sigma=[0.1,0.2,0.3,0.4]", f"results_dir={tmp_path}", "workers=0"]
     real, left = files.replace_file, [after]
 

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.ink import GREY, ink
 from bench.claims.pieces import centre, estimator, expectation, problem, rule, stochastic_descent
 from bench.model import Array, FunctionScene, Problem, param
 
@@ -147,11 +148,11 @@ class ThrownBall(Claim):
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both gradients, and where the descents end."""
-        axes.plot(series["x"], series["truth"], label="true")
-        axes.plot(series["x"], series["first"], label="first-order mean")
-        axes.axhline(0.0, color="#404040", linewidth=0.6)
-        axes.plot([series["first_end"]], [0], "o", color="#D55E00", label="first order ends")
-        axes.plot([series["zeroth_end"]], [0], "s", color="#009E73", label="zeroth order ends")
+        axes.plot(series["x"], series["truth"], color=GREY, label="true")
+        axes.plot(series["x"], series["first"], color=ink("fobg"), label="first-order mean")
+        axes.axhline(0.0, color=GREY, linewidth=0.6)
+        axes.plot([series["first_end"]], [0], "o", color=ink("fobg"), label="first order ends")
+        axes.plot([series["zeroth_end"]], [0], "s", color=ink("reinforce"), label="zeroth order ends")
 
 
 def _exact_descent(at: Problem) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.ink import GREY
 from bench.claims.pieces import problem
 from bench.report.averages import summary
 
@@ -88,6 +89,6 @@ class Missed(Claim):
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw the smoothed gradients."""
-        axes.plot(series["u"], series["truth"], color="#404040", label="true")
+        axes.plot(series["u"], series["truth"], color=GREY, label="true")
         axes.plot(series["u"], series["plain"], "--", label="plain")
         axes.plot(series["u"], series["surrogate"], label="surrogate")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.ink import GREY
 from bench.claims.pieces import descend, native
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ class Collision(Claim):
         """Draw the costs."""
         for name in LABELS:
             axes.plot(series["iteration"], series[name], label=LABELS[name])
-        axes.axhline(2.0, color="#404040", linewidth=0.6, label="doing nothing")
+        axes.axhline(2.0, color=GREY, linewidth=0.6, label="doing nothing")
 
 
 def _costs(at: Problem) -> np.ndarray:

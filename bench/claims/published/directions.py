@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.ink import bars, ink
 from bench.claims.pieces import centre, estimator, problem
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class Directions(Claim):
     def measure(self) -> Outcome:
         """Sample estimates at two noise levels."""
         figures: list[Figure] = []
-        series: dict[str, list[float]] = {"n": [20, 100, 400], "gauss": [], "sphere": []}
+        series: dict[str, list[Any]] = {"n": [20, 100, 400], "gauss": [], "sphere": []}
         draw = np.random.default_rng(7)
         for count, texts in ((20, ("1.05", "0.95")), (100, ("0.21", "0.19")), (400, ("0.0525", "0.0475"))):
             noise = [draw.standard_normal((CHUNK, count, D)) for _ in range(REPEATS[count] // CHUNK)]
@@ -48,7 +49,7 @@ class Directions(Claim):
                     error = self._error(at, estimator(name), noise)
                     figures.append(Figure(f"{name}, N = {count}, sigma = {sigma:g}", text, *error))
                     if sigma == 0.1:
-                        series[key].append(error[0])
+                        series[key].append(error)
         at = problem(f"linear[dimension={D}]", backend="numpy")
         exact = self._error(at, estimator("finite_difference"), [draw.standard_normal((8, 20, D))])
         figures.append(Figure("finite_difference, N = 20", "0.0", exact[0], spread=1e-15))
@@ -62,6 +63,9 @@ class Directions(Claim):
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both errors against the number of samples."""
-        axes.loglog(series["n"], series["gauss"], "o-", label="Gaussian: (n + 1)/N")
-        axes.loglog(series["n"], series["sphere"], "s--", label="sphere: (n - 1)/N")
+        axes.set(xscale="log", yscale="log")
+        bars(
+            axes, series["n"], series["gauss"], fmt="o-", color=ink("randomized_smoothing"), label="Gaussian: (n + 1)/N"
+        )
+        bars(axes, series["n"], series["sphere"], fmt="s--", color=ink("sphere_smoothing"), label="sphere: (n - 1)/N")
         axes.set_xticks(series["n"], [f"{n:g}" for n in series["n"]])

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.ink import GREY, ink
 from bench.claims.pieces import centre, expectation, problem, stochastic_descent
 from bench.model import Array, FunctionScene, param
 
@@ -80,6 +81,6 @@ class FallingPivot(Claim):
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both gradients around the edge."""
-        axes.plot(series["x"], series["truth"], label="true")
-        axes.plot(series["x"], series["first"], label="first-order mean")
-        axes.axvline(math.pi / 4, color="#404040", linewidth=0.6, label="edge")
+        axes.plot(series["x"], series["truth"], color=GREY, label="true")
+        axes.plot(series["x"], series["first"], color=ink("fobg"), label="first-order mean")
+        axes.axvline(math.pi / 4, color=GREY, linestyle=":", linewidth=0.8, label="edge")

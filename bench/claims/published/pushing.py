@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.ink import bars, ink
 from bench.claims.pieces import estimator, problem, spread, terms
 
 if TYPE_CHECKING:
@@ -59,15 +60,15 @@ class SmoothedPush(Claim):
         first = {"1e2": "10.82", "1.27e4": "10.77", "2.8e4": "15.99", "6.4e4": "3.9e5"}
         zeroth = {"1e2": "2970", "1.27e4": "2959", "2.8e4": "2967", "6.4e4": "2368"}
         figures: list[Figure] = []
-        series: dict[str, list[float]] = {"beta": [], "first": [], "zeroth": []}
+        series: dict[str, list[Any]] = {"beta": [], "first": [], "zeroth": []}
         seeds = []
         for beta in first:
             at = problem("pushing[sigma=0.3]", f"softplus[stiffness=1e5,beta={float(beta)!r}]")
             (v1, e1), (v0, e0) = sampled(at, SMOOTHED, 16)
             once = of_the_source((v1, e1), SMOOTHED), of_the_source((v0, e0), SMOOTHED)
             series["beta"].append(float(beta))
-            series["first"].append(v1)
-            series["zeroth"].append(v0)
+            series["first"].append((v1, e1))
+            series["zeroth"].append((v0, e0))
             figures.append(Figure(f"zeroth order, beta = {beta}", zeroth[beta], v0, e0, spread=once[1]))
             if beta == "6.4e4":
                 seeds = [sampled(at, 1000, seed)[0][0] for seed in range(12)]
@@ -93,8 +94,9 @@ class SmoothedPush(Claim):
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both variances against the sharpness."""
-        axes.loglog(series["beta"], series["first"], "o-", label="first order")
-        axes.loglog(series["beta"], series["zeroth"], "s-", label="zeroth order")
+        axes.set(xscale="log", yscale="log")
+        bars(axes, series["beta"], series["first"], fmt="o-", color=ink("fobg"), label="first order")
+        bars(axes, series["beta"], series["zeroth"], fmt="s-", color=ink("reinforce"), label="zeroth order")
 
 
 class StiffPush(Claim):
@@ -118,12 +120,12 @@ class StiffPush(Claim):
         coarse = {10.0: "46", 100.0: "7e2", 300.0: "4e4", 1000.0: "1e10"}
         fine = {10.0: "44", 100.0: "6e2", 300.0: "1e4", 1000.0: "2e7"}
         figures: list[Figure] = []
-        series: dict[str, list[float]] = {"k": list(coarse), "coarse": [], "fine": [], "zeroth": []}
+        series: dict[str, list[Any]] = {"k": list(coarse), "coarse": [], "fine": [], "zeroth": []}
         for k, text in coarse.items():
             at = problem(f"pushing[{values},horizon=200,dt=0.005]", f"penalty[stiffness={k!r}]")
             (v1, e1), (v0, e0) = sampled(at, COARSE, 17)
-            series["coarse"].append(v1)
-            series["zeroth"].append(v0)
+            series["coarse"].append((v1, e1))
+            series["zeroth"].append((v0, e0))
             figures.append(_heavy(f"first order, k = {k:g}", text, v1, e1, COARSE))
             once = of_the_source((v0, e0), COARSE)
             figures.append(Figure(f"zeroth order, k = {k:g}", "1.3e7", v0, e0, spread=once))
@@ -131,9 +133,9 @@ class StiffPush(Claim):
             at = problem(f"pushing[{finer}]", f"penalty[stiffness={k!r}]")
             w = np.random.default_rng(171).standard_normal((200, FINE))
             v1, e1 = spread(terms(at, estimator("fobg"), w), 16)
-            series["fine"].append(v1)
+            series["fine"].append((v1, e1))
             figures.append(_heavy(f"first order, k = {k:g}, step 20 times finer", text, v1, e1, FINE))
-        ratio = series["coarse"][-1] / series["fine"][-1]
+        ratio = series["coarse"][-1][0] / series["fine"][-1][0]
         return Outcome(
             figures,
             reservation=(
@@ -145,9 +147,10 @@ class StiffPush(Claim):
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw the variances against the stiffness."""
-        axes.loglog(series["k"], series["coarse"], "o-", label="first order, step 5 ms")
-        axes.loglog(series["k"], series["fine"], "o--", label="first order, step 0.25 ms")
-        axes.loglog(series["k"], series["zeroth"], "s-", label="zeroth order")
+        axes.set(xscale="log", yscale="log")
+        bars(axes, series["k"], series["coarse"], fmt="o-", color=ink("fobg"), label="first order, step 5 ms")
+        bars(axes, series["k"], series["fine"], fmt="o--", color=ink("fobg"), label="first order, step 0.25 ms")
+        bars(axes, series["k"], series["zeroth"], fmt="s-", color=ink("reinforce"), label="zeroth order")
 
 
 def _heavy(what: str, text: str, measured: float, error: float, count: int) -> Figure:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.ink import GREY, ink
 from bench.claims.pieces import centre, estimator, moments, problem
 
 if TYPE_CHECKING:
@@ -93,6 +94,6 @@ class Ramp(Claim):
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both variances against the width."""
-        axes.loglog(series["width"], series["first"], label="first order")
-        axes.loglog(series["width"], series["zeroth"], label="zeroth order")
-        axes.axvline(1.517, color="#404040", linewidth=0.6, label="published crossing")
+        axes.loglog(series["width"], series["first"], color=ink("fobg"), label="first order")
+        axes.loglog(series["width"], series["zeroth"], color=ink("reinforce"), label="zeroth order")
+        axes.axvline(1.517, color=GREY, linewidth=0.6, label="published crossing")

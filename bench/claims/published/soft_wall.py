@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.ink import GREY
 from bench.claims.pieces import native
 from bench.report.averages import summary
 
@@ -67,7 +68,7 @@ class SoftWall(Claim):
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw the error against the step."""
         axes.loglog(series["dt"], series["error"], "o-", label="penalty program")
-        axes.axhline(SPEED, color="#404040", linewidth=0.6, label="size of the gradient")
+        axes.axhline(SPEED, color=GREY, linewidth=0.6, label="size of the gradient")
 
 
 def _mean_error(dt: float, shares: np.ndarray) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.ink import ink
 from bench.claims.pieces import estimator, moments, problem
 
 if TYPE_CHECKING:
@@ -54,5 +55,5 @@ class Step(Claim):
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both means along theta."""
-        axes.plot(series["theta"], series["zeroth"], label="zeroth order: the slope")
-        axes.plot(series["theta"], series["first"], label="first order: 0 everywhere")
+        axes.plot(series["theta"], series["zeroth"], color=ink("reinforce"), label="zeroth order: the slope")
+        axes.plot(series["theta"], series["first"], color=ink("fobg"), label="first order: 0 everywhere")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import ERRORS, Claim, Figure, Outcome
+from bench.claims.ink import GREY
 from bench.claims.pieces import estimator, problem
 from bench.claims.published.ball_with_wall import BallWithWall
 from bench.claims.published.pivot import Pivot
@@ -36,7 +37,7 @@ class Switching(Claim):
         "A test for bias pays at a jump in one variable; on rollouts the orders' variances decide, and are best weighted "
         "action by action."
     )
-    labels = ("relative RMSE of switching, best setting", "of weights per action (a jump: per coordinate)")
+    labels = ("relative RMSE of switching, best setting", "relative RMSE of the weights")
     quick = False
 
     def measure(self) -> Outcome:
@@ -78,16 +79,20 @@ class Switching(Claim):
                 "name": [*jumps, *rollouts],
                 "best": [found.best for found in (*safer, *better)],
                 "weighted": [found.weighted for found in (*safer, *better)],
+                "errors": [found.errors for found in (*safer, *better)],
             },
         )
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw one error against the other: below the line weighting is better."""
         jumps = 3
+        axes.set(xscale="log", yscale="log")
+        across, up = 1.96 * np.array(series["errors"]).T
         for part, mark, label in ((slice(0, jumps), "o", "jumps"), (slice(jumps, None), "s", "rollouts")):
-            axes.loglog(series["best"][part], series["weighted"][part], mark, label=label)
+            x, y = series["best"][part], series["weighted"][part]
+            axes.errorbar(x, y, xerr=across[part], yerr=up[part], fmt=mark, capsize=2, elinewidth=0.8, label=label)
         ends = [0.5 * min(series["best"] + series["weighted"]), 2.0 * max(series["best"] + series["weighted"])]
-        axes.plot(ends, ends, color="#404040", linewidth=0.6, label="the same error")
+        axes.plot(ends, ends, color=GREY, linewidth=0.6, label="the same error")
 
 
 class _Found:
@@ -99,7 +104,12 @@ class _Found:
         roots = [float(np.sqrt(square.mean())) / size for square in squares]
         self.weighted, self.switches = roots[0], roots[1:]
         self.best = min(self.switches)
-        apart = squares[0] - squares[1 + self.switches.index(self.best)]
+        place = 1 + self.switches.index(self.best)
+        # by the delta method: a root's error is that of its square over twice the root
+        self.errors = [
+            float(squares[i].std(ddof=1) / np.sqrt(len(squares[i])) / (2 * size**2 * roots[i])) for i in (place, 0)
+        ]
+        apart = squares[0] - squares[place]
         self.apart = float(apart.mean()), float(apart.std(ddof=1) / np.sqrt(len(apart)))
 
 

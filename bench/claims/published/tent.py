@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.ink import bars, ink
 from bench.claims.pieces import estimator, problem, spread, terms
 from bench.model import Array, FunctionScene, param
 
@@ -83,12 +84,13 @@ class Chaos(Claim):
             figures,
             series={
                 "steps": list(found),
-                "first": [v[0][0] for v in found.values()],
-                "zeroth": [v[1][0] for v in found.values()],
+                "first": [v[0] for v in found.values()],
+                "zeroth": [v[1] for v in found.values()],
             },
         )
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both variances against the horizon."""
-        axes.semilogy(series["steps"], series["first"], "o-", label="first order: 4^T")
-        axes.semilogy(series["steps"], series["zeroth"], "s-", label="zeroth order")
+        axes.set_yscale("log")
+        bars(axes, series["steps"], series["first"], fmt="o-", color=ink("fobg"), label="first order: 4^T")
+        bars(axes, series["steps"], series["zeroth"], fmt="s-", color=ink("reinforce"), label="zeroth order")

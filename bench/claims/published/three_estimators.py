@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.ink import bars, ink
 from bench.claims.pieces import estimator, hermite, moments, problem, spread, terms
 from bench.model import Array, FunctionScene, param
 
@@ -108,7 +109,7 @@ class ThreeEstimators(Claim):
             )
         return Outcome(
             figures,
-            series={"k": list(waves), **{n: [v[i][0] for v in waves.values()] for i, n in enumerate(methods)}},
+            series={"k": list(waves), **{n: [v[i] for v in waves.values()] for i, n in enumerate(methods)}},
         )
 
     def _best_baseline(self, at: Any, k: float, nodes: np.ndarray, weights: np.ndarray) -> Figure:
@@ -123,8 +124,9 @@ class ThreeEstimators(Claim):
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw the variances against the frequency."""
-        for name in ("pathwise", "score", "measure-valued"):
-            axes.loglog(series["k"], series[name], "o-", label=name)
+        axes.set(xscale="log", yscale="log")
+        for name, method in (("pathwise", "fobg"), ("score", "reinforce"), ("measure-valued", "measure_valued")):
+            bars(axes, series["k"], series[name], fmt="o-", color=ink(method), label=name)
         axes.set_xticks(series["k"], [f"{k:g}" for k in series["k"]])
 
 
