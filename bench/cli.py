@@ -91,7 +91,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _stopped_by_signals() -> Iterator[None]:
     """Have SIGTERM and SIGHUP stop a command like Ctrl-C, and a second one of the three end it at once and in silence.
 
-    Nothing is lost then: finished rows are on disk, and workers end with their run.
+    Nothing is lost then: finished rows are on disk, and workers end with their run. A signal that arrives in a finaliser
+    or a callback of the garbage collector, where Python prints an exception and goes on, says nothing: ``INTERRUPTED`` is
+    set, and the run stops after the cell.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -104,6 +106,12 @@ def _stopped_by_signals() -> Iterator[None]:
         INTERRUPTED.set()
         raise KeyboardInterrupt
 
+    def drop(lost: sys.UnraisableHookArgs, /) -> None:
+        if not (lost.exc_type is KeyboardInterrupt and INTERRUPTED.is_set()):
+            before_dropped(lost)
+
+    before_dropped = sys.unraisablehook
+    sys.unraisablehook = drop
     before = {name: signal.getsignal(name) for name in names}
     for name in names:
         if before[name] not in (signal.SIG_IGN, None):  # as under nohup
@@ -112,6 +120,8 @@ def _stopped_by_signals() -> Iterator[None]:
         yield
     finally:
         INTERRUPTED.clear()
+        if sys.unraisablehook is drop:
+            sys.unraisablehook = before_dropped
         for name, handler in before.items():
             if signal.getsignal(name) is stop:
                 signal.signal(name, handler)

@@ -335,6 +335,32 @@ def test_a_library_leaves_the_signals_of_its_program_alone():
     )
 
 
+COLLECTED = """
+import gc, os, signal
+from bench.cli import _stopped_by_signals
+from bench.model.guard import guarded
+
+def struck(*_):
+    gc.callbacks.remove(struck)
+    os.kill(os.getpid(), signal.SIGTERM)
+    for _ in range(10):
+        pass
+
+with _stopped_by_signals():
+    gc.callbacks.append(struck)
+    try:
+        with guarded():
+            gc.collect()
+    except KeyboardInterrupt:
+        print("stopped")
+"""
+
+
+def test_a_signal_in_the_garbage_collector_stops_the_run_after_the_cell_and_prints_nothing():
+    done = subprocess.run([sys.executable, "-c", COLLECTED], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("stopped\n", "")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM", "SIGHUP"])
 @pytest.mark.parametrize("times", [1, 2])
