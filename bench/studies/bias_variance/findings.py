@@ -113,7 +113,9 @@ def tally(parts: Sequence[tuple[Family, Sequence[Line]]]) -> str:
     if not broken:
         return "Every estimator is better than answering zero on every problem that it was run on"
     first, tried = broken[0], found[broken[0]]
-    among = f"{sum(tried)} of {len(tried)} problems" if len(tried) > 1 else next(iter(parts))[0].label
+    if len(parts) == 1:
+        return f"{first} fails; {sound or 'none'} of {len(names)} estimators {'is' if sound == 1 else 'are'} better than zero"
+    among = f"{sum(tried)} of {len(tried)} problem{'s' * (len(tried) > 1)}"
     return f"{first} fails on {among}; {sound or 'none'} of {len(names)} estimators fail{'s' * (sound == 1)} on none"
 
 
