@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar, TypeVar, cast
 
-from bench.errors import UserError, unknown
+from bench.errors import UserError, printable, unknown
 
 LARGEST = 2**53
 """The largest whole number that is exact as float64, the type of number columns."""
@@ -96,14 +96,25 @@ def traced(plugin: Plugin) -> list[str]:
 
 
 def build(plugin: type[Plugin], values: Mapping[str, Any]) -> Plugin:
-    """Build an instance with checked parameter values; raises :class:`UserError` for a bad name, type or value."""
+    """Build an instance with checked parameter values; raises :class:`UserError` for a bad name, type or value.
+
+    And where the plugin's own code fails or exits: it may depend on what was made before it.
+    """
     declared = parameters(plugin)
     checked = {}
     for name, value in values.items():
         if name not in declared:
             raise unknown(f"parameter of {singular(plugin.kind)} {plugin.name}", name, declared)
         checked[name] = check(declared[name], value, f"{plugin.name}.{name}")
-    return plugin(**checked)
+    try:
+        return plugin(**checked)
+    except (UserError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        said = f"{type(error).__name__}: {printable(error)[:300]}"
+        raise UserError(
+            f"{singular(plugin.kind)} '{plugin.name}' cannot be made with these parameters: {said}"
+        ) from None
 
 
 def singular(kind: str) -> str:

@@ -85,7 +85,10 @@ def log_axis(
         words = 3 if text is not None else 4  # labels with a unit are wider than numbers
         ticks = _round_ticks(low, high, words if which == "x" else 5)
     if text is None:
-        powers = any(not 1e-3 <= t <= 1e3 for t in ticks) and all(f"{t:.1e}".startswith("1.0e") for t in ticks)
+        wide = which == "x" and len(ticks) > 3 and min(ticks) < 1e-2  # 0.001 and 0.01 would touch
+        powers = (wide or any(not 1e-3 <= t <= 1e3 for t in ticks)) and all(
+            f"{t:.1e}".startswith("1.0e") for t in ticks
+        )
         text = _power if powers else axis_value
     axis.set_major_locator(FixedLocator(ticks))
     axis.set_major_formatter(FuncFormatter(lambda t, _: text(t)))

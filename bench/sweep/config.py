@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bench.errors import STATUSES, UserError, printable, unknown
+from bench.errors import STATUSES, UserError, unknown
 from bench.model import Decision, guard, registry
 from bench.model.identity import parse_identity
 from bench.model.parameters import build, coerce, remember, singular
@@ -387,13 +387,7 @@ def _choice(kind: str, text: Any) -> Choice:
     name, values = parse_identity(text)
     entry = registry.find(kind, name)
     if entry.plugin is not None:
-        try:
-            # a plugin that leaves the working folder would take relative paths with it
-            with guard.quiet(f"{singular(kind)} {name}"), guard.guarded():
-                build(entry.plugin, values)
-        except (UserError, KeyboardInterrupt):
-            raise
-        except BaseException as error:  # a plugin that exits when it is made, too
-            said = f"{type(error).__name__}: {printable(error)[:300]}"
-            raise UserError(f"{singular(kind)} '{name}' cannot be made with these parameters: {said}") from None
+        # a plugin that leaves the working folder would take relative paths with it
+        with guard.quiet(f"{singular(kind)} {name}"), guard.guarded():
+            build(entry.plugin, values)
     return Choice(entry, tuple(sorted(values.items())))

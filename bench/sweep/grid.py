@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bench.errors import Unsupported, UserError, printable, unknown
+from bench.errors import Unsupported, UserError, unknown
 from bench.model import Decision, MechanicalScene, Plugin, Scene, compose
 from bench.model.parameters import build, coerce, parameters, singular
 from bench.model.program import OWN
@@ -305,13 +305,5 @@ def _build(plugin: type[Plugin], values: Sequence[tuple[str, Any]]) -> Plugin:
     """Return the one instance with these values; 1, 1.0 and True are distinct, since a parameter may refuse some."""
     key = (plugin, repr(values))
     if key not in _built:
-        try:
-            _built[key] = build(plugin, dict(values))
-        except (UserError, KeyboardInterrupt):
-            raise
-        except BaseException as error:  # made once already, but it may depend on what was made before it
-            said = f"{type(error).__name__}: {printable(error)[:300]}"
-            raise UserError(
-                f"{singular(plugin.kind)} '{plugin.name}' cannot be made with these parameters: {said}"
-            ) from None
+        _built[key] = build(plugin, dict(values))
     return _built[key]

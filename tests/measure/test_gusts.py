@@ -124,3 +124,9 @@ def test_gusts_need_controls():
         @dataclass(frozen=True)
         class Without(GustyScene):
             name = "without"
+
+
+def test_one_explicit_step_of_the_cart_moves_by_the_velocity_before_it():
+    """Its share of the force is 0, and so are the gradient and what it is divided by."""
+    program = compose(GustyCart(horizon=1), None, ExplicitEuler())
+    assert program.closed_form_gradient() == np.zeros(1)

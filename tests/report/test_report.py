@@ -28,6 +28,7 @@ from helpers import (
 )
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from bench.cli import main
 from bench.report import views
@@ -288,6 +289,20 @@ def test_nothing_swept_gives_an_overview():
     figures = drawn(rows, ["sigma"], sweep={"sigma": [0.1]})
     assert set(figures) == {"overview", "speed_accuracy"}
     assert set(curves(figures["overview"].axes[0])) == set(NAMES)
+
+
+def test_the_title_of_an_overview_says_who_fails_on_how_many_problems():
+    """fobg is lowest on heaviside and no better than zero on pushing; the others are better than zero on both."""
+    errors = {("fobg", "heaviside"): 0.01, ("fobg", "pushing"): 1.5}
+    rows = table(
+        [row(estimator=e, scene=s, rmse_rel=errors.get((e, s), 0.3)) for e in NAMES for s in ("heaviside", "pushing")]
+    )
+    figure = drawn(rows, ["sigma"], sweep={"sigma": [0.1]})["overview"]
+    said = f"fobg fails on 1 of 2 problems; {len(NAMES) - 1} of {len(NAMES)} estimators fail on none"
+    assert said in {text.get_text() for text in figure.findobj(Text)}
+    alone = drawn(rows[rows["scene"] == "pushing"], ["sigma"], sweep={"sigma": [0.1]})["overview"]
+    said = f"fobg fails; {len(NAMES) - 1} of {len(NAMES)} estimators are better than zero"
+    assert said in {text.get_text() for text in alone.findobj(Text)}
 
 
 def test_a_parameter_in_an_identity_string_is_an_axis():

@@ -186,8 +186,15 @@ def test_jobs_of_submitit_give_the_rows_of_a_local_run(tmp_path):
         f"results_dir={tmp_path}",
     ]
     assert main([*words, "name=local"]) == 0
-    done = bench(*words, "name=sent", "launcher=slurm", "slurm.cluster=local", "slurm.cells=4", "slurm.parallel=2")
+    sent = ["name=sent", "launcher=slurm", "slurm.cluster=local", "slurm.cells=4", "slurm.parallel=2"]
+    assert main([*words, "name=sent", "sweep.sigma=[0.2]"]) == 0  # one launcher begins, another goes on
+    begun = rows(tmp_path / "sent")
+    done = bench(*words, *sent)
     assert done.returncode == 0, done.stderr
+    assert len(begun) == 2
+    table = pd.read_parquet(tmp_path / "sent" / "rows.parquet").set_index("key")
+    first = table.loc[begun["key"], "sequence"].max()
+    assert (table.drop(index=begun["key"])["sequence"] > first).all()
     pd.testing.assert_frame_equal(rows(tmp_path / "sent"), rows(tmp_path / "local"), check_exact=True)
     assert not (tmp_path / "sent" / "jobs").exists()
     again = bench("plan", *words, "name=sent")
@@ -212,6 +219,8 @@ def test_a_ray_cluster_that_loses_a_node_gives_the_table_of_a_local_run(tmp_path
     try:
         address = next(line.strip() for line in cluster.stdout if ":" in line)
         ray = ["launcher=ray", f"ray.address={address}", "ray.cells=6"]
+        assert main([*words, "sweep.seed=[0,1]", "name=sent"]) == 0  # begun here, gone on with there
+        begun = pd.read_parquet(tmp_path / "sent" / "rows.parquet").set_index("key")["stored_at"]
         run = subprocess.Popen(
             [sys.executable, "-m", "bench", *words, *ray, "name=sent"], stderr=subprocess.PIPE, text=True,
             stdout=subprocess.DEVNULL, env=environment,
@@ -235,6 +244,8 @@ def test_a_ray_cluster_that_loses_a_node_gives_the_table_of_a_local_run(tmp_path
             cluster.kill()
             cluster.wait()
         cluster.stdout.close()
+    stored = pd.read_parquet(tmp_path / "sent" / "rows.parquet").set_index("key")["stored_at"]
+    assert stored[begun.index].equals(begun)
     assert main([*words, "name=local", "workers=2"]) == 0
     pd.testing.assert_frame_equal(rows(tmp_path / "sent"), rows(tmp_path / "local"), check_exact=True)
     assert (rows(tmp_path / "timed")["time_s"] > 0).all()

@@ -6,6 +6,13 @@ import sys
 
 import misbehave
 import pytest
+from bench.plugins.scenes.quadratic import Quadratic
+
+from bench.errors import UserError
+from bench.model.parameters import build
+from bench.report import reproduce
+from bench.sweep import config
+from bench.sweep.execute import execute, store_of
 
 
 def test_the_bank_holds_every_kind_place_and_fault():
@@ -31,3 +38,20 @@ def test_a_plugin_that_shouts_when_it_is_made_reaches_no_terminal_from_the_repor
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert not misbehave.SAID.search(done.stdout + done.stderr)
+
+
+def test_a_plugin_that_cannot_be_made_again_for_the_page_leaves_a_line_without_its_command(tmp_path, monkeypatch):
+    """It was: status 2 and an error of the system without a name, after all cells had run."""
+    words = ["scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "samples=2", "repeats=3", "timing=false"]
+    experiment = config.load([*words, "workers=0", f"results_dir={tmp_path}"])
+    execute(experiment)
+    rows = store_of(experiment).load()
+    assert reproduce.commands(experiment, rows)[0]
+
+    def refuse(self, **values):
+        raise OSError(9, "Bad file descriptor")
+
+    monkeypatch.setattr(Quadratic, "__init__", refuse)
+    assert reproduce.commands(experiment, rows) == [[]]
+    with pytest.raises(UserError, match="scene 'quadratic' cannot be made"):
+        build(Quadratic, {})

@@ -100,6 +100,25 @@ def headline(
     return "; ".join(clauses) or f"No estimator is better than zero anywhere along {axis.column}"
 
 
+def tally(parts: Sequence[tuple[Family, Sequence[Line]]]) -> str:
+    """Write on how many problems the estimator that is lowest most often fails, and how many fail on none.
+
+    Failing is what it is in :func:`headline`.
+    """
+    wins = Counter(label for _, curves in parts for labels in winners(curves).values() for label in labels)
+    names = sorted(dict.fromkeys(line.label for _, curves in parts for line in curves), key=lambda name: -wins[name])
+    found = {name: [any(where.values()) for _, curves in parts if (where := _failures(curves, name))] for name in names}
+    broken = [name for name in names if any(found[name])]
+    sound = sum(bool(tried) and not any(tried) for tried in found.values())
+    if not broken:
+        return "Every estimator is better than answering zero on every problem that it was run on"
+    first, tried = broken[0], found[broken[0]]
+    if len(parts) == 1:
+        return f"{first} fails; {sound or 'none'} of {len(names)} estimators {'is' if sound == 1 else 'are'} better than zero"
+    among = f"{sum(tried)} of {len(tried)} problem{'s' * (len(tried) > 1)}"
+    return f"{first} fails on {among}; {sound or 'none'} of {len(names)} estimators fail{'s' * (sound == 1)} on none"
+
+
 def _change(line: Line) -> float:
     """Return the ratio of a line's largest to its smallest error; 1 where it has fewer than two."""
     rows = line.rows[line.rows["status"] == "ok"]

@@ -34,7 +34,7 @@ from bench.report.style import (
 )
 from bench.report.views import Family, Line, lines, pareto, resolved
 from bench.studies.bias_variance.costs import Cost
-from bench.studies.bias_variance.findings import headline
+from bench.studies.bias_variance.findings import headline, tally
 from bench.sweep.axes import Axis
 
 ALIKE = 0.03
@@ -303,8 +303,9 @@ def _draw_scales(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
 
 
 def overview(problems: Sequence[Family], notes: Sequence[str], look: Look) -> Figure:
-    """Draw relative bias and RMSE of every estimator, a panel per problem."""
-    drawn = [{_row_label(line, curves): line for line in curves} for curves in (lines(p.rows, ALIKE) for p in problems)]
+    """Draw relative bias and RMSE of every estimator, a panel per problem; the title says who fails on how many."""
+    every = [lines(problem.rows, ALIKE) for problem in problems]
+    drawn = [{_row_label(line, curves): line for line in curves} for curves in every]
     labels = list(dict.fromkeys(label for curves in drawn for label in curves))
     symbols: list[Any] = [
         _handle("relative bias, 95% interval", marker="o", linestyle="none"),
@@ -316,7 +317,8 @@ def overview(problems: Sequence[Family], notes: Sequence[str], look: Look) -> Fi
         symbols.append(_handle("cell failed", **CROSS))
     figure, panels = page(
         problems, columns(len(problems), 3), 0.55 + 0.24 * len(labels), ("",),
-        "Relative bias and RMSE of one estimate", [*shared(problems, ""), *notes], ([], symbols), sharey=True,
+        tally(list(zip(problems, every, strict=True))),
+        ["Relative bias and RMSE of one estimate", *shared(problems, ""), *notes], ([], symbols), sharey=True,
     )  # fmt: skip
     for (panel,), curves in zip(panels, drawn, strict=True):
         for label, line in curves.items():
