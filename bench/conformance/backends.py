@@ -211,10 +211,13 @@ def shared_theta_is_spread(backend: Backend) -> str:
 
 @verifies(Backend)
 def failed_rollouts_have_no_gradient(backend: Backend) -> str:
-    """Verify that a gradient is not finite where its cost is not: theta far out, in one column of a batch."""
+    """Verify that a cost is not finite where the plain backend's is not, nor a gradient where its cost is not.
+
+    Theta is far out in one column of a batch. An engine that stops, resets or repeats its last state has to say so.
+    """
     if "grad" not in backend.provides:
         raise Skipped("gives no gradients")
-    lost = []
+    lost, plain = [], plain_backend()
     for program in programs_for(backend, telling):
         theta, w = samples(program)
         far = np.where(np.arange(COLUMNS) == 1, FAR * (1.0 + np.abs(theta)), theta)
@@ -222,6 +225,9 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
         with np.errstate(all="ignore"):
             failed = ~np.isfinite(problem.value(far, w))
             gone = ~np.isfinite(problem.grad(far, w)).all(axis=0)
+            if plain.lacks(program) is None:
+                beyond = ~np.isfinite(plain.compile(program).value(far, w))
+                require(failed[beyond].all(), f"{title(program)}: a rollout that leaves all numbers has a finite cost")
         require(gone[failed].all(), f"{title(program)}: a cost that is not finite has a finite gradient")
         lost.append(failed.any())
     if not any(lost):

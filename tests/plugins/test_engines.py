@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.backends import compiling
+from bench.plugins.backends import compiling, mujoco
 from bench.plugins.backends.jax import Jax
 from bench.plugins.backends.mjx import Mjx
 from bench.plugins.backends.mujoco import Mujoco
@@ -20,6 +20,7 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.bouncing_ball import BouncingBall
 from bench.plugins.scenes.cartpole import Cartpole
+from bench.plugins.scenes.double_integrator import DoubleIntegrator
 from bench.plugins.scenes.double_pendulum import DoublePendulum
 from bench.plugins.scenes.hopper import Hopper
 from bench.plugins.scenes.pendulum import Pendulum
@@ -31,6 +32,8 @@ from bench.cli import main
 from bench.conformance import backends
 from bench.conformance.kit import Failed
 from bench.conformance.subjects import distance, law_for, samples
+from bench.measure import noise
+from bench.measure.reference import certify
 from bench.model import EngineScene, EngineTwin, compose, registry
 from bench.plugins import mjcf
 from bench.studies.bias_variance import BiasVariance
@@ -283,3 +286,34 @@ def test_force_of_unscaled_edges_fails_the_kit(monkeypatch):
     monkeypatch.setattr(mjcf, "_edges", lambda model: np.ones(model.npair))
     with pytest.raises(Failed, match=r"63\.97 \(10\)"):
         backends.frictional_contact_has_the_force_of_its_law(Mujoco())
+
+
+def test_rollout_that_stops_with_a_number_fails_the_kit(monkeypatch):
+    """MuJoCo stops at the first bad number: were that the end of the rollout, its cost would be a number."""
+    rolled = mujoco.Engine.rollout
+    monkeypatch.setattr(mujoco.Engine, "rollout", lambda *given: np.nan_to_num(rolled(*given)))
+    with pytest.raises(Failed, match="has a finite cost"):
+        backends.failed_rollouts_have_no_gradient(Mujoco())
+
+
+def test_gradient_of_a_failed_rollout_that_is_a_number_fails_the_kit(monkeypatch):
+    reverse = mujoco._reverse
+    monkeypatch.setattr(mujoco, "_reverse", lambda *given, **more: np.nan_to_num(reverse(*given, **more)))
+    with pytest.raises(Failed, match="has a finite gradient"):
+        backends.failed_rollouts_have_no_gradient(Mujoco())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", [Mujoco(), Mjx()], ids=repr)
+def test_references_of_an_engine_miss_the_gradient_by_the_error_they_state(engine, monkeypatch):
+    """Twenty references from draws of their own, on a scene whose gradient is known: errors over stated errors are about 1."""
+    of = program(DoubleIntegrator(horizon=10))
+    problem, truth, ratios = engine.compile(of), of.closed_form_gradient(), []
+    drawn = noise.draw
+    for seed in range(20):
+        monkeypatch.setattr(noise, "draw", lambda block, *rest, seed=seed: drawn(block + 10**6 * seed, *rest))
+        found = certify(problem, engine.provides, 4096, 0.0)
+        assert found.method.startswith("sampling")
+        ratios.append(np.linalg.norm(found.gradient - truth) / found.known().standard_error)
+    assert 0.5 < np.mean(np.square(ratios)) < 1.7, ratios
+    assert max(ratios) < 4.0
