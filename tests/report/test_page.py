@@ -270,6 +270,23 @@ def test_status_reason_and_time_are_in_sight_on_a_laptop(browser, tmp_path):
     browser.size(*WIDE)
 
 
+def test_what_to_use_where_is_in_sight_as_a_whole_on_a_laptop(browser, tmp_path):
+    """Long settings of estimators break; they pushed the last column out of sight."""
+    path, long = tmp_path / "report.html", "delta=0.95,gamma=4,sharing=shared,samples=quasi_random,pilot=0.25"
+    rows = [
+        row(stiffness=k, estimator=e, estimator_params=p, rmse_rel=error)
+        for k in (1.0, 10.0)
+        for e, p, error in (("randomized_smoothing", "", 0.1), ("alpha_order", long, 2.0), ("alpha_order", f"{long},ratio=3", 0.5), ("control_variate", "", 3.0))
+    ]  # fmt: skip
+    path.write_text(page(table(rows)))
+    browser.size(1280, 900)
+    browser.open(path)
+    wider = "(b => b.scrollWidth - b.clientWidth)(document.querySelector('#answers .scroll'))"
+    assert browser.do(wider) <= 0
+    assert browser.do("document.querySelectorAll('#answers tr').length") > 1
+    browser.size(*WIDE)
+
+
 @pytest.mark.slow
 def test_print_fills_the_page_with_charts_and_tables_that_fit_it(browser, tmp_path):
     """What is wider than A4 between its margins would make a browser print everything smaller."""
