@@ -269,7 +269,7 @@ FAULTS = [
     Fault(EL, "GUARD = 64.0", "GUARD = 0.0", OF_EXAMINE),
     Fault(EL, "if order < 0.5:", "if order < -0.5:", OF_EXAMINE),
     Fault(EL, "elif order < 1.5:", "elif order < 2.5:", OF_EXAMINE),
-    Fault(EL, "float(change[end, k] / widths[end])", "float(change[end, k])", OF_EXAMINE),
+    Fault(EL, "float(bends[end][k])", "float(bends[0][k])", OF_EXAMINE),
     Fault(EL, "(np.abs(level) <= noise).mean() > 0.5", "True", OF_EXAMINE),
     Fault(EF, "or self.tread):", "):", OF_EXAMINE),
     Fault(EF, "return max(treads) if alike and self.missed > SEEN else 0.0", "return max(treads) if alike else 0.0", OF_EXAMINE),
