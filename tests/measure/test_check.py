@@ -1,11 +1,14 @@
 """The check of a gradient: each planted fault gets the name of its cause, and right gradients of hard costs get none."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from bench.measure.gradcheck import EPS, TRUSTED, UNTRUSTED, VERDICTS, Options, check, judge, roughness, worst
 from bench.measure.gradcheck.sampling import points, samples
 
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "trust.md").read_text().partition("## Planted faults")[2]
 THETA = np.array([0.3, 1.2, -0.7])
 UNIT = float(np.finfo(np.float64).eps)
 EXACT = 1e-7
@@ -60,6 +63,7 @@ FAULTS = {
     "one component stopped": ("disconnected", cost, lambda x: gradient(x) * [0.0, 1.0, 1.0]),
     "half": ("wrong_factor", cost, lambda x: 0.5 * gradient(x)),
     "one part in a thousand": ("wrong_factor", cost, lambda x: 1.001 * gradient(x)),
+    "sign": ("wrong_factor", cost, lambda x: -gradient(x)),
     "sign of one component": ("wrong_factor", cost, lambda x: gradient(x) * [-1.0, 1.0, 1.0]),
     "coupling left out": ("missing_term", cost, lambda x: np.cos(x) + 0.2 * x),
     "term of one component left out": ("missing_term", cost, lambda x: gradient(x) - first(np.cos(x[0]))),
@@ -67,6 +71,7 @@ FAULTS = {
     "term that acts only here": (
         "missing_term", lambda x: cost(x) - 40.0 * np.maximum(0.6 - x[0], 0.0) ** 2 * (x[1] + 3.0 * x[2]), gradient
     ),
+    "factor that hardly changes": ("missing_term", cost, lambda x: gradient(x) * (0.5 + 2e-3 * x[1])),
     "wrong beside theta": ("missing_term", cost, lambda x: gradient(x) + 0.3 * (x - THETA)),
     "components in another order": ("wrong_adjoint", cost, lambda x: gradient(x)[[1, 2, 0]] * [-1.0, 3.0, 4.0]),
     "jump": ("jump", lambda x: cost(x) + 0.1 * (x[0] > 0.3), gradient),
@@ -90,6 +95,13 @@ def test_planted_fault_is_named_by_its_cause(name):
     found = check(planted, program, THETA)
     assert found.cause == cause, found.sentence()
     assert found.trusted == (cause in TRUSTED)
+
+
+def test_the_planted_faults_are_those_that_the_documents_list():
+    listed = (line.split("|")[1:3] for line in DOCUMENT.splitlines() if line.startswith("| `"))
+    planted = {cause.strip(" `"): names.strip() for cause, names in listed if cause.strip(" `") in VERDICTS}
+    for cause in {cause for cause, *_ in FAULTS.values()}:
+        assert planted[cause] == ", ".join(name for name, fault in FAULTS.items() if fault[0] == cause)
 
 
 def test_right_gradient_is_smooth_and_each_component_has_its_numbers():

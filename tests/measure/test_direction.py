@@ -92,6 +92,37 @@ def test_a_factor_is_named_only_where_ratios_agree_within_their_errors():
     assert of_ratios({0: same, 1: other}, [], False) == dict.fromkeys([0, 1, None], "missing_term")
 
 
+def cause(values, error, **given):
+    return of_ratios({0: [Ratio(value, error) for value in values]}, [], some_right=False, **given)[0]
+
+
+def test_ratios_may_differ_by_the_programs_rounding_by_ten_errors_and_no_more():
+    """By a hundred-thousandth of their size or of their distance from 1, whichever is less."""
+    assert cause([0.5, 0.500003, 0.499997, 0.5], 1e-13) == "wrong_factor"
+    assert cause([0.5, 0.50003, 0.49997, 0.5], 1e-13) == "missing_term"
+    assert cause([1.001, 1.001001, 1.000999, 1.001001], 1e-13) == "missing_term"
+    assert cause([1.001, 1.001001, 1.000999, 1.001001], 3e-7) == "wrong_factor"
+    assert cause([0.5, 0.50005, 0.49995, 0.50005], 1e-5) == "wrong_factor"
+    assert cause([0.5, 0.50005, 0.49995, 0.50005], 1e-6) == "missing_term"
+
+
+def test_one_ratio_of_five_may_be_spoilt_and_two_may_not():
+    assert cause([0.5] * 4 + [0.9], 1e-9) == "wrong_factor"
+    assert cause([0.5] * 3 + [0.9, 0.7], 1e-9) == "missing_term"
+    assert cause([0.5, 0.7, 0.9, 1.2, -3.0], 1e-9) == "missing_term"
+    assert cause([0.5, 0.7, 0.9, -1.2, -3.0], 1e-9) == "wrong_adjoint"
+    assert cause([0.5, 0.7, 0.9, -1.2, -3.0], 1e-9, right_elsewhere=True) == "missing_term"
+
+
+def test_one_factor_for_several_components_is_one_and_the_most_frequent_cause_is_that_of_directions():
+    """Two ratios are too few to say alone, and enough together; what most components have, random directions have."""
+    few = [Ratio(0.5, 1e-9)] * 2
+    assert of_ratios({0: few, 1: few}, [], False) == dict.fromkeys([0, 1, None], "wrong_factor")
+    beyond, partly = ([Ratio(v, 1e-9) for v in values] for values in ([-3.0, 5.0, 2.5], [0.1, 0.9, 0.5]))
+    assert of_ratios({0: beyond, 1: partly, 2: partly}, [], False)[None] == "missing_term"
+    assert of_ratios({0: partly, 1: beyond, 2: beyond}, [], False)[None] == "wrong_adjoint"
+
+
 def test_noise_is_the_standard_deviation_of_independent_normal_numbers():
     values = 3e-7 * np.random.default_rng(2).standard_normal((1, 100_000))
     smooth = np.linspace(0.0, 1.0, values.size) ** 2

@@ -120,6 +120,15 @@ def test_a_row_dated_in_the_future_is_replaced_by_the_next_one(tmp_path, monkeyp
     assert list(Store(tmp_path, COLUMNS).load()["bias"]) == [3.0]
 
 
+@pytest.mark.parametrize("dated", [0, 1])
+def test_of_two_rows_without_a_count_the_one_with_a_date_wins(tmp_path, dated):
+    (tmp_path / "pending").mkdir()
+    for i in range(2):
+        old = {name: value for name, value in row(bias=float(i)).items() if name not in ("stored_at", "sequence")}
+        (tmp_path / "pending" / f"{i}.json").write_text(json.dumps([old | ({"stored_at": 1e9} if i == dated else {})]))
+    assert list(Store(tmp_path, COLUMNS).load()["bias"]) == [float(dated)]
+
+
 @pytest.mark.parametrize("count", [float("inf"), 1e300, -5.0, float("nan")])
 def test_a_count_that_no_run_has_written_wins_nothing(tmp_path, count):
     (tmp_path / "pending").mkdir()

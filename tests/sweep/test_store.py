@@ -75,6 +75,18 @@ def test_newest_row_of_a_key_wins_wherever_it_lies(tmp_path):
     assert list(store.load()["bias"]) == [3.0]
 
 
+def test_rows_stay_in_the_order_of_their_file_whenever_they_were_stored(tmp_path):
+    store = Store(tmp_path, COLUMNS)
+    for i in (1, 2, 3):
+        store.append(row(i))
+    keys = [row(i)["key"] for i in (3, 1, 2)]
+    store.compact(keys)
+    store.append(row(4))
+    assert list(store.load()["key"]) == [*keys, row(4)["key"]]
+    store.compact()
+    assert list(pd.read_parquet(tmp_path / "rows.parquet")["key"]) == [*keys, row(4)["key"]]
+
+
 def test_rows_of_an_older_store_are_read(tmp_path):
     (tmp_path / "pending").mkdir()
     old = {k: v for k, v in row(1).items() if k not in ("wall_s", "stored_at")}
