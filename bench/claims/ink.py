@@ -7,18 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.model import registry
-from bench.report.style import GREY, colour
+from bench.report.ink import ink
+from bench.report.style import GREY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = ["GREY", "bars", "ink"]
-
-
-def ink(estimator: str) -> str:
-    """Return the colour that an estimator has in every chart."""
-    return colour(sorted(registry.entries()["estimators"]).index(estimator))
 
 
 def bars(axes: Axes, x: Sequence[float], measured: Sequence[tuple[float, float]], **look: Any) -> None:

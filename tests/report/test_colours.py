@@ -5,10 +5,15 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.colors import to_rgb
 
+from bench.model import registry
 from bench.report.style import MARKERS, PALETTE, colour
+from bench.studies.growth import report as growth
+from bench.studies.optimise import findings
+from bench.studies.optimise import report as searches
 
 DEUTERANOPIA = np.array(
     [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
@@ -54,3 +59,37 @@ def test_red_and_green_of_equal_lightness_would_be_caught():
 def test_more_estimators_than_colours_differ_by_colour_or_marker(seen):
     for a, b in combinations(range(ESTIMATORS), 2):
         assert marker(a) != marker(b) or apart(colour(a), colour(b), seen) > DISTINCT, (a, b)
+
+
+def test_an_estimator_keeps_its_colour_in_searches_and_in_errors_and_what_sees_costs_only_is_grey_and_dashed():
+    """fobg was blue in one experiment's searches, pink in another's, and orange in growth."""
+    found = searches.looks(
+        ["cem[elites=8,population=40]", "fobg, adam", "fobg, line_search", "windowed[steps=5], adam"]
+    )
+    for method, estimator in (
+        ("fobg, adam", "fobg"),
+        ("fobg, line_search", "fobg"),
+        ("windowed[steps=5], adam", "windowed"),
+    ):
+        assert found[method]["color"] == colour(sorted(registry.entries()["estimators"]).index(estimator))
+    assert found["fobg, adam"]["linestyle"] != found["fobg, line_search"]["linestyle"]
+    context = found["cem[elites=8,population=40]"]
+    assert len(set(to_rgb(context["color"]))) == 1
+    assert context["linestyle"] != "-"
+    assert growth.VARIANCES["first_order"][1]["color"] == found["fobg, adam"]["color"]
+
+
+def test_titles_of_searches_say_what_was_found():
+    rho = pd.DataFrame(
+        [("stiff", 12, 0.9, 0.6, 1.0, 0.02), ("smooth", 12, 0.1, -0.4, 0.7, 0.9), ("chaotic", 3, -1.0, -1.0, -1.0, 0.0)],
+        columns=["scene_class", "points", "rho", "rho_low", "rho_high", "chance"],
+    )  # fmt: skip
+    assert (
+        findings.sooner(rho)
+        == "The better gradient arrives sooner on stiff scenes; not known on smooth, chaotic scenes"
+    )
+    assert findings.sooner(rho[1:]).startswith("Whether the better gradient arrives sooner is not known on smooth")
+    assert findings.reaches({"cem": 0.5, "fobg, adam": 0.4, "reinforce, adam": 0.1}) == (
+        "cem reaches most targets (50%); with gradients fobg, adam (40%)"
+    )
+    assert findings.reaches({"fobg, adam": 0.4, "cem": 0.3}) == "fobg, adam reaches most targets (40%)"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import textwrap
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,9 +14,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 
 from bench.report.style import plain
-from bench.report.text import number
+from bench.report.text import counted, number
 from bench.report.views import Family
-from bench.studies.bias_variance.costs import Cost
+from bench.studies.bias_variance.costs import ROLLOUTS, Cost
 from bench.studies.bias_variance.fastest import TARGETS, Reached, methods
 
 FIRST = "#009E73"
@@ -29,7 +31,7 @@ WHY = {"never": "bias", "unknown": "bias?"}
 """What stands in a cell without a number."""
 LEGEND = (
     "Dark and bold: the first of its column; lighter: up to 3, and up to 30 times as much. Lead: the first over the next "
-    "estimator, with its 95%\ninterval; open where that reaches 1. bias: its bias is larger than the error. bias?: no bias known to be below the error."
+    "estimator, with its 95% interval; open where that reaches 1. bias: its bias is larger than the error. bias?: no bias known to be below the error."
 )
 LEAD = "lead over the next"
 
@@ -48,8 +50,8 @@ def glance(problems: Sequence[Family], costs: Sequence[Cost]) -> Figure:
     size = max(6.0, 1.5 + 0.93 * len(problems)), 0.9 + (0.45 + 0.27 * (len(names) + 1)) * len(found)
     figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(rect=(0.01, 0.0, 0.98, 1.0)))
     FigureCanvasAgg(figure)
-    figure.suptitle("What one estimate needs for an error, on its best backend", fontsize=9, fontweight="bold")
-    figure.supxlabel(LEGEND, fontsize=6.5)
+    figure.suptitle(f"{_leader(found)}\nWhat one estimate needs, on its best backend", fontsize=9, fontweight="bold")
+    figure.supxlabel(textwrap.fill(LEGEND, int(19 * size[0])), fontsize=6.5)
     panels = figure.subplots(len(found), 1, squeeze=False)[:, 0]
     for panel, ((cost, target), columns) in zip(panels, found.items(), strict=True):
         _matrix(panel, columns, names, cost)
@@ -57,6 +59,26 @@ def glance(problems: Sequence[Family], costs: Sequence[Cost]) -> Figure:
         panel.set_xticks(range(len(problems)), [plain(p.title().partition(",")[0]) for p in problems], fontsize=6.5)
         panel.set_yticks(range(len(names) + 1), [*map(plain, names), LEAD], fontsize=7)
     return figure
+
+
+def _leader(found: Mapping[tuple[Cost, float], Sequence[Mapping[str, tuple[Reached, str]]]]) -> str:
+    """Write which estimator is first most often at the first cost and error."""
+    (cost, target), columns = next(iter(found.items()))
+    firsts = Counter(_first(column) for column in columns)
+    unsure = firsts.pop(None, 0)
+    if not firsts:
+        return f"Which estimator is first to {target:.0%} error cannot be told on any problem"
+    name, times = firsts.most_common(1)[0]
+    kind = "rollouts" if cost is ROLLOUTS else "time"
+    said = f"{name} is first to {target:.0%} error by {kind} on {times} of {counted(len(columns), 'problem')}"
+    return said + (f", open on {unsure}" if unsure else "")
+
+
+def _first(column: Mapping[str, tuple[Reached, str]]) -> str | None:
+    """Return the estimator that is first; None if there is none or its lead may be chance."""
+    if _lead(column) in ("", "open"):
+        return None
+    return min((name for name in column if math.isfinite(column[name][0].cost)), key=lambda name: column[name][0].cost)
 
 
 def _best(reached: Mapping[str, Reached]) -> dict[str, tuple[Reached, str]]:

@@ -19,7 +19,7 @@ from bench.report.web.content import (
     looks,
     nothing_ran,
 )
-from bench.studies.growth.report import problem_of
+from bench.studies.growth.report import grown, problem_of
 from bench.sweep.experiment import Experiment
 
 HORIZON = [Axis("time_horizon", "horizon [s]"), Axis("horizon", "horizon [steps]")]
@@ -126,13 +126,8 @@ def gains_of(rows: pd.DataFrame) -> pd.DataFrame:
 
 def finding(table: pd.DataFrame) -> str:
     """Write which problems explode and vanish, and from which horizon on the zeroth order has the lower variance."""
-    parts = []
-    for growth, verb in (("exploding", "explode"), ("vanishing", "vanish"), ("neutral", "do neither")):
-        names = table.loc[table["growth"] == growth, "problem"]
-        if len(names):
-            parts.append(f"{verb} on {', '.join(names)}")
     better = table[table["zeroth order has less variance"] != "nowhere"]
-    text = "Gradients through time " + ", ".join(parts)
+    text = grown(dict(zip(table["problem"], table["growth"], strict=True)))
     crossing = ", ".join(
         f"{problem} {where}"
         for problem, where in zip(better["problem"], better["zeroth order has less variance"], strict=True)

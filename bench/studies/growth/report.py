@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
 
 from bench.report.figures import save, styled
+from bench.report.ink import ink
 from bench.report.page import WIDTH
 from bench.report.scales import log_axis
 from bench.report.style import PALETTE, plain
@@ -30,8 +32,8 @@ from bench.sweep.files import write_all
 
 NORM: dict[str, Any] = {"color": "#000000", "marker": "o"}
 VARIANCES: dict[str, tuple[str, dict[str, Any]]] = {
-    "first_order": ("fobg", {"color": PALETTE[2], "marker": "D"}),
-    "zeroth_order": ("zeroth order", {"color": PALETTE[5], "marker": "P", "linestyle": (0, (4, 1.5))}),
+    "first_order": ("fobg", {"color": ink("fobg"), "marker": "D"}),
+    "zeroth_order": ("zeroth order", {"color": ink("reinforce"), "marker": "P", "linestyle": (0, (4, 1.5))}),
 }
 SINGULAR: tuple[dict[str, Any], ...] = (
     {"color": PALETTE[2], "marker": "^", "markersize": 3.5},
@@ -148,6 +150,16 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
 # ------------------------------------------------------------------------------------------------------- chart
 
 
+def grown(growths: Mapping[str, str]) -> str:
+    """Write on which problems gradients explode and vanish; ``growths`` has the growth of each at its longest horizon."""
+    parts = []
+    for growth, verb in (("exploding", "explode"), ("vanishing", "vanish"), ("neutral", "do neither")):
+        names = [name for name, found in growths.items() if found == growth]
+        if names:
+            parts.append(f"{verb} on {', '.join(names)}")
+    return "Gradients through time " + ", ".join(parts)
+
+
 def figure(shown: Arranged) -> Figure | None:
     """Draw a column of panels per problem: norms of sampled gradients, the Jacobian product, variances per sample."""
     rows = ran(shown.rows)
@@ -160,7 +172,11 @@ def figure(shown: Arranged) -> Figure | None:
         return None
     drawing = Figure(figsize=(max(WIDTH, 1.45 * len(groups)), 7.6), layout="constrained")
     FigureCanvasAgg(drawing)
-    drawing.suptitle("Do gradients through time vanish or explode?", fontsize=9, fontweight="bold")
+    drawing.suptitle(
+        textwrap.fill(grown({name: part["growth"].iloc[-1] for name, part in groups}), 92),
+        fontsize=9,
+        fontweight="bold",
+    )
     grid = drawing.subplots(len(ROWS), len(groups), squeeze=False, sharey="row")
     for column, (name, part) in zip(grid.T, groups, strict=True):
         times = part["time_horizon"]

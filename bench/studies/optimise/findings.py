@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
@@ -47,6 +48,55 @@ def pays(rho: pd.DataFrame) -> str:
         else:
             parts.append(f"{row['scene_class']}: not known ({figures})")
     return "Does the gradient with the smaller error at the start arrive sooner? " + "; ".join(parts) + "."
+
+
+def sooner(rho: pd.DataFrame) -> str:
+    """Write in a title on which classes of scenes the smaller error arrives sooner."""
+    classes = rho[rho["scene_class"] != "all"].to_dict("records")
+    known = [row for row in classes if row["points"] >= 4 and row["chance"] <= CHANCE]
+    sure = {
+        "sooner": [row["scene_class"] for row in known if row["rho_low"] > 0],
+        "later": [row["scene_class"] for row in known if row["rho_high"] < 0],
+    }
+    said = [f"the better gradient arrives {when} on {' and '.join(on)} scenes" for when, on in sure.items() if on]
+    unsure = [row["scene_class"] for row in classes if row["scene_class"] not in (*sure["sooner"], *sure["later"])]
+    said += [f"not known on {', '.join(unsure)} scenes"] if unsure else []
+    text = "; ".join(said)
+    return (
+        text[:1].upper() + text[1:] if any(sure.values()) else f"Whether the better gradient arrives sooner is {text}"
+    )
+
+
+def closest(summed: pd.DataFrame) -> str:
+    """Write in a title which method comes closest to J*, and which first of those with gradients."""
+    known = summed[summed["score"].notna()].sort_values("score", ascending=False)
+    return _first([(row["method"], number(row["score"], 3)) for row in known.to_dict("records")], "has the best score")
+
+
+def reaches(shares: Mapping[str, float]) -> str:
+    """Write in a title which method reaches most targets, and which first of those with gradients."""
+    order = sorted(shares.items(), key=lambda item: -item[1])
+    return _first([(name, f"{share:.0%}") for name, share in order], "reaches most targets")
+
+
+def _first(order: Sequence[tuple[str, str]], what: str) -> str:
+    if not order:
+        return "No method got anywhere"
+    (first, figure), *others = order
+    said = f"{first} {what} ({figure})"
+    if ", " not in first:  # it looks at costs only
+        following = next(((name, value) for name, value in others if ", " in name), None)
+        said += f"; with gradients {following[0]} ({following[1]})" if following else ""
+    return said
+
+
+def moved(lines: pd.DataFrame) -> str:
+    """Write in a title where the tuning alone moves a method most."""
+    spread = lines.groupby(["method", "problem"], sort=False)["score"].agg(["min", "max"])
+    far = (spread["max"] - spread["min"]).sort_values(ascending=False)
+    method, problem = far.index[0]
+    low, high = spread.loc[far.index[0]]
+    return f"Tuning alone moves {method} from {number(low, 2)} to {number(high, 2)} on {str(problem).partition(',')[0]}"
 
 
 def ranking(summed: pd.DataFrame) -> str:

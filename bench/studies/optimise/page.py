@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 
 from bench.report.style import PALETTE
-from bench.report.web.content import STATUS, Axis, Chart, Column, Content, identity_columns, look, looks, nothing_ran
+from bench.report.web.content import STATUS, SYMBOLS, Axis, Chart, Column, Content, identity_columns, look, nothing_ran
 from bench.studies.optimise import findings, races
-from bench.studies.optimise.report import default_ratio, methods
+from bench.studies.optimise.report import default_ratio, looks, methods
 from bench.sweep.experiment import Experiment
 
 RESULTS = [
@@ -69,8 +71,16 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         answers=methods(races.summary(found, default)),
         answers_title="How each method did",
         tables={"quality": points, "paths": _paths(found, default, first), "rates": tuned},
-        looks={**looks(found.methods), **{name: look(shade) for name, shade in CLASS_COLOURS.items()}},
+        looks={**_looks(found), **{name: look(shade) for name, shade in CLASS_COLOURS.items()}},
     )
+
+
+def _looks(found: races.Races) -> dict[str, dict[str, Any]]:
+    """Return the figures' looks, in the page's words; the context is dashed."""
+    return {
+        name: look(style["color"], SYMBOLS[style["marker"]], "solid" if ", " in name else "dash")
+        for name, style in looks(found.methods).items()
+    }
 
 
 def _paths(found: races.Races, default: float, first: dict[tuple[str, str], int]) -> pd.DataFrame:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +18,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from bench.report.figures import save, styled
+from bench.report.ink import ink, stamp
 from bench.report.page import WIDTH, columns
 from bench.report.scales import log_axis
-from bench.report.style import MARKERS, PALETTE, VARIANTS, colour, inches, plain, wrapped
+from bench.report.style import DEVIANT, MARKERS, VARIANTS, inches, plain, wrapped
 from bench.report.tables import plain_markdown
 from bench.report.text import counted, number
 from bench.studies.optimise import findings, races
@@ -40,6 +44,12 @@ ACROSS = 4
 """Most panels side by side."""
 TITLE = 1.6
 """Inches of a line of a panel's title."""
+CONTEXT = tuple(zip(("#000000", "#8c8c8c", "#4d4d4d", "#b3b3b3"), (*VARIANTS[1:], *DEVIANT[:2]), strict=True))
+"""Greys and dashes of methods that look at costs only."""
+LETTERS = 92
+"""Letters of a title's line."""
+STEPS = 80
+"""Points of a drawn curve; a marker stands on every fifth part of it."""
 DEPTH = 1e-7
 """Regrets below this share of the largest are not drawn: one search reaches 0 where J* is the lowest cost of any."""
 
@@ -157,15 +167,25 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
 # ------------------------------------------------------------------------------------------------------- charts
 
 
-def looks(found: Races) -> dict[str, dict[str, Any]]:
-    """Return a colour, marker and line style for each method; those that look at costs only, the context, are dashed."""
-    costs_only = {method for method in found.methods if ", " not in method}
-    return {
-        method: {
-            "color": colour(i), "marker": MARKERS[i % len(MARKERS)], "linestyle": "--" if method in costs_only else VARIANTS[(i // len(PALETTE)) % len(VARIANTS)]
-        }
-        for i, method in enumerate(found.methods)
-    }  # fmt: skip
+def looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return each method's colour and marker, its estimator's own, and line style.
+
+    Those that look at costs only, the context, are grey and dashed.
+    """
+    styles: dict[str, dict[str, Any]] = {}
+    own: dict[str, Any]
+    seen: Counter[str] = Counter()
+    for method in methods:
+        name = re.split(r"[\[,]", method)[0] if ", " in method else ""
+        turn = seen[name]
+        seen[name] += 1
+        if name:
+            own = {"color": ink(name), "marker": stamp(name, turn), "linestyle": VARIANTS[turn % len(VARIANTS)]}
+        else:
+            grey, dashes = CONTEXT[turn % len(CONTEXT)]
+            own = {"color": grey, "marker": MARKERS[turn % len(MARKERS)], "linestyle": dashes}
+        styles[method] = own
+    return styles
 
 
 def _grid(count: int, most: int, height: float, title: str) -> tuple[Figure, list[Axes]]:
@@ -173,7 +193,7 @@ def _grid(count: int, most: int, height: float, title: str) -> tuple[Figure, lis
     down = math.ceil(count / across)
     drawn = Figure(figsize=(WIDTH, height * down + 1.0), layout="constrained")
     FigureCanvasAgg(drawn)
-    drawn.suptitle(title, fontsize=9, fontweight="bold")
+    drawn.suptitle(textwrap.fill(title, LETTERS), fontsize=9, fontweight="bold")
     panels = list(drawn.subplots(down, across, squeeze=False).ravel())
     for spare in panels[count:]:
         spare.remove()
@@ -193,12 +213,12 @@ def quality_figure(found: Races, default: float) -> Figure | None:
     if points.empty:
         return None
     rho = races.correlations(points).set_index("scene_class")
-    styles = {name: style for name, style in looks(found).items() if name in set(points["method"])}
+    styles = {name: style for name, style in looks(found.methods).items() if name in set(points["method"])}
     marked = points["problem"] if points["problem"].nunique() <= len(MARKERS) else points["problem"].map(_scene)
     marks = {mark: MARKERS[i % len(MARKERS)] for i, mark in enumerate(dict.fromkeys(marked))}
     points = points.assign(mark=marked)
     groups = list(points.groupby("scene_class", sort=False))
-    drawn, panels = _grid(len(groups), 3, 2.3, "Does the better gradient arrive sooner?")
+    drawn, panels = _grid(len(groups), 3, 2.3, findings.sooner(rho.reset_index()))
     for panel, (name, part) in zip(panels, groups, strict=True):
         reached = part[np.isfinite(part["art"])]
         missed = part[~np.isfinite(part["art"])]
@@ -250,7 +270,7 @@ def path_figure(found: Races, default: float) -> Figure | None:
     FigureCanvasAgg(drawn)
     drawn.suptitle("How good is the gradient on the way?", fontsize=9, fontweight="bold")
     grid = drawn.subplots(2, len(names), squeeze=False)
-    styles = {name: style for name, style in looks(found).items() if name in set(lines["method"])}
+    styles = {name: style for name, style in looks(found.methods).items() if name in set(lines["method"])}
     labels = {"rmse_rel": "relative RMSE of the gradient", "cosine": "cosine with the reference"}
     for row, (quantity, label) in zip(grid, labels.items(), strict=True):
         for panel, problem in zip(row, names, strict=True):
@@ -277,12 +297,17 @@ def path_figure(found: Races, default: float) -> Figure | None:
 def anytime_figure(found: Races, default: float) -> Figure:
     """Draw regret against rollouts, and against seconds where they were measured: median and 20% to 80% of seeds."""
     units = ("rollouts", "seconds") if found.rows["search_s"].notna().any() else ("rollouts",)
-    names, styles = found.problems, looks(found)
+    names, styles = found.problems, looks(found.methods)
     across = columns(len(names), ACROSS)
     down = math.ceil(len(names) / across) * len(units)
     drawn = Figure(figsize=(WIDTH, 1.9 * down + 1.0), layout="constrained")
     FigureCanvasAgg(drawn)
-    drawn.suptitle("Regret on the way, each method at its best tuning", fontsize=9, fontweight="bold")
+    title = findings.closest(races.summary(found, default))
+    drawn.suptitle(
+        f"{textwrap.fill(title, LETTERS)}\nRegret on the way, each method at its best tuning",
+        fontsize=9,
+        fontweight="bold",
+    )
     grid = drawn.subplots(down, across, squeeze=False)
     blocks = grid.reshape(-1, len(units), across).swapaxes(1, 2).reshape(-1, len(units))
     for spare in blocks[len(names) :].ravel():
@@ -309,7 +334,7 @@ def anytime_figure(found: Races, default: float) -> Figure:
         )
     for line in grid:
         line[0].set_ylabel("J - J*")
-    _legend(drawn, {name: {**style, "marker": ""} for name, style in styles.items()})
+    _legend(drawn, styles)
     return drawn
 
 
@@ -333,16 +358,18 @@ def _draw_curve(panel: Axes, rows: pd.DataFrame, places: list[np.ndarray], style
     starts = [place[1] for place in places if len(place) > 1]
     if not ends or max(ends) <= 0:
         return
-    grid = np.geomspace(max(min(starts), 1e-6), max(ends), 80)
+    grid = np.geomspace(max(min(starts), 1e-6), max(ends), STEPS)
     low, middle, high = np.where(np.isfinite(found := races.curve(rows, places, grid)), found, np.nan)
     panel.fill_between(grid, low, high, color=style["color"], alpha=0.15, linewidth=0)
-    panel.plot(grid, middle, **{**style, "marker": ""})
+    panel.plot(grid, middle, **style, markevery=STEPS // 5, markersize=3)
 
 
 def targets_figure(found: Races, default: float) -> Figure:
     """Draw the share of problems, targets and restarts that are reached, against rollouts."""
-    drawn, (panel,) = _grid(1, 1, 2.6, "How many targets are reached by when?")
-    styles, times = looks(found), races.runtimes(found, default)
+    styles, times = looks(found.methods), races.runtimes(found, default)
+    drawn, (panel,) = _grid(
+        1, 1, 2.6, findings.reaches({name: float(np.isfinite(t).mean()) for name, t in times.items()})
+    )
     longest = max([1.0, *(float(t[np.isfinite(t)].max()) for t in times.values() if np.isfinite(t).any())])
     shortest = min(
         [
@@ -350,14 +377,15 @@ def targets_figure(found: Races, default: float) -> Figure:
             *(float(t[np.isfinite(t) & (t > 0)].min()) for t in times.values() if (np.isfinite(t) & (t > 0)).any()),
         ]
     )
-    grid = np.geomspace(max(shortest, 1.0) / 1.5, longest * 1.5, 120)
+    grid = np.geomspace(max(shortest, 1.0) / 1.5, longest * 1.5, STEPS)
     for method, values in times.items():
-        panel.plot(grid, [(values <= x).mean() for x in grid], **{**styles[method], "marker": ""}, label=plain(method))
+        share = [(values <= x).mean() for x in grid]
+        panel.plot(grid, share, **styles[method], markevery=STEPS // 5, markersize=3, label=plain(method))
     panel.set_xscale("log")
     panel.set_ylim(-0.02, 1.02)
     panel.set_xlabel("rollouts with simulated restarts, a gradient at its time")
     panel.set_ylabel("share of targets (regret/10, /100, /1000)")
-    _legend(drawn, {name: {**styles[name], "marker": ""} for name in times})
+    _legend(drawn, {name: styles[name] for name in times})
     return drawn
 
 
@@ -370,8 +398,8 @@ def rates_figure(found: Races, default: float) -> Figure | None:
     if not len(lines):
         return None
     groups = list(lines.groupby(["axis", "problem"], sort=False))
-    drawn, panels = _grid(len(groups), 3, 2.0, "How far does the tuning alone move each method?")
-    styles = {name: style for name, style in looks(found).items() if name in set(lines["method"])}
+    drawn, panels = _grid(len(groups), 3, 2.0, findings.moved(lines))
+    styles = {name: style for name, style in looks(found.methods).items() if name in set(lines["method"])}
     for panel, ((axis, problem), part) in zip(panels, groups, strict=True):
         for method, own in part.groupby("method", sort=False):
             own = own.sort_values("value")
