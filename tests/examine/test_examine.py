@@ -515,6 +515,13 @@ def test_slow_simulator_is_checked_in_every_component_before_anything_else():
     assert "the whole check" in examination.left_out[0]
 
 
+def test_slow_simulator_of_many_numbers_is_checked_in_few_of_them():
+    clock = Clock(15.0)
+    clock.count("costs", 100, 0.5, warm=True)
+    simulator = Simulator(lambda x: float(np.sum(np.square(x))), Layout(np.ones(16)), clock=clock)
+    assert _Examination(simulator, simulator.layout, np.ones(16), [], clock, 0, "slow")._options().components == 4
+
+
 def test_costs_that_are_no_numbers_beside_theta_leave_no_mean():
     def bounded(x):
         if x[0] > 1.05:

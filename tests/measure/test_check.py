@@ -108,6 +108,23 @@ def test_the_planted_faults_are_those_that_the_documents_list():
         assert planted[cause] == ", ".join(name for name, fault in FAULTS.items() if fault[0] == cause)
 
 
+def test_a_factor_is_one_though_rounding_spoils_its_ratios_and_a_few_roundings_are_no_staircase():
+    """Beside 1e10 a ratio is known to a thousandth only; beside 1e6 treads of 2.5e-9 are ten roundings high."""
+    assert check(lambda x: 1e10 + cost(x), lambda x: 0.5 * gradient(x), THETA).cause == "wrong_factor"
+    stepped = check(lambda x: 1e6 + np.floor(cost(x) / 2.5e-9) * 2.5e-9, lambda x: 0.5 * gradient(x), THETA)
+    assert stepped.cause == "wrong_factor", stepped.sentence()
+
+
+def test_what_the_last_digits_of_theta_change_in_a_gradient_is_no_fault():
+    """As on an amplifying rollout: the gradient is asked for at theta four roundings away, to see how much that is."""
+
+    amplified = check(cost, lambda x: gradient(x) * (1.0 + 2e-5 * np.sin(3e16 * x)), THETA, Options(draws=0))
+    errors = [abs(part.ratio - 1.0) for part in amplified.components]
+    assert amplified.trusted
+    steady = check(cost, lambda x: gradient(x) * (1.0 + max(errors)), THETA, Options(draws=0))
+    assert not steady.trusted
+
+
 def test_gradient_beside_a_minimum_is_wrong_though_no_two_differences_agree_there():
     """They are rounding only, and yet all of them are far from the gradient."""
     found = check(lambda x: np.cos(x[0]), lambda x: 1e-3 - np.sin(x), np.zeros(1))
