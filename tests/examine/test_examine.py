@@ -13,6 +13,7 @@ import pytest
 import bench
 from bench import cli
 from bench.errors import UserError
+from bench.examine import smoothing
 from bench.examine.examination import _Examination
 from bench.examine.lines import Break, Line, scan
 from bench.examine.smoothing import Smoothed
@@ -479,6 +480,34 @@ def test_methods_cost_what_their_variance_says():
     unclear = Smoothed(0.1, np.zeros(2), 1.0, 0.5, 64, math.nan, math.nan, math.nan, math.nan, "", ())
     assert unclear.best is None
     assert not unclear.biased
+
+
+def test_a_method_costs_its_samples_times_the_calls_of_each():
+    terms = np.array([[1.0, -1.0] * 50])
+    found = smoothing._method("smoothing", 0.06, terms, 2.0, 2, 0.5)
+    samples = math.ceil(terms.var(ddof=1) / 4.0 / (0.1**2 - 0.06**2))
+    assert (found.samples, found.calls, found.seconds) == (samples, 2 * samples, samples)
+
+
+def test_the_line_taken_out_of_the_terms_leaves_their_mean():
+    """d = u^3 has E[d u] = 3. A line fitted to the terms that it is taken out of would lean to what they happen to be."""
+    draw = np.random.default_rng(0).standard_normal((4000, 1, 16))
+    means = np.array([smoothing._terms(u, u[0] ** 3).mean() for u in draw])
+    assert abs(means.mean() - 3.0) < 4 * means.std() / math.sqrt(means.size)
+
+
+def test_size_of_a_gradient_is_without_the_share_of_its_noise():
+    """Twenty seeds with few pairs, of a cost whose gradient is small beside their noise: J = 0.1 x0, E |estimate|^2 is more."""
+    sizes, raw = [], []
+    for seed in range(20):
+        simulator = Simulator(
+            lambda x: 0.1 * x[0] + np.sin(3.0 * x[1]) ** 3 + np.sin(4.0 * x[2]) ** 3, Layout(np.zeros(3))
+        )
+        found = smoothing.smoothed(simulator, np.zeros(3), 1.0, np.ones(3), None, Clock(60.0), seed, pairs=64)
+        sizes.append(found.norm)
+        raw.append(np.linalg.norm(found.gradient))
+        assert found.norm == pytest.approx(math.sqrt(max(raw[-1] ** 2 - found.error**2, 0.0)))
+    assert np.mean(np.square(sizes)) < 0.8 * np.mean(np.square(raw))
 
 
 def test_cost_that_is_constant_between_jumps_is_no_right_gradient():

@@ -112,6 +112,8 @@ def test_ratios_may_differ_by_the_programs_rounding_by_ten_errors_and_no_more():
     assert cause([1.001, 1.001001, 1.000999, 1.001001], 3e-7) == "wrong_factor"
     assert cause([0.5, 0.50005, 0.49995, 0.50005], 1e-5) == "wrong_factor"
     assert cause([0.5, 0.50005, 0.49995, 0.50005], 1e-6) == "missing_term"
+    # and by no more than a thousandth, however little is known
+    assert cause([0.5, 0.505, 0.495, 0.505], 1e-2) == "missing_term"
 
 
 def test_one_ratio_of_five_may_be_spoilt_and_two_may_not():
