@@ -126,12 +126,14 @@ def _narrowed(
     # three points: left, middle, right
     values = np.stack([[f[i], f[i + 1], f[i + 2]] for i in places])
     turns, widths = [_turn(values)], [width]
+    bends = [turns[0] / width]  # changes of slope: over all five points, as a kink may lie off the middle of three
     for _ in range(halvings):
         between = along(np.stack([centre - width / 2, centre + width / 2], axis=1))
         five = np.stack([values[:, 0], between[:, 0], values[:, 1], between[:, 1], values[:, 2]], axis=1)
         changes = np.abs(five[:, :-2] - 2 * five[:, 1:-1] + five[:, 2:])
         best = np.argmax(np.nan_to_num(changes, nan=-1.0), axis=1)
         width /= 2
+        bends.append(np.abs((five[:, 4] - five[:, 3]) - (five[:, 1] - five[:, 0])) / width)
         centre = centre + (best - 1) * width
         values = np.stack([five[np.arange(count), best + k] for k in range(3)], axis=1)
         turns.append(_turn(values))
@@ -151,7 +153,7 @@ def _narrowed(
         if order < 0.5:
             found.append(Break("jump", at, float(change[end, k])))
         elif order < 1.5:
-            found.append(Break("kink", at, float(change[end, k] / widths[end])))
+            found.append(Break("kink", at, float(bends[end][k])))
     return _apart(found, 4 * (t[1] - t[0]) / 2**halvings)
 
 

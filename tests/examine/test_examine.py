@@ -13,8 +13,9 @@ import pytest
 import bench
 from bench import cli
 from bench.errors import UserError
+from bench.examine import smoothing
 from bench.examine.examination import _Examination
-from bench.examine.lines import scan
+from bench.examine.lines import Break, Line, scan
 from bench.examine.smoothing import Smoothed
 from bench.simulator.clock import Clock, seconds
 from bench.simulator.columns import Simulator
@@ -194,6 +195,29 @@ def test_equal_jumps_at_even_distances_are_treads_and_others_are_not():
     assert tread(lambda x: np.sin(x[0]) + 1e-3 * (x[0] > 0.1) + 1e-3 * (x[0] > 1.1) + 1e-3 * (x[0] > 2.1)) == 0
 
 
+@pytest.mark.parametrize(
+    ("places", "heights", "tread"),
+    [
+        ([0.0, 1.0, 2.0, 4.0], [0.3] * 4, 0.3),
+        ([0.0, 1.0, 2.0], [0.3] * 3, 0.0),
+        ([0.0, 1.0, 2.0, 4.0], [0.3, 0.3, 0.32, 0.3], 0.0),
+        ([0.0, 1.0, 2.1, 4.0], [0.3] * 4, 0.0),
+    ],
+)
+def test_a_tread_is_the_height_of_four_equal_jumps_at_even_distances(places, heights, tread):
+    breaks = tuple(Break("jump", *each) for each in zip(places, heights, strict=True))
+    line = Line(np.ones(1), np.zeros(2), np.zeros(2), breaks, steps=False)
+    assert line.tread == pytest.approx(tread)
+
+
+def test_kink_has_its_change_of_slope_and_rounding_has_no_breaks():
+    line = scan(lambda x: 3.0 * abs(x[0] - 0.4) + x[0] ** 2, np.zeros(1), np.ones(1), noise=1e-15)
+    assert [(b.kind, round(b.at, 3)) for b in line.breaks] == [("kink", 0.4)]
+    assert line.kinks[0].size == pytest.approx(6.0, rel=1e-2)
+    rough = np.random.default_rng(0)
+    assert not scan(lambda x: 1e-9 * rough.standard_normal(x.shape[1]), np.zeros(1), np.ones(1), noise=1e-9).breaks
+
+
 def test_treads_that_a_gradient_misses_are_a_staircase_though_they_are_small():
     def cost(x):
         return float(np.sin(x[0]) * x[1] + 2e-4 * np.floor(1000 * x[0] + 0.5))
@@ -201,6 +225,44 @@ def test_treads_that_a_gradient_misses_are_a_staircase_though_they_are_small():
     report = bench.examine(cost, [0.5, 0.7], grad=lambda x: [np.cos(x[0]) * x[1], np.sin(x[0])], **QUICK)
     assert report.cause == "staircase"
     assert "at even distances" in str(report)
+
+
+@pytest.fixture(scope="module")
+def right():
+    return bench.examine(bowl, [1.0, 0.5], grad=slope, **QUICK)
+
+
+def jumpy(missed, *heights):
+    """A line for each height with four equal jumps at even distances, of which the gradient misses a share."""
+    found = [tuple(Break("jump", float(place), height) for place in range(4)) for height in heights]
+    return [Line(np.ones(2), np.zeros(2), np.zeros(2), breaks, False, missed) for breaks in found]
+
+
+def under_noise(error, low, high):
+    return Smoothed(0.1, np.zeros(2), error, 1.0, 64, (low + high) / 2, low, high, math.nan, "", ())
+
+
+@pytest.mark.parametrize(
+    ("found", "cause"),
+    [
+        ({"lines": jumpy(0.02, 0.3, 0.3)}, "staircase"),
+        ({"lines": jumpy(0.005, 0.3, 0.3)}, "smooth"),
+        ({"lines": jumpy(0.02, 0.3, 0.4)}, "smooth"),
+        ({"lines": jumpy(0.2, 0.3, 0.4)}, "jumps"),
+        ({"smoothed": [under_noise(0.01, 0.2, 0.4)]}, "biased"),
+        ({"smoothed": [under_noise(0.5, 0.2, 0.4)]}, "smooth"),
+        ({"smoothed": [under_noise(0.01, 0.0, 2.0)]}, "spread"),
+        ({"smoothed": [under_noise(0.01, 0.0, 0.5)]}, "smooth"),
+    ],
+)
+def test_what_was_found_decides_the_cause_and_the_status(right, found, cause):
+    report = dataclasses.replace(right, **found)
+    assert (report.cause, report.status) == (cause, int(cause != "smooth"))
+
+
+def test_a_check_under_other_noise_decides_too(right):
+    report = dataclasses.replace(right, more=[dataclasses.replace(right.check, cause="missing_term")])
+    assert (report.cause, report.status) == ("missing_term", 1)
 
 
 def test_smooth_line_has_no_breaks():
@@ -420,6 +482,34 @@ def test_methods_cost_what_their_variance_says():
     assert not unclear.biased
 
 
+def test_a_method_costs_its_samples_times_the_calls_of_each():
+    terms = np.array([[1.0, -1.0] * 50])
+    found = smoothing._method("smoothing", 0.06, terms, 2.0, 2, 0.5)
+    samples = math.ceil(terms.var(ddof=1) / 4.0 / (0.1**2 - 0.06**2))
+    assert (found.samples, found.calls, found.seconds) == (samples, 2 * samples, samples)
+
+
+def test_the_line_taken_out_of_the_terms_leaves_their_mean():
+    """d = u^3 has E[d u] = 3. A line fitted to the terms that it is taken out of would lean to what they happen to be."""
+    draw = np.random.default_rng(0).standard_normal((4000, 1, 16))
+    means = np.array([smoothing._terms(u, u[0] ** 3).mean() for u in draw])
+    assert abs(means.mean() - 3.0) < 4 * means.std() / math.sqrt(means.size)
+
+
+def test_size_of_a_gradient_is_without_the_share_of_its_noise():
+    """Twenty seeds with few pairs, of a cost whose gradient is small beside their noise: J = 0.1 x0, E |estimate|^2 is more."""
+    sizes, raw = [], []
+    for seed in range(20):
+        simulator = Simulator(
+            lambda x: 0.1 * x[0] + np.sin(3.0 * x[1]) ** 3 + np.sin(4.0 * x[2]) ** 3, Layout(np.zeros(3))
+        )
+        found = smoothing.smoothed(simulator, np.zeros(3), 1.0, np.ones(3), None, Clock(60.0), seed, pairs=64)
+        sizes.append(found.norm)
+        raw.append(np.linalg.norm(found.gradient))
+        assert found.norm == pytest.approx(math.sqrt(max(raw[-1] ** 2 - found.error**2, 0.0)))
+    assert np.mean(np.square(sizes)) < 0.8 * np.mean(np.square(raw))
+
+
 def test_cost_that_is_constant_between_jumps_is_no_right_gradient():
     """Its derivative is 0 wherever it exists, as a check of one theta would say."""
     report = bench.examine(lambda x: np.floor(20 * x[0]) / 20, [1.01], sigma=0.1, **QUICK)
@@ -452,6 +542,13 @@ def test_slow_simulator_is_checked_in_every_component_before_anything_else():
     assert (chosen.components, chosen.scanned) == (16, 0)
     assert "not done" not in str(examination.left_out)
     assert "the whole check" in examination.left_out[0]
+
+
+def test_slow_simulator_of_many_numbers_is_checked_in_few_of_them():
+    clock = Clock(15.0)
+    clock.count("costs", 100, 0.5, warm=True)
+    simulator = Simulator(lambda x: float(np.sum(np.square(x))), Layout(np.ones(16)), clock=clock)
+    assert _Examination(simulator, simulator.layout, np.ones(16), [], clock, 0, "slow")._options().components == 4
 
 
 def test_costs_that_are_no_numbers_beside_theta_leave_no_mean():

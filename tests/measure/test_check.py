@@ -49,6 +49,9 @@ FAULTS = {
     "inf in one component": ("nan_gradient", cost, lambda x: gradient(x) + first(np.inf)),
     "noise in the gradient": ("nondeterministic", cost, noisy(gradient, 1e-7)),
     "noise in the cost": ("nondeterministic", noisy(cost, 1e-12), gradient),
+    "cost that depends on its place in a batch": (
+        "nondeterministic", lambda x: cost(x) + 1e-9 * np.arange(x.shape[1]), gradient
+    ),
     "kept from the first theta": ("stale_gradient", cost, lambda x: gradient(THETA)),
     "cast to int": ("staircase", lambda x: stairs(x, 1e-6), lambda x: 0.0 * x),
     "cast to int of a term": ("staircase", lambda x: cost(x) + stairs(x, 1e-6), gradient),
@@ -67,6 +70,7 @@ FAULTS = {
     "sign of one component": ("wrong_factor", cost, lambda x: gradient(x) * [-1.0, 1.0, 1.0]),
     "coupling left out": ("missing_term", cost, lambda x: np.cos(x) + 0.2 * x),
     "term of one component left out": ("missing_term", cost, lambda x: gradient(x) - first(np.cos(x[0]))),
+    "large term too many in one component": ("missing_term", cost, lambda x: gradient(x) + first(8.0 * np.cos(9.0 * x[0]))),
     "little left out": ("missing_term", cost, lambda x: gradient(x) - 0.004 * np.cos(x) * [1.0, 0.7, 0.9]),
     "term that acts only here": (
         "missing_term", lambda x: cost(x) - 40.0 * np.maximum(0.6 - x[0], 0.0) ** 2 * (x[1] + 3.0 * x[2]), gradient
@@ -102,6 +106,30 @@ def test_the_planted_faults_are_those_that_the_documents_list():
     planted = {cause.strip(" `"): names.strip() for cause, names in listed if cause.strip(" `") in VERDICTS}
     for cause in {cause for cause, *_ in FAULTS.values()}:
         assert planted[cause] == ", ".join(name for name, fault in FAULTS.items() if fault[0] == cause)
+
+
+def test_a_factor_is_one_though_rounding_spoils_its_ratios_and_a_few_roundings_are_no_staircase():
+    """Beside 1e10 a ratio is known to a thousandth only; beside 1e6 treads of 2.5e-9 are ten roundings high."""
+    assert check(lambda x: 1e10 + cost(x), lambda x: 0.5 * gradient(x), THETA).cause == "wrong_factor"
+    stepped = check(lambda x: 1e6 + np.floor(cost(x) / 2.5e-9) * 2.5e-9, lambda x: 0.5 * gradient(x), THETA)
+    assert stepped.cause == "wrong_factor", stepped.sentence()
+
+
+def test_what_the_last_digits_of_theta_change_in_a_gradient_is_no_fault():
+    """As on an amplifying rollout: the gradient is asked for at theta four roundings away, to see how much that is."""
+
+    amplified = check(cost, lambda x: gradient(x) * (1.0 + 2e-5 * np.sin(3e16 * x)), THETA, Options(draws=0))
+    errors = [abs(part.ratio - 1.0) for part in amplified.components]
+    assert amplified.trusted
+    steady = check(cost, lambda x: gradient(x) * (1.0 + max(errors)), THETA, Options(draws=0))
+    assert not steady.trusted
+
+
+def test_gradient_beside_a_minimum_is_wrong_though_no_two_differences_agree_there():
+    """They are rounding only, and yet all of them are far from the gradient."""
+    found = check(lambda x: np.cos(x[0]), lambda x: 1e-3 - np.sin(x), np.zeros(1))
+    assert [part.verdict for part in found.components] == ["wrong_adjoint"]
+    assert check(lambda x: np.cos(x[0]), lambda x: -np.sin(x), np.zeros(1)).trusted
 
 
 def test_right_gradient_is_smooth_and_each_component_has_its_numbers():

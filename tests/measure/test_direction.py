@@ -75,6 +75,14 @@ def test_wide_differences_that_smaller_steps_contradict_are_not_believed():
     assert found.difference == pytest.approx(SLOPE, rel=1e-5)
 
 
+@pytest.mark.parametrize(("steps", "verdict"), [(3, "unsettled"), (6, "jump")])
+def test_a_jump_is_the_same_over_five_of_the_smallest_steps(steps, verdict):
+    side = SLOPE * EPS
+    side[-steps:] += 1e-3
+    sample = Sample(EPS, 1.0 - SLOPE * EPS, 1.0, 1.0 + side, SLOPE, np.zeros(EPS.size, bool), noise=1e-16)
+    assert judge(sample).verdict == verdict
+
+
 def test_a_part_of_the_derivative_is_a_missing_term():
     partly, beyond = ([Ratio(v, 1e-9) for v in values] for values in ([0.5, 0.7, 0.9, 1.2], [-3.0, 5.0, 2.5, -0.2]))
     assert of_ratios({0: partly}, [], some_right=False)[0] == "missing_term"
@@ -104,6 +112,8 @@ def test_ratios_may_differ_by_the_programs_rounding_by_ten_errors_and_no_more():
     assert cause([1.001, 1.001001, 1.000999, 1.001001], 3e-7) == "wrong_factor"
     assert cause([0.5, 0.50005, 0.49995, 0.50005], 1e-5) == "wrong_factor"
     assert cause([0.5, 0.50005, 0.49995, 0.50005], 1e-6) == "missing_term"
+    # and by no more than a thousandth, however little is known
+    assert cause([0.5, 0.505, 0.495, 0.505], 1e-2) == "missing_term"
 
 
 def test_one_ratio_of_five_may_be_spoilt_and_two_may_not():

@@ -14,6 +14,8 @@ import time
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from helpers import loaded
 
@@ -83,6 +85,9 @@ def test_rows_stay_in_the_order_of_their_file_whenever_they_were_stored(tmp_path
     store.compact(keys)
     store.append(row(4))
     assert list(store.load()["key"]) == [*keys, row(4)["key"]]
+    # those asked for are last, in their order
+    assert list(store_module.ordered(store.load(), keys[::-1])["key"]) == [row(4)["key"], *keys[::-1]]
+    assert list(store_module.ordered(store.load(), keys[:1])["key"]) == [*keys[1:], row(4)["key"], keys[0]]
     store.compact()
     assert list(pd.read_parquet(tmp_path / "rows.parquet")["key"]) == [*keys, row(4)["key"]]
 
@@ -168,6 +173,32 @@ def test_compaction_cut_short_at_any_step_loses_nothing(tmp_path, monkeypatch, s
     store.compact()
     assert keys(store) == [1, 2, 3, 4]
     assert len(pd.read_parquet(tmp_path / "rows.parquet")) == 4
+
+
+def test_a_table_that_another_run_has_put_there_meanwhile_is_read_before_it_is_replaced(tmp_path, monkeypatch):
+    store, real = Store(tmp_path, COLUMNS), os.rename
+    store.append(row(1))
+    store.compact()
+    store.append(row(2))
+
+    def fold():
+        """Fold what the other run had read before the part with row 2 was there."""
+        table = pd.read_parquet(tmp_path / "rows.parquet")
+        pd.concat([table, table.assign(key=row(3)["key"])]).to_parquet(tmp_path / "other")
+        os.replace(tmp_path / "other", tmp_path / "rows.parquet")
+
+    overtake = once(fold)
+    monkeypatch.setattr(os, "rename", lambda path, to: (path.name == "rows.parquet" and overtake(), real(path, to))[1])
+    store.compact()
+    assert keys(store) == [1, 2, 3]
+
+
+def test_two_columns_of_one_name_are_refused(tmp_path):
+    frame = pd.DataFrame([row(1)])
+    parts = [pa.array(frame["key"]), pa.array([1.0]), pa.array([2.0])]
+    pq.write_table(pa.Table.from_arrays(parts, ["key", "bias", "bias"]), tmp_path / "rows.parquet")
+    with pytest.raises(StorageError, match="two columns of one name"):
+        Store(tmp_path, COLUMNS).load()
 
 
 @pytest.mark.slow
