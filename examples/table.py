@@ -63,8 +63,8 @@ def foreign(name: str) -> str:
     return f"{package} {re.search(r'^Version: (.*)$', shown, re.MULTILINE)[1]}"
 
 
-def row(report: Any, version: str) -> list[str]:
-    """Return what a report says, as cells."""
+def row(report: Any, version: str, example: str) -> list[str]:
+    """Return what a report says, as cells; a bare function's name follows that of its example."""
     from bench.report.text import counted, duration, number
 
     parts = [part for part in report.check.parts if math.isfinite(part.error)] if report.check else []
@@ -78,8 +78,9 @@ def row(report: Any, version: str) -> list[str]:
     biases += ["-"] * (2 - len(biases))
     jumps = sum(len(line.jumps) for line in report.lines)
     said = f"{jumps} on {counted(len(report.lines), 'line')}" if report.lines else "not looked for"
+    bare = report.name.isidentifier() and report.name not in version
     return [
-        report.name, version, f"{judged} ({report.cause})", off, said, *biases[:2], duration(report.cost_s),
+        f"{example}: {report.name}" if bare else report.name, version, f"{judged} ({report.cause})", off, said, *biases[:2], duration(report.cost_s),
         duration(report.gradient_s) if math.isfinite(report.gradient_s) else "-", duration(report.seconds),
     ]  # fmt: skip
 
@@ -98,10 +99,11 @@ def record(path: Path) -> None:
     bench.examine = recorded
     sys.argv = [str(path)]
     runpy.run_path(str(path), run_name="__main__")
-    names = [name for name in imported(path.read_text()) if name in PACKAGES]
+    text = path.read_text()
+    names = [name for name in imported(text) if name in PACKAGES] + ["mujoco"] * ("bench.Mjcf" in text)
     first = sorted(names, key=lambda name: (name in ("numpy", "jax", "torch"), name))[:1]
     version = ", ".join(f"{PACKAGES[name]} {metadata.version(PACKAGES[name])}" for name in first) or foreign(path.stem)
-    print(MARK + json.dumps([row(report, version) for report in found]), flush=True)
+    print(MARK + json.dumps([row(report, version, path.stem) for report in found]), flush=True)
 
 
 def rows(name: str) -> list[list[str]]:

@@ -168,9 +168,10 @@ def markdown(found: Found) -> str:
 
 
 def latex(found: Found) -> str:
-    """Write one line per claim for a paper: its most sharply resolved figure, and the verdict."""
+    """Write one line per claim, across both columns of a paper: its most sharply resolved figure, and the verdict."""
     lines = [
-        r"\begin{tabular}{llp{5cm}rrl}",
+        r"\begin{table*}\centering\footnotesize\setlength{\tabcolsep}{3pt}",
+        r"\begin{tabular}{@{}lp{3.7cm}p{5cm}rrp{2.7cm}@{}}",
         r"\toprule",
         r"claim & source & figure & published & measured & verdict \\",
         r"\midrule",
@@ -181,7 +182,7 @@ def latex(found: Found) -> str:
         cells = [claim.name, claim.source]
         cells += [figure.what, figure.published, number(figure.measured, 4)] if figure else ["", "", ""]
         lines.append(" & ".join(map(escape_latex, [*cells, result.verdict])) + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table*}", ""])
 
 
 def page(found: Found, charts: dict[str, Path]) -> str:

@@ -194,3 +194,4 @@ def test_number_of_windows():
     assert windows_of(200, 8) == 8
     assert windows_of(7, 8) == 1
     assert windows_of(12, 8) == 6
+    assert windows_of(1, 8) == 1

@@ -1,6 +1,7 @@
 """The study of searches: known optima, stops, refusals, tables and charts, and the statistics that sum them up."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -19,7 +20,7 @@ import bench
 from bench.cli import main
 from bench.measure import performance
 from bench.measure.solve import solve
-from bench.model import Problem, compose
+from bench.model import Problem, State, compose
 from bench.studies.optimise import races, report
 from bench.studies.optimise.abreast import side_by_side
 from bench.studies.optimise.measure import compared, scene_class
@@ -99,7 +100,11 @@ def test_two_balls():
 
 @pytest.mark.parametrize(
     ("scene", "start", "least"),
-    [("pendulum_swing[dt=0.02]", 2008.0153, 872.590419), ("pendulum_swing", 2022.303027, 349.49046)],
+    [
+        ("pendulum_swing[dt=0.02]", 2008.0153, 872.590419),
+        ("pendulum_swing", 2022.303027, 349.49046),
+        ("pendulum_swing[terminal=1]", 1856.154406, 349.490454),
+    ],
 )
 @pytest.mark.slow
 def test_newton_finds_the_checked_optima(scene, start, least):
@@ -119,6 +124,66 @@ def test_newton_on_a_soft_push():
     assert solve(problem).cost == pytest.approx(1126.585263, rel=CHECKED)
 
 
+def test_first_cost_of_a_stiff_push():
+    problem = bench.problem(
+        "pushing[horizon=200,dt=0.005,velocity_factor=0.99]", contact="penalty[stiffness=1000]", backend="numpy",
+        theta0=[0.1] * 200,
+    )  # fmt: skip
+    assert problem.value(problem.program.theta0, np.zeros((200, 1)))[0] == pytest.approx(1821.249, rel=CHECKED)
+
+
+@pytest.mark.parametrize("steps", [4, 10, 50])
+def test_least_effort_from_rest_to_rest(steps):
+    """A metre in a second: 12 in continuous time, 12 / (1 - 1 / N^2) in N semi-implicit steps."""
+    ends = {"position": 0.0, "speed": 0.0, "end_position": 1e9, "end_speed": 1e9}
+    scene = Lqr(horizon=steps, dt=1 / steps, effort=1 / steps, **ends)
+    assert scene.optimum(None, SemiImplicitEuler())[0] == pytest.approx(12 / (1 - 1 / steps**2), rel=CHECKED)
+
+
+@dataclass(frozen=True)
+class Placed(TwoBalls):
+    """A force of (3, 3) on the first ball; theta moves x and its velocity of both balls at the start."""
+
+    name = "placed"
+    n_u = 0
+    open_loop = False
+    noise: str = "initial_state"
+
+    def theta0(self):
+        return np.zeros(4)
+
+    def initial_state(self, xp, theta):
+        x1, x2, v1, v2 = theta
+        zero = 0.0 * x1
+        return State(xp.stack([x1 - 2.0, zero - 2.0, x2 - 1.0, zero - 1.0]), xp.stack([v1, zero, v2, zero]))
+
+    def acceleration(self, xp, q, v, u):
+        return xp.stack([0.0 * q[0] + 3.0, 0.0 * q[0] + 3.0, 0.0 * q[0], 0.0 * q[0]])
+
+    def stage_cost(self, xp, q, v, u):
+        return 0.0 * q[0]
+
+    def optimum(self, contact, integrator):
+        return None
+
+
+def test_slopes_of_the_stroke():
+    """Of the end cost in x and its velocity of the first and the second ball.
+
+    Over many steps they are those of continuous time. Within one step they are not: the force changes no velocity
+    before the step ends, so that an earlier blow is no weaker, and the second ball takes over the first one's motion whole.
+    """
+    program = compose(Placed(horizon=4800, dt=1 / 4800), Impulse(), SemiImplicitEuler())
+    found = Numpy().compile(program)
+
+    def slopes(width):
+        costs = found.value(width * np.concatenate([np.eye(4), -np.eye(4)], axis=1), np.zeros((4, 8)))
+        return (costs[:4] - costs[4:]) / (2 * width)
+
+    assert slopes(0.03) == pytest.approx([-0.39867, -0.32125, -0.49779, -0.22213], rel=0.02)
+    assert slopes(1e-5) == pytest.approx([-0.7199, 0.0, -0.7199, 0.0], abs=1e-3)
+
+
 def test_valleys_of_a_record():
     """Frequencies D apart differ by 1 - sin(DT) / (DT): downhill is towards the record until D = 4.4934 / T, then away from it."""
     problem = bench.problem("spring_record[stiffness=100,damping=0,dt=0.01,horizon=1200]", backend="numpy")
@@ -130,6 +195,11 @@ def test_valleys_of_a_record():
     assert costs == pytest.approx(1 - np.sinc(ways / np.pi), abs=0.02)
     assert (np.diff(costs[:4]) > 0).all()
     assert (np.diff(costs[4:]) < 0).all()
+    false = np.array([7.0, 7.725252, 8.5])  # the first valley that is none
+    theta = np.stack([(10.0 + false / 12.0) ** 2, 0.0 * false])
+    left, bottom, right = problem.value(theta, np.zeros((2, 3)))
+    assert bottom == pytest.approx(0.871625, abs=0.02)
+    assert bottom < min(left, right)
     assert problem.program.scene.optimum(None, ExplicitEuler())[0] == 0.0
 
 

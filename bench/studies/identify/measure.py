@@ -208,8 +208,8 @@ def fitted(fitting: Fitting, optimizer: Optimizer, start: np.ndarray, data: np.n
 
 
 def windows_of(horizon: int, most: int) -> int:
-    """Return the largest number of equal windows up to ``most``, each of at least two steps."""
-    return max(count for count in range(1, most + 1) if horizon % count == 0 and horizon // count >= 2)
+    """Return the largest number of equal windows up to ``most``, each of at least two steps; one where there is one step."""
+    return max((n for n in range(1, most + 1) if horizon % n == 0 and horizon // n >= 2), default=1)
 
 
 def measure(cell: Cell, settings: Settings) -> dict[str, Any]:
