@@ -180,7 +180,6 @@ FAULTS = [
     Fault(ST, "position.argsort(kind=\"stable\")", "position.argsort(kind=\"stable\")[::-1]", OF_STORE),
     Fault(ST, "lambda key: place.get(key, -1)", "lambda key: place.get(key, len(place))", OF_STORE),
     Fault(ST, "typed[name].isna().sum() >", "False and typed[name].isna().sum() >", OF_STORE),
-    Fault(ST, "if not frame.columns.is_unique:", "if False:", OF_STORE),
     Fault("bench/sweep/files.py", "os.link(path, name)", "os.rename(path, name)", OF_STORE),
     Fault(ST, "            sync(self.directory)\n", "", OF_STORE),
     # gradient checks

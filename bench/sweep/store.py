@@ -279,8 +279,6 @@ def _typed(columns: Columns, frame: pd.DataFrame, path: Path) -> pd.DataFrame:
     """
     if "key" not in frame or not frame["key"].map(lambda key: isinstance(key, str) and bool(key)).all():
         raise StorageError(f"'{path}' has no keys, so its rows belong to no cell; move it away to start afresh")
-    if not frame.columns.is_unique:
-        raise StorageError(f"'{path}' has two columns of one name; move it away to start afresh")
     typed = columns.typed(frame)
     for name in columns.named("number"):
         numeric = name in frame and frame[name].dtype.kind in "fiub"
