@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -21,7 +20,7 @@ WIDTH, NARROW = 7.16, 3.5
 """Inches of two columns of a paper and of one (for a single panel): fonts are printed at the size given."""
 LINE = 0.16
 """Inches of a line of text."""
-BOLD = 1.25
+BOLD = 1.32
 """How much wider a title is than the same text elsewhere."""
 PLACES: Any = ("upper center", "lower center")
 
@@ -46,7 +45,7 @@ def page(
     titles = _panel_titles(problems, 0.86 * width / across)
     blocks = math.ceil(len(problems) / across)
     head = wrapped(subtitle, 0.97 * width)
-    title = "\n".join(textwrap.wrap(title, math.floor(len(title) * 0.97 * width / (BOLD * inches(title)))))
+    title = _lines(title, 0.97 * width)
     counts = [_legend_columns(part, width) for part in legends]
     named = 0.25 + LINE * title.count("\n")
     above = named + LINE * (head.count("\n") + 1)
@@ -61,6 +60,15 @@ def page(
     _legends(bottom, legends, counts)
     grid = centre.subplots(blocks * len(labels), across, squeeze=False, sharey=sharey)
     return figure, _panels(grid, titles, labels)
+
+
+def _lines(title: str, width: float) -> str:
+    """Break a title at its spaces, into lines of at most ``width`` inches as printed."""
+    out = ""
+    for word in title.split():
+        last = out.rpartition("\n")[2]
+        out += ("" if not out else " " if BOLD * inches(f"{last} {word}") <= width else "\n") + word
+    return out
 
 
 def _panels(grid: np.ndarray, titles: Sequence[str], labels: Sequence[str]) -> list[list[Axes]]:
