@@ -35,7 +35,8 @@ class Implicit(Jax):
         """Return JAX operations with a root finder.
 
         Equinox, on which optimistix and lineax are built, is set to leave a failed solve in the adjoint as it is, not
-        finite in its own column: its other choices, an exception or NaN, would spoil the whole batch.
+        finite in its own column: its other choices, an exception or NaN, would spoil the whole batch. A program that
+        imports Equinox before sets ``EQX_ON_ERROR=off`` itself, or a column that cannot be solved is an error of its batch.
         """
         os.environ.setdefault("EQX_ON_ERROR", "off")
         import jax
