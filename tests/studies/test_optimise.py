@@ -15,6 +15,7 @@ from bench.plugins.scenes.lqr import Lqr
 from bench.plugins.scenes.quadratic import Quadratic
 from bench.plugins.scenes.static_gain import StaticGain
 from bench.plugins.scenes.two_balls import TwoBalls
+from scipy.linalg import solve_discrete_lyapunov
 
 import bench
 from bench.cli import main
@@ -87,6 +88,32 @@ def test_scalar_regulator():
         np.stack([np.zeros(9), np.full(9, -0.9160798 / 3), -0.9160798 * np.eye(3).ravel()], axis=1), np.zeros((9, 3))
     )
     assert costs == pytest.approx([60.0, 3.274823934, 3.274823934], rel=1e-8)  # every K with K 1 = -.9160798
+
+
+GAIN = np.array([[-0.9, 0.05], [0.1, -0.8]])
+"""A gain u = K x of two copies under which x' = x + u dies out."""
+
+
+def test_gradient_of_a_static_gain():
+    """2 [(R + B'PB) K + B'PA] S, with P and S of discrete Lyapunov equations; 80 steps are as good as all."""
+    problem = bench.problem("static_gain[copies=2,horizon=80]", backend="numpy")
+    closed = np.eye(2) + GAIN
+    value = solve_discrete_lyapunov(closed.T, np.eye(2) + 0.1 * GAIN.T @ GAIN)
+    states = solve_discrete_lyapunov(closed, np.ones((2, 2)))
+    assert problem.value(GAIN.ravel(), np.zeros((4, 1)))[0] == pytest.approx(value.sum(), rel=1e-9)
+    expected = 2 * ((0.1 * np.eye(2) + value) @ GAIN + value) @ states
+    assert problem.grad(GAIN.ravel(), np.zeros((4, 1)))[:, 0] == pytest.approx(expected.ravel(), rel=CHECKED)
+
+
+def test_noise_on_actions_adds_what_it_costs():
+    """E J = x0'P x0 + sigma^2 sum_t (tr R + tr B'P_{t+1}B), with the values P of the gain itself."""
+    problem = bench.problem("static_gain[copies=2,noise=action,sigma=0.3]", backend="numpy")
+    costs = problem.value(GAIN.ravel(), np.random.default_rng(0).standard_normal((20, 40_000)))
+    value, noise, closed = 10 * np.eye(2), 0.0, np.eye(2) + GAIN
+    for _ in range(10):
+        noise += 0.3**2 * (0.1 * 2 + np.trace(value))
+        value = np.eye(2) + 0.1 * GAIN.T @ GAIN + closed.T @ value @ closed
+    assert abs(costs.mean() - value.sum() - noise) < 4.5 * costs.std() / 200
 
 
 def test_two_balls():

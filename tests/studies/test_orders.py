@@ -76,3 +76,13 @@ def test_only_the_time_of_impact_teaches_two_balls_to_strike():
     assert with_it["final_cost"] == pytest.approx(1.39654216, rel=0.01)
     assert with_it["final_cost"] == pytest.approx(1.395808, rel=1e-3)
     assert without["final_cost"] == pytest.approx(2.0, rel=0.001)
+
+
+@pytest.mark.slow
+def test_the_event_driven_integrator_teaches_two_balls_to_strike_too():
+    (found,) = ends(
+        "scenes=[two_balls[horizon=480,dt=0.0020833333333333333,sigma=1e-12]]", "backends=[jax]", "samples=1", "name=events",
+        "study=optimise[iterations=120,quality=none,budget=100000000]", "estimators=[fobg]", "timing=false",
+        "optimizers=[gradient_descent[rate=100]]", "contacts=[impulse]", "integrators=[event_driven]",
+    )  # fmt: skip
+    assert found["final_cost"] == pytest.approx(1.39911, rel=2e-3)
