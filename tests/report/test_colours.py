@@ -90,6 +90,7 @@ def test_titles_of_searches_say_what_was_found():
     )
     assert findings.sooner(rho[1:]).startswith("Whether the better gradient arrives sooner is not known on smooth")
     assert findings.reaches({"cem": 0.5, "fobg, adam": 0.4, "reinforce, adam": 0.1}) == (
-        "cem reaches most targets (50%); with gradients fobg, adam (40%)"
+        "Most targets reached: cem (50%); with gradients fobg, adam (40%)"
     )
-    assert findings.reaches({"fobg, adam": 0.4, "cem": 0.3}) == "fobg, adam reaches most targets (40%)"
+    assert findings.reaches({"fobg, adam": 0.4, "cem": 0.3}) == "Most targets reached: fobg, adam (40%)"
+    assert findings.reaches({"a, adam": 0.4, "b, adam": 0.4}) == "Most targets reached: a, adam and b, adam (40%)"

@@ -70,22 +70,23 @@ def sooner(rho: pd.DataFrame) -> str:
 def closest(summed: pd.DataFrame) -> str:
     """Write in a title which method comes closest to J*, and which first of those with gradients."""
     known = summed[summed["score"].notna()].sort_values("score", ascending=False)
-    return _first([(row["method"], number(row["score"], 3)) for row in known.to_dict("records")], "has the best score")
+    return _first([(row["method"], number(row["score"], 3)) for row in known.to_dict("records")], "the best score")
 
 
 def reaches(shares: Mapping[str, float]) -> str:
     """Write in a title which method reaches most targets, and which first of those with gradients."""
     order = sorted(shares.items(), key=lambda item: -item[1])
-    return _first([(name, f"{share:.0%}") for name, share in order], "reaches most targets")
+    return _first([(name, f"{share:.0%}") for name, share in order], "most targets reached")
 
 
 def _first(order: Sequence[tuple[str, str]], what: str) -> str:
     if not order:
         return "No method got anywhere"
-    (first, figure), *others = order
-    said = f"{first} {what} ({figure})"
-    if ", " not in first:  # it looks at costs only
-        following = next(((name, value) for name, value in others if ", " in name), None)
+    figure = order[0][1]
+    level = [name for name, value in order if value == figure]
+    said = f"{what[:1].upper()}{what[1:]}: {' and '.join(level)} ({figure})"
+    if not any(", " in name for name in level):  # they look at costs only
+        following = next(((name, value) for name, value in order if ", " in name), None)
         said += f"; with gradients {following[0]} ({following[1]})" if following else ""
     return said
 
