@@ -46,9 +46,9 @@ def test_order_of_three_methods_at_fixed_steps():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("estimator", "sigma", "low", "high"), [("fobg", 0.5, 874, 877), ("reinforce", 1.0, 899, 912)])
+@pytest.mark.parametrize(("estimator", "sigma", "low", "high"), [("fobg", 1.0, 874, 877), ("reinforce", 1.0, 899, 912)])
 def test_ends_with_backtracking(estimator, sigma, low, high):
-    """30 steps with Armijo's rule, a gradient and a batch of costs each, so that sigma falls like 1/(2 i - 1)."""
+    """30 steps with Armijo's rule, a gradient and a batch of costs each: gradients have sigma 1/(2 i - 1), about .5/i."""
     study = "study=optimise[iterations=60,quality=none,budget=100000000,sigma_decay=1]"
     words = [f"estimators=[{estimator}]", f"scene.pendulum_swing.sigma={sigma}", "optimizers=[line_search]"]
     found = np.array([row["final_cost"] for row in ends(*FIXED, study, "sweep.seed=[0,1,2]", *words)])
