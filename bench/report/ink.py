@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bench.model import registry
-from bench.report.style import MARKERS, PALETTE, colour
+from bench.report.style import colour, marker
 
 
 def ink(estimator: str) -> str:
@@ -13,8 +13,7 @@ def ink(estimator: str) -> str:
 
 def stamp(estimator: str, variant: int = 0) -> str:
     """Return the estimator's marker, another for each variant of its parameters."""
-    place = _place(estimator)
-    return MARKERS[(place + place // len(PALETTE) + 3 * variant) % len(MARKERS)]
+    return marker(_place(estimator), variant)
 
 
 def _place(estimator: str) -> int:

@@ -45,7 +45,7 @@ def page(
     titles = _panel_titles(problems, 0.86 * width / across)
     blocks = math.ceil(len(problems) / across)
     head = wrapped(subtitle, 0.97 * width)
-    title = _lines(title, 0.97 * width)
+    title = wrapped(title.split(), 0.97 * width / BOLD, " ")
     counts = [_legend_columns(part, width) for part in legends]
     named = 0.25 + LINE * title.count("\n")
     above = named + LINE * (head.count("\n") + 1)
@@ -60,15 +60,6 @@ def page(
     _legends(bottom, legends, counts)
     grid = centre.subplots(blocks * len(labels), across, squeeze=False, sharey=sharey)
     return figure, _panels(grid, titles, labels)
-
-
-def _lines(title: str, width: float) -> str:
-    """Break a title at its spaces, into lines of at most ``width`` inches as printed."""
-    out = ""
-    for word in title.split():
-        last = out.rpartition("\n")[2]
-        out += ("" if not out else " " if BOLD * inches(f"{last} {word}") <= width else "\n") + word
-    return out
 
 
 def _panels(grid: np.ndarray, titles: Sequence[str], labels: Sequence[str]) -> list[list[Axes]]:

@@ -76,9 +76,7 @@ class Look:
 
     def marked(self, line: Line) -> dict[str, Any]:
         """Return the line and the marker of an estimator and its parameters."""
-        place = self._names.index(line.estimator)
-        marker = MARKERS[(place + place // len(PALETTE) + 3 * self._variant(line)) % len(MARKERS)]
-        return {**self.line(line), "marker": marker}
+        return {**self.line(line), "marker": marker(self._names.index(line.estimator), self._variant(line))}
 
     def backend(self, name: str) -> str:
         """Return the marker of a backend, in charts that distinguish backends."""
@@ -102,6 +100,11 @@ def colour(place: int) -> str:
     share = share / 2 if turn % 2 == 0 and PALETTE[index] == "#000000" else share
     red, green, blue = ((1 - share) * part + share * end for part in to_rgb(PALETTE[index]))
     return to_hex((red, green, blue))
+
+
+def marker(place: int, variant: int = 0) -> str:
+    """Return the marker of a place in a list, another for each variant."""
+    return MARKERS[(place + place // len(PALETTE) + 3 * variant) % len(MARKERS)]
 
 
 def twin(line: Line, lines: Sequence[Line]) -> int:
@@ -145,10 +148,12 @@ def inches(text: str) -> float:
     return float(TextPath((0, 0), text, size=SIZE).get_extents().width / 72) if text.strip() else 0.0
 
 
-def wrapped(parts: Sequence[str], width: float) -> str:
-    """Join parts by commas, in lines of at most ``width`` inches unless one part is longer."""
+def wrapped(parts: Sequence[str], width: float, between: str = ", ") -> str:
+    """Join parts by ``between``, in lines of at most ``width`` inches unless one part is longer."""
     out = ""
     for part in filter(None, parts):
         last = out.rpartition("\n")[2]
-        out += ("" if not out else ", " if inches(f"{last}, {part}") <= width else ",\n") + part
+        out += (
+            "" if not out else between if inches(last + between + part) <= width else between.rstrip() + "\n"
+        ) + part
     return out

@@ -76,7 +76,7 @@ def test_an_estimator_keeps_its_colour_in_searches_and_in_errors_and_what_sees_c
     context = found["cem[elites=8,population=40]"]
     assert len(set(to_rgb(context["color"]))) == 1
     assert context["linestyle"] != "-"
-    assert growth.VARIANCES["first_order"][1]["color"] == found["fobg, adam"]["color"]
+    assert growth.variances()["first_order"][1]["color"] == found["fobg, adam"]["color"]
 
 
 def test_titles_of_searches_say_what_was_found():

@@ -80,8 +80,7 @@ def headline(
 
     Failing is an error no better than answering zero, or a cell that did not end well.
     """
-    wins = Counter(label for _, curves in parts for labels in winners(curves).values() for label in labels)
-    names = sorted(dict.fromkeys(line.label for _, curves in parts for line in curves), key=lambda name: -wins[name])
+    names = _by_wins(parts)
     bad = {name: [_failures(curves, name) for _, curves in parts] for name in names}
     names = [name for name in names if any(bad[name])]
     sound = [name for name in names if not any(any(where.values()) for where in bad[name])]
@@ -105,8 +104,7 @@ def tally(parts: Sequence[tuple[Family, Sequence[Line]]]) -> str:
 
     Failing is what it is in :func:`headline`.
     """
-    wins = Counter(label for _, curves in parts for labels in winners(curves).values() for label in labels)
-    names = sorted(dict.fromkeys(line.label for _, curves in parts for line in curves), key=lambda name: -wins[name])
+    names = _by_wins(parts)
     found = {name: [any(where.values()) for _, curves in parts if (where := _failures(curves, name))] for name in names}
     broken = [name for name in names if any(found[name])]
     sound = sum(bool(tried) and not any(tried) for tried in found.values())
@@ -117,6 +115,12 @@ def tally(parts: Sequence[tuple[Family, Sequence[Line]]]) -> str:
         return f"{first} fails; {sound or 'none'} of {len(names)} estimators {'is' if sound == 1 else 'are'} better than zero"
     among = f"{sum(tried)} of {len(tried)} problem{'s' * (len(tried) > 1)}"
     return f"{first} fails on {among}; {sound or 'none'} of {len(names)} estimators fail{'s' * (sound == 1)} on none"
+
+
+def _by_wins(parts: Sequence[tuple[Family, Sequence[Line]]]) -> list[str]:
+    """Return the estimators, the one that is lowest most often first."""
+    wins = Counter(label for _, curves in parts for labels in winners(curves).values() for label in labels)
+    return sorted(dict.fromkeys(line.label for _, curves in parts for line in curves), key=lambda name: -wins[name])
 
 
 def _change(line: Line) -> float:

@@ -31,10 +31,6 @@ from bench.sweep.experiment import Experiment
 from bench.sweep.files import write_all
 
 NORM: dict[str, Any] = {"color": "#000000", "marker": "o"}
-VARIANCES: dict[str, tuple[str, dict[str, Any]]] = {
-    "first_order": ("fobg", {"color": ink("fobg"), "marker": "D"}),
-    "zeroth_order": ("zeroth order", {"color": ink("reinforce"), "marker": "P", "linestyle": (0, (4, 1.5))}),
-}
 SINGULAR: tuple[dict[str, Any], ...] = (
     {"color": PALETTE[2], "marker": "^", "markersize": 3.5},
     {"color": PALETTE[0], "marker": "v", "markersize": 3.5},
@@ -55,6 +51,14 @@ NOTES = (
     "without controls), median. variance: per sample, median over "
     "repeats.",
 )
+
+
+def variances() -> dict[str, tuple[str, dict[str, Any]]]:
+    """Return, by column, the name and the look of the curves of variance."""
+    return {
+        "first_order": ("fobg", {"color": ink("fobg"), "marker": "D"}),
+        "zeroth_order": ("zeroth order", {"color": ink("reinforce"), "marker": "P", "linestyle": (0, (4, 1.5))}),
+    }
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
@@ -198,7 +202,7 @@ def _legend() -> list[Any]:
     handles.append(Patch(label="5% to 95%", color="#000000", alpha=0.2, linewidth=0))
     names = ("largest singular value", "smallest", "between")
     handles += [Line2D([], [], label=name, **look) for name, look in zip(names, SINGULAR, strict=True)]
-    handles += [Line2D([], [], label=f"variance of {name}", **style) for name, style in VARIANCES.values()]
+    handles += [Line2D([], [], label=f"variance of {name}", **style) for name, style in variances().values()]
     return handles
 
 
@@ -248,7 +252,7 @@ def _unity(panel: Axes) -> None:
 
 
 def _draw_variances(panel: Axes, rows: pd.DataFrame) -> None:
-    for name, (_, style) in VARIANCES.items():
+    for name, (_, style) in variances().items():
         shown = rows[rows[f"{name}_variance"] > 0]
         low, high = (shown[f"{name}_variance_{end}"] for end in ("low", "high"))
         panel.fill_between(shown["time_horizon"], low, high, color=style["color"], alpha=0.2, linewidth=0)
