@@ -20,6 +20,7 @@ import types
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
@@ -251,7 +252,12 @@ def make(kind: str, name: str, values: Mapping[str, Any] | None = None) -> Any:
 
 def kind_of(axis: str) -> str:
     """Return the kind of plugins on an axis: ``scenes`` for ``scene``; raises :class:`UserError` if there is none."""
-    kind = next((kind for kind in kinds() if singular(kind) == axis), None)
-    if kind is None:
-        raise unknown("axis", axis, map(singular, kinds()))
-    return kind
+    known = _by_axis(tuple(kinds()))
+    if axis not in known:
+        raise unknown("axis", axis, known)
+    return known[axis]
+
+
+@cache
+def _by_axis(kinds: tuple[str, ...]) -> dict[str, str]:
+    return {singular(kind): kind for kind in reversed(kinds)}

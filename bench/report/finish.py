@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -10,6 +11,7 @@ import pandas as pd
 from bench.errors import UserError, printable
 from bench.model import guard
 from bench.report import averages, web
+from bench.report.cores import spread
 from bench.report.views import latest
 from bench.sweep.execute import Finished, store_of
 from bench.sweep.experiment import Experiment
@@ -39,8 +41,12 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     if rows.empty:
         raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
     with guard.quiet("a plugin"), guard.guarded():  # the commands that repeat a cell are made from its plugins
-        written = study_of(experiment).write(experiment, rows)
-        return [*written, *averages.write(experiment, rows), web.write(experiment, rows)]
+        works = (study_of(experiment).write, averages.write, _page)
+        return [path for paths in spread([partial(work, experiment, rows) for work in works]) for path in paths]
+
+
+def _page(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+    return [web.write(experiment, rows)]
 
 
 def shown(rows: pd.DataFrame) -> pd.DataFrame:

@@ -143,9 +143,14 @@ def plain(text: str) -> str:
 @cache
 def inches(text: str) -> float:
     """Return the width of a text as printed."""
-    from matplotlib.textpath import TextPath
+    from matplotlib.cbook import is_math_text
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
 
-    return float(TextPath((0, 0), text, size=SIZE).get_extents().width / 72) if text.strip() else 0.0
+    formula = is_math_text(text)
+    shown = text if formula else text.replace(r"\$", "$")
+    width, _, _ = text_to_path.get_text_width_height_descent(shown, FontProperties(size=SIZE), formula)
+    return float(width / 72)
 
 
 def wrapped(parts: Sequence[str], width: float, between: str = ", ") -> str:

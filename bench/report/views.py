@@ -204,10 +204,10 @@ def lines(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Line]:
     several = rows["dtype"].nunique() > 1
     tidy = rows.drop_duplicates([*RUN, "x"], keep="last").sort_values("x", kind="stable").set_index("x")
     parts: dict[Any, pd.DataFrame] = dict(list(tidy.groupby(list(RUN), sort=False)))
-    every: dict[tuple[str, str], dict[str, pd.DataFrame]] = {}
+    every: dict[tuple[str, str], dict[str, _Run]] = {}
     for estimator, params, backend, dtype in rows[list(RUN)].drop_duplicates().itertuples(index=False, name=None):
         name = f"{backend} {dtype}" if several else str(backend)
-        every.setdefault((estimator, params), {})[name] = parts[estimator, params, backend, dtype]
+        every.setdefault((estimator, params), {})[name] = _Run(parts[estimator, params, backend, dtype])
     result = []
     for (estimator, params), runs in every.items():
         while runs:
@@ -215,20 +215,34 @@ def lines(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Line]:
             alike = [n for n, run in runs.items() if n == first or (close is not None and _agree(mine, run, close))]
             exact = {name: name == first or _agree(mine, runs[name], EXACT) for name in alike}
             backends = dict(sorted(exact.items(), key=lambda item: not item[1]))
-            seconds = {name: float(runs[name]["time_s"].median()) for name in backends}
-            noisy = frozenset(name for name in backends if unsteady(runs[name]).mean() > 0.5)
-            failed = sum(int(runs[name]["lost"].sum()) for name in backends)
-            result.append(Line(str(estimator), str(params), backends, mine, seconds, noisy, failed))
+            seconds = {name: float(runs[name].rows["time_s"].median()) for name in backends}
+            noisy = frozenset(name for name in backends if unsteady(runs[name].rows).mean() > 0.5)
+            failed = sum(int(runs[name].rows["lost"].sum()) for name in backends)
+            result.append(Line(str(estimator), str(params), backends, mine.rows, seconds, noisy, failed))
             runs = {name: run for name, run in runs.items() if name not in backends}
     return result
 
 
-def _agree(a: pd.DataFrame, b: pd.DataFrame, tolerance: float) -> bool:
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """One estimator on one backend along ``x``."""
+
+    rows: pd.DataFrame
+
+    @cached_property
+    def ends(self) -> list[tuple[float, str]]:
+        return list(zip(self.rows.index, self.rows["status"], strict=True))
+
+    @cached_property
+    def numbers(self) -> np.ndarray:
+        return self.rows[["rmse", "variance", "bias_high", "bias"]].to_numpy(dtype=float)
+
+
+def _agree(a: _Run, b: _Run, tolerance: float) -> bool:
     """Return whether two backends ended alike at every ``x`` and gave numbers within a relative tolerance."""
-    if not a.index.equals(b.index) or a["status"].tolist() != b["status"].tolist():
+    if a.ends != b.ends:
         return False
-    names = ["rmse", "variance", "bias_high", "bias"]
-    x, y = (table[names].to_numpy(dtype=float) for table in (a, b))
+    x, y = a.numbers, b.numbers
     with np.errstate(invalid="ignore"):
         margin = tolerance * np.fmax(np.abs(x), np.abs(y))[:, [0, 1, 2, 2]]
         alike = (x == y) | (np.isnan(x) & np.isnan(y)) | (np.abs(x - y) <= margin)

@@ -186,17 +186,20 @@ def _together(sweep: Mapping[str, Any]) -> list[frozenset[str]]:
 
 def _meaning(names: Iterable[str], given: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     """Return unit and meaning of a parameter, as its plugin declares them."""
+    plugins = {(group, part["name"]): None for one in given for group, part in one.items() if _is_part(group, part)}
     meanings = {}
     for name in names:
-        for one in given:
-            for group, part in one.items():
-                if group in NOT_PARTS or part is None:
-                    continue
-                declared = declared_parameters(registry.kind_of(group), part["name"])
-                if (parameter := applies(name, registry.kind_of(group), part["name"], declared)) is not None:
-                    meanings[declared[parameter].unit] = declared[parameter].doc
+        for group, plugin in plugins:
+            kind = registry.kind_of(group)
+            declared = declared_parameters(kind, plugin)
+            if (parameter := applies(name, kind, plugin, declared)) is not None:
+                meanings[declared[parameter].unit] = declared[parameter].doc
     # a unit that differs between scenes cannot stand on a common axis
     return next(iter(meanings.items())) if len(meanings) == 1 else ("", "")
+
+
+def _is_part(group: str, part: Any) -> bool:
+    return group not in NOT_PARTS and part is not None
 
 
 def declared_parameters(kind: str, name: str) -> Mapping[str, Parameter]:
@@ -237,12 +240,20 @@ def revived(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
 
 def relabelled(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
     """Drop from rows' identity strings the parameters shown as columns of swept axes; unknown plugins keep theirs."""
-    cache: dict[int, dict[str, str]] = {}
+    names = [name for axis in axes for name in axis.names]
+    known: dict[str, dict[str, str]] = {}
+
+    def read(some: Mapping[str, Any]) -> dict[str, str]:
+        text = repr(some)
+        if text not in known:
+            known[text] = _labels(some, names)
+        return known[text]
+
     lines = []
     for given in parsed(rows):
-        if id(given) not in cache:
-            cache[id(given)] = _labels(given, [name for axis in axes for name in axis.names])
-        lines.append(cache[id(given)])
+        estimator = {group: part for group, part in given.items() if group == "estimator"}
+        problem = {group: part for group, part in given.items() if group not in ("estimator", *NOT_PARTS)}
+        lines.append(read(problem) | read(estimator))
     changed = {name for line in lines for name in line}
     return rows.assign(
         **{name: [line.get(name, old) for line, old in zip(lines, rows[name], strict=True)] for name in changed}

@@ -18,6 +18,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.model import SURROGATE, registry
+from bench.report.cores import spread
 from bench.report.figures import save, styled
 from bench.report.style import Look, plain, symbol
 from bench.report.views import CATEGORIES, Family, along, arranged, families, ran
@@ -36,13 +37,16 @@ ROOM = 4
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Draw every chart that the rows can fill, in the experiment's formats; returns the files' paths."""
-    paths = []
-    with styled():
-        for name, figure in figures(experiment, rows).items():
-            figure.draw_without_rendering()  # places everything, once
-            figure.set_layout_engine(None)
-            paths += save(figure, experiment.directory / name, experiment.formats)
-    return paths
+
+    def drawn(name: str, figure: Callable[[], Figure]) -> list[Path]:
+        with styled():
+            made = figure()
+            made.draw_without_rendering()  # places everything, once
+            made.set_layout_engine(None)
+            return save(made, experiment.directory / name, experiment.formats)
+
+    works = [partial(drawn, name, figure) for name, figure in drawings(experiment, rows).items()]
+    return [path for paths in spread(works) for path in paths]
 
 
 def file_name(axis: Axis, kind: str = "bias_variance") -> str:
@@ -58,6 +62,12 @@ def along_longest(experiment: Experiment, rows: pd.DataFrame) -> list[str]:
 
 def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
     """Return the charts by file name."""
+    with styled():
+        return {name: figure() for name, figure in drawings(experiment, rows).items()}
+
+
+def drawings(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
+    """Return, by file name, what draws each chart."""
     shown = arranged(experiment, charged(rows))
     rows = shown.rows
     look = Look(rows, sorted(registry.entries()["estimators"]))
@@ -65,7 +75,7 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
     merged = [f"medians over {seeds} seeds"] if seeds > 1 else []
     for law in rows.loc[rows["reason"].str.contains(SURROGATE, regex=False), "contact"].unique():
         merged.append(f"{plain(law)}: {SURROGATE}")
-    drawings: dict[str, Figure] = {}
+    made: dict[str, Callable[[], Figure]] = {}
 
     def problems(axis: Axis | None, drawable: Callable[[pd.DataFrame], bool]) -> list[Family]:
         return [p for p in families(shown, along(shown, axis)) if drawable(p.rows)]
@@ -73,15 +83,15 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
     for axis in shown.swept():
         chosen, held = choose(problems(axis, lambda part: ran(part)["x"].nunique() > 1))
         if chosen:
-            drawings[file_name(axis)] = bias_variance(chosen, held + merged, look, axis, shown.marks(axis))
-    nothing_swept = not drawings
+            made[file_name(axis)] = partial(bias_variance, chosen, held + merged, look, axis, shown.marks(axis))
+    nothing_swept = not made
     good = rows[rows["status"] == "ok"]
     swept = shown.swept()
     longest = max(swept, key=lambda axis: swept[axis], default=None)
     if longest is not None and good["samples"].nunique() < 2 and good["time_s"].notna().any():
         chosen, held = choose(problems(longest, lambda part: TIME.known(part)["x"].nunique() >= FEWEST))
         if chosen:
-            drawings[file_name(longest, "time")] = course(chosen, held + merged, look, longest)
+            made[file_name(longest, "time")] = partial(course, chosen, held + merged, look, longest)
     if good["samples"].nunique() > 1 or good["backend"].nunique() > 1:
         for name, cost in (
             ("speed_accuracy", TIME_COMPILED if experiment.compile_time else TIME),
@@ -91,17 +101,20 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
             curves = [problem for problem in costed if ran(problem.rows)["x"].nunique() > 1]
             chosen, held = choose(curves or costed)
             if chosen and (cost is not ROLLOUTS or good["samples"].nunique() > 1):
-                said, first = _said(chosen, cost)
-                drawings[name] = speed_accuracy(chosen, held + merged, look, cost, said, first)
+                made[name] = partial(_costs, chosen, held + merged, look, cost)
         raced = problems(SAMPLES, lambda part: ran(part)["x"].nunique() > 1) if good["samples"].nunique() > 1 else []
         if raced:
             costs = [TIME, ROLLOUTS] if good["time_s"].notna().any() else [ROLLOUTS]
-            drawings["at_a_glance"] = glance(choose(raced, 2 * ROOM)[0], costs)
+            made["at_a_glance"] = partial(glance, choose(raced, 2 * ROOM)[0], costs)
     if nothing_swept:
         chosen = problems(None, lambda part: len(ran(part)) > 0)
         if chosen:
-            drawings["overview"] = overview(chosen, merged, look)
-    return drawings
+            made["overview"] = partial(overview, chosen, merged, look)
+    return made
+
+
+def _costs(problems: Sequence[Family], notes: Sequence[str], look: Look, cost: Cost) -> Figure:
+    return speed_accuracy(problems, notes, look, cost, *_said(problems, cost))
 
 
 def _said(problems: Sequence[Family], cost: Cost) -> tuple[dict[int, str], str]:

@@ -30,9 +30,10 @@ class Cost:
 
     def known(self, rows: pd.DataFrame) -> pd.DataFrame:
         """Return the rows that have both an error and a cost."""
-        cost = self.of(rows)
-        good = (rows["status"] == "ok") & np.isfinite(rows["rmse_rel"]) & np.isfinite(cost)
-        return rows[good & (rows["rmse_rel"] > 0) & (cost > 0)]
+        good = (rows["status"] == "ok").to_numpy(bool)
+        for values in (self.of(rows).to_numpy(float), rows["rmse_rel"].to_numpy(float)):
+            good = good & np.isfinite(values) & (values > 0)
+        return rows if good.all() else rows[good]
 
 
 def _seconds(value: float) -> str:

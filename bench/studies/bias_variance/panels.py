@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -91,38 +92,52 @@ def _deviation(line: Line, curves: Sequence[Line]) -> dict[str, Any]:
     return {"linestyle": DEVIANT[(place - 1) % len(DEVIANT)]} if place else {}
 
 
-def _estimates(rows: pd.DataFrame, column: str, power: int) -> pd.DataFrame:
-    """Return rows with an RMSE, bias or variance: value and interval relative to |grad J|, and whether it is a limit."""
-    scale = _scale(rows, power)
-    if column == "rmse":
-        norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
-        ends = {end: np.hypot(rows[f"bias_{end}"], np.sqrt(rows[f"variance_{end}"])) / norm for end in ("low", "high")}
-        table = pd.DataFrame({"value": rows["rmse"] / scale, **ends})
-    else:
-        named = {"value": "", "low": "_low", "high": "_high"}
-        table = pd.DataFrame({name: rows[column + end] / scale for name, end in named.items()})
-    limit = ~resolved(rows) & (column == "bias")
-    table["value"] = table["value"].where(~limit, table["high"])
-    floor = FLOOR**power
-    table["limit"] = limit | (table["value"] <= floor)
-    table = table[(rows["status"] == "ok") & np.isfinite(table["value"])]
-    return table.assign(value=table["value"].clip(lower=floor), low=table["low"].clip(lower=floor))
+@dataclass(frozen=True)
+class Points:
+    """Values to draw, each an array ``(n,)``, relative to |grad J|."""
+
+    known: np.ndarray
+    """Of all rows: whether it has a value; the others are of those alone."""
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    limit: np.ndarray
+    """Whether the value is an upper limit."""
 
 
-def _scale(rows: pd.DataFrame, power: int) -> pd.Series:
-    """Return a power of |grad J|, or 1 where that is 0."""
-    norm = rows["reference_norm"]
-    return norm.where((norm > 0) & np.isfinite(norm), 1.0) ** power
+def _estimates(rows: pd.DataFrame, column: str, power: int) -> Points:
+    """Return the RMSE, bias or variance of rows with its interval."""
+    names = (column, *(f"{part}_{end}" for part in ("bias", "variance") for end in ("low", "high")))
+    read = {name: rows[name].to_numpy(float) for name in names}
+    norm, scale = rows["reference_norm"].to_numpy(float), _scale(rows)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if column == "rmse":
+            size = np.where(norm > 0, norm, np.nan)
+            ends = [np.hypot(read[f"bias_{end}"], np.sqrt(read[f"variance_{end}"])) / size for end in ("low", "high")]
+        else:
+            ends = [read[f"{column}_{end}"] / scale**power for end in ("low", "high")]
+        value = read[column] / scale**power
+        limit = ~(read["bias_low"] > 0) & (column == "bias")
+        value = np.where(limit, ends[1], value)
+        floor = FLOOR**power
+        known = (rows["status"] == "ok").to_numpy(bool) & np.isfinite(value)
+        low, high = (end[known] for end in ends)
+        return Points(known, value[known].clip(floor), low.clip(floor), high, (limit | (value <= floor))[known])
+
+
+def _scale(rows: pd.DataFrame) -> np.ndarray:
+    """Return |grad J|, or 1 where that is 0."""
+    norm = rows["reference_norm"].to_numpy(float)
+    return np.where((norm > 0) & np.isfinite(norm), norm, 1.0)
 
 
 def _draw_errors(panel: Axes, line: Line, place: Transform, style: Mapping[str, Any], column: str, power: int) -> None:
     """Draw one estimator's RMSE, bias or variance along the axis at ``place``, and crosses where cells were lost."""
     points, at = _estimates(line.rows, column, power), line.rows.index.to_numpy(float)
-    has = line.rows.index.isin(points.index)
     curve = {**style, "marker": "", "alpha": 0.75}
-    panel.plot(at[has], points["value"], label=line.label, transform=place, **curve)
-    _draw_points(panel, at[has], points, {**style, "transform": place})
-    lost = at[~has | (line.rows["lost"] > 0)]
+    panel.plot(at[points.known], points.value, label=line.label, transform=place, **curve)
+    _draw_points(panel, at[points.known], points, {**style, "transform": place})
+    lost = at[~points.known | (line.rows["lost"].to_numpy() > 0)]
     if len(lost):
         height = 0.955 - 0.05 * (sum(other.get_marker() == "x" for other in panel.lines) % 4)
         panel.plot(
@@ -131,9 +146,7 @@ def _draw_errors(panel: Axes, line: Line, place: Transform, style: Mapping[str, 
         )  # fmt: skip
 
 
-def _draw_points(
-    panel: Axes, at: np.ndarray, values: pd.DataFrame, style: Mapping[str, Any], lying: bool = False
-) -> None:
+def _draw_points(panel: Axes, at: np.ndarray, found: Points, style: Mapping[str, Any], lying: bool = False) -> None:
     """Draw full markers with intervals, hollow ones with arrows at upper limits; ``lying``: values to the right."""
     mark: Any = {
         "color": style["color"],
@@ -141,12 +154,11 @@ def _draw_points(
         "zorder": 3,
         "transform": style.get("transform", panel.transData),
     }
-    limit = values["limit"].to_numpy()
-    clear = values[~limit]
-    bars = np.array([clear["value"] - clear["low"], clear["high"] - clear["value"]])
+    limit, clear = found.limit, ~found.limit
+    bars = np.array([(found.value - found.low)[clear], (found.high - found.value)[clear]])
     bars = np.nan_to_num(bars, posinf=0.0).clip(min=0.0)
-    points: Any = (at[~limit], clear["value"])
-    limits: Any = (at[limit], values["value"][limit])
+    points: Any = (at[clear], found.value[clear])
+    limits: Any = (at[limit], found.value[limit])
     if lying:
         points, limits = points[::-1], limits[::-1]
     error: Any = {"xerr": bars} if lying else {"yerr": bars}
@@ -171,7 +183,7 @@ def _line_legends(
     rows = pd.concat([line.rows for line, _ in every])
     good = rows[rows["status"] == "ok"]
     texts = ["bias not distinguishable from 0: 95% limit"] * bool((~resolved(good)).any())
-    texts += ["below the scale"] * bool(_estimates(rows, "variance", 2)["limit"].any())
+    texts += ["below the scale"] * bool(_estimates(rows, "variance", 2).limit.any())
     if texts:
         symbols.append(_handle(", or ".join(texts), marker="o", markerfacecolor="white", linestyle="none"))
     if (rows["lost"] > 0).any():
@@ -342,10 +354,10 @@ def _row_label(line: Line, curves: Sequence[Line]) -> str:
 def _draw_dot(panel: Axes, line: Line, height: int, colour: str) -> None:
     panel.axhline(height, color="#e5e5e5", linewidth=0.6, zorder=0)
     rows = line.rows
-    error = rows["rmse"] / _scale(rows, 1)
+    error = rows["rmse"] / _scale(rows)
     good = (rows["status"] == "ok") & np.isfinite(error)
     points = _estimates(rows[good], "bias", 1)
-    _draw_points(panel, np.full(len(points), height), points, {"color": colour, "marker": "o"}, lying=True)
+    _draw_points(panel, np.full(len(points.value), height), points, {"color": colour, "marker": "o"}, lying=True)
     panel.plot(error[good].clip(lower=FLOOR), [height] * good.sum(), color=colour, label=line.label, **TICK)
     if not good.all() or (rows["lost"] > 0).any():
         panel.plot([0.97], [height], transform=panel.get_yaxis_transform(), color=colour, **CROSS)
