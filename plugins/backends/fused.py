@@ -14,9 +14,6 @@ from ..fused import emit, kernels, trace
 from ..fused.graph import Refused
 from .jax import Jax, JaxOps, JaxProblem
 
-BEYOND = 1e75
-"""Size of a slope from which the cost itself is looked at."""
-
 
 @dataclass(frozen=True)
 class Fused(Backend):
@@ -125,28 +122,30 @@ class FusedProblem(JaxProblem):
     grain = emit.LANES
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._kernel("value", theta, w, 1)[0]
+        return self._kernel("value", theta, w, 1)[0][0]
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        gradient = self._kernel("grad", theta, w, self.dim)
-        # a cost that overflows has no gradient, finite as its slope may be; asked only of slopes beyond reason
-        if not (np.abs(gradient) < BEYOND).all():
-            gradient = np.where(np.isfinite(self._value(theta, w)), gradient, np.nan)
-        return gradient
+        gradient, tame = self._kernel("grad", theta, w, self.dim)
+        # a cost that overflows has no gradient, finite as its slope may be
+        return gradient if tame else np.where(np.isfinite(self._value(theta, w)), gradient, np.nan)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._kernel("score", theta, w, self.dim)
+        return self._kernel("score", theta, w, self.dim)[0]
 
-    def _kernel(self, function: str, theta: np.ndarray, w: np.ndarray, rows: int) -> np.ndarray:
-        """Return ``(rows, B)`` of a kernel, for a batch that is a multiple of the lanes."""
+    def _kernel(self, function: str, theta: np.ndarray, w: np.ndarray, rows: int) -> tuple[np.ndarray, bool]:
+        """Return ``(rows, B)`` of a kernel, and whether all slopes are so small that their cost is surely finite."""
         batch = w.shape[1]
         if batch % self.grain:
             # a batch below one block comes as it is
             short = -batch % self.grain
             wide = [np.pad(x, ((0, 0), (0, short)), mode="edge") if x.shape[1] == batch else x for x in (theta, w)]
-            return self._kernel(function, wide[0], wide[1], rows)[:, :batch] if batch else np.empty((rows, 0))
+            found, tame = self._kernel(function, wide[0], wide[1], rows)
+            return found[:, :batch], tame
+        if not batch:
+            return np.empty((rows, 0)), True
         source = _source(_Structure(self.program), function, self._dtype.name)
-        w, noise_row = self._flat(w)
+        # in one piece: rows that lie far apart in a large batch would each need a page of their own
+        w, noise_row = self._flat(np.ascontiguousarray(w))
         if theta.shape[1] == 1:
             theta = np.repeat(theta, self.grain, axis=1)
             column = 0
@@ -158,9 +157,10 @@ class FusedProblem(JaxProblem):
             self._parameters, source.constants, source.indices, source.length, flat, row, column, flat, row, column,
             w, noise_row, out.reshape(-1), batch, rows, 0, batch,
         )  # fmt: skip
-        if not self._compiled(source.text)(*arguments):
-            self._compiled(kernels.exact(source.text))(*arguments)
-        return out.astype(np.float64, copy=False)
+        small, tame = self._compiled(source.text)(*arguments)
+        if not small:
+            _, tame = self._compiled(kernels.exact(source.text))(*arguments)
+        return out.astype(np.float64, copy=False), tame
 
     def _flat(self, array: np.ndarray) -> tuple[np.ndarray, int]:
         """Return a view that begins at the first entry, and the distance of its rows."""

@@ -27,6 +27,8 @@ import numpy as np
 from numba import njit
 
 F = np.{dtype}
+# a cost that overflows has no gradient, finite as its slope may be; it is looked at where slopes are beyond this
+BEYOND = F({beyond!r})
 # an unsigned index cannot mean "from the end", which would keep loops from being vectorised
 at = np.uint64
 {helpers}
@@ -34,7 +36,8 @@ at = np.uint64
 @njit(nogil=True, error_model="numpy", fastmath={{"contract"}}, cache={cache})
 def kernel(parameter, constant, index, horizon, theta, theta_row, theta_column, scored, scored_row, scored_column,
            noise, noise_row, out, out_row, rows, start, stop):
-    """Fill columns start to stop of ``out``; return whether all angles were small enough for fast sine and cosine."""
+    """Fill columns start to stop of ``out``; return whether all angles were small enough for fast sine and cosine, and
+    whether all slopes are below ``BEYOND``."""
 '''
 ARGUMENTS = ("theta", "scored", "noise")
 
@@ -105,7 +108,8 @@ class _Kernel:
         self._lanes(everything, forward, starts, backward)
         body = self.code.lines
         helpers = _helpers(everything)
-        text = HEAD.format(title=title, dtype=dtype, helpers=helpers, cache=cache)
+        beyond = float(np.finfo(dtype).max) ** 0.25
+        text = HEAD.format(title=title, dtype=dtype, beyond=beyond, helpers=helpers, cache=cache)
         return text + _renumbered("\n".join("    " + line for line in body)) + "\n"
 
     def _needed(self, roots: Iterable[Node], carries: Iterable[int] = ()) -> list[int]:
@@ -222,19 +226,20 @@ class _Kernel:
         ]
         crossing = self._crossing(early, inside, [n for n in after if n is not None])
 
-        rows: list[str] = [f"c{i}" for i in forward]
+        history = {i: j for j, i in enumerate(backward.history)} if backward else {}
+        # the carries that the backward pass reads come first and together
+        rows: list[str] = [f"c{i}" for i in (*history, *(i for i in forward if i not in history))]
         rows += [f"k{n.number}" for n in crossing]
         if backward:
             rows += [f"a{i}" for i in backward.step] + [f"t{n.number}" for n in backward.totals]
             rows += [f"o{table}" for table in backward.tables]
-        if fast:
-            rows.append("big")
+        judged = self.wrt == "theta"
+        rows += ["big"] * fast + ["wild"] * judged
         self.slots = {name: i * LANES for i, name in enumerate(rows)}
-        history = {i: j for j, i in enumerate(backward.history)} if backward else {}
         code.add(0, f"lane = np.empty({max(len(rows), 1) * LANES}, F)")
         if history:
             code.add(0, f"kept = np.empty(horizon * {len(history) * LANES}, F)")
-        code.add(0, "small = True")
+        code.add(0, "small = tame = True")
         code.add(0, f"for b in range(start, stop, {LANES}):")
         code.add(1, "theta_at = b * theta_column")
         code.add(1, "scored_at = b * scored_column")
@@ -244,7 +249,7 @@ class _Kernel:
         stores = [(f"c{i}", node) for i, node in starts.items()]
         stores += [(f"k{n.number}", n) for n in crossing]
         zeros = [f"t{n.number}" for n in backward.totals] if backward else []
-        zeros += ["big"] if fast else []
+        zeros += ["big"] * fast + ["wild"] * judged
         self._pass(1, [node for _, node in stores], {}, lambda names: [
             *(f"lane[{self.slots[slot]} + l] = {names[node.number]}" for slot, node in stores),
             *(f"lane[{self.slots[slot]} + l] = F(0.0)" for slot in zeros),
@@ -253,18 +258,18 @@ class _Kernel:
 
         if forward:
             code.add(1, "for t in range(horizon):")
+            if history:
+                # a loop of its own: beside so many other arrays the compiler gives up proving that none overlap
+                code.add(2, f"past = (horizon - 1 - t) * {len(history) * LANES}")
+                code.add(2, f"for l in range({len(history) * LANES}):")
+                code.add(3, "kept[at(past + l)] = lane[l]")
             self._at_step(2, forward.values())
             loads = {self.graph.leaf("carry", i).number: f"lane[{self.slots[f'c{i}']} + l]" for i in forward}
-            keep = [
-                f"kept[at((horizon - 1 - t) * {len(history) * LANES} + {j * LANES} + l)] = " for j in history.values()
-            ]
 
             def store(names: dict[int, str]) -> list[str]:
-                kept = [text + names[self.graph.leaf("carry", i).number] for text, i in zip(keep, history, strict=True)]
-                return kept + [f"lane[{self.slots[f'c{i}']} + l] = {names[n.number]}" for i, n in forward.items()]
+                return [f"lane[{self.slots[f'c{i}']} + l] = {names[n.number]}" for i, n in forward.items()]
 
-            roots = [*forward.values(), *(self.graph.leaf("carry", i) for i in history)]
-            self._pass(2, roots, loads | kept_values, store)
+            self._pass(2, list(forward.values()), loads | kept_values, store)
 
         finals = {self.graph.leaf("final", i).number: f"lane[{self.slots[f'c{i}']} + l]" for i in forward}
         if backward is None:
@@ -277,7 +282,11 @@ class _Kernel:
             code.add(1, f"for l in range({LANES}):")
             code.add(2, f"if lane[{self.slots['big']} + l] > F(LIMIT):")
             code.add(3, "small = False")
-        code.add(0, "return small")
+        if judged:
+            code.add(1, f"for l in range({LANES}):")
+            code.add(2, f"if lane[{self.slots['wild']} + l] > F(0.0):")
+            code.add(3, "tame = False")
+        code.add(0, "return small, tame")
 
     def _crossing(self, early: list[Node], inside: list[Node], after: list[Node]) -> list[Node]:
         """Return the numbers computed before the loop over time that are read in it or after it."""
@@ -337,7 +346,8 @@ class _Kernel:
             # a loop of its own: beside so many other arrays the compiler gives up proving that none overlap
             for table in backward.tables:
                 code.add(2, f"for l in range({LANES}):")
-                code.add(3, f"out[at(o{table} + l)] {write} lane[{self.slots[f'o{table}']} + l]")
+                for line in self._written(f"o{table} + l", write, f"lane[{self.slots[f'o{table}']} + l]"):
+                    code.add(3, line)
         ends = backward.ends
         loads = finals | {graph.leaf("before", i).number: f"lane[{self.slots[f'a{i}']} + l]" for i in backward.step}
         loads |= {
@@ -345,8 +355,20 @@ class _Kernel:
         }
         if ends:
             self._pass(1, list(ends.values()), loads, lambda names: [
-                f"out[at({i} * out_row + b + l)] += {names[n.number]}" for i, n in ends.items()
+                line for i, n in ends.items()
+                for line in self._written(f"{i} * out_row + b + l", "+=", names[n.number])
             ])  # fmt: skip
+
+    def _written(self, place: str, write: str, value: str) -> list[str]:
+        """Write a value to the result, or add it; where it is a slope by theta, remember one that is too large."""
+        if "wild" not in self.slots:
+            return [f"out[at({place})] {write} {value}"]
+        wild = f"lane[{self.slots['wild']} + l]"
+        total = value if write == "=" else f"out[at({place})] + {value}"
+        return [
+            f"slope = {total}", f"out[at({place})] = slope",
+            f"{wild} = {wild} if abs(slope) < BEYOND else F(1.0)",
+        ]  # fmt: skip
 
     def _at_step(self, depth: int, roots: Iterable[Node]) -> None:
         """Write what is the same in all lanes of one step, and where the arrays of the step begin."""

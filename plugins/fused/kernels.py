@@ -28,7 +28,7 @@ class Kernel:
     """A compiled kernel, the seconds that compiling took, and whether it was loaded from a folder."""
 
     name: str
-    call: Callable[..., bool]
+    call: Callable[..., tuple[bool, bool]]
     seconds: float
     loaded: bool
 
