@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 MOST = 255
 """Pieces that can be shared out: each is a byte in a pipe."""
-UNSAFE = ("jax", "torch")
+UNSAFE = ("jaxlib", "torch._C")
 """Modules whose threads do not survive in a copy."""
 T = TypeVar("T")
 
