@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 LEAST = 512
-"""Fewest columns for which it pays to give a part of a batch to another core."""
+"""Fewest columns for which it pays to give a part of a batch to another core, unless a problem says otherwise."""
 MOST = 1 << 14
 """Columns beyond which a larger block saves nothing."""
 
@@ -50,14 +51,17 @@ def fitting(column_bytes: int, grain: int) -> int:
     return max(1, min(max(wanted, LEAST), MOST) // grain) * grain
 
 
+def sharing(count: int, threads: int, least: int = LEAST) -> int:
+    """Return how many threads share a batch: as many as get ``least`` columns each, at least one."""
+    return max(1, min(threads, count // least))
+
+
 def size(count: int, most: int, grain: int, threads: int) -> int:
     """Return the columns of each of a batch's equal blocks: a multiple of ``grain``, about ``most`` at the most.
 
-    The number of blocks is a multiple of ``threads``, or one if the batch is too small to share.
+    The number of blocks is a multiple of ``threads``.
     """
-    parts = max(math.ceil(count / most), min(threads, count // LEAST), 1)
-    if parts > 1:
-        parts = math.ceil(parts / threads) * threads
+    parts = math.ceil(max(1, count / most) / threads) * threads
     return max(1, math.ceil(count / parts / grain)) * grain
 
 
@@ -84,14 +88,33 @@ def evaluate(
         found = function(theta if shared else _filled(theta[:, part], columns), _filled(w[:, part], columns))
         result[..., part] = found[..., : part.stop - part.start]
 
-    starts = range(0, count, columns)
-    if threads > 1 and len(starts) > 1:
-        # a pool per process: a forked child inherits the pool, but not its threads
-        list(_pool(threads, os.getpid()).map(block, starts))
-    else:
-        for start in starts:
-            block(start)
+    _share(block, range(0, count, columns), threads)
     return result
+
+
+def _share(block: Callable[[int], None], starts: Sequence[int], threads: int) -> None:
+    """Call ``block`` with each start, in this thread and in ``threads - 1`` others."""
+    left = deque(starts)
+
+    def work() -> None:
+        while left:
+            try:
+                start = left.popleft()
+            except IndexError:  # another thread was faster
+                return
+            block(start)
+
+    helpers = min(threads, len(starts)) - 1
+    # a pool per process: a forked child inherits the pool, but not its threads
+    begun = [_pool(threads - 1, os.getpid()).submit(work) for _ in range(helpers)] if helpers > 0 else []
+    try:
+        work()
+    finally:
+        left.clear()
+        # a thread that has not woken up yet has nothing left to do
+        failed = [helper.exception() for helper in begun if not helper.cancel()]
+    for error in filter(None, failed):
+        raise error
 
 
 def _filled(part: np.ndarray, columns: int) -> np.ndarray:

@@ -79,12 +79,13 @@ class Problem(ABC):
 
     ``theta`` is ``(d,)`` for one theta shared by all samples or ``(d, B)``; ``w`` is ``(n_w, B)``. Larger batches than
     ``block`` columns are evaluated block by block, so that memory stays flat; blocks are filled up to a multiple of
-    ``grain`` columns, so that few shapes occur, and ``threads`` of them run at once.
+    ``grain`` columns, so that few shapes occur, and ``threads`` of them run at once, each with ``least`` columns or more.
     """
 
     block: int = 1 << 16
     grain: int = 1
     threads: int = 1
+    least: int = blocks.LEAST
     device: str = "cpu"
     """The device that the program runs on."""
     provides: frozenset[str] = frozenset({"value", "grad", "score"})
@@ -186,7 +187,8 @@ class Problem(ABC):
     ) -> np.ndarray:
         theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
         w = np.asarray(w, dtype=np.float64)
-        columns = blocks.size(w.shape[1], self.block, self.grain, self.threads)
+        threads = blocks.sharing(w.shape[1], self.threads, self.least)
+        columns = blocks.size(w.shape[1], self.block, self.grain, threads)
 
         def real(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
             found = function(theta, w)
@@ -194,7 +196,7 @@ class Problem(ABC):
                 raise TypeError(f"{type(self).__name__}{function.__name__} returns complex numbers; costs are real")
             return found
 
-        return blocks.evaluate(real, theta, w, columns, self.threads, lead)
+        return blocks.evaluate(real, theta, w, columns, threads, lead)
 
     @abstractmethod
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...

@@ -120,6 +120,8 @@ class FusedProblem(JaxProblem):
     """A program as compiled kernels; they take any batch and horizon, and float parameters as arguments."""
 
     grain = emit.LANES
+    # fewer are done before another thread has woken up
+    least = 4096
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._kernel("value", theta, w, 1)[0][0]

@@ -2,6 +2,8 @@
 
 import itertools
 import json
+import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -64,6 +66,23 @@ def test_failure_in_a_block_is_raised():
 
     with pytest.raises(ValueError, match="no"):
         blocks.evaluate(fails, np.zeros((1, 1)), np.zeros((1, 50)), 10, 2, (1,))
+
+
+def test_failure_in_another_thread_is_raised():
+    here = threading.get_ident()
+
+    def fails(theta, w):
+        if threading.get_ident() == here:
+            time.sleep(0.2)
+            return w
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        blocks.evaluate(fails, np.zeros((1, 1)), np.zeros((1, 50)), 10, 2, (1,))
+
+
+def test_small_batches_are_not_shared():
+    assert [blocks.sharing(count, 4, 512) for count in (1, 511, 1023, 1024, 2047, 2048, 10**6)] == [1, 1, 1, 2, 3, 4, 4]
 
 
 def test_threads_obey_the_environment(monkeypatch):
