@@ -187,6 +187,28 @@ def test_a_factor_is_claimed_only_where_its_interval_excludes_1(tmp_path, width,
     assert said in sentence(found[(found["by"] == "time") & (found["relative error"] == 0.1)].iloc[0])
 
 
+def test_an_error_far_above_all_variances_leaves_no_doubt_about_the_times(tmp_path):
+    """Both reach it with their smallest batch and more: only their times differ, however uncertain their variances."""
+    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
+    quick = rows(variance=1e-9, rmse=1e-4, rmse_rel=5e-5, time_s=1e-3)
+    slow = rows(variance=1e-9, rmse=1e-4, rmse_rel=5e-5, time_s=3e-3, estimator="slow")
+    found = table(given, with_intervals(pd.concat([quick, slow], ignore_index=True), 50.0))
+    assert "e on b, 3.0 times (3.0 to 3.0) before slow on b" in sentence(found[found["by"] == "time"].iloc[0])
+    # by rollouts both costs are upper limits: one sample of either may do
+    told = sentence(found[found["by"] == "rollouts"].iloc[0])
+    assert "not distinguishable" in told
+
+
+def test_the_next_is_another_estimator_or_the_same_on_another_backend_by_time_alone(tmp_path):
+    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
+    other = rows(backend="other").assign(time_s=lambda r: 2 * r["time_s"])
+    slow = rows(estimator="slow").assign(time_s=lambda r: 3 * r["time_s"])
+    both = with_intervals(pd.concat([rows(), other], ignore_index=True), 50.0)
+    assert "e on b, 2.0 times (2.0 to 2.0) before e on other" in sentence(table(given, both).iloc[0])
+    every = with_intervals(pd.concat([rows(), other, slow], ignore_index=True), 1.1)
+    assert table(given, every).iloc[0]["next"] == "slow on b"
+
+
 def test_charts_name_curves_floors_and_the_first_at_a_glance(tmp_path):
     given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
     slow = rows(estimator="slow", backend="other").assign(time_s=lambda r: 3 * r["time_s"])
@@ -216,4 +238,4 @@ def test_names_stay_within_their_panel_and_the_leader_is_named(tmp_path):
     name = next(text for text in panel.texts if text.get_text() == "an_estimator_with_a_long_name")
     assert name.get_window_extent().x1 <= panel.get_window_extent().x1 + 2  # pixels of padding
     told = [text.get_text() for part in figure.subfigs for text in part.texts]
-    assert any("first to 10%, of 1: e on b in 1" in " ".join(text.split()) for text in told)
+    assert any("e on b is first to 10% error on 1 of 1 problem, to 1% on 1" in " ".join(text.split()) for text in told)

@@ -18,7 +18,7 @@ import pandas as pd
 
 from bench.measure.statistics import unexplained
 from bench.report.tables import escape_markdown, plain_markdown
-from bench.report.text import axis_value, number
+from bench.report.text import axis_value, counted, number
 from bench.report.views import Family, Line, along, arranged, families, lines
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost, charged
 from bench.sweep.axes import Axis
@@ -46,8 +46,12 @@ class Reached:
     """``measured``, ``at once``, ``extrapolated``, ``never`` or ``unknown``."""
     cost: float = math.nan
     samples: float = math.nan
-    spread: float = 0.0
-    """Half the width of the 95% interval of the cost's logarithm: by the variance's interval, and the times' range."""
+    down: float = math.nan
+    """From the cost's logarithm to the lower end of its 95% interval; NaN where the variance has no interval."""
+    up: float = math.nan
+    """To its upper end; infinite where it is not certain that the error is reached."""
+    times: float = 0.0
+    """The interquartile range of times, over their median."""
 
 
 def reach(line: Line, target: float, cost: Cost) -> Reached:
@@ -55,15 +59,40 @@ def reach(line: Line, target: float, cost: Cost) -> Reached:
     rows = cost.known(line.rows).sort_index()
     if rows.empty:
         return Reached("unknown")
-    return replace(_reach(rows, target, cost), spread=_spread(rows.iloc[-1], cost))
+    way = _reach(rows, target, cost)
+    last = rows.iloc[-1]
+    times = float(last["time_iqr_s"] / last["time_s"]) if cost is not ROLLOUTS else 0.0
+    if not math.isfinite(way.cost) or "variance_high" not in rows:
+        return replace(way, times=times)
+    least, most = (_reach(_at_end(rows, end), target, cost).cost for end in ("low", "high"))
+    if way.how == "at once":  # fewer samples may do, down to one
+        least = _of_one(rows, cost)
+    down = max(0.0, math.log(way.cost / least)) if least > 0 else math.inf
+    up = max(0.0, math.log(most / way.cost)) if math.isfinite(most) else math.inf
+    return replace(way, down=down, up=up, times=times)
 
 
-def _spread(row: Any, cost: Cost) -> float:
-    """Return the uncertainty of what a method needs, from its row with most samples: N is proportional to v."""
-    low, high = row.get("variance_low", math.nan), row.get("variance_high", math.nan)
-    spread = 0.5 * math.log(high / low) if low > 0 and math.isfinite(high) else math.nan
-    times = row["time_iqr_s"] / row["time_s"] if cost is not ROLLOUTS else 0.0
-    return math.hypot(spread, times)
+def _of_one(rows: pd.DataFrame, cost: Cost) -> float:
+    """Return the cost of one sample, on the line through the costs of the two smallest batches."""
+    n, price = rows.index.to_numpy(float)[:2], cost.of(rows).to_numpy(float)[:2]
+    slope = (price[1] - price[0]) / (n[1] - n[0]) if len(n) > 1 else price[0] / n[0]
+    return float(np.clip(price[0] - slope * (n[0] - 1.0), price[0] / n[0], price[0]))
+
+
+def _at_end(rows: pd.DataFrame, end: str) -> pd.DataFrame:
+    """Return rows with variance, and bias where it is resolved, at an end of their 95% intervals."""
+    bias = rows[f"bias_{end}"].where(rows["bias_low"] > 0, 0.0)
+    error = np.hypot(bias, np.sqrt(rows[f"variance_{end}"])) / rows["reference_norm"]
+    return rows.assign(bias=bias, variance=rows[f"variance_{end}"], rmse_rel=error)
+
+
+def lead(first: Reached, second: Reached, alike: bool = False) -> tuple[float, float, float]:
+    """Return how many times the cost of the first the second has, with its 95% interval; ``alike``: times alone differ."""
+    factor = second.cost / first.cost
+    noise = (first.times, second.times)
+    low = math.hypot(*noise) if alike else math.hypot(first.up, second.down, *noise)
+    high = math.hypot(*noise) if alike else math.hypot(first.down, second.up, *noise)
+    return factor, factor * math.exp(-low), factor * math.exp(high)
 
 
 def _reach(rows: pd.DataFrame, target: float, cost: Cost) -> Reached:
@@ -124,8 +153,13 @@ def methods(problem: Family, target: float, cost: Cost) -> dict[str, Reached]:
     return reached
 
 
+def estimator_of(method: str) -> str:
+    """Return the estimator of a method: ``fobg`` of ``fobg on jax``."""
+    return method.partition(" on ")[0]
+
+
 def line(problem: Family, target: float, kind: str, cost: Cost) -> dict[str, Any]:
-    """Return the fastest method, the next one, and those that are out."""
+    """Return the fastest method, the next one of another estimator if there is one, and those that are out."""
     reached = methods(problem, target, cost)
     ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
     entry: dict[str, Any] = {
@@ -145,10 +179,11 @@ def line(problem: Family, target: float, kind: str, cost: Cost) -> dict[str, Any
         entry["how"] = "no bias known to be below"
     else:
         entry["how"] = "never"
-    if len(ranked) > 1:
-        factor = ranked[1][0] / ranked[0][0]
-        width = math.exp(math.hypot(reached[ranked[0][1]].spread, reached[ranked[1][1]].spread))
-        entry |= {"next": ranked[1][1], "factor": factor, "factor_low": factor / width, "factor_high": factor * width}
+    others = [name for _, name in ranked if estimator_of(name) != estimator_of(ranked[0][1])]
+    following = others[0] if others else ranked[1][1] if len(ranked) > 1 else ""
+    if following:
+        factor, low, high = lead(reached[ranked[0][1]], reached[following], alike=not others)
+        entry |= {"next": following, "factor": factor, "factor_low": low, "factor_high": high}
     out = {how: ", ".join(name for name, r in reached.items() if r.how == how) or "-" for how in ("never", "unknown")}
     return {"problem": problem.title(), "relative error": target, "by": kind, **entry, **out}
 
@@ -196,15 +231,18 @@ def in_words(best: pd.DataFrame) -> list[str]:
 
 
 def leaders(entries: Sequence[Any]) -> str:
-    """Return who is certainly first in how many problems: ``first to 10%: a on b in 2 of 6, undecided in 4``."""
-    said = []
+    """Write who is certainly first on most problems: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
+    said: list[str] = []
+    before = ""
     for target in dict.fromkeys(entry["relative error"] for entry in entries):
         asked = [entry for entry in entries if entry["relative error"] == target]
         clear = [e["fastest"] for e in asked if e["fastest"] != "-" and (e["next"] == "-" or e["factor_low"] > 1.0)]
-        parts = [f"{name} in {count}" for name, count in Counter(clear).most_common()]
-        parts += [f"undecided in {len(asked) - len(clear)}"] if len(clear) < len(asked) else []
-        said.append(f"first to {target:.0%}, of {len(asked)}: {', '.join(parts)}")
-    return "; ".join(said)
+        name, count = Counter(clear).most_common(1)[0] if clear else ("nobody", len(asked))
+        who = "" if name == before else f"{name} is {'certainly ' * (not clear)}first "
+        error, among = " error" * (not said), f" of {counted(len(asked), 'problem')}" if name != before else ""
+        said.append(f"{who}to {target:.0%}{error} on {count}{among}")
+        before = name
+    return ", ".join(said)
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:

@@ -17,7 +17,7 @@ from bench.report.style import plain
 from bench.report.text import counted, number
 from bench.report.views import Family
 from bench.studies.bias_variance.costs import ROLLOUTS, Cost
-from bench.studies.bias_variance.fastest import TARGETS, Reached, methods
+from bench.studies.bias_variance.fastest import TARGETS, Reached, estimator_of, lead, methods
 
 FIRST = "#009E73"
 SHADES = (
@@ -85,7 +85,7 @@ def _best(reached: Mapping[str, Reached]) -> dict[str, tuple[Reached, str]]:
     """Return what each estimator needs on its best backend, and that backend."""
     best: dict[str, tuple[Reached, str]] = {}
     for name, way in reached.items():
-        estimator, _, backend = name.partition(" on ")
+        estimator, backend = estimator_of(name), name.partition(" on ")[2]
         known = best.get(estimator)
         if known is None or math.isnan(known[0].cost) or way.cost < known[0].cost:
             best[estimator] = (way, backend)
@@ -121,7 +121,5 @@ def _lead(column: Mapping[str, tuple[Reached, str]]) -> str:
     ways = sorted((way for way, _ in column.values() if math.isfinite(way.cost)), key=lambda way: way.cost)
     if len(ways) < 2:
         return "alone" if ways else ""
-    factor, width = ways[1].cost / ways[0].cost, math.exp(math.hypot(ways[0].spread, ways[1].spread))
-    if not factor > width:
-        return "open"
-    return f"{number(factor)} times\n({number(factor / width)} to {number(factor * width)})"
+    factor, low, high = lead(ways[0], ways[1])
+    return f"{number(factor)} times\n({number(low)} to {number(high)})" if low > 1.0 else "open"

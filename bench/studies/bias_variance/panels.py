@@ -210,7 +210,7 @@ def speed_accuracy(
 
     Colour and marker are the estimator, the line style the backend; the best backend's curve has the estimator's name at
     its end. Along a thin grey guide the error falls as N^-1/2; a dotted line is a bias that no samples remove. ``said``
-    are sentences by problem, ``first`` one over all of them.
+    are sentences by problem, ``first`` one over all of them, the title.
     """
     drawn = [lines(problem.rows, close=None) for problem in problems]
     every = [line for curves in drawn for line in curves]
@@ -226,8 +226,8 @@ def speed_accuracy(
     across = columns(len(problems), 2)
     figure, panels = page(
         problems, across, 2.3, ("relative RMSE",),
-        f"Relative RMSE of one estimate against {cost.name}",
-        [*shared(problems, "samples"), *notes, *([first] if first else [])],
+        first or f"Relative RMSE of one estimate against {cost.name}",
+        [*([f"relative RMSE of one estimate against {cost.name}"] if first else []), *shared(problems, "samples"), *notes],
         (list(entries.values()), symbols),
     )  # fmt: skip
     for place, ((panel,), problem, curves) in enumerate(zip(panels, problems, drawn, strict=True)):
