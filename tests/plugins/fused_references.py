@@ -36,8 +36,8 @@ def seconds(settings: dict[str, Any], scene: dict[str, Any], backend: str) -> tu
 def main() -> None:
     """Print a line per scene."""
     settings = yaml.safe_load((Path(__file__).parents[2] / "conf" / "bench_self.yaml").read_text())
-    seconds(settings, settings["compared"]["scenes"][0], "fused")  # imports
-    seconds(settings, settings["compared"]["scenes"][0], "jax")
+    for name in ("jax", "fused"):
+        seconds(settings, {"scene": "double_integrator"}, name)  # imports
     for scene in settings["compared"]["scenes"]:
         (first, after), (fused_first, fused_after) = (seconds(settings, scene, name) for name in ("jax", "fused"))
         start, saved = (fused_first - fused_after) - (first - after), after - fused_after

@@ -19,8 +19,9 @@ from bench.studies.bias_variance.costs import (
     at_equal_cost,
     charged,
 )
-from bench.studies.bias_variance.fastest import reach, sentence, table
+from bench.studies.bias_variance.fastest import leaders, reach, sentence, table
 from bench.studies.bias_variance.findings import winners
+from bench.studies.bias_variance.panels import apart
 from bench.sweep import config
 
 SAMPLES = (16, 64, 256)
@@ -239,3 +240,36 @@ def test_names_stay_within_their_panel_and_the_leader_is_named(tmp_path):
     assert name.get_window_extent().x1 <= panel.get_window_extent().x1 + 2  # pixels of padding
     told = [text.get_text() for part in figure.subfigs for text in part.texts]
     assert any("e on b is first to 10% error on 1 of 1 problem, to 1% on 1" in " ".join(text.split()) for text in told)
+
+
+def test_names_beside_curves_are_apart_and_within_the_panel():
+    assert apart([0.1, 0.12, 0.5], 0.1, 0.04, 0.96) == pytest.approx([0.1, 0.2, 0.5])
+    assert apart([0.0, 0.9, 0.95, 0.99], 0.1, 0.04, 0.96) == pytest.approx([0.04, 0.76, 0.86, 0.96])
+
+
+def test_a_leader_is_an_estimator_and_its_backend_where_that_is_one():
+    def entry(fastest, following, low, target=0.1):
+        return {"relative error": target, "fastest": fastest, "next": following, "factor_low": low}
+
+    both = [entry("a on x", "b on x", 2.0), entry("a on x", "b on y", 1.5), entry("b on x", "a on x", 0.9)]
+    assert leaders(both) == "a on x is first to 10% error on 2 of 3 problems"
+    assert (
+        leaders([entry("a on x", "b on x", 2.0), entry("a on y", "a on x", 0.5)])
+        == "a is first to 10% error on 2 of 2 problems"
+    )
+    assert (
+        leaders([entry("a on x", "b on x", 0.5), entry("-", "-", 0.0)])
+        == "nobody is certainly first to 10% error on 2 of 2 problems"
+    )
+
+
+def test_without_a_sweep_of_samples_the_title_tells_who_is_accurate_and_who_is_fast(tmp_path):
+    given = config.load([f"results_dir={tmp_path}"])
+    first = rows()[:1].assign(samples=64.0)
+    slow = rows(estimator="slow", backend="other").assign(time_s=1.0, rmse_rel=0.1, rmse=0.2)[:1].assign(samples=64.0)
+    useless = rows(estimator="quick").assign(time_s=1e-5, rmse_rel=3.0, rmse=6.0)[:1].assign(samples=64.0)
+    every = with_intervals(pd.concat([first, slow, useless], ignore_index=True), 1.2)
+    figure = figures(given, every.assign(reason="", dim=1.0))["speed_accuracy"]
+    told = " ".join(text.get_text() for part in figure.subfigs for text in part.texts)
+    said = "slow is most accurate on 1 of 1 problem; quick is fastest on 1, no better than zero on 1 of these"
+    assert said in " ".join(told.split())

@@ -86,7 +86,8 @@ def drawings(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[
             made[file_name(axis)] = partial(bias_variance, chosen, held + merged, look, axis, shown.marks(axis))
     nothing_swept = not made
     good = rows[rows["status"] == "ok"]
-    swept = shown.swept()
+    # noise changes an estimate and not its time
+    swept = {axis: count for axis, count in shown.swept().items() if axis.short != "sigma"}
     longest = max(swept, key=lambda axis: swept[axis], default=None)
     if longest is not None and good["samples"].nunique() < 2 and good["time_s"].notna().any():
         chosen, held = choose(problems(longest, lambda part: TIME.known(part)["x"].nunique() >= FEWEST))
@@ -118,7 +119,10 @@ def _costs(problems: Sequence[Family], notes: Sequence[str], look: Look, cost: C
 
 
 def _said(problems: Sequence[Family], cost: Cost) -> tuple[dict[int, str], str]:
-    """Return, for each problem by place, who reaches an error of 10% and of 1% first, and who leads over all."""
+    """Return, for each problem by place, who reaches an error of 10% and of 1% first, and who leads over all.
+
+    Where samples are not swept nobody reaches anything: it is told who is most accurate and who fastest.
+    """
     kind = "rollouts" if cost is ROLLOUTS else "time"
     said = {}
     every: list[dict[str, Any]] = []
@@ -127,7 +131,7 @@ def _said(problems: Sequence[Family], cost: Cost) -> tuple[dict[int, str], str]:
             entries = [fastest.line(problem, target, kind, cost) for target in fastest.TARGETS]
             said[place] = "\n".join(map(fastest.sentence, entries))
             every += entries
-    return said, fastest.leaders(every)
+    return said, fastest.leaders(every) if every else fastest.front(problems, cost)
 
 
 def _costed(cost: Cost, rows: pd.DataFrame) -> bool:

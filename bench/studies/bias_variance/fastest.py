@@ -230,19 +230,48 @@ def in_words(best: pd.DataFrame) -> list[str]:
     return [f"{problem}: {'; '.join(sentences)}." for problem, sentences in told.items()]
 
 
+def _certain(entry: Any) -> bool:
+    """Return whether the fastest method's estimator is certainly the first."""
+    if entry["fastest"] == "-":
+        return False
+    alone = entry["next"] == "-" or estimator_of(entry["next"]) == estimator_of(entry["fastest"])
+    return alone or bool(entry["factor_low"] > 1.0)
+
+
 def leaders(entries: Sequence[Any]) -> str:
     """Write who is certainly first on most problems: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
     said: list[str] = []
     before = ""
     for target in dict.fromkeys(entry["relative error"] for entry in entries):
         asked = [entry for entry in entries if entry["relative error"] == target]
-        clear = [e["fastest"] for e in asked if e["fastest"] != "-" and (e["next"] == "-" or e["factor_low"] > 1.0)]
-        name, count = Counter(clear).most_common(1)[0] if clear else ("nobody", len(asked))
+        clear = [e["fastest"] for e in asked if _certain(e)]
+        leader, count = Counter(map(estimator_of, clear)).most_common(1)[0] if clear else ("nobody", len(asked))
+        ways = {method for method in clear if estimator_of(method) == leader}
+        name = ways.pop() if len(ways) == 1 else leader
         who = "" if name == before else f"{name} is {'certainly ' * (not clear)}first "
         error, among = " error" * (not said), f" of {counted(len(asked), 'problem')}" if name != before else ""
         said.append(f"{who}to {target:.0%}{error} on {count}{among}")
         before = name
     return ", ".join(said)
+
+
+def front(problems: Sequence[Family], cost: Cost) -> str:
+    """Write who is most accurate on most problems, who costs least, and on how many of those it is useless."""
+    accurate: Counter[str] = Counter()
+    cheap: Counter[str] = Counter()
+    useless: Counter[str] = Counter()
+    for problem in problems:
+        known = [(line.label, cost.known(line.rows)) for line in lines(problem.rows, close=None)]
+        rows = pd.concat([rows.assign(label=label, at=cost.of(rows)) for label, rows in known])
+        best, first = (rows.sort_values(by, kind="stable").iloc[0] for by in ("rmse_rel", "at"))
+        accurate[best["label"]] += 1
+        cheap[first["label"]] += 1
+        useless[first["label"]] += bool(first["rmse_rel"] >= 1.0)
+    (best_, wins), (first_, times) = accurate.most_common(1)[0], cheap.most_common(1)[0]
+    costs = "needs fewest rollouts" if cost is ROLLOUTS else "is fastest"
+    second = f" and {costs.removeprefix('is ')} on {times}" if best_ == first_ else f"; {first_} {costs} on {times}"
+    text = f"{best_} is most accurate on {wins} of {counted(len(problems), 'problem')}{second}"
+    return text + (f", no better than zero on {useless[first_]} of these" if useless[first_] else "")
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -245,6 +246,8 @@ def speed_accuracy(
 
 NAME_SIZE = 6
 """Points of the names beside curves."""
+APART = 0.075
+"""Part of a panel's height between two names."""
 MARGIN = 0.75
 """Inches beside a panel that its labels take, at most."""
 GUIDE: dict[str, Any] = {"color": "#b0b0b0", "linewidth": 0.8, "zorder": 0.4}
@@ -260,6 +263,9 @@ def _draw_curve(panel: Axes, line: Line, cost: Cost, style: Mapping[str, Any]) -
     last = rows.sort_index().iloc[-1]
     if last["bias_low"] > 0 and last["bias"] > 0.5 * last["rmse"]:
         floor = last["bias"] / last["reference_norm"]
+        drawn = [other for other in panel.lines if other.get_linestyle() == ":" and other.get_color() == style["color"]]
+        if any(abs(math.log(float(np.ravel(other.get_ydata())[0]) / floor)) < ALIKE for other in drawn):
+            return  # of another backend
         panel.axhline(floor, color=style["color"], linewidth=0.9, linestyle=":", zorder=0.6)
         panel.text(
             0.01 + 0.07 * sum(text.get_text() == "bias" for text in panel.texts), floor, "bias", transform=panel.get_yaxis_transform(), color=style["color"], fontsize=NAME_SIZE - 0.5,
@@ -288,17 +294,25 @@ def _name_curves(panel: Axes, curves: Sequence[Line], cost: Cost, look: Look, wi
             if line.label not in ends or at < ends[line.label][0]:
                 ends[line.label] = (at, float(last["rmse_rel"]), line)
     low, high = np.log(panel.get_ylim())
-    taken: list[float] = []
-    for label, (at, error, line) in sorted(ends.items(), key=lambda item: item[1][1]):
-        height = (np.log(error) - low) / (high - low)
-        height = max(height, taken[-1] + 0.075) if taken else max(height, 0.04)
-        taken.append(height)
+    named = sorted(ends.items(), key=lambda item: item[1][1])
+    heights = apart([(np.log(error) - low) / (high - low) for _, (_, error, _) in named], APART, 0.04, 0.96)
+    for (label, (at, _, line)), height in zip(named, heights, strict=True):
         left, right = np.log(panel.get_xlim())
         x = min((np.log(at) - left) / (right - left) + 0.03, 1.0 - inches(label) * NAME_SIZE / SIZE / width)
         panel.text(
             x, height, plain(label), transform=panel.transAxes, color=look.line(line)["color"], fontsize=NAME_SIZE, va="center",
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.3, "alpha": 0.75}, zorder=5,
         )  # fmt: skip
+
+
+def apart(heights: Sequence[float], gap: float, low: float, high: float) -> list[float]:
+    """Return increasing heights moved so that they are ``gap`` apart and, if there is room, from ``low`` to ``high``."""
+    moved: list[float] = []
+    for height in heights:
+        moved.append(max(height, moved[-1] + gap if moved else low))
+    for i in reversed(range(len(moved))):
+        moved[i] = min(moved[i], moved[i + 1] - gap if i + 1 < len(moved) else high)
+    return moved
 
 
 def _draw_scales(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
