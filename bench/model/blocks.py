@@ -52,8 +52,8 @@ def fitting(column_bytes: int, grain: int) -> int:
 
 
 def sharing(count: int, threads: int, least: int = LEAST) -> int:
-    """Return how many threads share a batch: as many as get ``least`` columns each, at least one."""
-    return max(1, min(threads, count // least))
+    """Return how many threads share a batch: as many as get about ``least`` columns each, at least one."""
+    return max(1, min(threads, round(count / least)))
 
 
 def size(count: int, most: int, grain: int, threads: int) -> int:

@@ -79,7 +79,7 @@ class Problem(ABC):
 
     ``theta`` is ``(d,)`` for one theta shared by all samples or ``(d, B)``; ``w`` is ``(n_w, B)``. Larger batches than
     ``block`` columns are evaluated block by block, so that memory stays flat; blocks are filled up to a multiple of
-    ``grain`` columns, so that few shapes occur, and ``threads`` of them run at once, each with ``least`` columns or more.
+    ``grain`` columns, so that few shapes occur, and ``threads`` of them run at once, each with about ``least`` columns or more.
     """
 
     block: int = 1 << 16

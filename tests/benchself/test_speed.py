@@ -82,7 +82,7 @@ def test_failure_in_another_thread_is_raised():
 
 
 def test_small_batches_are_not_shared():
-    assert [blocks.sharing(count, 4, 512) for count in (1, 511, 1023, 1024, 2047, 2048, 10**6)] == [1, 1, 1, 2, 3, 4, 4]
+    assert [blocks.sharing(count, 4, 512) for count in (0, 1, 700, 1000, 1500, 2048, 10**6)] == [1, 1, 1, 2, 3, 4, 4]
 
 
 def test_threads_obey_the_environment(monkeypatch):
