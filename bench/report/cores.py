@@ -10,6 +10,7 @@ import pickle
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -83,7 +84,10 @@ def _copy(works: Sequence[Callable[[], Any]], left: int, others: Sequence[tuple[
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     parent = os.getpid()
-    process = os.fork()
+    with warnings.catch_warnings():
+        # newer Pythons warn of threads of any library; those that do not survive are in UNSAFE
+        warnings.simplefilter("ignore", DeprecationWarning)
+        process = os.fork()
     if process:
         os.close(results)
         return process, answers

@@ -250,9 +250,12 @@ class _Kernel:
         stores += [(f"k{n.number}", n) for n in crossing]
         zeros = [f"t{n.number}" for n in backward.totals] if backward else []
         zeros += ["big"] * fast + ["wild"] * judged
+        if zeros:
+            code.add(1, f"for l in range({LANES}):")
+        for slot in zeros:
+            code.add(2, f"lane[{self.slots[slot]} + l] = F(0.0)")
         self._pass(1, [node for _, node in stores], {}, lambda names: [
-            *(f"lane[{self.slots[slot]} + l] = {names[node.number]}" for slot, node in stores),
-            *(f"lane[{self.slots[slot]} + l] = F(0.0)" for slot in zeros),
+            f"lane[{self.slots[slot]} + l] = {names[node.number]}" for slot, node in stores
         ])  # fmt: skip
         kept_values = {n.number: f"lane[{self.slots[f'k{n.number}']} + l]" for n in crossing}
 

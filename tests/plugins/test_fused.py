@@ -1,6 +1,7 @@
 """The fused backend: the same numbers as JAX, ties and NaN included, from code that is compiled once per structure."""
 
 import math
+import re
 import time
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -12,6 +13,7 @@ from bench.model import Array, Compilations, FunctionScene, compose, param, regi
 
 pytest.importorskip("numba")
 
+from bench.plugins.backends.fused import _source, _Structure
 from bench.plugins.fused import functions, kernels, trace
 from bench.plugins.fused.graph import Graph, Refused
 
@@ -109,6 +111,15 @@ def test_a_cost_that_overflows_has_no_gradient_finite_as_its_slope_may_be(pushin
         problem = registry.make("backends", name, {"dtype": dtype}).compile(program)
         lost = np.isnan(problem.grad(theta, np.zeros((3, 3))))
         assert lost.tolist() == [[False, True, True]] * 3, name
+
+
+def test_what_is_remembered_of_a_block_begins_at_zero_without_a_loop_over_time_too():
+    """Without carries nothing was stored before the passes, and the mark of large slopes was whatever lay in memory."""
+    program = compose(registry.make("scenes", "quadratic"))
+    text = _source(_Structure(program), "grad", "float64").text
+    place = re.search(r"lane\[(\d+) \+ l\] = lane\[\1 \+ l\] if abs", text)
+    assert place
+    assert f"lane[{place[1]} + l] = F(0.0)" in text
 
 
 def test_a_gradient_costs_a_few_values(pushing):
