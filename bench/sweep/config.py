@@ -84,6 +84,10 @@ def _known_keys() -> frozenset[str]:
     return _settings() | {*kinds, *map(singular, kinds)}
 
 
+LAYOUT = ("columns", "rows")
+"""Settings of ``table`` that may be given by their own names."""
+
+
 @remember
 def _settings() -> frozenset[str]:
     import yaml
@@ -99,6 +103,8 @@ def _prepared(override: str, config_dirs: Sequence[Path]) -> str:
         raise UserError(f"'{override}': interpolations are not resolved here, give the value itself")
     key, _, value = override.partition("=")
     bare = key.lstrip("+~")
+    if bare in LAYOUT:
+        bare = f"table.{bare}"
     head = bare.partition(".")[0]
     if head == "experiment":
         if "," in value:
@@ -112,7 +118,7 @@ def _prepared(override: str, config_dirs: Sequence[Path]) -> str:
     if head.partition("/")[0] == "hydra" or key.startswith("~"):
         raise UserError(f"'{override}': Hydra's own settings cannot be changed here")
     if head not in _known_keys():
-        raise unknown("setting", bare, {*_known_keys(), "experiment"})
+        raise unknown("setting", bare, {*_known_keys(), *LAYOUT, "experiment"})
     kinds = registry.kinds()
     if bare in kinds:
         return f"++{bare}={_quoted(value)}"
@@ -253,7 +259,7 @@ ROWS = ("estimator", "backend")
 def _layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> Layout:
     for key in settings:
         if key not in ("columns", "rows"):
-            raise unknown("setting of table", key, ("columns", "rows"))
+            raise unknown("setting of table", key, LAYOUT)
     columns = "" if settings["columns"] is None else str(settings["columns"])
     names = {part for name in swept(sweep) for part in (name, name.rpartition(".")[2])}
     if columns and columns not in names:

@@ -475,6 +475,7 @@ def test_columns_and_rows_of_the_papers_table_can_be_chosen(tmp_path, capsys):
     for more, across, names in (
         ([], ("10", "100", "1000"), 1),
         (["table.columns=sigma"], ("0.1", "0.3"), 1),
+        (["columns=sigma"], ("0.1", "0.3"), 1),
         (["table.rows=[estimator,backend]"], ("10", "100", "1000"), 2),
     ):
         given, cells = loaded(*words, *more)
@@ -483,6 +484,7 @@ def test_columns_and_rows_of_the_papers_table_can_be_chosen(tmp_path, capsys):
         assert {len(block.rows) for block in made.blocks} == {names}
     for word, said in (
         ("table.columns=sigmas", "did you mean 'sigma'"),
+        ("columns=sigmas", "did you mean 'sigma'"),
         ("table.rows=[backend]", "must hold estimator"),
         ("table.row=[estimator]", "table.row"),
     ):
