@@ -105,10 +105,31 @@ def findings(shown: Arranged) -> list[str]:
     return [*failing(lines), *(f"{name}: {one['words']}; {one['step_note']}." for name, one in parts.iterrows())]
 
 
+def _lost(lines: pd.DataFrame) -> pd.DataFrame:
+    """Return the cases whose fits do not converge."""
+    return lines[lines["converged_high"] < 0.9]
+
+
+def _short(lines: pd.DataFrame) -> pd.DataFrame:
+    """Return the cases whose intervals cover too little."""
+    return lines[lines["coverage_high"] < 0.95]
+
+
+def headline(lines: pd.DataFrame) -> str:
+    """Write in how many cases fits fail, and in how many intervals cover too little."""
+    fits = (
+        f"Fits fail in {len(_lost(lines))} of {counted(len(lines), 'case')}"
+        if len(_lost(lines))
+        else "All fits converge"
+    )
+    short = len(_short(lines))
+    return f"{fits}; intervals cover {f'too little in {short}' if short else 'the truth as often as they say'}"
+
+
 def failing(lines: pd.DataFrame) -> list[str]:
     """Say which fits do not converge, which intervals cover too little, and how many hide what the record lacks."""
     said = []
-    lost = lines[lines["converged_high"] < 0.9]
+    lost, short = _lost(lines), _short(lines)
     if len(lost):
         where = "; ".join(
             f"{name} ({', '.join(f'{way} {number(share)}' for way, share in zip(part['shooting'], part['converged'], strict=True))})"
@@ -118,7 +139,6 @@ def failing(lines: pd.DataFrame) -> list[str]:
             f"Fits fail in {counted(len(lost), 'case')} of {len(lines)}: their residuals are not the noise, since the model is "
             f"wrong or the fit ended elsewhere. Share of fits that converged: {where}."
         )
-    short = lines[lines["coverage_high"] < 0.95]
     if len(short):
         worst = short.sort_values("coverage").iloc[0]
         said.append(
@@ -161,7 +181,7 @@ def figure(lines: pd.DataFrame) -> Figure:
     ways = list(dict.fromkeys(lines["shooting"]))
     drawn = Figure(figsize=(WIDTH, 0.42 * len(names) + 1.5), layout="constrained")
     FigureCanvasAgg(drawn)
-    drawn.suptitle("Do fits find what the record tells, and do their intervals say so?", fontsize=9, fontweight="bold")
+    drawn.suptitle(headline(lines), fontsize=9, fontweight="bold")
     panels = drawn.subplots(1, 3, sharey=True)
     titles = (
         ("converged", "share of fits that converge"),

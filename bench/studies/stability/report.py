@@ -364,7 +364,11 @@ def heat_map(integrator: str, maps: Sequence[Panel], axes: Sequence[Axis] = ()) 
     grid = figure.subplots(down, across, squeeze=False)
     measured = {panel.measured for panel in maps}
     common = len(measured) == 1
-    head = f"Is the gradient right? {plain(integrator)}" + "".join(f" on {text}" for text in measured if common)
+    where = "".join(f" ({text})" for text in measured if common)
+    judged = ran(rows)
+    judged = judged[judged["verdict"] != ""]
+    share = f"right in {(looks(judged) == 'ok').mean():.0%} of the cells" if len(judged) else "not known in any cell"
+    head = f"{plain(integrator)}: the gradient is {share}{where}"
     figure.suptitle(head, fontsize=9, fontweight="bold")
     for area, panel in zip(grid.flat, maps, strict=False):
         _draw(area, panel, steps, levels, common)
