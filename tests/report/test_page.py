@@ -324,6 +324,42 @@ def test_backends_are_told_apart_by_name(browser, tmp_path):
     assert browser.said == []
 
 
+def test_a_browser_draws_a_panel_for_each_stiffness_and_noise(browser, tmp_path):
+    """Points of two stiffnesses or noises in one panel would look like scatter."""
+    rows = table([
+        row(stiffness=k, sigma=s, samples=n, time_s=1e-3 * n, rmse_rel=n**-0.5)
+        for k in (10.0, 1000.0) for s in (0.1, 0.3) for n in (16, 64)
+    ])  # fmt: skip
+    path = tmp_path / "report.html"
+    path.write_text(page(rows, sweep={"samples": [16, 64], "stiffness": [10.0, 1000.0], "sigma": [0.1, 0.3]}, marks={}))
+    browser.open(path)
+    browser.do(SETTLED)
+    drawn = browser.do(
+        "charts.map((c) => [...c.panels.querySelectorAll('.plot')].map((p) => p.data.filter((d) => d.text)"
+        ".reduce((n, d) => n + d.x.length, 0)))"
+    )
+    assert drawn[0] == [2] * 4, "two sample counts for each stiffness and noise"
+    assert all(max(panels, default=0) <= 2 for panels in drawn), drawn
+    assert browser.said == []
+
+
+def test_a_browser_shows_what_fails_first_and_tells_worse_from_no_better(browser, tmp_path):
+    rows = table([row(stiffness=k, estimator="wild") for k in (1.0, 10.0, 100.0)] + [row(estimator="fine")])
+    rows["rmse_rel"] = [0.2, 1.1, 50.0, 0.1]
+    rows[["bias_low", "variance_low"]] = 0.0
+    rows.loc[2, "variance_low"] = (40.0 * rows["reference_norm"][2]) ** 2
+    path = tmp_path / "report.html"
+    path.write_text(page(rows))
+    browser.size(1280, 900)
+    browser.open(path)
+    assert browser.do("document.getElementById('finding').innerText").startswith(
+        "wild is worse than answering zero in 1 (up to 50 times the gradient), no better than zero in 1 of 3 cells"
+    )
+    assert browser.do("document.getElementById('finding').getBoundingClientRect().bottom") < 900
+    browser.size(*WIDE)
+    assert browser.said == []
+
+
 def test_charts_are_drawn_and_a_filter_takes_points_away(shown):
     rows = small_rows()
     before = shown.do(MARKS)
@@ -376,42 +412,6 @@ def test_no_panel_pools_stiffness_or_sigma():
     derived = bias_variance_page.derived(stiffness_rows())
     pooled = derived.groupby("problem")[["stiffness", "sigma"]].nunique()
     assert (pooled == 1).all().all()
-
-
-def test_a_browser_draws_a_panel_for_each_stiffness_and_noise(browser, tmp_path):
-    """Points of two stiffnesses or noises in one panel would look like scatter."""
-    rows = table([
-        row(stiffness=k, sigma=s, samples=n, time_s=1e-3 * n, rmse_rel=n**-0.5)
-        for k in (10.0, 1000.0) for s in (0.1, 0.3) for n in (16, 64)
-    ])  # fmt: skip
-    path = tmp_path / "report.html"
-    path.write_text(page(rows, sweep={"samples": [16, 64], "stiffness": [10.0, 1000.0], "sigma": [0.1, 0.3]}, marks={}))
-    browser.open(path)
-    browser.do(SETTLED)
-    drawn = browser.do(
-        "charts.map((c) => [...c.panels.querySelectorAll('.plot')].map((p) => p.data.filter((d) => d.text)"
-        ".reduce((n, d) => n + d.x.length, 0)))"
-    )
-    assert drawn[0] == [2] * 4, "two sample counts for each stiffness and noise"
-    assert all(max(panels, default=0) <= 2 for panels in drawn), drawn
-    assert browser.said == []
-
-
-def test_a_browser_shows_what_fails_first_and_tells_worse_from_no_better(browser, tmp_path):
-    rows = table([row(stiffness=k, estimator="wild") for k in (1.0, 10.0, 100.0)] + [row(estimator="fine")])
-    rows["rmse_rel"] = [0.2, 1.1, 50.0, 0.1]
-    rows[["bias_low", "variance_low"]] = 0.0
-    rows.loc[2, "variance_low"] = (40.0 * rows["reference_norm"][2]) ** 2
-    path = tmp_path / "report.html"
-    path.write_text(page(rows))
-    browser.size(1280, 900)
-    browser.open(path)
-    assert browser.do("document.getElementById('finding').innerText").startswith(
-        "wild is worse than answering zero in 1 (up to 50 times the gradient), no better than zero in 1 of 3 cells"
-    )
-    assert browser.do("document.getElementById('finding').getBoundingClientRect().bottom") < 900
-    browser.size(*WIDE)
-    assert browser.said == []
 
 
 def test_number_of_points_in_the_first_chart_is_that_of_the_good_cells(shown):
