@@ -51,7 +51,7 @@ def fitting(column_bytes: int, grain: int) -> int:
     return max(1, min(max(wanted, LEAST), MOST) // grain) * grain
 
 
-def sharing(count: int, threads: int, least: int = LEAST) -> int:
+def sharing(count: int, threads: int, least: int) -> int:
     """Return how many threads share a batch: as many as get about ``least`` columns each, at least one."""
     return max(1, min(threads, round(count / least)))
 

@@ -11,75 +11,70 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
-MOST = 255
-"""Pieces that can be shared out: each is a byte in a pipe."""
+from bench.model import blocks
+
 UNSAFE = ("jaxlib", "torch._C")
 """Modules whose threads do not survive in a copy."""
 T = TypeVar("T")
 
 
 def spread(works: Sequence[Callable[[], T]]) -> list[T]:
-    """Return the results of all works, in their order; the copies and this process each take the next one left.
+    """Return the results of all works, in their order; this process and its copies take turns.
 
     Raises the error of the first work, in their order, that failed. What a copy leaves undone, since it was killed, is
     done here. One core does it all where copies are not safe: elsewhere than on Linux, beside other threads of Python or
     those of ``UNSAFE``.
     """
-    helpers = min(_cores(), len(works)) - 1
-    if helpers < 1 or len(works) > MOST or not _safe():
+    helpers = min(blocks.cores(), len(works)) - 1
+    if helpers < 1 or not _safe():
         return [work() for work in works]
-    left, places = os.pipe()
-    os.write(places, bytes(range(len(works))))
-    os.close(places)
+    turns = [range(first, len(works), helpers + 1) for first in range(helpers + 1)]
     copies: list[tuple[int, int]] = []
     gc.freeze()  # or the first collection in a copy would copy every page
     try:
-        for _ in range(helpers):
-            copies.append(_copy(works, left, copies))
-        done = _take(works, left)
+        for places in turns[1:]:
+            copies.append(_copy(works, places, copies))
+        done = _take(works, turns[0])
         for _, answers in copies:
             done |= _read(answers)
     finally:
         gc.unfreeze()
-        os.close(left)
         for process, answers in copies:
             os.close(answers)
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
             with contextlib.suppress(ChildProcessError):
                 os.waitpid(process, 0)
-    for place in sorted(set(range(len(works))) - set(done)):
-        done[place] = (works[place](), None)
-    for _, error in (done[place] for place in range(len(works))):
+    results = [done[place] if place in done else (work(), None) for place, work in enumerate(works)]
+    for _, error in results:
         if error is not None:
             raise error
-    return [done[place][0] for place in range(len(works))]
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else 1
+    return [result for result, _ in results]
 
 
 def _safe() -> bool:
-    return threading.active_count() == 1 and not any(name in sys.modules for name in UNSAFE)
+    alone = threading.active_count() == 1 and not any(name in sys.modules for name in UNSAFE)
+    return alone and sys.platform == "linux"
 
 
-def _take(works: Sequence[Callable[[], Any]], left: int) -> dict[int, tuple[Any, Exception | None]]:
-    """Do works until none is left; returns result and error of each by its place."""
+def _take(works: Sequence[Callable[[], Any]], places: Iterable[int]) -> dict[int, tuple[Any, Exception | None]]:
+    """Do the works at some places; returns result and error of each by its place."""
     done: dict[int, tuple[Any, Exception | None]] = {}
-    while place := os.read(left, 1):
+    for place in places:
         try:
-            done[place[0]] = (works[place[0]](), None)
+            done[place] = (works[place](), None)
         except Exception as error:
-            done[place[0]] = (None, error)
+            done[place] = (None, error)
     return done
 
 
-def _copy(works: Sequence[Callable[[], Any]], left: int, others: Sequence[tuple[int, int]]) -> tuple[int, int]:
-    """Fork a copy that takes works too; returns its number and the pipe that its results come through."""
+def _copy(
+    works: Sequence[Callable[[], Any]], places: Iterable[int], others: Sequence[tuple[int, int]]
+) -> tuple[int, int]:
+    """Fork a copy that does the works at some places; returns its number and the pipe that its results come through."""
     answers, results = os.pipe()
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
@@ -98,7 +93,7 @@ def _copy(works: Sequence[Callable[[], Any]], left: int, others: Sequence[tuple[
             os.close(inherited)
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: it ends with its parent
         if os.getppid() == parent:
-            content = pickle.dumps(_take(works, left))
+            content = pickle.dumps(_take(works, places))
             with os.fdopen(results, "wb") as out:
                 out.write(content)
     finally:

@@ -41,7 +41,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     if rows.empty:
         raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
     with guard.quiet("a plugin"), guard.guarded():  # the commands that repeat a cell are made from its plugins
-        works = (study_of(experiment).write, averages.write, _page)
+        works = (study_of(experiment).write, _page, averages.write)
         return [path for paths in spread([partial(work, experiment, rows) for work in works]) for path in paths]
 
 

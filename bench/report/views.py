@@ -272,16 +272,16 @@ def relative(row: Any, column: str) -> float:
     return float(row[column] / norm) if norm > 0 else math.nan
 
 
-def rmse_interval(row: Any) -> tuple[float, float]:
-    """Return the 95% interval of a relative RMSE; NaN where the variance has none.
+def rmse_interval(row: Any) -> tuple[Any, Any]:
+    """Return the 95% interval of the relative RMSE of a row, or of each of some rows; NaN where the variance has none.
 
     It goes from the lower to the upper ends of bias and variance, RMSE^2 = bias^2 + variance.
     """
+    norm = np.where(row["reference_norm"] > 0, row["reference_norm"], math.nan)
     low, high = (
-        math.hypot(row[f"bias_{end}"], math.sqrt(row.get(f"variance_{end}", math.nan))) for end in ("low", "high")
+        np.hypot(row[f"bias_{end}"], np.sqrt(row.get(f"variance_{end}", math.nan))) / norm for end in ("low", "high")
     )
-    norm = row["reference_norm"]
-    return (low / norm, high / norm) if norm > 0 else (math.nan, math.nan)
+    return low, high
 
 
 def bias_text(row: Any, norm: float = 1.0, interval: bool = True) -> str:

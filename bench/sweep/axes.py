@@ -65,7 +65,7 @@ def value_of(name: str, given: Mapping[str, Any]) -> Any:
     if of_theta(name):
         return _coordinate(name, (given.get("theta") or {}).get("at") or ())
     for group, part in given.items():
-        if group not in NOT_PARTS and part is not None:
+        if _is_part(group, part):
             parameter = applies(name, registry.kind_of(group), part["name"], part)
             if parameter is not None and parameter != "name":
                 return part[parameter]
@@ -252,7 +252,7 @@ def relabelled(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
     lines = []
     for given in parsed(rows):
         estimator = {group: part for group, part in given.items() if group == "estimator"}
-        problem = {group: part for group, part in given.items() if group not in ("estimator", *NOT_PARTS)}
+        problem = {group: part for group, part in given.items() if group != "estimator"}
         lines.append(read(problem) | read(estimator))
     changed = {name for line in lines for name in line}
     return rows.assign(
@@ -263,7 +263,7 @@ def relabelled(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
 def _labels(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, str]:
     hidden: dict[str, set[str]] = {}
     for group, part in given.items():
-        if group not in NOT_PARTS and part is not None:
+        if _is_part(group, part):
             taken = {applies(name, registry.kind_of(group), part["name"], part) for name in names}
             hidden[group] = {parameter for parameter in taken if parameter is not None}
     if not any(hidden.values()):

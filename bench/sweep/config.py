@@ -258,7 +258,7 @@ ROWS = ("estimator", "backend")
 
 def _layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> Layout:
     for key in settings:
-        if key not in ("columns", "rows"):
+        if key not in LAYOUT:
             raise unknown("setting of table", key, LAYOUT)
     columns = "" if settings["columns"] is None else str(settings["columns"])
     names = {part for name in swept(sweep) for part in (name, name.rpartition(".")[2])}

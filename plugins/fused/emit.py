@@ -234,7 +234,8 @@ class _Kernel:
             rows += [f"a{i}" for i in backward.step] + [f"t{n.number}" for n in backward.totals]
             rows += [f"o{table}" for table in backward.tables]
         judged = self.wrt == "theta"
-        rows += ["big"] * fast + ["wild"] * judged
+        marks = ["big"] * fast + ["wild"] * judged
+        rows += marks
         self.slots = {name: i * LANES for i, name in enumerate(rows)}
         code.add(0, f"lane = np.empty({max(len(rows), 1) * LANES}, F)")
         if history:
@@ -248,8 +249,7 @@ class _Kernel:
         # before the loop over time
         stores = [(f"c{i}", node) for i, node in starts.items()]
         stores += [(f"k{n.number}", n) for n in crossing]
-        zeros = [f"t{n.number}" for n in backward.totals] if backward else []
-        zeros += ["big"] * fast + ["wild"] * judged
+        zeros = [*(f"t{n.number}" for n in backward.totals), *marks] if backward else marks
         if zeros:
             code.add(1, f"for l in range({LANES}):")
         for slot in zeros:

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from bench.report import cores
+from bench.model import blocks
 from bench.report.cores import spread
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="copies are forked on Linux alone")
 
 
 def test_one_core_does_all_in_order(monkeypatch):
-    monkeypatch.setattr(cores, "_cores", lambda: 1)
+    monkeypatch.setattr(blocks, "cores", lambda: 1)
     done = []
     assert spread([lambda i=i: done.append(i) or i * i for i in range(5)]) == [0, 1, 4, 9, 16]
     assert done == list(range(5))
@@ -25,9 +25,9 @@ def test_one_core_does_all_in_order(monkeypatch):
 HEAD = """
 import os, sys, time
 from pathlib import Path
-from bench.report import cores
+from bench.model import blocks
 from bench.report.cores import spread
-cores._cores = lambda: 3
+blocks.cores = lambda: 3
 own = os.getpid()
 """
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from bench.model import registry
-from bench.report.style import MARKERS, PALETTE, VARIANTS, colour
+from bench.report.style import MARKERS, VARIANTS, colour, marker
 from bench.report.text import axis_value
 from bench.report.views import NUMBERS, Arranged, ran
 from bench.sweep import axes as sweep
@@ -112,11 +112,7 @@ def look(
 
 def looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return a colour of its own for each name (the palette's, then darker and lighter ones) and a symbol."""
-    symbols = list(SYMBOLS.values())
-    return {
-        name: look(colour(i), symbols[(i + i // len(PALETTE)) % len(symbols)])
-        for i, name in enumerate(dict.fromkeys(names))
-    }
+    return {name: look(colour(i), SYMBOLS[marker(i)]) for i, name in enumerate(dict.fromkeys(names))}
 
 
 def identity_columns(rows: pd.DataFrame, swept: Sequence[str] = ()) -> list[Column]:

@@ -80,15 +80,15 @@ def drawings(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[
     def problems(axis: Axis | None, drawable: Callable[[pd.DataFrame], bool]) -> list[Family]:
         return [p for p in families(shown, along(shown, axis)) if drawable(p.rows)]
 
-    for axis in shown.swept():
+    swept = shown.swept()
+    for axis in swept:
         chosen, held = choose(problems(axis, lambda part: ran(part)["x"].nunique() > 1))
         if chosen:
             made[file_name(axis)] = partial(bias_variance, chosen, held + merged, look, axis, shown.marks(axis))
     nothing_swept = not made
     good = rows[rows["status"] == "ok"]
     # noise changes an estimate and not its time
-    swept = {axis: count for axis, count in shown.swept().items() if axis.short != "sigma"}
-    longest = max(swept, key=lambda axis: swept[axis], default=None)
+    longest = max((axis for axis in swept if axis.short != "sigma"), key=lambda axis: swept[axis], default=None)
     if longest is not None and good["samples"].nunique() < 2 and good["time_s"].notna().any():
         chosen, held = choose(problems(longest, lambda part: TIME.known(part)["x"].nunique() >= FEWEST))
         if chosen:

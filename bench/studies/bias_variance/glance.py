@@ -17,7 +17,7 @@ from bench.report.style import plain
 from bench.report.text import counted, number
 from bench.report.views import Family
 from bench.studies.bias_variance.costs import ROLLOUTS, Cost
-from bench.studies.bias_variance.fastest import TARGETS, Reached, estimator_of, lead, methods
+from bench.studies.bias_variance.fastest import TARGETS, Reached, lead, methods
 
 FIRST = "#009E73"
 SHADES = (
@@ -85,7 +85,7 @@ def _best(reached: Mapping[str, Reached]) -> dict[str, tuple[Reached, str]]:
     """Return what each estimator needs on its best backend, and that backend."""
     best: dict[str, tuple[Reached, str]] = {}
     for name, way in reached.items():
-        estimator, backend = estimator_of(name), name.partition(" on ")[2]
+        estimator, _, backend = name.partition(" on ")
         known = best.get(estimator)
         if known is None or math.isnan(known[0].cost) or way.cost < known[0].cost:
             best[estimator] = (way, backend)

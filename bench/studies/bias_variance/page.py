@@ -249,7 +249,7 @@ def failing(rows: pd.DataFrame) -> str:
     for label, part in ran(rows).groupby(_label(ran(rows)), sort=False):
         good = part[(part["status"] == "ok") & np.isfinite(part["rmse_rel"])]
         bad = good[good["rmse_rel"] >= 1]
-        lows = np.array([rmse_interval(row)[0] for row in bad.to_dict("records")])
+        lows = rmse_interval(bad)[0]
         worse, lost = int((lows > 1).sum()), int((part["status"] != "ok").sum())
         texts = [
             f"worse than answering zero in {worse} (up to {number(bad['rmse_rel'].max())} times the gradient)"

@@ -34,7 +34,7 @@ from bench.report.style import (
     quantity,
     twin,
 )
-from bench.report.views import Family, Line, lines, pareto, resolved
+from bench.report.views import Family, Line, lines, pareto, resolved, rmse_interval
 from bench.studies.bias_variance.costs import Cost
 from bench.studies.bias_variance.findings import headline, tally
 from bench.sweep.axes import Axis
@@ -108,13 +108,12 @@ class Points:
 
 def _estimates(rows: pd.DataFrame, column: str, power: int) -> Points:
     """Return the RMSE, bias or variance of rows with its interval."""
-    names = (column, *(f"{part}_{end}" for part in ("bias", "variance") for end in ("low", "high")))
+    names = (column, "reference_norm", *(f"{part}_{end}" for part in ("bias", "variance") for end in ("low", "high")))
     read = {name: rows[name].to_numpy(float) for name in names}
-    norm, scale = rows["reference_norm"].to_numpy(float), _scale(rows)
+    scale = _scale(rows)
     with np.errstate(invalid="ignore", divide="ignore"):
         if column == "rmse":
-            size = np.where(norm > 0, norm, np.nan)
-            ends = [np.hypot(read[f"bias_{end}"], np.sqrt(read[f"variance_{end}"])) / size for end in ("low", "high")]
+            ends = list(rmse_interval(read))
         else:
             ends = [read[f"{column}_{end}"] / scale**power for end in ("low", "high")]
         value = read[column] / scale**power
@@ -227,8 +226,7 @@ def speed_accuracy(
     across = columns(len(problems), 2)
     figure, panels = page(
         problems, across, 2.3, ("relative RMSE",),
-        first or f"Relative RMSE of one estimate against {cost.name}",
-        [*([f"relative RMSE of one estimate against {cost.name}"] if first else []), *shared(problems, "samples"), *notes],
+        first, [f"relative RMSE of one estimate against {cost.name}", *shared(problems, "samples"), *notes],
         (list(entries.values()), symbols),
     )  # fmt: skip
     for place, ((panel,), problem, curves) in enumerate(zip(panels, problems, drawn, strict=True)):

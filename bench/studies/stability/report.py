@@ -133,6 +133,12 @@ def unstable(rows: pd.DataFrame) -> pd.Series:
     return rows["verdict"].isin(LOST) | (rows["growth_factor"] > GROWING)
 
 
+def judged(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of cells that have a verdict."""
+    rows = ran(rows)
+    return rows[rows["verdict"] != ""]
+
+
 def looks(rows: pd.DataFrame) -> pd.Series:
     """Return what colours each cell: its verdict, and of a finite but wrong gradient the cause."""
     verdict = rows["verdict"].where(rows["verdict"].isin(list(VERDICTS)), "")
@@ -365,9 +371,8 @@ def heat_map(integrator: str, maps: Sequence[Panel], axes: Sequence[Axis] = ()) 
     measured = {panel.measured for panel in maps}
     common = len(measured) == 1
     where = "".join(f" ({text})" for text in measured if common)
-    judged = ran(rows)
-    judged = judged[judged["verdict"] != ""]
-    share = f"right in {(looks(judged) == 'ok').mean():.0%} of the cells" if len(judged) else "not known in any cell"
+    cells = judged(rows)
+    share = f"right in {(looks(cells) == 'ok').mean():.0%} of the cells" if len(cells) else "not known in any cell"
     head = f"{plain(integrator)}: the gradient is {share}{where}"
     figure.suptitle(head, fontsize=9, fontweight="bold")
     for area, panel in zip(grid.flat, maps, strict=False):

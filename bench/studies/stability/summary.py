@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.style import plain
-from bench.report.views import ran
-from bench.studies.stability.report import DARK, FILLS, LOST, VERDICTS, Panel, looks, panels, placed, swatches
+from bench.studies.stability.report import DARK, FILLS, LOST, VERDICTS, Panel, judged, looks, panels, placed, swatches
 from bench.sweep.experiment import Experiment
 from bench.sweep.files import write_whole
 
@@ -29,7 +28,7 @@ LETTER = 0.055
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Draw the summary as ``stability_summary``, where some cell has a verdict."""
     maps = panels(placed(experiment, rows))
-    if not any((ran(panel.rows)["verdict"] != "").any() for panel in maps):
+    if not any(len(judged(panel.rows)) for panel in maps):
         return []
     with styled():
         paths = save(figure(maps), experiment.directory / "stability_summary", experiment.formats)
@@ -40,9 +39,8 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 def counted(maps: Sequence[Panel]) -> pd.DataFrame:
     """Return the number of cells by integrator, problem (scene and law, without parameters) and what colours them."""
-    parts = [ran(panel.rows).assign(integrator=panel.kind[0], problem=_problem(*panel.kind[1:])) for panel in maps]
-    cells = pd.concat(parts)
-    cells = cells[cells["verdict"] != ""].assign(look=looks)
+    parts = [judged(panel.rows).assign(integrator=panel.kind[0], problem=_problem(*panel.kind[1:])) for panel in maps]
+    cells = pd.concat(parts).assign(look=looks)
     return cells.groupby(["problem", "integrator", "look"], sort=False).size().rename("cells").reset_index()
 
 
