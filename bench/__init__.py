@@ -4,21 +4,23 @@ The Python face (:func:`run`, :func:`load`, :func:`problem`, :func:`estimate`, :
 """
 
 # ruff: noqa: E402
-from bench.starting import heed_interrupts
+from bench.interrupts import exit_on_interrupt
 
-heed_interrupts()  # before the imports that take a second
+exit_on_interrupt()  # before the imports that take a second
 
+import bench.run  # noqa: F401, before the function of the same name takes its place here
+from bench import deprecated
+from bench.api import Estimates, estimate, load, problem, run
 from bench.errors import StorageError, UserError
 from bench.examine import Report, examine
-from bench.face import Estimates, estimate, load, problem, run
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule
+from bench.experiment.experiment import Experiment
+from bench.experiment.session import Session
+from bench.experiment.study import Study
 from bench.model import *  # noqa: F403
 from bench.model import __all__ as _contracts
-from bench.simulator.mjcf import Mjcf
-from bench.sweep.cell import Cell
-from bench.sweep.columns import Column, Columns, Judged
-from bench.sweep.experiment import Experiment
-from bench.sweep.session import Session
-from bench.sweep.study import Study
+from bench.model.simulator.mjcf import Mjcf
 
 __version__ = "0.3.0"
 __all__ = [
@@ -28,7 +30,7 @@ __all__ = [
     "Columns",
     "Estimates",
     "Experiment",
-    "Judged",
+    "ComparisonRule",
     "Mjcf",
     "Report",
     "Session",
@@ -41,3 +43,6 @@ __all__ = [
     "problem",
     "run",
 ]
+
+deprecated.install()
+__getattr__ = deprecated.lookup(__name__, globals())

@@ -20,8 +20,8 @@ from bench.errors import INTERRUPTED, UserError, printable, unknown
 if TYPE_CHECKING:
     import pandas as pd
 
-    from bench.sweep.execute import Finished
-    from bench.sweep.experiment import Experiment
+    from bench.experiment.experiment import Experiment
+    from bench.run.execute import Finished
 
 SETTINGS = """\
 Settings: scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..] study=NAME
@@ -151,7 +151,7 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _overview() -> str:
-    from bench.sweep import config
+    from bench.experiment import config
 
     lines = [f"  python -m bench {verb.usage:<45} {verb.does}" for verb in VERBS.values()]
     parts = [
@@ -168,7 +168,7 @@ def _overview() -> str:
 
 def _loaded(words: Sequence[str], notes: bool = True) -> Experiment:
     """Load the experiment that the words describe."""
-    from bench.sweep import config
+    from bench.experiment import config
 
     overrides, folders = [], []
     rest = iter(word for word in words if word != QUIET)
@@ -194,9 +194,9 @@ def _run(words: list[str]) -> int:
 
 def _executed(experiment: Experiment, words: Sequence[str]) -> Finished | int:
     """Return the finished run, or the exit status of one that ended early."""
-    from bench.sweep import runner
-    from bench.sweep.execute import execute, store_of
-    from bench.sweep.grid import cells
+    from bench.experiment.grid import cells
+    from bench.run import runner
+    from bench.run.execute import execute, store_of
 
     try:
         return execute(experiment, QUIET in words)
@@ -223,8 +223,8 @@ def _finished(finished: Finished, words: Sequence[str]) -> tuple[int, pd.DataFra
 
 
 def _show(experiment: Experiment, rows: pd.DataFrame, paths: Sequence[Path]) -> int:
+    from bench.experiment.study import study_of
     from bench.report.finish import shown
-    from bench.sweep.study import study_of
 
     study_of(experiment).show(experiment, shown(rows))
     _print_written(paths)
@@ -245,14 +245,14 @@ def _report(words: list[str]) -> int:
 
 
 def _plan(words: list[str]) -> int:
-    from bench.sweep import plan, progress
-    from bench.sweep.execute import store_of
+    from bench.run import plan, progress
+    from bench.run.execute import store_of
 
     experiment = _loaded(words)
     store = store_of(experiment)
     progress.print_plan(experiment, plan.plan(experiment, store), store.load())
     if experiment.execution.launcher == "slurm":
-        from bench.sweep.launchers.slurm import script
+        from bench.run.launchers.slurm import script
 
         print(f"\nthe job script:\n{script(experiment)}")
     return 0
@@ -306,13 +306,16 @@ def _facts(entry: Any) -> str:
         facts.append(f"provides {', '.join(sorted(plugin.provides))}")
     elif issubclass(plugin, Estimator):
         facts.append(f"needs {', '.join(sorted(plugin.needs))}")
-        facts.append("unbiased" + (", across jumps too" if plugin.across_jumps else " where the cost is continuous"))
+        facts.append(
+            "unbiased"
+            + (", across jumps too" if plugin.unbiased_at_discontinuities else " where the cost is continuous")
+        )
         if not plugin.unbiased:
             facts[-1] = "biased at finite N"
     elif issubclass(plugin, Integrator):
         facts.append(f"order {plugin.order}")
-    elif issubclass(plugin, Scene) and plugin.leaves_out:
-        facts.append(f"leaves out {plugin.leaves_out}")
+    elif issubclass(plugin, Scene) and plugin.neglected_effects:
+        facts.append(f"leaves out {plugin.neglected_effects}")
     if not entry.available:
         facts.append(f"UNAVAILABLE, {entry.reason}")
     return "; ".join(facts)
@@ -362,8 +365,8 @@ def _gradcheck(words: list[str]) -> int:
     """Run ``gradient_check`` on the scenes named first, with the overrides that follow; a fault too gives status 1."""
     from dataclasses import replace
 
+    from bench.experiment.study import study_of
     from bench.model.parameters import parameters
-    from bench.sweep.study import study_of
 
     scenes, rest = _scenes_first(words, "gradcheck")
     settings_ = [f"scenes=[{','.join(scenes)}]", "name=gradcheck"] if scenes else ["name=gradcheck"]

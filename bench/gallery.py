@@ -12,14 +12,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.errors import UserError
+from bench.experiment import config
+from bench.experiment.experiment import Experiment
+from bench.experiment.study import study_of
 from bench.report.tables import escape_markdown
 from bench.report.views import latest
 from bench.report.web import content
-from bench.sweep import config
-from bench.sweep.execute import store_of
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import make_directory, write_whole
-from bench.sweep.study import study_of
+from bench.run.execute import store_of
+from bench.run.files import make_directory, write_whole
 
 DEFAULTS = "docs/gallery.md", "results/standard"
 MARKS = "<!-- gallery -->", "<!-- end of gallery -->"

@@ -44,7 +44,7 @@ def build(backend: Any, program: Program) -> Any:
     """
     import mujoco
 
-    reason = backend.refuses(program)
+    reason = backend.unsupported_reason(program)
     if reason:
         raise Unsupported(reason)
     scene, law = program.scene, program.contact

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.experiment import config
+from bench.experiment.cell import Cell
+from bench.experiment.columns import IDENTITY
+from bench.experiment.experiment import Experiment, TableLayout
+from bench.experiment.grid import cells
 from bench.model import registry
 from bench.model.identity import parse_identity
 from bench.model.parameters import parameters
+from bench.run.runner import blank
 from bench.studies.bias_variance import BiasVariance
 from bench.studies.bias_variance.columns import COLUMNS
-from bench.sweep import config
-from bench.sweep.cell import Cell
-from bench.sweep.columns import IDENTITY
-from bench.sweep.experiment import Experiment, Layout
-from bench.sweep.grid import cells
-from bench.sweep.runner import blank
 
 NAMES = ("alpha_order", "finite_difference", "fobg", "inverse_variance", "randomized_smoothing", "reinforce")
 STIFFNESS = (1e1, 1e2, 1e3, 3e3, 1e4, 1e5, 1e6)
@@ -189,7 +189,7 @@ def experiment(
     marks: Mapping[str, Mapping[str, float]] | None = None,
     name: str = "made_up",
     formats: tuple[str, ...] = ("png",),
-    table: Layout | None = None,
+    table: TableLayout | None = None,
 ) -> Experiment:
     """An experiment to show made-up rows of: a sweep and nothing that could be run."""
     return Experiment(
@@ -202,7 +202,7 @@ def experiment(
         question="As contact stiffens, which gradient stays right?",
         marks={"stiffness": {"step size limit": 6400}} if marks is None else marks,
         formats=formats,
-        table=table or Layout(),
+        table=table or TableLayout(),
     )
 
 

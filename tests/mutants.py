@@ -38,14 +38,14 @@ OF_REFERENCE = "tests/measure/test_reference.py"
 OF_STATISTICS = "tests/measure/test_statistics.py tests/measure/test_unexplained.py"
 OF_SCORES = "tests/model/test_explicit.py"
 OF_WEIGHTS = "tests/plugins/test_weights.py"
-T, ST = "bench/measure/timing.py", "bench/sweep/store.py"
+T, ST = "bench/measure/timing.py", "bench/run/store.py"
 GC, GD, GK, GR, GS, GV = (
     f"bench/measure/gradcheck/{name}.py"
     for name in ("check", "direction", "causes", "roughness", "sampling", "verdicts")
 )
 X = "plugins/estimators/"
 OF_TIMING = "tests/studies/test_flat.py tests/benchself/test_speed.py::test_timing_repeats_fast_calls_and_keeps_the_results_asked_for tests/benchself/test_speed.py::test_slow_calls_are_made_once_each tests/measure/test_timing.py"
-OF_STORE = "-m not\\ slow tests/sweep/test_store.py tests/sweep/test_nothing_lost.py"
+OF_STORE = "-m not\\ slow tests/run/test_store.py tests/run/test_nothing_lost.py"
 OF_CHECKS = "tests/measure/test_direction.py tests/measure/test_check.py"
 EL, EF, EX, ES = (f"bench/examine/{name}.py" for name in ("lines", "findings", "examination", "smoothing"))
 OF_EXAMINE = "-m not\\ slow tests/examine/test_examine.py --deselect tests/examine/test_examine.py::test_python_number_from_torch_is_disconnected_in_double_precision"
@@ -121,7 +121,7 @@ FAULTS = [
     Fault(P, "scene.feedback(xp, theta_moved, moved.q, moved.v)):", "scene.feedback(xp, theta_moved, state.q, state.v)):", OF_SCORES),
     Fault(P, "and self._only_controls and not self._moves_start", "and self._only_controls", OF_SCORES),
     Fault(E, "problem.score(theta, w) + problem.explicit(theta, w), noise)", "problem.score(theta, w), noise)", OF_SCORES),
-    Fault(E, "if not self.adds_explicit:", "if False:", OF_SCORES),
+    Fault(E, "if not self.includes_explicit_derivative:", "if False:", OF_SCORES),
     Fault("plugins/estimators/inverse_variance.py", "v0 = zeroth.var(axis=1, ddof=1) / zeroth.shape[1]", "v0 = zeroth.var(axis=1, ddof=1)", OF_WEIGHTS),
     Fault("plugins/estimators/inverse_variance.py", "v1 = first.var(axis=1, ddof=1) / first.shape[1]", "v1 = first.var(axis=1) / first.shape[1]", OF_WEIGHTS),
     Fault("plugins/estimators/alpha_order.py", "first.var(axis=1, ddof=1).sum(axis=-1) / first.shape[1]", "first.var(axis=1, ddof=1).sum(axis=-1) / n", OF_WEIGHTS),
@@ -180,7 +180,7 @@ FAULTS = [
     Fault(ST, "position.argsort(kind=\"stable\")", "position.argsort(kind=\"stable\")[::-1]", OF_STORE),
     Fault(ST, "lambda key: place.get(key, -1)", "lambda key: place.get(key, len(place))", OF_STORE),
     Fault(ST, "typed[name].isna().sum() >", "False and typed[name].isna().sum() >", OF_STORE),
-    Fault("bench/sweep/files.py", "os.link(path, name)", "os.rename(path, name)", OF_STORE),
+    Fault("bench/run/files.py", "os.link(path, name)", "os.rename(path, name)", OF_STORE),
     Fault(ST, "            sync(self.directory)\n", "", OF_STORE),
     # gradient checks
     Fault(GC, "np.array_equal(first, again, equal_nan=True)", "np.allclose(first, again, equal_nan=True)", OF_CHECKS),

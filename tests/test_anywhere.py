@@ -108,9 +108,9 @@ OWN_STUDY = """
 from dataclasses import dataclass
 from typing import ClassVar
 import numpy as np
-from bench.sweep.columns import Column, Columns, Judged
-from bench.sweep.files import write_all
-from bench.sweep.study import Study
+from bench.experiment.columns import Column, Columns, ComparisonRule
+from bench.run.files import write_all
+from bench.experiment.study import Study
 
 @dataclass(frozen=True)
 class CostAt(Study):
@@ -118,7 +118,7 @@ class CostAt(Study):
 
     name = "cost_at"
     axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend")
-    columns: ClassVar[Columns] = Columns.of(Column("cost_at_theta", "f at theta", judged=Judged("exact", "cost")))
+    columns: ClassVar[Columns] = Columns.of(Column("cost_at_theta", "f at theta", comparison=ComparisonRule("exact", "cost")))
 
     def measure(self, cell, session):
         problem = session.problem(cell)

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from bench.cli import VERBS, main
+from bench.experiment.columns import IDENTITY
 from bench.studies.bias_variance.columns import COLUMNS
-from bench.sweep.columns import IDENTITY
 
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny"]
 TIMES = ["time_s", "time_iqr_s", "compile_s", "peak_memory_mb"]

@@ -12,15 +12,15 @@ from bench import model
 ROOT = Path(__file__).resolve().parents[1]
 BENCH = ROOT / "bench"
 LAYERS = [
-    ["errors", "starting"],
-    ["simulator"],
+    ["errors", "interrupts", "deprecated"],
     ["model"],
     ["measure", "conformance", "plugins"],
-    ["sweep"],
+    ["experiment"],
+    ["run"],
     ["report"],
     ["studies", "trace"],
     ["compare", "gallery", "benchself", "examine", "claims"],
-    ["face"],
+    ["api"],
     ["__init__"],
     ["cli"],
     ["__main__"],
@@ -38,7 +38,7 @@ def module_of(path: Path) -> str:
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Every module and name that a file imports, at its top, later, or for types only, as ``bench.sweep.cell.Cell``."""
+    """Every module and name that a file imports, at its top, later, or for types only, as ``bench.experiment.cell.Cell``."""
     own = module_of(path)
     parent = own if path.name == "__init__.py" else own.rpartition(".")[0]
     for node in ast.walk(ast.parse(path.read_text())):
@@ -127,7 +127,7 @@ def test_the_core_names_no_plugin():
         if kind not in ("backends", "studies") and "_" in n
     }
     studies = {f'"{name}"' for name in registry.entries()["studies"]}
-    for folder in ("sweep", "report", "compare"):
+    for folder in ("experiment", "run", "report", "compare"):
         for path in (BENCH / folder).rglob("*.py"):
             strings = [
                 node.value

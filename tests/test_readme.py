@@ -13,9 +13,9 @@ import yaml
 
 import bench
 from bench import cli
+from bench.experiment import config
+from bench.experiment.columns import COMMON
 from bench.model import registry
-from bench.sweep import config
-from bench.sweep.columns import COMMON
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = {path.name: path.read_text() for path in sorted((ROOT / "docs").glob("*.md"))}

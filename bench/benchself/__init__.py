@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bench.benchself import harness, lines, rollouts, sweep
 from bench.errors import UserError
-from bench.sweep.config import config_dir
+from bench.experiment.config import config_dir
 
 
 def main(words: Sequence[str]) -> int:
@@ -33,7 +33,7 @@ def main(words: Sequence[str]) -> int:
     return 0
 
 
-def measure(quick: bool) -> Iterator[lines.Line]:
+def measure(quick: bool) -> Iterator[lines.SpeedRow]:
     """Return all lines, one after the other."""
     import yaml
 

@@ -9,13 +9,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from bench.benchself.lines import Line
-from bench.sweep import config
-from bench.sweep.execute import store_of
-from bench.sweep.experiment import Experiment
-from bench.sweep.grid import cells
-from bench.sweep.plan import plan
-from bench.sweep.tasks import blank
+from bench.benchself.lines import SpeedRow
+from bench.experiment import config
+from bench.experiment.experiment import Experiment
+from bench.experiment.grid import cells
+from bench.run.execute import store_of
+from bench.run.plan import plan
+from bench.run.tasks import blank
 
 SIDE, QUICK_SIDE = 100, 5
 """Values on each of the two axes of the planned sweep."""
@@ -24,7 +24,7 @@ CELLS, QUICK_CELLS = 500, 40
 SMALL = ("scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "samples=16", "repeats=4")
 
 
-def lines(quick: bool) -> Iterator[Line]:
+def lines(quick: bool) -> Iterator[SpeedRow]:
     """Measure every figure of the harness, each command in a process of its own, as a user starts it."""
     with tempfile.TemporaryDirectory() as folder:
         side = QUICK_SIDE if quick else SIDE
@@ -35,11 +35,13 @@ def lines(quick: bool) -> Iterator[Line]:
             "name=many",
             f"results_dir={folder}",
         ]
-        yield Line(f"planning {side**2} cells", _fastest("plan", *sweep), "s", 2.0)
+        yield SpeedRow(f"planning {side**2} cells", _fastest("plan", *sweep), "s", 2.0)
         experiment = config.load(sweep)
         store_all(experiment)
-        yield Line(f"resuming {side**2} stored cells", _fastest("plan", *sweep), "s", 3.0, note="until none is missing")
-        yield Line("python -m bench list", _fastest("list"), "s", 1.0)
+        yield SpeedRow(
+            f"resuming {side**2} stored cells", _fastest("plan", *sweep), "s", 3.0, note="until none is missing"
+        )
+        yield SpeedRow("python -m bench list", _fastest("list"), "s", 1.0)
         yield _overhead(Path(folder), QUICK_CELLS if quick else CELLS)
 
 
@@ -66,7 +68,7 @@ def _fastest(*words: str, calls: int = 3) -> float:
     return min(seconds)
 
 
-def _overhead(folder: Path, count: int) -> Line:
+def _overhead(folder: Path, count: int) -> SpeedRow:
     """Return the seconds per cell between the first cell stored and the last, less those spent in estimates."""
     words = [*SMALL, f"sweep.seed=[{_range(count)}]", "name=overhead", f"results_dir={folder}"]
     subprocess.run([sys.executable, "-m", "bench", *words], check=True, capture_output=True)
@@ -74,6 +76,6 @@ def _overhead(folder: Path, count: int) -> Line:
     rows = store_of(experiment).load().sort_values("stored_at")
     later = rows[rows["stored_at"] > rows["stored_at"].iloc[0]]
     spent = rows["stored_at"].iloc[-1] - rows["stored_at"].iloc[0] - later["estimates_s"].sum()
-    return Line(
+    return SpeedRow(
         "overhead of a cell", 1e3 * spent / len(later), "ms", 1.0, note="mean time of a cell less its estimates"
     )

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from bench.report.tables import plain_markdown
-from bench.sweep.files import make_directory, write_all
-from bench.sweep.record import machine
+from bench.run.files import make_directory, write_all
+from bench.run.record import machine
 
 
 @dataclass(frozen=True)
-class Line:
+class SpeedRow:
     """One measured number: at most ``target`` is wanted, NaN for no target."""
 
     what: str
@@ -32,7 +32,7 @@ class Line:
         return self.value / self.target
 
 
-def texts(lines: Sequence[Line]) -> list[dict[str, str]]:
+def texts(lines: Sequence[SpeedRow]) -> list[dict[str, str]]:
     """Return the lines as they are printed."""
     return [
         {
@@ -52,7 +52,7 @@ def _number(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.3g}" if abs(value) < 1e4 else f"{value:.0f}"
 
 
-def show(lines: Sequence[Line]) -> None:
+def show(lines: Sequence[SpeedRow]) -> None:
     """Print the table."""
     from rich.console import Console
     from rich.table import Table
@@ -64,7 +64,7 @@ def show(lines: Sequence[Line]) -> None:
     Console(width=130).print(table)
 
 
-def write(lines: Sequence[Line], directory: Path, load_before: list[float] | None) -> list[Path]:
+def write(lines: Sequence[SpeedRow], directory: Path, load_before: list[float] | None) -> list[Path]:
     """Write ``bench_self`` as .csv, .md and .json; returns their paths."""
     import pandas as pd
 

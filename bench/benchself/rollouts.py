@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bench.benchself import loop, native
-from bench.benchself.lines import Line
+from bench.benchself.lines import SpeedRow
 from bench.measure import noise, timing
 from bench.model import Problem, blocks, compose, registry
 
@@ -52,19 +52,21 @@ def batch(compiled: Problem, count: int) -> np.ndarray:
     return np.ascontiguousarray(np.tile(drawn, (1, -(-count // drawn.shape[1])))[:, :count])
 
 
-def timed(what: str, call: Callable[[], Any], count: int, target: float = float("nan"), note: str = "") -> Line:
+def timed(what: str, call: Callable[[], Any], count: int, target: float = float("nan"), note: str = "") -> SpeedRow:
     """Return the microseconds per rollout of a call that makes ``count`` of them."""
     _, clock = timing.timed(lambda _: call()[..., :1].copy(), 3, SECONDS, CALLS)
-    return Line(what, clock.median_s / count * 1e6, "us", target, clock.spread, note)
+    return SpeedRow(what, clock.median_s / count * 1e6, "us", target, clock.spread, note)
 
 
-def backends(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
+def backends(settings: Mapping[str, Any], quick: bool) -> Iterator[SpeedRow]:
     """Measure every subject at every batch size, with memory where gradients are fast enough for the largest."""
     found: set[str] = set()
     for subject in settings["subjects"]:
         entry = registry.find("backends", subject["backend"])
         if not entry.available:
-            yield Line(f"{subject['backend']} {subject['call']}", math.nan, "us", note=f"unavailable: {entry.reason}")
+            yield SpeedRow(
+                f"{subject['backend']} {subject['call']}", math.nan, "us", note=f"unavailable: {entry.reason}"
+            )
             continue
         compiled = problem(settings, subject["backend"], subject["contact"])
         theta = compiled.program.theta0
@@ -80,11 +82,13 @@ def backends(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
             peak = timing.peak_memory_mb() - _own_mb(w, subject["call"] == "grad", compiled.dim)
             yield line
             if count in MEMORY_SIZES:
-                yield Line(f"{name}: peak memory", peak, "MB", note="without the noise given and the result returned")
+                yield SpeedRow(
+                    f"{name}: peak memory", peak, "MB", note="without the noise given and the result returned"
+                )
             if line.value * count * 10e-6 > LONGEST:
                 break
     if not found:
-        yield Line("rollouts on an accelerator", math.nan, "us", note="no device: every line is of the processor")
+        yield SpeedRow("rollouts on an accelerator", math.nan, "us", note="no device: every line is of the processor")
 
 
 def _own_mb(w: np.ndarray, gradient: bool, dim: int) -> float:
@@ -92,7 +96,7 @@ def _own_mb(w: np.ndarray, gradient: bool, dim: int) -> float:
     return (w.nbytes + w.shape[1] * 8 * (dim if gradient else 1)) / 2**20
 
 
-def references(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
+def references(settings: Mapping[str, Any], quick: bool) -> Iterator[SpeedRow]:
     """Measure the same gradient in a plain NumPy loop and in native code, checked against the first subject."""
     subject = settings["subjects"][0]
     compiled = problem(settings, subject["backend"], subject["contact"])
@@ -106,12 +110,12 @@ def references(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
     try:
         kernel = native.gradient(scene, stiffness)
     except native.Unavailable as error:
-        yield Line("native C kernel", float("nan"), "us", note=f"unavailable: {error}")
+        yield SpeedRow("native C kernel", float("nan"), "us", note=f"unavailable: {error}")
         return
     w = batch(compiled, QUICK_SIZES[0])
     wanted, native_ = compiled.grad(theta, w), kernel(theta, w)
     difference = float(np.abs(native_ - wanted).max() / np.abs(wanted).max())
-    yield Line("native C kernel: largest relative difference", difference, "", AGREEMENT)
+    yield SpeedRow("native C kernel: largest relative difference", difference, "", AGREEMENT)
     rival = settings["native"]["rival"]
     other = problem(settings, rival, subject["contact"]) if registry.find("backends", rival).available else None
     if other is not None:
@@ -127,15 +131,15 @@ def references(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
             found = timed("", partial(other.grad, theta, w), count)
             target = settings["native"]["target"] if count in SIZES else math.nan
             share = f"{rival} on one thread over the C kernel, {count:g} rollouts"
-            yield Line(share, found.value / line.value, "", target, found.spread)
+            yield SpeedRow(share, found.value / line.value, "", target, found.spread)
 
 
-def compared(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
+def compared(settings: Mapping[str, Any], quick: bool) -> Iterator[SpeedRow]:
     """Measure the gradients of two backends on several scenes, and the time of the second over that of the first."""
     given = settings["compared"]
     missing = [name for name in given["backends"] if not registry.find("backends", name).available]
     if missing:
-        yield Line("gradients of two backends", math.nan, note=f"unavailable: {', '.join(missing)}", unit="")
+        yield SpeedRow("gradients of two backends", math.nan, note=f"unavailable: {', '.join(missing)}", unit="")
         return
     for one in given["scenes"][:1] if quick else given["scenes"]:
         own = {**settings, "scene": one["scene"], "values": one.get("values", {})}
@@ -149,4 +153,4 @@ def compared(settings: Mapping[str, Any], quick: bool) -> Iterator[Line]:
                 took.append(line.value)
                 yield replace(line, note=f"compiled in {compiled.usage.compile_s:.1f} s")
             share = f"{given['backends'][1]} over {given['backends'][0]}, {one['scene']}, {count:g} rollouts"
-            yield Line(share, took[1] / took[0], "", math.nan if quick else given["target"])
+            yield SpeedRow(share, took[1] / took[0], "", math.nan if quick else given["target"])

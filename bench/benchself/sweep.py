@@ -6,14 +6,14 @@ import itertools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from bench.benchself.lines import Line
+from bench.benchself.lines import SpeedRow
 from bench.benchself.rollouts import batch, problem
 from bench.model import Compilations
 
 FACTORS = (0.5, 1.0, 2.0)
 
 
-def lines(settings: Mapping[str, Any]) -> Iterator[Line]:
+def lines(settings: Mapping[str, Any]) -> Iterator[SpeedRow]:
     """Return how many programs a sweep of parameters compiles; the target is the number of shapes."""
     backend, chosen = settings["subjects"][0]["backend"], settings["sweep"]
     points = list(itertools.product(FACTORS, repeat=len(chosen["parameters"])))
@@ -26,4 +26,4 @@ def lines(settings: Mapping[str, Any]) -> Iterator[Line]:
         compiled.value(theta, w)
         compiled.grad(theta, w)
     what = f"compilations over {len(points)} values of {' x '.join(chosen['parameters'])}"
-    yield Line(what, compilations.made, "", len(compilations.shapes), note="target: distinct shapes")
+    yield SpeedRow(what, compilations.made, "", len(compilations.shapes), note="target: distinct shapes")

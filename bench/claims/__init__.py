@@ -16,9 +16,9 @@ OPTIONS = ("--list", "--quick", "--again")
 
 def main(words: Sequence[str]) -> int:
     """Run the claims named, or all; returns 1 where one is not reproduced or its code fails."""
-    from bench.claims import results, shelf, tables
+    from bench.claims import discovery, results, tables
     from bench.report.text import counted
-    from bench.sweep.files import make_directory
+    from bench.run.files import make_directory
 
     names = [word for word in words if not word.startswith("-") and "=" not in word]
     directory = Path("results")
@@ -28,14 +28,14 @@ def main(words: Sequence[str]) -> int:
             directory = Path(value).expanduser()
         elif word not in OPTIONS and word not in names:
             raise UserError(f"claims takes names, {', '.join(OPTIONS)} and results_dir=FOLDER, not '{word}'")
-    claims = shelf.chosen(names, "--quick" in words)
+    claims = discovery.chosen(names, "--quick" in words)
     if "--list" in words:
         for line in tables.listed(claims):
             print(printable(line) if not line.startswith("  ") else f"  {printable(line)}")
         return 0
     directory = directory / "claims"
     make_directory(directory)
-    found = {claim.name: results.stored(directory, claim) for claim in shelf.claims().values()}
+    found = {claim.name: results.stored(directory, claim) for claim in discovery.claims().values()}
     for claim in claims:
         result = None if "--again" in words else found[claim.name]
         fresh = result is None
@@ -47,7 +47,7 @@ def main(words: Sequence[str]) -> int:
             print(line, flush=True)
         found[claim.name] = result
     # the page has all that is stored, also of claims that this command did not name, and what failed just now
-    shown = [(claim, result) for claim in shelf.claims().values() if (result := found[claim.name]) is not None]
+    shown = [(claim, result) for claim in discovery.claims().values() if (result := found[claim.name]) is not None]
     if shown:
         for path in tables.write(directory, shown)[-4:]:
             print(f"  {path}")

@@ -12,19 +12,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from bench.claims import pieces
+from bench.claims import toolkit
 from bench.claims.claim import UNDECIDED, Claim, Figure, verdict
 from bench.errors import Unsupported
 from bench.model import registry
 from bench.model.sources import hash_of, source_hash, sources
-from bench.sweep.files import write_whole
+from bench.run.files import write_whole
 
 FAILED = "failed"
 """The verdict of a claim whose code raised an error."""
 
 
 @dataclass(frozen=True)
-class Result:
+class ClaimResult:
     """What was found of one claim."""
 
     name: str
@@ -45,18 +45,18 @@ class Result:
         return json.dumps(asdict(self), indent=1)
 
 
-def measured(claim: type[Claim]) -> Result:
+def measured(claim: type[Claim]) -> ClaimResult:
     """Measure a claim now; an error in its code is a result of its own."""
-    pieces.used.clear()
+    toolkit.used.clear()
     started = time.process_time()
     try:
         outcome = claim().measure()
     except Unsupported as reason:
-        return Result(claim.name, UNDECIDED, time.process_time() - started, remark=str(reason))
+        return ClaimResult(claim.name, UNDECIDED, time.process_time() - started, remark=str(reason))
     except Exception as error:
-        return Result(claim.name, FAILED, time.process_time() - started, remark=f"{type(error).__name__}: {error}")
-    used = tuple(sorted(pieces.used))
-    return Result(
+        return ClaimResult(claim.name, FAILED, time.process_time() - started, remark=f"{type(error).__name__}: {error}")
+    used = tuple(sorted(toolkit.used))
+    return ClaimResult(
         claim.name,
         verdict(outcome.figures, outcome.reservation),
         time.process_time() - started,
@@ -70,7 +70,7 @@ def measured(claim: type[Claim]) -> Result:
 
 def key_of(claim: type[Claim], used: tuple[tuple[str, str], ...]) -> str:
     """Return the hash of the claim's code, of what claims are made of, and of the plugins used."""
-    digest = hashlib.sha256((_code(claim.__module__) + _code(pieces.__name__)).encode())
+    digest = hashlib.sha256((_code(claim.__module__) + _code(toolkit.__name__)).encode())
     for kind, name in used:
         digest.update(source_hash(registry.usable(kind, name)).encode())
     return digest.hexdigest()
@@ -86,20 +86,20 @@ def path_of(directory: Path, name: str) -> Path:
     return directory / f"{name}.json"
 
 
-def stored(directory: Path, claim: type[Claim]) -> Result | None:
+def stored(directory: Path, claim: type[Claim]) -> ClaimResult | None:
     """Return the stored result, or None where there is none, or it is of other code, or it cannot be read."""
     try:
         values = json.loads(path_of(directory, claim.name).read_text())
         values["figures"] = tuple(Figure(**one) for one in values["figures"])
         values["plugins"] = tuple((kind, name) for kind, name in values["plugins"])
-        result = Result(**values)
+        result = ClaimResult(**values)
         return result if result.key == key_of(claim, result.plugins) else None
     except Exception:
         # whatever is wrong with the file, measuring again mends it
         return None
 
 
-def keep(directory: Path, result: Result) -> None:
+def keep(directory: Path, result: ClaimResult) -> None:
     """Store a result, unless it failed: that is tried again."""
     if result.key:
         write_whole(path_of(directory, result.name), result.to_json().encode())

@@ -10,13 +10,13 @@ from textwrap import fill
 import pandas as pd
 
 from bench.claims.claim import VERDICTS, Claim, Figure
-from bench.claims.results import FAILED, Result
-from bench.claims.shelf import LESSONS
+from bench.claims.discovery import LESSONS
+from bench.claims.results import FAILED, ClaimResult
 from bench.report.tables import csv, escape_latex, escape_markdown
 from bench.report.text import counted, duration, number
-from bench.sweep.files import write_all
+from bench.run.files import write_all
 
-Found = Sequence[tuple[type[Claim], Result]]
+Found = Sequence[tuple[type[Claim], ClaimResult]]
 WIDE = 26
 """Letters of the longest label with which two fit beside each other below a chart."""
 BOLD_LETTERS, LETTERS = 48, 54
@@ -43,7 +43,7 @@ def write(directory: Path, found: Found) -> list[Path]:
     return [*charts.values(), *paths]
 
 
-def chart(directory: Path, claim: type[Claim], result: Result) -> list[Path]:
+def chart(directory: Path, claim: type[Claim], result: ClaimResult) -> list[Path]:
     """Draw one claim from its stored series; returns the picture's path, or nothing without a series."""
     if not result.series:
         return []
@@ -236,7 +236,7 @@ def _row(figure: Figure) -> str:
     return f'<tr class="{"" if figure.agrees else "bad"}">{line}</tr>'
 
 
-def lines(claim: type[Claim], result: Result, again: bool) -> Iterator[str]:
+def lines(claim: type[Claim], result: ClaimResult, again: bool) -> Iterator[str]:
     """Yield what the terminal shows of one claim."""
     worst = [figure for figure in result.figures if not figure.agrees]
     kept = "" if again else ", as stored"

@@ -14,8 +14,8 @@ from bench.compare.report import Comparison, show, write
 from bench.compare.sources import Results, opened
 from bench.compare.timings import RUNS
 from bench.errors import UserError, unknown
+from bench.experiment.columns import Column
 from bench.model import registry
-from bench.sweep.columns import Column
 
 SETTINGS = ("timings", "again", "out", "plugins")
 
@@ -66,7 +66,7 @@ def compare(
         if one.study != two.study:
             raise UserError(f"{name} is of study {one.study} in {before} and of study {two.study} in {after}")
         runs = [results[name].rows for results in again if name in results]
-        judged |= {column.name: column for column in one.columns.judged}
+        judged |= {column.name: column for column in one.columns.compared}
         table, said = compared(one.rows, two.rows, one.columns, asked.timings, runs)
         remarks += [
             f"{name}: {remark}" for remark in (*_older(one, two), *machine_remarks(one, two, asked.timings), *said)

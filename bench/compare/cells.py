@@ -11,7 +11,7 @@ import pandas as pd
 
 from bench.compare import timings
 from bench.compare.judging import Change, Row, judge, same_estimates
-from bench.sweep.columns import IDENTITY, Column, Columns
+from bench.experiment.columns import IDENTITY, Column, Columns
 
 OUTCOMES = ("worse", "better", "changed", "same")
 COUNTS = ("samples", "repeats", "seed")
@@ -37,15 +37,15 @@ def compared(
     old, new = rows_by_cell(before), rows_by_cell(after)
     times: dict[Hashable, list[Change]] = {}
     remarks: list[str] = []
-    for column in columns.judged if timed else ():
-        if column.judged and column.judged.by == "time":
+    for column in columns.compared if timed else ():
+        if column.comparison and column.comparison.by == "time":
             runs = [_good(rows_by_cell(rows)) for rows in again]
-            changes, said = timings.judged(column.name, column.judged.called, _good(old), _good(new), runs)
+            changes, said = timings.judged(column.name, column.comparison.called, _good(old), _good(new), runs)
             remarks += said
             for key, change in changes.items():
                 times.setdefault(key, []).append(change)
     lines = [_line(old.get(key), new.get(key), columns, times.get(key, [])) for key in dict.fromkeys([*old, *new])]
-    return pd.DataFrame(lines, columns=[*FIRST, *both_sides(columns.judged), *LAST]), remarks
+    return pd.DataFrame(lines, columns=[*FIRST, *both_sides(columns.compared), *LAST]), remarks
 
 
 def _good(rows: Mapping[tuple[str, ...], Row]) -> dict[Hashable, Row]:
@@ -69,7 +69,7 @@ def _line(old: Row | None, new: Row | None, columns: Columns, times: Sequence[Ch
     assert there is not None
     line = {name: there.get(name) for name in (*IDENTITY, "parameters")}
     for when, row in (("before", old), ("after", new)):
-        line |= {f"{c.name}_{when}": _missing(c) if row is None else row.get(c.name) for c in columns.judged}
+        line |= {f"{c.name}_{when}": _missing(c) if row is None else row.get(c.name) for c in columns.compared}
         line[f"status_{when}"] = "" if row is None else row["status"]
     changes = [*_changes(old, new, columns), *times]
     outcomes = {change.outcome for change in changes}
@@ -89,10 +89,12 @@ def _changes(old: Row | None, new: Row | None, columns: Columns) -> list[Change]
         return [_status(old, new)]
     if old["status"] != "ok":
         return []
-    judged = [column for column in columns.judged if column.judged and column.judged.by != "time"]
+    judged = [column for column in columns.compared if column.comparison and column.comparison.by != "time"]
     if any(same_estimates(column, old, new) for column in judged):
         # what is left to differ is the reference, and that is no merit or fault of the estimates
-        judged = [column for column in judged if column.judged and column.judged.by not in ("interval", "spread")]
+        judged = [
+            column for column in judged if column.comparison and column.comparison.by not in ("interval", "spread")
+        ]
     changes = [judge(column, columns, old, new) for column in judged]
     return [change for change in changes if change is not None]
 

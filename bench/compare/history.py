@@ -15,11 +15,11 @@ import pandas as pd
 from bench.compare.cells import rows_by_cell
 from bench.compare.sources import Results, opened
 from bench.errors import UserError, unknown
+from bench.experiment.columns import Column, Columns
 from bench.model import registry
 from bench.report.tables import plain_markdown
 from bench.report.text import number
-from bench.sweep.columns import Column, Columns
-from bench.sweep.files import make_directory, write_all
+from bench.run.files import make_directory, write_all
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -91,7 +91,7 @@ def _ratio(columns: Columns, pairs: Sequence[tuple[Mapping[str, object], Mapping
 
 
 def _followed(columns: Columns) -> Column | None:
-    return next((c for by in ERRORS for c in columns.judged if c.judged and c.judged.by == by), None)
+    return next((c for by in ERRORS for c in columns.compared if c.comparison and c.comparison.by == by), None)
 
 
 def write(history: History, out: Path) -> list[Path]:

@@ -1,6 +1,6 @@
 """Judges whether a column of a cell changed by more than the uncertainty of both measurements.
 
-The study says how a column is judged (:class:`bench.sweep.columns.Judged`):
+The study says how a column is judged (:class:`bench.experiment.columns.ComparisonRule`):
 
 - ``paired``: the cells of both sides have the same seed and noise, so unchanged code gives the same mean estimate. It
   moved where the mean or the variance differ by more than ROUNDING. It got worse or better where the root mean squared
@@ -24,9 +24,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.experiment.columns import Column, Columns, ComparisonRule
 from bench.measure.statistics import UNEXPLAINED, unexplained
 from bench.report.text import number
-from bench.sweep.columns import Column, Columns, Judged
 
 EFFECT = 1.25
 """Ratio below which neither a variance nor a computed error counts as changed."""
@@ -63,14 +63,14 @@ class Change(NamedTuple):
 
 def judge(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
     """Return the change of one judged column between two rows that both ended well, or None."""
-    assert column.judged is not None
-    change = RULES[column.judged.by](column, columns, old, new)
+    assert column.comparison is not None
+    change = RULES[column.comparison.by](column, columns, old, new)
     if change is None:
         return None
-    if column.judged.neutral:
+    if column.comparison.neutral:
         change = change._replace(outcome="changed")
     remarks = [str(row["reason"]) for row in (old, new) if isinstance(row.get("reason"), str) and row["reason"]]
-    if remarks and column.judged.by in ("interval", "spread"):
+    if remarks and column.comparison.by in ("interval", "spread"):
         doubt = UNEXPLAINED if any(map(unexplained, remarks)) else "intervals doubtful"
         return Change("changed", f"{change.text}, {doubt}")
     return change
@@ -97,7 +97,7 @@ class _Pair(NamedTuple):
         return max(self.moved, abs(now - was)) <= ROUNDING * self.scale
 
 
-def _pair(judged: Judged, old: Row, new: Row) -> _Pair | None:
+def _pair(judged: ComparisonRule, old: Row, new: Row) -> _Pair | None:
     """Return what two rows of the same noise store, or None where a side does not."""
     if judged.by != "paired":
         return None
@@ -209,9 +209,9 @@ RULES: dict[str, Callable[[Column, Columns, Row, Row], Change | None]] = {
 }  # fmt: skip
 
 
-def _judged(column: Column) -> Judged:
-    assert column.judged is not None
-    return column.judged
+def _judged(column: Column) -> ComparisonRule:
+    assert column.comparison is not None
+    return column.comparison
 
 
 def _by_size(column: Column, old: Row, new: Row) -> Change:

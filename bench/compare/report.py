@@ -18,15 +18,15 @@ from bench.compare import timings
 from bench.compare.cells import FIRST, LAST, OUTCOMES, both_sides
 from bench.compare.judging import NOTES
 from bench.compare.machine import as_json, as_junit, counts
+from bench.experiment.columns import Column
+from bench.experiment.experiment import Experiment
 from bench.model import registry
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted
-from bench.report.web.content import STATUS, Axis, Chart, Content, identity_columns, look
-from bench.report.web.content import Column as Shown
+from bench.report.web.content import STATUS, Chart, Content, PlotAxis, identity_columns, look
+from bench.report.web.content import TableColumn as Shown
 from bench.report.web.document import assemble
-from bench.sweep.columns import Column
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import make_directory, write_all
+from bench.run.files import make_directory, write_all
 
 PRINTED = 30
 """Most changes that are printed; the files have all of them."""
@@ -190,7 +190,7 @@ def page(comparison: Comparison) -> str:
 
 
 def _called(column: Column) -> str:
-    return column.judged.called if column.judged else column.name
+    return column.comparison.called if column.comparison else column.name
 
 
 def _kind(column: Column) -> str:
@@ -201,5 +201,5 @@ def _before_after(column: Column) -> Chart:
     unit = f" [{column.unit}]" if column.unit else ""
     return Chart(
         f"{_called(column)}{unit}".capitalize(), "Points above the diagonal are larger after.",
-        [Axis(f"{column.name}_before", "before")], [Axis(f"{column.name}_after", "after")], facet="experiment",
+        [PlotAxis(f"{column.name}_before", "before")], [PlotAxis(f"{column.name}_after", "after")], facet="experiment",
     )  # fmt: skip

@@ -15,9 +15,9 @@ from pathlib import Path
 import pandas as pd
 
 from bench.errors import UserError
+from bench.experiment.columns import IDENTITY, Columns
+from bench.experiment.study import Study
 from bench.model import registry
-from bench.sweep.columns import IDENTITY, Columns
-from bench.sweep.study import Study
 
 STANDARD = "standard"
 """The folder of committed results inside the results folder."""
@@ -134,9 +134,9 @@ def _results(rows: pd.DataFrame, place: Path, label: str, name: str) -> Results:
 
 def _one_per_cell(rows: pd.DataFrame, columns: Columns) -> pd.DataFrame:
     """Return the last row of each key; of several lines of one cell (one per check) that of the worst verdict."""
-    for column in columns.judged:
-        if column.judged and column.judged.by == "verdict":
-            rank = {verdict: -place for place, verdict in enumerate(column.judged.order)}
+    for column in columns.compared:
+        if column.comparison and column.comparison.by == "verdict":
+            rank = {verdict: -place for place, verdict in enumerate(column.comparison.order)}
             rows = rows.iloc[
                 rows[column.name].map(lambda verdict, rank=rank: rank.get(verdict, 1)).argsort(kind="stable")
             ]

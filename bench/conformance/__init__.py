@@ -9,11 +9,22 @@ sample means are set at 4.5 standard errors, a false alarm in 150,000.
 """
 
 # the modules of checks register them as they are imported
-from bench.conformance import anything, backends, contacts, estimators, integrators, optimizers, scenes
-from bench.conformance.kit import Failed, Result, Skipped, check, main, parametrize, verifies
+from bench.conformance import backends, contacts, estimators, generic, integrators, optimizers, scenes
+from bench.conformance.kit import CheckResult, Failed, Skipped, check, main, parametrize, verifies
 
 __all__ = [
-    "Failed", "Result", "Skipped", "anything", "backends", "check", "contacts", "estimators", "integrators", "main",
+    "CheckResult",
+    "Failed",
+    "Skipped",
+    "backends",
+    "check",
+    "contacts",
+    "estimators",
+    "generic",
+    "integrators",
+    "main",
     "optimizers",
-    "parametrize", "scenes", "verifies",
+    "parametrize",
+    "scenes",
+    "verifies",
 ]  # fmt: skip

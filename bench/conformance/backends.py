@@ -22,13 +22,13 @@ from bench.conformance.subjects import (
     available,
     covering,
     distance,
+    distinguishing_programs,
     disturbed,
     law_for,
     plain_backend,
     rng,
     samples,
     stepping,
-    telling,
     title,
 )
 from bench.model import (
@@ -71,12 +71,14 @@ def programs_for(
     backend: Backend, sort: Callable[[list[Program]], list[Program]], found: Iterable[Program] | None = None
 ) -> list[Program]:
     """Return programs of a sort that the backend can run; with non-default parameters, smooth ones and equations."""
-    runs = [program for program in (all_programs() if found is None else found) if backend.lacks(program) is None]
+    runs = [
+        program for program in (all_programs() if found is None else found) if backend.incompatibility(program) is None
+    ]
     if not runs:
         raise Skipped("refuses every program")
     if backend == type(backend)():
         return sort(runs)
-    few = telling(runs)
+    few = distinguishing_programs(runs)
     return [program for program in few if program.needs_root or program.contact is None] or few[:1]
 
 
@@ -84,7 +86,9 @@ def programs_for(
 def value_agrees(backend: Backend) -> str:
     """Verify that costs equal the plain backend's on every scene and law; for engines, within the twin's tolerance."""
     plain = plain_backend()
-    programs = programs_for(backend, list, [program for program in all_programs() if plain.lacks(program) is None])
+    programs = programs_for(
+        backend, list, [program for program in all_programs() if plain.incompatibility(program) is None]
+    )
     worst = 0.0
     for program in programs:
         theta, w = samples(program)
@@ -153,7 +157,7 @@ def score_is_that_of_actions(backend: Backend) -> str:
     if "score" not in backend.provides:
         raise Skipped("gives no scores")
     details = []
-    for program in programs_for(backend, telling):
+    for program in programs_for(backend, distinguishing_programs):
         theta, w = samples(program)
         problem = backend.compile(program)
         score = problem.score(theta, w)
@@ -177,7 +181,7 @@ def score_is_that_of_actions(backend: Backend) -> str:
 def columns_are_independent(backend: Backend) -> str:
     """Verify that column b of a result depends only on column b of theta and w, whatever else is in the batch."""
     worst = 0.0
-    for program in programs_for(backend, telling):
+    for program in programs_for(backend, distinguishing_programs):
         problem, (theta, w) = backend.compile(program), samples(program)
         for capability in sorted(backend.provides & {"value", "grad", "score"}):
             function = getattr(problem, capability)
@@ -195,7 +199,7 @@ def columns_are_independent(backend: Backend) -> str:
 def shared_theta_is_spread(backend: Backend) -> str:
     """Verify that ``theta (d,)`` acts as ``theta (d, B)`` of equal columns, and a batch as its columns one by one."""
     worst = 0.0
-    for program in programs_for(backend, telling)[-1:]:
+    for program in programs_for(backend, distinguishing_programs)[-1:]:
         problem, w = backend.compile(program), samples(program)[1]
         theta = program.theta0
         for capability in sorted(backend.provides & {"value", "grad", "score"}):
@@ -218,14 +222,14 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
     if "grad" not in backend.provides:
         raise Skipped("gives no gradients")
     lost, plain = [], plain_backend()
-    for program in programs_for(backend, telling):
+    for program in programs_for(backend, distinguishing_programs):
         theta, w = samples(program)
         far = np.where(np.arange(COLUMNS) == 1, FAR * (1.0 + np.abs(theta)), theta)
         problem = backend.compile(program)
         with np.errstate(all="ignore"):
             failed = ~np.isfinite(problem.value(far, w))
             gone = ~np.isfinite(problem.grad(far, w)).all(axis=0)
-            if plain.lacks(program) is None:
+            if plain.incompatibility(program) is None:
                 beyond = ~np.isfinite(plain.compile(program).value(far, w))
                 require(failed[beyond].all(), f"{title(program)}: a rollout that leaves all numbers has a finite cost")
         require(gone[failed].all(), f"{title(program)}: a cost that is not finite has a finite gradient")
@@ -240,7 +244,7 @@ def single_precision_is_finite(backend: Backend) -> str:
     """Verify that ``dtype=float32`` gives costs and gradients near those in double precision, on smooth scenes."""
     single = dataclasses.replace(backend, dtype="float32")
     worst = dict.fromkeys(sorted(backend.provides & {"value", "grad"}), 0.0)
-    smooth = [p for p in programs_for(single, telling) if p.contact is None and p.continuous]
+    smooth = [p for p in programs_for(single, distinguishing_programs) if p.contact is None and p.continuous]
     for program, capability in itertools.product(smooth, worst):
         actual, expected = (getattr(b.compile(program), capability)(*samples(program)) for b in (single, backend))
         require(np.isfinite(actual).all(), f"{capability} of {title(program)}: not finite in float32")
@@ -257,7 +261,7 @@ def provides_is_truthful(backend: Backend) -> str:
     strange = sorted(set(backend.provides) - CAPABILITIES)
     require(not strange, f"{', '.join(strange)} are none of {', '.join(sorted(CAPABILITIES))}")
     require("value" in backend.provides, "gives no costs")
-    for program in programs_for(backend, telling):
+    for program in programs_for(backend, distinguishing_programs):
         problem, (theta, w) = backend.compile(program), samples(program)
         for capability in sorted(backend.provides & {"value", "grad", "score"}):
             result = getattr(problem, capability)(theta, w)
@@ -387,7 +391,7 @@ def frictional_contact_has_the_force_of_its_law(backend: Backend) -> str:
     scene = _Pressed()
     laws = [law_for(scene, law) for law in available("contacts")]
     springs = [law for law in laws if isinstance(law, ForceLaw) and law.spring() is not None]
-    runs = [p for p in (compose(scene, law, stepping()) for law in springs) if backend.lacks(p) is None]
+    runs = [p for p in (compose(scene, law, stepping()) for law in springs) if backend.incompatibility(p) is None]
     if not runs:
         raise Skipped("runs no spring with friction")
     program = runs[0]

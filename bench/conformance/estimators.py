@@ -122,7 +122,7 @@ def lively_oracle(estimator: Estimator) -> Oracle:
 
 def usable(estimator: Estimator, candidates: Iterable[Oracle]) -> Iterator[Oracle]:
     """Yield the oracles that the estimator does not refuse."""
-    return (oracle for oracle in candidates if estimator.refuses(oracle.problem.program) is None)
+    return (oracle for oracle in candidates if estimator.unsupported_reason(oracle.problem.program) is None)
 
 
 def draw_noise(oracle: Oracle, repeats: int, count: int, *key: str | int) -> np.ndarray:
@@ -164,15 +164,16 @@ def shape_and_repeatability(estimator: Estimator) -> str:
 
 
 @verifies(Estimator)
-def reports_are_as_declared(estimator: Estimator) -> str:
+def diagnostics_are_as_declared(estimator: Estimator) -> str:
     """Verify that ``explained`` gives the estimates, and finite ``(R,)`` or ``(R, d)`` arrays of the declared names."""
     oracle = lively_oracle(estimator)
     noise = draw_noise(oracle, 6, 8)
-    values, decided = estimator.explained(oracle.problem, oracle.problem.program.theta0, noise)
+    values, decided = estimator.estimate_with_diagnostics(oracle.problem, oracle.problem.program.theta0, noise)
     same = np.array_equal(values, estimates(estimator, oracle, noise))
     require(same, "explained and estimate give different estimates")
     require(
-        tuple(decided) == estimator.reports, f"reports {', '.join(decided)}, declares {', '.join(estimator.reports)}"
+        tuple(decided) == estimator.diagnostics,
+        f"reports {', '.join(decided)}, declares {', '.join(estimator.diagnostics)}",
     )
     for name, array in decided.items():
         shapes = [(6,), (6, oracle.problem.dim)]
@@ -252,13 +253,13 @@ def bias_is_as_declared(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def bias_across_jumps_is_as_declared(estimator: Estimator) -> str:
-    """Verify the bias on costs that jump: none if ``across_jumps``, a visible one if not."""
+    """Verify the bias on costs that jump: none if ``unbiased_at_discontinuities``, a visible one if not."""
     candidates = list(usable(estimator, [o for o in oracles() if not o.continuous]))
     if not estimator.unbiased:
         raise Skipped("declares a bias anyway")
     if not candidates or estimator.target != "smoothed":
         raise Skipped("no oracle with a jump applies")
-    if estimator.across_jumps:
+    if estimator.unbiased_at_discontinuities:
         return _bias_held(estimator, candidates)
     details = []
     for oracle in candidates:

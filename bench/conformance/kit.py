@@ -15,7 +15,7 @@ from bench.model.parameters import build, parameters
 
 
 @dataclass(frozen=True)
-class Result:
+class CheckResult:
     """The outcome of one check: ``pass``, ``fail`` or ``skip``, and what was measured or why."""
 
     plugin: str
@@ -62,7 +62,7 @@ def main(names: Sequence[str]) -> int:
             continue
         plugins += 1
         if entry.plugin is None or not entry.available:
-            results = [Result(entry.name, "available", "fail" if names else "skip", entry.reason)]
+            results = [CheckResult(entry.name, "available", "fail" if names else "skip", entry.reason)]
         else:
             results = check(entry.plugin)
         for result in results:
@@ -74,7 +74,7 @@ def main(names: Sequence[str]) -> int:
     return 1 if tally["fail"] else 0
 
 
-def check(plugin_class: type[Plugin], only: Collection[str] = ()) -> list[Result]:
+def check(plugin_class: type[Plugin], only: Collection[str] = ()) -> list[CheckResult]:
     """Run every check that applies to a plugin class, with default parameters and with each other choice it offers. Names in ``only`` leave out the other checks."""
     results = [
         _outcome(function, subject, name)
@@ -174,7 +174,7 @@ _skipped: dict[tuple[Check, type, str], bool] = {}
 """Whether a check did not apply to a variant, for the checks that ran in this process."""
 
 
-def _outcome(function: Check, subject: Any, name: str) -> Result:
+def _outcome(function: Check, subject: Any, name: str) -> CheckResult:
     try:
         outcome, detail = "pass", _remembered(function, subject, name)
     except Skipped as reason:
@@ -183,7 +183,7 @@ def _outcome(function: Check, subject: Any, name: str) -> Result:
         outcome, detail = "fail", str(reason)
     except Exception as error:
         outcome, detail = "fail", f"{type(error).__name__}: {error}"
-    return Result(name, function.__name__, outcome, " ".join(detail.split()))
+    return CheckResult(name, function.__name__, outcome, " ".join(detail.split()))
 
 
 def _remembered(function: Check, subject: Any, name: str) -> str:

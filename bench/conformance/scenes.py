@@ -35,12 +35,12 @@ from bench.model import (
     ContactLaw,
     ContactScene,
     EngineScene,
-    HeldScene,
     ImpulseLaw,
     Integrator,
     MechanicalScene,
     Program,
     Scene,
+    ZeroOrderHoldScene,
     compose,
 )
 
@@ -116,7 +116,7 @@ def backends_agree(scene: Scene) -> str:
         theta, w = samples(program)
         expected = able_backend(program).compile(program).value(theta, w)
         for backend in (plugin() for plugin in available("backends")):
-            if "physics" not in backend.provides and backend.lacks(program) is None:
+            if "physics" not in backend.provides and backend.incompatibility(program) is None:
                 off = distance(backend.compile(program).value(theta, w), expected)
                 require(off < SAME, f"{title(program)}: {backend.name} differs by {off:.1e}")
                 worst = max(worst, off)
@@ -131,7 +131,7 @@ def continuity_is_as_declared(scene: Scene) -> str:
     The contact law is a continuous one.
     """
     subjects = [p for p in programs(scene) if p.contact is None or p.contact.continuous]
-    runs = [p for p in subjects if plain_backend().lacks(p) is None] or subjects
+    runs = [p for p in subjects if plain_backend().incompatibility(p) is None] or subjects
     if not runs:
         raise Skipped("no continuous contact law is available")
     jump = largest_jump(runs[0], lines=2)
@@ -195,7 +195,7 @@ def score_gives_the_gradient(scene: Scene) -> str:
     """
     if isinstance(scene, MechanicalScene):
         scene = dataclasses.replace(scene, horizon=min(scene.horizon, SCORED_STEPS))
-    runs = [p for p in programs(scene) if p.continuous and plain_backend().lacks(p) is None]
+    runs = [p for p in programs(scene) if p.continuous and plain_backend().incompatibility(p) is None]
     if not runs:
         raise Skipped("no continuous program runs on the plain backend")
     program = runs[0]
@@ -280,7 +280,7 @@ def _refined(scene: Scene, factor: int, law: ContactLaw | None, integrator: Inte
     if not isinstance(scene, MechanicalScene):
         return compose(scene)
     finer: dict[str, Any] = {"horizon": scene.horizon * factor, "dt": scene.dt / factor}
-    if isinstance(scene, HeldScene):
+    if isinstance(scene, ZeroOrderHoldScene):
         finer["hold"] = scene.hold * factor
     fine = dataclasses.replace(scene, **finer)
     if fine.theta0().shape != scene.theta0().shape:

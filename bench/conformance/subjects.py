@@ -65,7 +65,7 @@ def able_backend(program: Program) -> Backend:
     """Return the plain backend if it can run the program, else the first that can; compiling ones come last."""
     others = sorted((plugin() for plugin in available("backends")), key=lambda backend: backend.compiles)
     for backend in (plain_backend(), *others):
-        if backend.lacks(program) is None:
+        if backend.incompatibility(program) is None:
             return backend
     raise Skipped("no available backend can run it")
 
@@ -94,7 +94,9 @@ def programs(scene: Scene) -> list[Program]:
     composed = [compose(scene, law_for(scene, law), stepping()) for law in sound_laws()]
     if isinstance(scene, EngineScene):
         engines = [plugin() for plugin in available("backends") if "physics" in plugin.provides]
-        composed = [program for program in composed if any(engine.lacks(program) is None for engine in engines)]
+        composed = [
+            program for program in composed if any(engine.incompatibility(program) is None for engine in engines)
+        ]
         if not composed:
             raise Skipped("no available physics engine can run it")
     return composed
@@ -125,7 +127,7 @@ def all_programs() -> tuple[Program, ...]:
 
 def _is_sound(program: Program) -> bool:
     """Return whether the plain backend finds finite costs or cannot run the program."""
-    if plain_backend().lacks(program) is not None:
+    if plain_backend().incompatibility(program) is not None:
         return True
     try:
         return bool(np.isfinite(plain_backend().compile(program).value(*samples(program))).all())
@@ -152,7 +154,7 @@ def covering(programs: Iterable[Program]) -> list[Program]:
     return few
 
 
-def telling(programs: Iterable[Program]) -> list[Program]:
+def distinguishing_programs(programs: Iterable[Program]) -> list[Program]:
     """Choose one program of each sort: function, feedback, open loop, force law, impulse law, equation to solve."""
     sorts: dict[tuple[bool, ...], Program] = {}
     for program in programs:

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from bench.errors import UserError
-from bench.examine.lines import HALVINGS, PLACES, POINTS, Line, scan
+from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
 from bench.examine.report import Report
 from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, smoothed
 from bench.measure.gradcheck import EPS, Check, Options, check
-from bench.simulator.clock import Clock, OutOfTime, seconds
-from bench.simulator.columns import Simulator
-from bench.simulator.layout import Layout
+from bench.model.simulator.clock import Clock, OutOfTime, seconds
+from bench.model.simulator.simulator import Simulator
+from bench.model.simulator.tree import ParameterTree
 
 MADE = re.compile(r"_[0-9a-f]{8}$")
 """What a module's name gets when it is loaded from a file."""
@@ -84,7 +84,7 @@ def examine(
     levels = _levels(sigma)
     if not isinstance(noise, int | np.integer) or noise < 0:
         raise UserError(f"noise={noise} is the length of w in cost(theta, w), a whole number")
-    layout = Layout(theta)
+    layout = ParameterTree(theta)
     scales = layout.scales() if scale is None else _scales(layout, scale)
     clock.stage("first call")
     try:
@@ -108,7 +108,7 @@ def _levels(sigma: float | Sequence[float]) -> list[float]:
     return levels
 
 
-def _scales(layout: Layout, scale: Any) -> np.ndarray:
+def _scales(layout: ParameterTree, scale: Any) -> np.ndarray:
     given = (
         np.full(layout.vector.size, float(scale)) if isinstance(scale, int | float) else layout.take(scale, "scale")
     ).astype(np.float64)
@@ -135,7 +135,7 @@ class _Examination:
     def __init__(
         self,
         simulator: Simulator,
-        layout: Layout,
+        layout: ParameterTree,
         scale: np.ndarray,
         levels: Sequence[float],
         clock: Clock,
@@ -296,7 +296,7 @@ class _Examination:
         self.clock.allow(1.0)
         return found
 
-    def _lines(self, checked: Check | None) -> list[Line]:
+    def _lines(self, checked: Check | None) -> list[LineScan]:
         """Scan the cost for jumps and kinks along random directions."""
         self.clock.stage("scanning lines")
         spread = self.scale * RELATIVE if not self.levels else np.full(self.theta.size, max(self.levels))
@@ -326,7 +326,7 @@ class _Examination:
         self.clock.allow(1.0)
         return found
 
-    def _missed(self, line: Line, checked: Check | None) -> float:
+    def _missed(self, line: LineScan, checked: Check | None) -> float:
         """Return the share of the cost's change along a line that its gradient does not explain.
 
         The integral of a right gradient along a line is the difference of the costs at its ends, except for jumps. It needs

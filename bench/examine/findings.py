@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.examine.lines import ALIKE, Line
+from bench.examine.lines import ALIKE, LineScan
 from bench.examine.smoothing import WANTED, Smoothed
 from bench.measure.gradcheck import FAULTS, MEANING, Check, Part
 from bench.report.text import counted, duration, number
@@ -76,7 +76,7 @@ class Findings:
     """The gradient check; None where it did not end within the budget."""
     more: Sequence[Check]
     """Checks under other noise of the simulator's own."""
-    lines: Sequence[Line]
+    lines: Sequence[LineScan]
     reach: float
     """One standard deviation on the lines: a sigma of theta, or a share of the scale of each input."""
     relative: bool

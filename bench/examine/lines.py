@@ -40,7 +40,7 @@ class Break:
 
 
 @dataclass(frozen=True)
-class Line:
+class LineScan:
     """A cost along ``theta + t * direction``."""
 
     direction: np.ndarray
@@ -88,7 +88,7 @@ def scan(
     points: int = POINTS,
     halvings: int = HALVINGS,
     most: int = PLACES,
-) -> Line:
+) -> LineScan:
     """Scan ``cost((d, B)) -> (B,)`` on a line from -reach to +reach times ``direction (d,)`` about ``theta (d,)``.
 
     ``noise`` is the size of what the cost's rounding changes; ``most`` places are looked at.
@@ -108,7 +108,7 @@ def scan(
     found = _narrowed(along, t, f, places, halvings, noise) if places else []
     level = np.diff(f)
     steps = bool(level.any() and (np.abs(level) <= noise).mean() > 0.5 and any(b.kind == "jump" for b in found))
-    return Line(direction, t, f, tuple(sorted(found, key=lambda b: b.at)), steps)
+    return LineScan(direction, t, f, tuple(sorted(found, key=lambda b: b.at)), steps)
 
 
 def _narrowed(

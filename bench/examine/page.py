@@ -13,7 +13,7 @@ from bench.examine.findings import Findings
 from bench.report.figures import save, styled
 from bench.report.style import GREY, MARKERS, PALETTE
 from bench.report.text import number
-from bench.sweep.files import make_directory, write_all, write_whole
+from bench.run.files import make_directory, write_all, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.simulator.clock import Clock, OutOfTime
-from bench.simulator.columns import Simulator
+from bench.model.simulator.clock import Clock, OutOfTime
+from bench.model.simulator.simulator import Simulator
 
 PAIRS = 4096
 """Pairs of costs for one sigma, where the time allows."""

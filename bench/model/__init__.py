@@ -9,6 +9,7 @@ against the array namespace ``ops.xp`` of whichever backend runs them. A paramet
 so never branch on it in Python; every other type is static.
 """
 
+from bench import deprecated
 from bench.errors import Unsupported
 from bench.model.adjoint import Slopes, by_actions, by_theta, slopes
 from bench.model.adjoint import gradient as adjoint_gradient
@@ -29,7 +30,7 @@ from bench.model.estimator import (
     zeroth_order,
 )
 from bench.model.integrator import Integrator
-from bench.model.known import Identified, KnownOptimum, KnownValue
+from bench.model.known_solutions import Identified, KnownOptimum, KnownValue
 from bench.model.loaded import simulator_files, simulator_of
 from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
@@ -54,11 +55,11 @@ from bench.model.scene import (
     EngineTwin,
     FrictionScene,
     FunctionScene,
-    GustyScene,
-    HeldScene,
     MechanicalScene,
     Oscillator,
+    ProcessNoiseScene,
     Scene,
+    ZeroOrderHoldScene,
 )
 
 __all__ = [
@@ -85,8 +86,6 @@ __all__ = [
     "FrictionScene",
     "FunctionProgram",
     "FunctionScene",
-    "GustyScene",
-    "HeldScene",
     "Identified",
     "ImpulseLaw",
     "Integrator",
@@ -102,6 +101,7 @@ __all__ = [
     "Plugin",
     "Population",
     "Problem",
+    "ProcessNoiseScene",
     "Program",
     "Rollout",
     "SampleMean",
@@ -112,6 +112,7 @@ __all__ = [
     "Trajectory",
     "Unsupported",
     "Usage",
+    "ZeroOrderHoldScene",
     "adjoint_gradient",
     "by_actions",
     "by_theta",
@@ -129,3 +130,5 @@ __all__ = [
     "stopped",
     "zeroth_order",
 ]
+
+__getattr__ = deprecated.lookup(__name__, globals())

@@ -41,11 +41,11 @@ class Backend(Plugin):
     def compile(self, program: Program) -> Problem:
         """Return the program made ready to run."""
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Return why this backend cannot run the program, or None."""
         return None
 
-    def lacks(self, program: Program) -> str | None:
+    def incompatibility(self, program: Program) -> str | None:
         """Return why this backend cannot run the program: its own or the scene's refusal, or a lack; or None."""
         only = program.scene.backends
         if only and self.name not in only:
@@ -55,4 +55,4 @@ class Backend(Plugin):
             return f"{part.name} solves an equation each step, backend {self.name} has no root finder"
         if not program.needs <= self.provides:
             return f"{program.scene.name} runs only in physics engines, and backend {self.name} is not one"
-        return self.refuses(program)
+        return self.unsupported_reason(program)

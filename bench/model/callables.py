@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from bench.model.scene import Scene
-from bench.simulator import Simulator
+from bench.model.simulator import Simulator
 
 
 @dataclass(frozen=True)

@@ -36,11 +36,11 @@ class Estimator(Plugin):
     """The quantity estimated: ``smoothed`` grad J_sigma, or the ``plain`` grad f."""
     unbiased: ClassVar[bool] = True
     """Whether the expectation is the target for continuous costs."""
-    across_jumps: ClassVar[bool] = False
+    unbiased_at_discontinuities: ClassVar[bool] = False
     """Whether it is also unbiased when the cost jumps in theta."""
-    reports: ClassVar[tuple[str, ...]] = ()
-    """Names of the auxiliaries that :meth:`explained` gives beside the estimates, a weight for example."""
-    adds_explicit: ClassVar[bool] = False
+    diagnostics: ClassVar[tuple[str, ...]] = ()
+    """Names of the auxiliaries that :meth:`estimate_with_diagnostics` gives beside the estimates, a weight for example."""
+    includes_explicit_derivative: ClassVar[bool] = False
     """Whether it adds :meth:`Problem.explicit` to cost times score; if not, it is refused where theta sets the initial
     state and noise is on the actions, since cost times score alone is then biased."""
 
@@ -54,8 +54,10 @@ class Estimator(Plugin):
         All randomness comes from ``noise``: estimate r depends on ``noise[r]`` and on nothing else random.
         """
 
-    def explained(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates, and by name what decided them: one array ``(R,)`` or ``(R, d)`` for each of ``reports``.
+    def estimate_with_diagnostics(
+        self, problem: Problem, theta: np.ndarray, noise: np.ndarray
+    ) -> tuple[np.ndarray, Auxiliaries]:
+        """Return the estimates, and by name what decided them: one array ``(R,)`` or ``(R, d)`` for each of ``diagnostics``.
 
         An estimator that reports something defines this method, and :meth:`estimate` as its first part.
         """
@@ -64,17 +66,17 @@ class Estimator(Plugin):
     def declares_unbiased(self, program: Program) -> bool:
         """Whether its expectation is grad J_sigma of the program, by what it declares."""
         derivative = program.continuous and not program.surrogate
-        return self.unbiased and self.target == "smoothed" and (derivative or self.across_jumps)
+        return self.unbiased and self.target == "smoothed" and (derivative or self.unbiased_at_discontinuities)
 
     def smoothing(self, program: Program) -> Smoothing | None:
         """Return the smoothing whose gradient its rows are measured against; None for J_sigma."""
         return None
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Return why this estimator cannot be used on the program, or None."""
         return None
 
-    def lacks(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
+    def incompatibility(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
         """Return why it cannot be used on a program run by a backend that ``provides`` certain capabilities, or None."""
         missing = self.needs - provides
         if missing:
@@ -84,11 +86,11 @@ class Estimator(Plugin):
             return f"{self.name} needs the surrogate gradient of contact law {law}, and {backend} takes differences of costs"
         if "score" in self.needs and program.explicit:
             start = f"theta sets the initial state of {program.scene.name} while noise is on the actions, so "
-            if not self.adds_explicit:
+            if not self.includes_explicit_derivative:
                 return f"{start}cost times score lacks a term, which {self.name} does not add"
             if "explicit" not in provides:
                 return f"{start}{self.name} needs explicit, which {backend} lacks"
-        return self.refuses(program)
+        return self.unsupported_reason(program)
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,10 @@ def guarded() -> Iterator[None]:
         end_copies(own)
         if here and _folder() != here:
             os.chdir(here)
-    heed_interrupts()
+    raise_pending_interrupt()
 
 
-def heed_interrupts() -> None:
+def raise_pending_interrupt() -> None:
     """Raise the KeyboardInterrupt that a plugin, a callback from C or a finaliser has swallowed."""
     if INTERRUPTED.is_set():
         INTERRUPTED.clear()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench.simulator import LIBRARIES, Layout, Simulator, attribute, load
-from bench.simulator.clock import Clock
+from bench.model.simulator import LIBRARIES, ParameterTree, Simulator, attribute, load
+from bench.model.simulator.clock import Clock
 
 
 def simulator_of(cost: str, theta: str = "theta", grad: str = "", batch: str = "", noise: int = 0) -> Simulator:
@@ -13,7 +13,7 @@ def simulator_of(cost: str, theta: str = "theta", grad: str = "", batch: str = "
     module = load(cost.rpartition(":")[0])
     start = attribute(theta, module)
     gradient = grad if grad in LIBRARIES else attribute(grad, module) if grad else None
-    layout = Layout(start() if callable(start) else start)
+    layout = ParameterTree(start() if callable(start) else start)
     return Simulator(attribute(cost), layout, gradient, noise, batch or None, Clock(float("inf")))
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar, TypeVar, cast
 
+from bench import deprecated
 from bench.errors import UserError, printable, unknown
 
 LARGEST = 2**53
@@ -56,6 +57,16 @@ class Plugin(ABC):  # noqa: B024, each kind has abstract methods of its own
     """The one name used on the command line, in tables, legends and caches."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Modules that must be installed for the plugin to be available, as ``module`` or ``module=distribution``."""
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        deprecated.rename_members(cls)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in deprecated.MEMBERS and hasattr(type(self), deprecated.MEMBERS[name]):
+            deprecated.warn(f"{type(self).__name__}.{name}", deprecated.MEMBERS[name])
+            return getattr(self, deprecated.MEMBERS[name])
+        raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from bench.model.dynamics import Dynamics
 from bench.model.integrator import Integrator
 from bench.model.ops import Array, Ops, State
 from bench.model.parameters import Plugin, traced
-from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, GustyScene, MechanicalScene, Scene
+from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, MechanicalScene, ProcessNoiseScene, Scene
 
 SURROGATE = "the gradient is a surrogate, not the derivative of the program"
 """What rows, tables and charts say where :attr:`Program.surrogate` holds."""
@@ -366,7 +366,7 @@ class Rollout(Program):
     @property
     def exogenous(self) -> int:
         """Count of the numbers of a scene's gusts: one per step and control."""
-        return self.scene.horizon * self.scene.n_u if isinstance(self.scene, GustyScene) else 0
+        return self.scene.horizon * self.scene.n_u if isinstance(self.scene, ProcessNoiseScene) else 0
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
         """Return the stage costs and the terminal cost of the rollout."""
@@ -427,7 +427,7 @@ class Rollout(Program):
             scanned.append(scene.held(xp, xp.reshape(w, (scene.controls, *shape[1:]))))
         else:
             theta = theta + scene.sigma * (w[: self.dim] if self.exogenous else w)
-        if isinstance(scene, GustyScene):
+        if isinstance(scene, ProcessNoiseScene):
             scanned.append(scene.gust * xp.reshape(w[self.dim :], shape))
         planned = scene.planned_controls(xp, theta)
         if planned is not None:

@@ -23,7 +23,7 @@ class Scene(Plugin):
     """
 
     kind: ClassVar[str] = "scenes"
-    leaves_out: ClassVar[str] = ""
+    neglected_effects: ClassVar[str] = ""
     """What the scene does not model, in a few words."""
     backends: ClassVar[tuple[str, ...]] = ()
     """Names of the backends that it runs on; empty for all whose array namespace its code is written for."""
@@ -137,7 +137,7 @@ class MechanicalScene(Scene):
 
     @property
     def controls(self) -> int:
-        """Number of controls in a rollout: one per step unless a :class:`HeldScene` holds them."""
+        """Number of controls in a rollout: one per step unless a :class:`ZeroOrderHoldScene` holds them."""
         return self.horizon
 
     def held(self, xp: Any, values: Array) -> Array:
@@ -174,7 +174,7 @@ class DampedScene(MechanicalScene):
 
 
 @dataclass(frozen=True)
-class GustyScene(MechanicalScene):
+class ProcessNoiseScene(MechanicalScene):
     """A role: noise from outside on every control of every step, beside the noise on theta.
 
     ``u_t = plan + feedback + gust e_t`` with ``horizon * n_u`` normal numbers e, which follow the d numbers on theta, so
@@ -192,7 +192,7 @@ class GustyScene(MechanicalScene):
 
 
 @dataclass(frozen=True)
-class HeldScene(MechanicalScene):
+class ZeroOrderHoldScene(MechanicalScene):
     """A role: each control of an open loop, and its noise, is held over ``hold`` steps (zero-order hold).
 
     The step can then be refined with theta, the noise and the duration as they were: ``horizon`` and ``hold`` grow by a

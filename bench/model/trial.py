@@ -107,8 +107,8 @@ def _ask(module: ModuleType) -> None:
         "scenes": {"theta0": (), "breakpoints": (), "closed_form_gradient": (None, None)},
         "contacts": {"spring": ()},
         "integrators": {"transition": (0.01, 1.0, 0.1, 1.0)},
-        "backends": {"lacks": (program,)},
-        "estimators": {"lacks": (program, CAPABILITIES, "numpy")},
+        "backends": {"incompatibility": (program,)},
+        "estimators": {"incompatibility": (program, CAPABILITIES, "numpy")},
     }
     for plugin in list(vars(module).values()):
         with contextlib.suppress(Exception):

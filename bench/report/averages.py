@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from bench.experiment.axes import Axis, axes, relabelled, with_axes
+from bench.experiment.columns import IDENTITY
+from bench.experiment.experiment import Experiment
 from bench.report.tables import csv, plain_markdown
 from bench.report.text import number
-from bench.sweep.axes import Axis, axes, relabelled, with_axes
-from bench.sweep.columns import IDENTITY
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_all
+from bench.run.files import write_all
 
 SIGNED = "signed error"
 """The length of the average of (mean estimate - reference): errors of opposite sign cancel in it."""

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from bench.report.plotted import plotted
 from bench.report.style import STYLE
-from bench.sweep.files import write_whole
+from bench.run.files import write_whole
 
 METADATA: dict[str, dict[str, Any]] = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
 """Metadata left out of each kind of file, since it would differ between equal figures."""

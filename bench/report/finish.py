@@ -9,15 +9,15 @@ from pathlib import Path
 import pandas as pd
 
 from bench.errors import UserError, printable
+from bench.experiment.experiment import Experiment
+from bench.experiment.study import study_of
 from bench.model import guard
 from bench.report import averages, web
 from bench.report.cores import spread
 from bench.report.views import latest
-from bench.sweep.execute import Finished, store_of
-from bench.sweep.experiment import Experiment
-from bench.sweep.record import record
-from bench.sweep.store import ordered
-from bench.sweep.study import study_of
+from bench.run.execute import Finished, store_of
+from bench.run.record import record
+from bench.run.store import ordered
 
 
 def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, list[Path]]:

@@ -14,7 +14,7 @@ import pandas as pd
 
 from bench.errors import UserError
 from bench.report.text import counted
-from bench.sweep.files import write_whole
+from bench.run.files import write_whole
 
 STYLE = """
 :root { color-scheme: light dark; }

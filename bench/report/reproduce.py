@@ -12,14 +12,14 @@ from typing import Any
 import pandas as pd
 
 from bench.errors import UserError
+from bench.experiment.axes import NOT_PARTS, parsed
+from bench.experiment.cell import Cell
+from bench.experiment.experiment import Budget, Experiment
+from bench.experiment.grid import COUNTS
+from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, registry
 from bench.model.identity import changed, identity
 from bench.model.parameters import build
-from bench.sweep.axes import NOT_PARTS, parsed
-from bench.sweep.cell import Cell
-from bench.sweep.experiment import Budget, Experiment
-from bench.sweep.grid import COUNTS
-from bench.sweep.study import Study
 
 HEAD = "python -m bench name=one_cell"
 

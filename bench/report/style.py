@@ -8,10 +8,10 @@ from typing import Any
 
 import pandas as pd
 
+from bench.experiment.axes import Axis
+from bench.experiment.columns import COMMON
 from bench.report.text import axis_value
-from bench.report.views import Line
-from bench.sweep.axes import Axis
-from bench.sweep.columns import COMMON
+from bench.report.views import Curve
 
 PALETTE = ("#0072B2", "#000000", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000")
 """Colours that colour-blind readers can distinguish (Okabe and Ito, yellow replaced by brown for white paper)."""
@@ -67,14 +67,14 @@ class Look:
         self._variants = sorted(set(zip(rows["estimator"], rows["estimator_params"], strict=True)))
         self._backends = list(dict.fromkeys(rows["backend"]))
 
-    def line(self, line: Line) -> dict[str, Any]:
+    def line(self, line: Curve) -> dict[str, Any]:
         """Return the colour and line style of an estimator and its parameters."""
         return {
             "color": colour(self._names.index(line.estimator)),
             "linestyle": VARIANTS[self._variant(line) % len(VARIANTS)],
         }
 
-    def marked(self, line: Line) -> dict[str, Any]:
+    def marked(self, line: Curve) -> dict[str, Any]:
         """Return the line and the marker of an estimator and its parameters."""
         return {**self.line(line), "marker": marker(self._names.index(line.estimator), self._variant(line))}
 
@@ -82,7 +82,7 @@ class Look:
         """Return the marker of a backend, in charts that distinguish backends."""
         return MARKERS[self._backends.index(name) % len(MARKERS)]
 
-    def _variant(self, line: Line) -> int:
+    def _variant(self, line: Curve) -> int:
         variants = [params for estimator, params in self._variants if estimator == line.estimator]
         return variants.index(line.params) if line.params in variants else 0
 
@@ -107,7 +107,7 @@ def marker(place: int, variant: int = 0) -> str:
     return MARKERS[(place + place // len(PALETTE) + 3 * variant) % len(MARKERS)]
 
 
-def twin(line: Line, lines: Sequence[Line]) -> int:
+def twin(line: Curve, lines: Sequence[Curve]) -> int:
     """Return how many lines of the same estimator on other backends come before this one."""
     return [other for other in lines if other.label == line.label].index(line)
 

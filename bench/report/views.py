@@ -1,7 +1,7 @@
 """Rows arranged for reading: what tables, charts and pages share.
 
 :func:`arranged` puts the swept axes into columns; then rows along one axis (:func:`along`), one problem at a time
-(:func:`families`), and in it one line per estimator with the backends that agree merged (:func:`lines`).
+(:func:`split_by_problem`), and in it one line per estimator with the backends that agree merged (:func:`lines`).
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.experiment.axes import Axis, axes, relabelled, shown_by, values_of
+from bench.experiment.columns import IDENTITY
+from bench.experiment.experiment import Experiment
 from bench.measure.timing import NOISY
 from bench.model import ContactLaw, registry
 from bench.report.text import axis_value, number
-from bench.sweep.axes import Axis, axes, relabelled, shown_by, values_of
-from bench.sweep.columns import IDENTITY
-from bench.sweep.experiment import Experiment
 
 CATEGORIES = ("scene", "contact", "integrator", "noise")
 NUMBERS = ("horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats")
@@ -35,7 +35,7 @@ EXACT, CLOSE = 1e-6, 1e-2
 """Relative difference below which backends count as giving the same numbers, and nearly the same ones."""
 
 
-def ran(rows: pd.DataFrame) -> pd.DataFrame:
+def attempted(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of cells that were not refused."""
     return rows[~rows["status"].isin(("unsupported", "unavailable"))]
 
@@ -97,7 +97,7 @@ def along(shown: Arranged, axis: Axis | None) -> pd.DataFrame:
 def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
     """Merge seeds to one row per cell, medians over those that ended well; ``lost`` counts those that did not."""
     good = rows["status"] == "ok"
-    rows = rows.assign(lost=(~good & rows.index.isin(ran(rows).index)).astype(float))
+    rows = rows.assign(lost=(~good & rows.index.isin(attempted(rows).index)).astype(float))
     if rows["seed"].nunique() < 2:
         return rows
     identity = [c for c in dict.fromkeys((*CELL, *IDENTITY)) if c != "seed"]
@@ -121,7 +121,7 @@ class Family:
         return ", ".join(str(v) if k in CATEGORIES else f"{k}={axis_value(v)}" for k, v in self.identity.items())
 
 
-def families(shown: Arranged, table: pd.DataFrame, always: Sequence[str] = ()) -> list[Family]:
+def split_by_problem(shown: Arranged, table: pd.DataFrame, always: Sequence[str] = ()) -> list[Family]:
     """Split a table made by :func:`along` into problems, in order of appearance; ``always`` are columns to name anyway.
 
     A numeric column splits problems when it varies at fixed ``x``; one that moves with ``x`` (a zipped axis) does not.
@@ -164,7 +164,7 @@ def smoothing_of(contact: str) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class Curve:
     """One estimator along ``x``, on one backend or on several that agree."""
 
     estimator: str
@@ -195,12 +195,12 @@ RUN = ("estimator", "estimator_params", "backend", "dtype")
 """Columns that tell the runs of one family along an axis apart."""
 
 
-def lines(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Line]:
+def lines(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Curve]:
     """Return the lines of one family, in order of appearance; cells that were never run are left out.
 
     Backends within a relative difference of ``close`` are merged into one line; without it, each is a line of its own.
     """
-    rows = ran(rows)
+    rows = attempted(rows)
     several = rows["dtype"].nunique() > 1
     tidy = rows.drop_duplicates([*RUN, "x"], keep="last").sort_values("x", kind="stable").set_index("x")
     parts: dict[Any, pd.DataFrame] = dict(list(tidy.groupby(list(RUN), sort=False)))
@@ -218,7 +218,7 @@ def lines(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Line]:
             seconds = {name: float(runs[name].rows["time_s"].median()) for name in backends}
             noisy = frozenset(name for name in backends if unsteady(runs[name].rows).mean() > 0.5)
             failed = sum(int(runs[name].rows["lost"].sum()) for name in backends)
-            result.append(Line(str(estimator), str(params), backends, mine.rows, seconds, noisy, failed))
+            result.append(Curve(str(estimator), str(params), backends, mine.rows, seconds, noisy, failed))
             runs = {name: run for name, run in runs.items() if name not in backends}
     return result
 

@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.style import GREY, PALETTE, SHADE, STYLE, plain, wrapped
-from bench.sweep.files import make_directory, write_whole
+from bench.run.files import make_directory, write_whole
 from bench.trace.sentences import three_digits
 from bench.trace.spikes import MEASURES, align, spikes
 from bench.trace.trace import Trace

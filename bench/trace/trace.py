@@ -13,15 +13,15 @@ import numpy as np
 import pandas as pd
 
 from bench.errors import UserError
+from bench.experiment.cell import Cell
+from bench.experiment.experiment import Experiment
+from bench.experiment.grid import cells
 from bench.measure import noise
 from bench.measure.contacts import split
 from bench.model import EngineScene, Jacobians, LoopOps, MechanicalScene, Problem, Program, Unsupported, rollout
 from bench.model.identity import label
-from bench.sweep.cell import Cell
-from bench.sweep.experiment import Experiment
-from bench.sweep.grid import cells
-from bench.sweep.referees import linearising
-from bench.sweep.session import Session
+from bench.run.reference_backends import linearising
+from bench.run.session import Session
 from bench.trace import sentences
 from bench.trace.adjoints import adjoints
 from bench.trace.contacts import contact_columns

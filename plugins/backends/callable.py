@@ -20,12 +20,12 @@ class CallableBackend(Backend):
 
     def compile(self, program: Program) -> Problem:
         """Return the simulator ready to be called; raises :class:`Unsupported` for any other program."""
-        if reason := self.refuses(program):
+        if reason := self.unsupported_reason(program):
             raise Unsupported(reason)
         assert isinstance(program, CallableProgram)
         return CallableProblem(program, self.step)
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Return why the program cannot run: it is no simulator of the user's own, or single precision is asked for."""
         if not isinstance(program, CallableProgram):
             return f"scene {program.scene.name} is no simulator of the user's own"

@@ -35,7 +35,7 @@ class Fused(Backend):
         _use_double()
         return FusedProblem(program, JaxOps(), self.dtype, "reverse")
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Return the operation that has no form as scalar code, or None."""
         if program.needs - self.provides:
             return None

@@ -50,7 +50,7 @@ class Mjx(Jax):
         ops = self.ops()
         return MjxProblem(MjxProgram(rollout(program), self), ops, self.dtype, self._direction(program))
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Return why the program cannot run: it has no twin, or MJX cannot differentiate it; or None."""
         reason = mjcf.refusal(self, program)
         if reason is None and self.mode == "reverse" and self.iterations > 1:

@@ -59,7 +59,7 @@ class Mujoco(Backend):
         """Build the twin's model; nothing is compiled."""
         return MujocoProblem(program, self)
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Return why the program cannot run: single precision, or a program without a twin; or None."""
         if self.dtype != "float64":
             return "MuJoCo computes in double precision"

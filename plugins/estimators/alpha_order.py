@@ -25,9 +25,9 @@ class AlphaOrder(Estimator):
 
     name = "alpha_order"
     needs = frozenset({"value", "grad", "score"})
-    adds_explicit = True
+    includes_explicit_derivative = True
     unbiased = False
-    reports: ClassVar[tuple[str, ...]] = ("alpha", "eps")
+    diagnostics: ClassVar[tuple[str, ...]] = ("alpha", "eps")
 
     gamma: float | None = param(
         None, "accuracy asked of the zeroth-order mean, in units of the gradient; null: ratio times eps", positive=True
@@ -39,9 +39,11 @@ class AlphaOrder(Estimator):
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return estimates with one interpolation weight per repeat."""
-        return self.explained(problem, theta, noise)[0]
+        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
-    def explained(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Auxiliaries]:
+    def estimate_with_diagnostics(
+        self, problem: Problem, theta: np.ndarray, noise: np.ndarray
+    ) -> tuple[np.ndarray, Auxiliaries]:
         """Return the estimates with alpha and eps, each ``(R,)``. Raises ValueError below 4 samples, or 2 shared."""
         if self.sharing == "split":
             first, zeroth = halves(problem, theta, noise)

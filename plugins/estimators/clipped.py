@@ -21,7 +21,7 @@ class Clipped(Estimator):
     name = "clipped"
     needs = frozenset({"grad"})
     unbiased = False
-    reports: ClassVar[tuple[str, ...]] = ("cut",)
+    diagnostics: ClassVar[tuple[str, ...]] = ("cut",)
 
     by: str = param("sample", "what is cut", choices=("sample", "batch", "element"))
     limit: float | None = param(
@@ -31,9 +31,11 @@ class Clipped(Estimator):
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the means of the cut gradients."""
-        return self.explained(problem, theta, noise)[0]
+        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
-    def explained(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Auxiliaries]:
+    def estimate_with_diagnostics(
+        self, problem: Problem, theta: np.ndarray, noise: np.ndarray
+    ) -> tuple[np.ndarray, Auxiliaries]:
         """Return the estimates, and the share of sizes that were cut, ``(R,)``."""
         terms = first_order(problem, theta, noise)
         sizes = np.abs(terms) if self.by == "element" else np.linalg.norm(terms, axis=-1, keepdims=True)

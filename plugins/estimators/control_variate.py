@@ -21,14 +21,16 @@ class ControlVariate(Estimator):
 
     name = "control_variate"
     needs = frozenset({"value", "grad", "score"})
-    across_jumps = True
-    reports: ClassVar[tuple[str, ...]] = ("coefficient",)
+    unbiased_at_discontinuities = True
+    diagnostics: ClassVar[tuple[str, ...]] = ("coefficient",)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of the controlled terms."""
-        return self.explained(problem, theta, noise)[0]
+        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
-    def explained(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Auxiliaries]:
+    def estimate_with_diagnostics(
+        self, problem: Problem, theta: np.ndarray, noise: np.ndarray
+    ) -> tuple[np.ndarray, Auxiliaries]:
         """Return the estimates, and the coefficient ``(R,)``."""
         if noise.shape[1] < 4:
             raise ValueError(f"{self.name} needs at least 4 samples, got {noise.shape[1]}")
@@ -46,7 +48,7 @@ class ControlVariate(Estimator):
         ]
         return np.concatenate(corrected, axis=1).mean(axis=1), {"coefficient": np.mean(coefficients, axis=0)}
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Refuse noise that is not on theta, where (g . w) w has another expectation."""
         return None if program.noise_on_theta else f"{self.name} needs the noise on theta, not on a policy's actions"
 

@@ -17,7 +17,7 @@ class FiniteDifference(SampleMean):
 
     name = "finite_difference"
     unbiased = False
-    across_jumps = False
+    unbiased_at_discontinuities = False
 
     step: float = param(1e-3, "half the distance of the two points, in units of theta", positive=True)
 

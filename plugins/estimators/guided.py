@@ -42,7 +42,7 @@ class Guided(Estimator):
         change = problem.displaced(shift, theta, still) - problem.displaced(-shift, theta, still)
         return per_repeat(change * shift / (2.0 * s * s), fresh).mean(axis=1)
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
         if program.n_noise >= program.dim:
             return None

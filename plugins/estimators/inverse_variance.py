@@ -19,15 +19,17 @@ class InverseVariance(Estimator):
 
     name = "inverse_variance"
     needs = frozenset({"value", "grad", "score"})
-    adds_explicit = True
+    includes_explicit_derivative = True
     unbiased = False
-    reports: ClassVar[tuple[str, ...]] = ("weight",)
+    diagnostics: ClassVar[tuple[str, ...]] = ("weight",)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return estimates with one weight per repeat and coordinate."""
-        return self.explained(problem, theta, noise)[0]
+        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
-    def explained(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Auxiliaries]:
+    def estimate_with_diagnostics(
+        self, problem: Problem, theta: np.ndarray, noise: np.ndarray
+    ) -> tuple[np.ndarray, Auxiliaries]:
         """Return the estimates, and the first-order weights ``(R, d)``."""
         first, zeroth = halves(problem, theta, noise)
         v1 = first.var(axis=1, ddof=1) / first.shape[1]

@@ -18,7 +18,7 @@ class MeasureValued(SampleMean):
     """
 
     name = "measure_valued"
-    across_jumps = True
+    unbiased_at_discontinuities = True
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return the scaled difference of both costs for every coordinate."""
@@ -34,6 +34,6 @@ class MeasureValued(SampleMean):
             rows.append(ahead - problem.value(theta, moved))
         return np.stack(rows) / (problem.sigma * np.sqrt(2.0 * np.pi))
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Refuse noise that is not on theta: each action would need differences of its own."""
         return None if program.noise_on_theta else f"{self.name} needs the noise on theta, not on a policy's actions"

@@ -17,7 +17,7 @@ class RandomizedSmoothing(SampleMean):
     """
 
     name = "randomized_smoothing"
-    across_jumps = True
+    unbiased_at_discontinuities = True
 
     variant: str = param("antithetic", "which difference", choices=("antithetic", "forward"))
     radius: float | None = param(
@@ -53,7 +53,7 @@ class RandomizedSmoothing(SampleMean):
             return None
         return Smoothing("gaussian", self.radius)
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
         if program.n_noise >= program.dim:
             return None

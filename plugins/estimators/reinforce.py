@@ -19,8 +19,8 @@ class Reinforce(SampleMean):
 
     name = "reinforce"
     needs = frozenset({"value", "score"})
-    adds_explicit = True
-    across_jumps = True
+    includes_explicit_derivative = True
+    unbiased_at_discontinuities = True
 
     baseline: str = param("center", "what is subtracted from f", choices=("none", "center", "leave_one_out"))
 

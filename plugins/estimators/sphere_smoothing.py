@@ -48,7 +48,7 @@ class SphereSmoothing(SampleMean):
         """Return whether its expectation is the reference: that of the ball is, whatever the cost."""
         return self.reference == "own"
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
         if program.n_noise >= program.dim:
             return None

@@ -43,17 +43,19 @@ class TotalPropagation(Estimator):
 
     name = "total_propagation"
     needs = frozenset({"value", "grad", "score"})
-    adds_explicit = True
+    includes_explicit_derivative = True
     unbiased = False
-    reports: ClassVar[tuple[str, ...]] = ("weight",)
+    diagnostics: ClassVar[tuple[str, ...]] = ("weight",)
 
     per: str = param("step", "what is weighted together", choices=("step", "control", "action"))
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return estimates with one weight per repeat and part of theta."""
-        return self.explained(problem, theta, noise)[0]
+        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
-    def explained(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, Auxiliaries]:
+    def estimate_with_diagnostics(
+        self, problem: Problem, theta: np.ndarray, noise: np.ndarray
+    ) -> tuple[np.ndarray, Auxiliaries]:
         """Return the estimates, and the first-order weights ``(R, d)``. Raises ValueError for a single sample."""
         if noise.shape[1] < 2:
             raise ValueError(f"{self.name} needs at least 2 samples, got 1")
@@ -83,7 +85,7 @@ class TotalPropagation(Estimator):
         result = per_repeat(by_theta(problem, found, mixed, start), noise).mean(axis=1)
         return result, {"weight": np.moveaxis(weight[..., 0], 2, 0).reshape(repeats, -1)}
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Refuse ``per=action`` where no action of a step has noise of its own, or theta acts in another way too."""
         if self.per != "action":
             return None

@@ -46,7 +46,7 @@ class Windowed(Estimator):
     )
     ridge: float = param(1e-3, "weight of the fitted value's squared coefficients, per sample", positive=True)
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         """Refuse an exact value that the scene does not know, and a theta of named parameters, which acts in every step."""
         if self.terminal == "exact" and not isinstance(program.scene, KnownValue | FunctionScene):
             return f"{self.name}[terminal=exact] needs a scene that knows its cost to go, which {program.scene.name} does not"

@@ -19,7 +19,7 @@ class Billiard(ContactScene):
     """
 
     name = "billiard"
-    leaves_out: ClassVar[str] = "spin, friction, cushions, the third dimension"
+    neglected_effects: ClassVar[str] = "spin, friction, cushions, the third dimension"
     n_q: ClassVar[int] = 4
     n_u: ClassVar[int] = 2
     n_contacts: ClassVar[int] = 1

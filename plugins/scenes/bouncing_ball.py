@@ -23,7 +23,7 @@ class BouncingBall(EngineTwin, ContactScene):
     """
 
     name = "bouncing_ball"
-    leaves_out: ClassVar[str] = "horizontal motion, spin, air, the ball's shape"
+    neglected_effects: ClassVar[str] = "horizontal motion, spin, air, the ball's shape"
     n_q: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1
     twin_difference: ClassVar[float] = 1e-3

@@ -16,10 +16,10 @@ class Callable(CallableScene):
     """
 
     name = "callable"
-    leaves_out = "whatever the simulator leaves out"
+    neglected_effects = "whatever the simulator leaves out"
     backends: ClassVar[tuple[str, ...]] = ("callable",)
 
-    cost: str = param("bench.simulator.example:cost", "the cost, as FILE:NAME or MODULE:NAME")
+    cost: str = param("bench.model.simulator.example:cost", "the cost, as FILE:NAME or MODULE:NAME")
     theta: str = param("theta", "where it starts: a name in the file")
     grad: str = param("gradient", "jax, torch, or a function of theta in the file; empty for differences")
     batch: str = param("", "how several thetas are taken at once; by default detected")

@@ -20,7 +20,7 @@ class Cartpole(EngineTwin, MechanicalScene):
     """
 
     name = "cartpole"
-    leaves_out = "the track's ends, friction, the pole's inertia about its tip"
+    neglected_effects = "the track's ends, friction, the pole's inertia about its tip"
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 1
 

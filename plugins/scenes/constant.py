@@ -13,7 +13,7 @@ class Constant(FunctionScene):
     """f = value, grad J = 0. Without a baseline, score-function terms still have variance (value / sigma)^2 each."""
 
     name = "constant"
-    leaves_out = "dynamics"
+    neglected_effects = "dynamics"
 
     dimension: int = param(5, "d, length of theta", positive=True)
     value: float = param(3.0, "the cost")

@@ -16,7 +16,7 @@ class Cubic(FunctionScene):
     """
 
     name = "cubic"
-    leaves_out = "dynamics"
+    neglected_effects = "dynamics"
 
     dimension: int = param(5, "d, length of theta", positive=True)
 

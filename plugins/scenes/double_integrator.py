@@ -17,7 +17,7 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
     """
 
     name = "double_integrator"
-    leaves_out = "contact, friction, effort in the cost"
+    neglected_effects = "contact, friction, effort in the cost"
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1

@@ -18,7 +18,7 @@ class DoublePendulum(MechanicalScene):
     """
 
     name = "double_pendulum"
-    leaves_out = "the rods' mass, friction, torques"
+    neglected_effects = "the rods' mass, friction, torques"
     n_q: ClassVar[int] = 2
 
     sigma: float = param(0.1, "standard deviation of the noise on the initial state", "rad and rad/s", positive=True)

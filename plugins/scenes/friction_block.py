@@ -24,7 +24,9 @@ class FrictionBlock(FrictionScene):
     """
 
     name = "friction_block"
-    leaves_out: ClassVar[str] = "rotation and shape, a higher coefficient at rest, the second horizontal direction"
+    neglected_effects: ClassVar[str] = (
+        "rotation and shape, a higher coefficient at rest, the second horizontal direction"
+    )
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1

@@ -23,7 +23,7 @@ class GroundWall(ContactScene):
     """
 
     name = "ground_wall"
-    leaves_out: ClassVar[str] = "spin, friction, air, the corner of ground and wall"
+    neglected_effects: ClassVar[str] = "spin, friction, air, the corner of ground and wall"
     n_q: ClassVar[int] = 2
     n_contacts: ClassVar[int] = 2
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 10.0, "damping_mode": "approach"}

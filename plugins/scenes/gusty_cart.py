@@ -6,11 +6,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.model import Array, ContactLaw, GustyScene, Plugin, State, param
+from bench.model import Array, ContactLaw, Plugin, ProcessNoiseScene, State, param
 
 
 @dataclass(frozen=True)
-class GustyCart(GustyScene):
+class GustyCart(ProcessNoiseScene):
     """A constant force theta (d = 1) pushes a cart from rest; a gust adds to it at every step; f = max(0, q_N - edge)^2.
 
     q_N = c (theta + sigma u) + b . gust e, with b_i = dt^2 (N - i) / mass for semi-implicit and dt^2 (N - i - 1) / mass
@@ -20,7 +20,7 @@ class GustyCart(GustyScene):
     """
 
     name = "gusty_cart"
-    leaves_out: ClassVar[str] = "friction, wind that lasts longer than a step"
+    neglected_effects: ClassVar[str] = "friction, wind that lasts longer than a step"
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1
 

@@ -17,7 +17,7 @@ class Heaviside(FunctionScene):
     """
 
     name = "heaviside"
-    leaves_out = "dynamics; stands for a contact that is made or missed"
+    neglected_effects = "dynamics; stands for a contact that is made or missed"
     continuous: ClassVar[bool] = False
 
     theta: float = param(0.0, "where the gradient is estimated; the jump is at 0")

@@ -16,7 +16,7 @@ class Linear(FunctionScene):
     """
 
     name = "linear"
-    leaves_out = "dynamics"
+    neglected_effects = "dynamics"
 
     dimension: int = param(5, "d, length of theta", positive=True)
     slope: float = param(2.0, "the largest of the slopes a_i")

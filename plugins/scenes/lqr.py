@@ -19,7 +19,7 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
     """
 
     name = "lqr"
-    leaves_out = "contact, limits"
+    neglected_effects = "contact, limits"
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1

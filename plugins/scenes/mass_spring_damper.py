@@ -18,7 +18,7 @@ class MassSpringDamper(Identified, MechanicalScene):
     """
 
     name = "mass_spring_damper"
-    leaves_out = "friction that does not grow with speed, a spring that stiffens"
+    neglected_effects = "friction that does not grow with speed, a spring that stiffens"
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1
     unknowns: ClassVar[tuple[str, ...]] = ("mass", "stiffness", "damping")

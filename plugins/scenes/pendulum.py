@@ -17,7 +17,7 @@ class Pendulum(EngineTwin, MechanicalScene):
     """
 
     name = "pendulum"
-    leaves_out = "the rod's mass, torque limits, contact"
+    neglected_effects = "the rod's mass, torque limits, contact"
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1

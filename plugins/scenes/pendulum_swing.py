@@ -20,7 +20,7 @@ class PendulumSwing(MechanicalScene):
     """
 
     name = "pendulum_swing"
-    leaves_out = "units, damping, torque limits, contact"
+    neglected_effects = "units, damping, torque limits, contact"
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1

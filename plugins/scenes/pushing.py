@@ -6,11 +6,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.model import Array, ContactScene, DampedScene, EngineTwin, HeldScene, State, param
+from bench.model import Array, ContactScene, DampedScene, EngineTwin, State, ZeroOrderHoldScene, param
 
 
 @dataclass(frozen=True)
-class Pushing(EngineTwin, HeldScene, DampedScene, ContactScene):
+class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
     """Two bodies on a line, the first pushed by an open-loop force; they touch when closer than 1 m.
 
     State (x1, x2, v1, v2); theta is the force sequence (d = horizon / hold). f = sum over steps of the Q-weighted squared
@@ -19,7 +19,7 @@ class Pushing(EngineTwin, HeldScene, DampedScene, ContactScene):
     """
 
     name = "pushing"
-    leaves_out: ClassVar[str] = (
+    neglected_effects: ClassVar[str] = (
         "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
     )
     open_loop: ClassVar[bool] = True

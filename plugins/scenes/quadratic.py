@@ -17,7 +17,7 @@ class Quadratic(FunctionScene):
     """
 
     name = "quadratic"
-    leaves_out = "dynamics"
+    neglected_effects = "dynamics"
 
     dimension: int = param(5, "d, length of theta", positive=True)
     condition: float = param(10.0, "largest curvature over the smallest", positive=True)

@@ -18,7 +18,7 @@ class SlidingBlock(Identified, MechanicalScene):
     """
 
     name = "sliding_block"
-    leaves_out = "a higher coefficient at rest, friction that changes with speed"
+    neglected_effects = "a higher coefficient at rest, friction that changes with speed"
     n_q: ClassVar[int] = 1
     unknowns: ClassVar[tuple[str, ...]] = ("friction",)
     end_only: ClassVar[bool] = True

@@ -18,7 +18,7 @@ class SoftHeaviside(FunctionScene):
     """
 
     name = "soft_heaviside"
-    leaves_out = "dynamics; stands for a stiff contact that is made or missed"
+    neglected_effects = "dynamics; stands for a stiff contact that is made or missed"
 
     theta: float = param(0.0, "where the gradient is estimated; the ramp is around 0")
     nu: float = param(0.1, "width of the ramp", positive=True)

@@ -19,7 +19,7 @@ class SpringRecord(KnownOptimum, MechanicalScene):
     """
 
     name = "spring_record"
-    leaves_out = "noise in the record, an unknown mass or start (a record tells k/m and c/m only)"
+    neglected_effects = "noise in the record, an unknown mass or start (a record tells k/m and c/m only)"
     identifies: ClassVar[bool] = True
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 2

@@ -19,7 +19,7 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
     """
 
     name = "static_gain"
-    leaves_out = "positions, coupling of the copies"
+    neglected_effects = "positions, coupling of the copies"
 
     sigma: float = param(0.1, "standard deviation of the noise on the gains, or on each control", positive=True)
     noise: str = param("parameter", "what the noise perturbs", choices=("parameter", "action"))

@@ -19,7 +19,7 @@ class StiffDecay(MechanicalScene):
     """
 
     name = "stiff_decay"
-    leaves_out = "positions, any second time scale"
+    neglected_effects = "positions, any second time scale"
     n_q: ClassVar[int] = 0
     n_v: ClassVar[int | None] = 1
 

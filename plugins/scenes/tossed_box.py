@@ -18,7 +18,7 @@ class TossedBox(EngineScene):
     """
 
     name = "tossed_box"
-    leaves_out: ClassVar[str] = "the third dimension, edges and faces (corners are small spheres)"
+    neglected_effects: ClassVar[str] = "the third dimension, edges and faces (corners are small spheres)"
     n_q: ClassVar[int] = 3
     n_contacts: ClassVar[int] = 4
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 50.0, "damping_mode": "clipped"}

@@ -25,7 +25,7 @@ class TwoBalls(KnownOptimum, ContactScene):
     """
 
     name = "two_balls"
-    leaves_out: ClassVar[str] = "spin, friction, the table's edges, further balls"
+    neglected_effects: ClassVar[str] = "spin, friction, the table's edges, further balls"
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 4
     n_u: ClassVar[int] = 2

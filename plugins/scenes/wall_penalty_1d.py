@@ -22,7 +22,7 @@ class WallPenalty1d(EngineTwin, ContactScene):
     """
 
     name = "wall_penalty_1d"
-    leaves_out: ClassVar[str] = "gravity, the second and third dimension, shapes"
+    neglected_effects: ClassVar[str] = "gravity, the second and third dimension, shapes"
     n_q: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1
     twin_difference: ClassVar[float] = 1e-3

@@ -19,11 +19,11 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.pushing import Pushing
 
 from bench import cli
+from bench.experiment import config
 from bench.measure import timing
 from bench.model import Compilations, blocks, compose, registry
-from bench.sweep import config
-from bench.sweep.execute import store_of
-from bench.sweep.plan import plan
+from bench.run.execute import store_of
+from bench.run.plan import plan
 
 # ------------------------------------------------------------------------------------------------------------ blocks
 

@@ -5,8 +5,8 @@ import dataclasses
 import yaml
 
 from bench.benchself import rollouts
+from bench.experiment.config import config_dir
 from bench.model import registry
-from bench.sweep.config import config_dir
 
 
 def test_an_absent_library_is_a_line_with_the_command_that_installs_it(monkeypatch):

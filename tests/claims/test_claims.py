@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench import cli
-from bench.claims import Claim, Figure, Outcome, results, shelf
+from bench.claims import Claim, Figure, Outcome, discovery, results
 from bench.claims.claim import NOT_REPRODUCED, REPRODUCED, RESERVED, UNDECIDED, last_digit, verdict
 
 CHEAP = ("C5", "C19", "L4")
@@ -21,7 +21,7 @@ BLIND = {"C2": 6, "C8": 1, "C10": 1, "C14": 2, "C16": 6, "C17": 12, "C20": 3}
 @pytest.fixture(scope="module")
 def measured():
     """What the cheap claims measure."""
-    return {name: results.measured(shelf.claims()[name]) for name in CHEAP}
+    return {name: results.measured(discovery.claims()[name]) for name in CHEAP}
 
 
 @pytest.mark.parametrize("name", CHEAP)
@@ -56,9 +56,9 @@ def test_planted_wrong_figures_are_not_reproduced(measured):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", list(shelf.claims()))
+@pytest.mark.parametrize("name", list(discovery.claims()))
 def test_every_claim_holds_and_would_fail_with_a_wrong_figure(name):
-    result = results.measured(shelf.claims()[name])
+    result = results.measured(discovery.claims()[name])
     assert result.verdict in (REPRODUCED, RESERVED), (result.remark, [f for f in result.figures if not f.agrees])
     assert unnoticed(result) == []
     assert sum(not figure.sees for figure in result.figures) == BLIND.get(name, 0)
@@ -136,7 +136,7 @@ class Toy(Claim):
 
 @pytest.fixture
 def toy(monkeypatch):
-    monkeypatch.setattr(shelf, "claims", lambda: {"T1": Toy})
+    monkeypatch.setattr(discovery, "claims", lambda: {"T1": Toy})
     monkeypatch.setattr(Toy, "calls", 0)
     return Toy
 
@@ -192,12 +192,14 @@ def test_names_options_and_folders_are_checked(capsys):
 
 def test_claims_of_other_packages_are_found(monkeypatch):
     point = SimpleNamespace(name="toys", load=lambda: Toy)
-    monkeypatch.setattr(shelf, "entry_points", lambda group: [point] if group == shelf.ENTRY_POINT_GROUP else [])
-    shelf.claims.cache_clear()
+    monkeypatch.setattr(
+        discovery, "entry_points", lambda group: [point] if group == discovery.ENTRY_POINT_GROUP else []
+    )
+    discovery.claims.cache_clear()
     try:
-        assert list(shelf.claims())[-1] == "T1"
+        assert list(discovery.claims())[-1] == "T1"
     finally:
-        shelf.claims.cache_clear()
+        discovery.claims.cache_clear()
 
 
 OF_ANOTHER = """
@@ -224,13 +226,13 @@ def test_an_installed_package_brings_claims_by_its_entry_point(tmp_path, monkeyp
     (made / "entry_points.txt").write_text("[bench.claims]\nmine = claims_of_mine\n")
     (tmp_path / "claims_of_mine.py").write_text(OF_ANOTHER)
     monkeypatch.syspath_prepend(tmp_path)
-    shelf.claims.cache_clear()
+    discovery.claims.cache_clear()
     try:
         assert cli.main(["claims", "M1", f"results_dir={tmp_path}"]) == 0
         assert "two is two" in capsys.readouterr().out
         assert "<h2>My lesson</h2>" in (tmp_path / "claims" / "claims.html").read_text()
     finally:
-        shelf.claims.cache_clear()
+        discovery.claims.cache_clear()
         sys.modules.pop("claims_of_mine", None)
 
 
@@ -239,12 +241,12 @@ def test_a_broken_package_hides_no_other_claim(monkeypatch, capsys):
         raise ImportError("no such module")
 
     points = [SimpleNamespace(name="bad", load=broken), SimpleNamespace(name="odd", load=lambda: int)]
-    monkeypatch.setattr(shelf, "entry_points", lambda group: points)
-    shelf.claims.cache_clear()
+    monkeypatch.setattr(discovery, "entry_points", lambda group: points)
+    discovery.claims.cache_clear()
     try:
-        assert "C1" in shelf.claims()
+        assert "C1" in discovery.claims()
     finally:
-        shelf.claims.cache_clear()
+        discovery.claims.cache_clear()
     said = capsys.readouterr().err
     assert "'bad'" in said
     assert "no such module" in said
@@ -252,13 +254,13 @@ def test_a_broken_package_hides_no_other_claim(monkeypatch, capsys):
 
 
 def test_every_claim_says_what_where_and_why():
-    for name, claim in shelf.claims().items():
-        assert claim.lesson in shelf.LESSONS, name
+    for name, claim in discovery.claims().items():
+        assert claim.lesson in discovery.LESSONS, name
         assert all((claim.statement, claim.source, claim.learned, all(claim.labels))), name
 
 
 def test_measured_intervals_of_sampled_moments_cover():
-    from bench.claims.pieces import spread
+    from bench.claims.toolkit import spread
 
     draw = np.random.default_rng(0)
     z = []

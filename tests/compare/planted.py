@@ -22,8 +22,8 @@ from helpers import loaded
 
 from bench.compare import cells
 from bench.model import Problem, registry
-from bench.sweep import tasks
-from bench.sweep.session import Session
+from bench.run import tasks
+from bench.run.session import Session
 
 SHORT = ("pushing", "cartpole", "double_pendulum", "pendulum", "hopper", "friction_block", "tossed_box", "mass_spring", "ground_wall", "bouncing_ball")  # fmt: skip
 """Scenes whose rollouts are cut to ten steps where they have a horizon."""

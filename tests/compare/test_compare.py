@@ -18,12 +18,12 @@ from helpers import experiment, loaded, small_rows
 
 from bench import cli, compare
 from bench.compare import cells, judging, sources, timings
+from bench.experiment import axes
+from bench.experiment.columns import Columns
 from bench.model import registry
 from bench.report.tables import csv
+from bench.run.runner import blank
 from bench.studies.bias_variance.columns import COLUMNS
-from bench.sweep import axes
-from bench.sweep.columns import Columns
-from bench.sweep.runner import blank
 
 MACHINE = {"processor": "a chip", "cores": 2, "system": "Linux", "load_average": [0.1, 0.1, 0.1]}
 
@@ -115,12 +115,12 @@ def test_verdicts_are_judged_by_the_order_of_their_study(study, was, now, outcom
 @pytest.mark.parametrize("study", list(registry.entries()["studies"]))
 def test_the_columns_that_a_rule_needs_are_columns_of_the_study(study):
     columns = sources.columns_of(study)
-    assert columns.judged
-    for column in columns.judged:
-        if column.judged.by == "interval":
+    assert columns.compared
+    for column in columns.compared:
+        if column.comparison.by == "interval":
             assert set(judging._ends(column, columns)) <= set(columns.by_name)
-        if column.judged.by == "verdict":
-            assert column.judged.order
+        if column.comparison.by == "verdict":
+            assert column.comparison.order
 
 
 def test_cells_are_matched_by_all_their_parameters():
@@ -292,7 +292,7 @@ def test_exit_status_files_and_table(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "status ok to error (it broke)" in printed
     table = pd.read_csv(tmp_path / "out" / "compare.csv")
-    assert list(table.columns) == ["experiment", *cells.FIRST, *cells.both_sides(COLUMNS.judged), *cells.LAST]
+    assert list(table.columns) == ["experiment", *cells.FIRST, *cells.both_sides(COLUMNS.compared), *cells.LAST]
     assert (table["outcome"] == "worse").sum() == 1
     assert "it broke" in (tmp_path / "out" / "compare.md").read_text()
     assert "it broke" in (tmp_path / "out" / "compare.html").read_text()
@@ -428,7 +428,9 @@ def test_a_table_with_several_lines_per_cell_has_the_worst_verdict_of_each(tmp_p
 def test_results_of_every_study_are_compared(study, parquet, tmp_path):
     """One of them gave no result: rows of every kind of column, from Parquet and from the committed table."""
     columns, rows = of_study(study, "scenes=[pushing,quadratic]")
-    rows = rows.assign(experiment="some", **{column.name: 1.0 for column in columns.judged if column.kind == "number"})
+    rows = rows.assign(
+        experiment="some", **{column.name: 1.0 for column in columns.compared if column.kind == "number"}
+    )
     old = save(rows, tmp_path / "old", "some", parquet=parquet)
     assert run(old, old, out=tmp_path / "out") == 0
     rows.loc[0, "status"] = "error"

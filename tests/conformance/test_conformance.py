@@ -89,7 +89,7 @@ class SigmaForSigmaSquared(SampleMean):
     """Zeroth-order, f sigma w / sigma^2 with a sigma for the sigma^2."""
 
     name = "sigma_for_sigma_squared"
-    across_jumps = True
+    unbiased_at_discontinuities = True
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         cost = problem.value(theta, w) - problem.value(theta, 0 * w[:, :1])
@@ -137,7 +137,7 @@ class OwnSampleInBaseline(Estimator):
 
     name = "own_sample_in_baseline"
     needs = frozenset({"value", "score"})
-    across_jumps = True
+    unbiased_at_discontinuities = True
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         w = columns(noise)
@@ -151,7 +151,7 @@ class OpenLoopScore(SampleMean):
 
     name = "open_loop_score"
     needs = frozenset({"value", "score"})
-    across_jumps = True
+    unbiased_at_discontinuities = True
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         cost = problem.value(theta, w) - problem.value(theta, 0 * w[:, :1])
@@ -197,7 +197,7 @@ class ClaimsJumps(UnusedScore):
 
     name = "claims_jumps"
     needs = frozenset({"grad"})
-    across_jumps = True
+    unbiased_at_discontinuities = True
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ class RefusesEverything(UnusedScore):
 
     name = "refuses_everything"
 
-    def refuses(self, program: Program) -> str | None:
+    def unsupported_reason(self, program: Program) -> str | None:
         return "not this one"
 
 

@@ -5,8 +5,8 @@ import pytest
 
 import bench
 from bench.errors import UserError
+from bench.experiment.keys import fingerprint
 from bench.model import registry
-from bench.sweep.keys import fingerprint
 
 MADE = """
 import numpy as np

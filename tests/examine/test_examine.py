@@ -15,11 +15,11 @@ from bench import cli
 from bench.errors import UserError
 from bench.examine import smoothing
 from bench.examine.examination import _Examination
-from bench.examine.lines import Break, Line, scan
+from bench.examine.lines import Break, LineScan, scan
 from bench.examine.smoothing import Smoothed
-from bench.simulator.clock import Clock, seconds
-from bench.simulator.columns import Simulator
-from bench.simulator.layout import Layout
+from bench.model.simulator.clock import Clock, seconds
+from bench.model.simulator.simulator import Simulator
+from bench.model.simulator.tree import ParameterTree
 
 QUICK = {"progress": False, "budget": 20}
 
@@ -56,7 +56,7 @@ Pair = namedtuple("Pair", "left right")
     ],
 )
 def test_theta_is_taken_apart_and_put_together(theta, names):
-    layout = Layout(theta)
+    layout = ParameterTree(theta)
     assert layout.names == names
     built = layout.build(layout.vector + 1)
     assert type(built) is type(theta) or isinstance(theta, list)
@@ -69,12 +69,12 @@ def test_theta_is_taken_apart_and_put_together(theta, names):
 )
 def test_theta_without_real_numbers_is_bad_input(theta, match):
     with pytest.raises(UserError, match=match):
-        Layout(theta)
+        ParameterTree(theta)
 
 
 def test_gradients_are_matched_by_name_whatever_their_order():
     """JAX sorts the keys of a dict: a gradient in its order is right."""
-    layout = Layout({"speed": 1.0, "mass": 2.0})
+    layout = ParameterTree({"speed": 1.0, "mass": 2.0})
     np.testing.assert_array_equal(layout.take({"mass": 20.0, "speed": 10.0}), [10.0, 20.0])
     with pytest.raises(UserError, match=r"has shape mass .*, spin"):
         layout.take({"mass": 20.0, "spin": 10.0})
@@ -86,7 +86,7 @@ def test_gradients_are_matched_by_name_whatever_their_order():
 
 
 def test_list_of_numbers_of_any_library_is_a_vector():
-    layout = Layout([1.0, 2.0])
+    layout = ParameterTree([1.0, 2.0])
     np.testing.assert_array_equal(layout.take([np.float32(3), np.array(4.0)]), [3.0, 4.0])
     with pytest.raises(UserError, match="theta is theta"):
         layout.take([np.float32(3)])
@@ -100,11 +100,11 @@ def test_cost_that_takes_its_argument_apart_is_given_another_each_time():
 
 def test_theta_that_would_fill_the_memory_is_bad_input():
     with pytest.raises(UserError, match="up to 100,000"):
-        Layout(np.zeros(100_001))
+        ParameterTree(np.zeros(100_001))
 
 
 def test_scale_of_zero_is_that_of_its_array():
-    np.testing.assert_allclose(Layout({"drag": 2e4, "x": [0.0, 3.0], "y": 0.0}).scales(), [2e4, 3.0, 3.0, 1.0])
+    np.testing.assert_allclose(ParameterTree({"drag": 2e4, "x": [0.0, 3.0], "y": 0.0}).scales(), [2e4, 3.0, 3.0, 1.0])
 
 
 # -------------------------------------------------------------------------------------------- gradients
@@ -206,7 +206,7 @@ def test_equal_jumps_at_even_distances_are_treads_and_others_are_not():
 )
 def test_a_tread_is_the_height_of_four_equal_jumps_at_even_distances(places, heights, tread):
     breaks = tuple(Break("jump", *each) for each in zip(places, heights, strict=True))
-    line = Line(np.ones(1), np.zeros(2), np.zeros(2), breaks, steps=False)
+    line = LineScan(np.ones(1), np.zeros(2), np.zeros(2), breaks, steps=False)
     assert line.tread == pytest.approx(tread)
 
 
@@ -235,7 +235,7 @@ def right():
 def jumpy(missed, *heights):
     """A line for each height with four equal jumps at even distances, of which the gradient misses a share."""
     found = [tuple(Break("jump", float(place), height) for place in range(4)) for height in heights]
-    return [Line(np.ones(2), np.zeros(2), np.zeros(2), breaks, False, missed) for breaks in found]
+    return [LineScan(np.ones(2), np.zeros(2), np.zeros(2), breaks, False, missed) for breaks in found]
 
 
 def under_noise(error, low, high):
@@ -501,7 +501,7 @@ def test_size_of_a_gradient_is_without_the_share_of_its_noise():
     sizes, raw = [], []
     for seed in range(20):
         simulator = Simulator(
-            lambda x: 0.1 * x[0] + np.sin(3.0 * x[1]) ** 3 + np.sin(4.0 * x[2]) ** 3, Layout(np.zeros(3))
+            lambda x: 0.1 * x[0] + np.sin(3.0 * x[1]) ** 3 + np.sin(4.0 * x[2]) ** 3, ParameterTree(np.zeros(3))
         )
         found = smoothing.smoothed(simulator, np.zeros(3), 1.0, np.ones(3), None, Clock(60.0), seed, pairs=64)
         sizes.append(found.norm)
@@ -536,7 +536,7 @@ def test_slow_simulator_is_checked_in_every_component_before_anything_else():
     """5 ms a cost and 6 s: 1,200 costs, so that no time is left to scan for staircases."""
     clock = Clock(6.0)
     clock.count("costs", 100, 0.5, warm=True)
-    simulator = Simulator(bowl, Layout([1.0, 0.5]), slope, clock=clock)
+    simulator = Simulator(bowl, ParameterTree([1.0, 0.5]), slope, clock=clock)
     examination = _Examination(simulator, simulator.layout, np.ones(2), [], clock, 0, "slow")
     chosen = examination._options()
     assert (chosen.components, chosen.scanned) == (16, 0)
@@ -547,7 +547,7 @@ def test_slow_simulator_is_checked_in_every_component_before_anything_else():
 def test_slow_simulator_of_many_numbers_is_checked_in_few_of_them():
     clock = Clock(15.0)
     clock.count("costs", 100, 0.5, warm=True)
-    simulator = Simulator(lambda x: float(np.sum(np.square(x))), Layout(np.ones(16)), clock=clock)
+    simulator = Simulator(lambda x: float(np.sum(np.square(x))), ParameterTree(np.ones(16)), clock=clock)
     assert _Examination(simulator, simulator.layout, np.ones(16), [], clock, 0, "slow")._options().components == 4
 
 

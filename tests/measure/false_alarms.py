@@ -43,7 +43,7 @@ def run(count, only=None):
     """Return verdicts by count, the blamed ``(name, seed, sentence)``, and the seconds of each check; ``count`` checks."""
     chosen = [(name, program) for name, program in programs() if only is None or only(name)]
     verdicts, blamed, seconds = Counter(), [], []
-    unit, search = float(np.finfo(np.float64).eps), measure.Search(2, 16, 2.0, 1e-4)
+    unit, search = float(np.finfo(np.float64).eps), measure.SwitchSearch(2, 16, 2.0, 1e-4)
     for place, (name, program) in enumerate(chosen):
         problem = registry.make("backends", "jax", {}).compile(program)
         theta0 = program.theta0

@@ -9,12 +9,12 @@ import pytest
 
 from bench import run
 from bench.cli import main
+from bench.experiment.columns import IDENTITY
 from bench.measure import noise
 from bench.measure.gradcheck import EPS, FAULTS, VERDICTS, Sample, diagnose
 from bench.model import Problem, compose, registry
 from bench.studies.gradient_check import GradientCheck, measure, report
 from bench.studies.gradient_check.places import trusted
-from bench.sweep.columns import IDENTITY
 
 FLOAT64, FLOAT32 = (float(np.finfo(dtype).eps) for dtype in (np.float64, np.float32))
 
@@ -23,7 +23,7 @@ def plugin(kind, name, **values):
     return registry.make(kind, name, values)
 
 
-SEARCH = measure.Search(*(getattr(GradientCheck(), name) for name in ("directions", "drawn", "reach", "aside")))
+SEARCH = measure.SwitchSearch(*(getattr(GradientCheck(), name) for name in ("directions", "drawn", "reach", "aside")))
 """Where the study looks by default."""
 
 

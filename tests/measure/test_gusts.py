@@ -14,7 +14,7 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.gusty_cart import GustyCart
 
 from bench.measure.reference import certify
-from bench.model import Decision, GustyScene, State, compose
+from bench.model import Decision, ProcessNoiseScene, State, compose
 
 ERRORS = 4.5
 """Standard errors: below 1e-5 by chance."""
@@ -22,7 +22,7 @@ SAMPLES = 1 << 17
 
 
 @dataclass(frozen=True)
-class LooseSpring(GustyScene):
+class LooseSpring(ProcessNoiseScene):
     """A mass starts at theta on a spring whose stiffness is off by a share in each of two steps; f = q_2^2.
 
     With k = dt^2: q_1 = q_0 (1 - k (1 + e_0)), q_2 = q_1 (2 - k (1 + e_1)) - q_0, all of it theta's own.
@@ -122,7 +122,7 @@ def test_gusts_need_controls():
     with pytest.raises(TypeError, match="set n_u"):
 
         @dataclass(frozen=True)
-        class Without(GustyScene):
+        class Without(ProcessNoiseScene):
             name = "without"
 
 

@@ -15,11 +15,11 @@ from bench.plugins.estimators.reinforce import Reinforce
 from bench.plugins.estimators.sphere_smoothing import SphereSmoothing
 from helpers import loaded
 
+from bench.experiment.problems import Problems
 from bench.measure.reference import certify
 from bench.measure.smoothed import over_ball, widened
 from bench.model import DisturbedScene, FunctionScene, compose
-from bench.sweep.problems import Problems
-from bench.sweep.references import References
+from bench.run.references import References
 
 ERRORS = 4.5
 """Standard errors: below 1e-5 by chance."""

@@ -164,9 +164,9 @@ def test_what_does_not_add_the_term_is_refused():
     program = composed(Gusts())
 
     class Careless(Reinforce):
-        adds_explicit = False
+        includes_explicit_derivative = False
 
-    assert "lacks a term" in Careless().lacks(program, Torch.provides, "torch")
-    assert "needs explicit, which mujoco lacks" in Reinforce().lacks(program, Mujoco.provides, "mujoco")
-    assert Reinforce().lacks(program, Torch.provides, "torch") is None
-    assert Careless().lacks(composed(Cartpole()), Torch.provides, "torch") is None
+    assert "lacks a term" in Careless().incompatibility(program, Torch.provides, "torch")
+    assert "needs explicit, which mujoco lacks" in Reinforce().incompatibility(program, Mujoco.provides, "mujoco")
+    assert Reinforce().incompatibility(program, Torch.provides, "torch") is None
+    assert Careless().incompatibility(composed(Cartpole()), Torch.provides, "torch") is None

@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 
 from bench import UserError
-from bench.model import HeldScene, LoopOps, MechanicalScene, State, adjoint_gradient, compose, param, registry, slopes
+from bench.model import (
+    LoopOps,
+    MechanicalScene,
+    State,
+    ZeroOrderHoldScene,
+    adjoint_gradient,
+    compose,
+    param,
+    registry,
+    slopes,
+)
 from bench.model.parameters import build
 
 ROUNDING = 1e-12
@@ -17,7 +27,7 @@ DIFFERENCES = 1e-6
 
 
 @dataclass(frozen=True)
-class Cart(HeldScene):
+class Cart(ZeroOrderHoldScene):
     """q'' = u from rest, with a cost of every step."""
 
     name = "held_cart"
@@ -101,7 +111,7 @@ def test_a_hold_that_does_not_fill_the_horizon_is_refused():
 def test_a_feedback_law_cannot_be_held():
     with pytest.raises(TypeError, match="set open_loop"):
 
-        class Closed(HeldScene):
+        class Closed(ZeroOrderHoldScene):
             n_q = 1
 
 

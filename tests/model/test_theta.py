@@ -93,7 +93,7 @@ def differences(program, values):
 @pytest.mark.parametrize("case", CASES)
 def test_gradient_is_that_of_the_cost_by_the_parameters(case, backend):
     program = program_of(*CASES[case])
-    if reason := backend.lacks(program):
+    if reason := backend.incompatibility(program):
         pytest.skip(reason)
     problem, theta = backend.compile(program), program.theta0
     w = np.array([[0.0, 1.0, -0.7], [0.0, 0.4, 1.3]])[: program.dim]

@@ -32,14 +32,14 @@ from bench.cli import main
 from bench.conformance import backends
 from bench.conformance.kit import Failed
 from bench.conformance.subjects import distance, law_for, samples
+from bench.experiment.cell import Cell
+from bench.experiment.experiment import Budget
 from bench.measure import noise
 from bench.measure.reference import certify
 from bench.model import EngineScene, EngineTwin, compose, registry
 from bench.plugins import mjcf
+from bench.run.reference_backends import reference_key
 from bench.studies.bias_variance import BiasVariance
-from bench.sweep.cell import Cell
-from bench.sweep.experiment import Budget
-from bench.sweep.referees import reference_key
 
 ROOT = Path(__file__).resolve().parents[2]
 for _name in ("mujoco", "mjx"):
@@ -184,13 +184,13 @@ def test_stiffness_and_mass_compile_nothing_anew(mode):
     ids=lambda value: value if isinstance(value, str) else "",
 )  # fmt: skip
 def test_what_an_engine_cannot_do_is_refused(engine, of, reason):
-    assert reason in engine.refuses(of)
+    assert reason in engine.unsupported_reason(of)
 
 
 def test_allowed_settings_are_not_refused():
     for engine in (Mjx(), Mjx(iterations=5), Mjx(mode="reverse"), Mjx(cone="elliptic"), Mujoco(cone="elliptic")):
-        assert engine.refuses(program(Pushing())) is None
-    assert Mjx(integrator="rk4").refuses(compose(Pendulum(), None, Rk4())) is None
+        assert engine.unsupported_reason(program(Pushing())) is None
+    assert Mjx(integrator="rk4").unsupported_reason(compose(Pendulum(), None, Rk4())) is None
 
 
 def test_scene_for_engines_is_refused_elsewhere():
@@ -212,7 +212,7 @@ def test_every_twin_is_listed_with_its_difference():
         scene = entry.plugin()
         if isinstance(scene, EngineTwin):
             assert 0 < scene.twin_difference <= 1e-3 or isinstance(scene, EngineScene)
-            assert Mujoco().refuses(program(scene)) is None
+            assert Mujoco().unsupported_reason(program(scene)) is None
 
 
 # --------------------------------------------------------------------------------------------------- commands

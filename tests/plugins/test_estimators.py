@@ -169,7 +169,7 @@ def weights(estimator, stiffness, samples=100, repeats=12):
     problem = Numpy().compile(program)
     w = noise.draw(0, "pushing", repeats, samples, program.n_noise, "cells")
     truth = certify(problem, Numpy().provides, 1 << 14, 0.005)
-    values, decided = estimator.explained(problem, program.theta0, w)
+    values, decided = estimator.estimate_with_diagnostics(problem, program.theta0, w)
     return summarise(values, truth.known(), samples).rmse_rel, decided.get("alpha")
 
 
@@ -187,7 +187,7 @@ def test_a_fixed_accuracy_far_below_eps_is_the_zeroth_order_alone():
 def test_sharing_takes_every_sample_for_both_orders():
     problem = Torch().compile(compose(SoftHeaviside(nu=0.2)))
     theta, w = problem.program.theta0, noise.draw(5, "shared", 3, 64, 1, "cells")
-    shared, decided = AlphaOrder(sharing="shared").explained(problem, theta, w)
+    shared, decided = AlphaOrder(sharing="shared").estimate_with_diagnostics(problem, theta, w)
     alpha = decided["alpha"][:, None]
     expected = alpha * Fobg().estimate(problem, theta, w) + (1 - alpha) * Reinforce().estimate(problem, theta, w)
     np.testing.assert_allclose(shared, expected, rtol=1e-12)
@@ -243,7 +243,7 @@ def test_clipping_a_ramp_has_the_expectation_limit_times_chance(limit, by):
 def test_clipping_a_batch_cuts_its_norm():
     problem = Numpy().compile(compose(Linear(dimension=8)))
     w = noise.draw(1, "plane", 3, 4, 8, "cells")
-    values, decided = Clipped(by="batch", limit=0.5).explained(problem, problem.program.theta0, w)
+    values, decided = Clipped(by="batch", limit=0.5).estimate_with_diagnostics(problem, problem.program.theta0, w)
     assert np.linalg.norm(values, axis=1) == pytest.approx(0.5)
     assert (decided["cut"] == 1).all()
 
@@ -277,7 +277,7 @@ def test_total_propagation_weights_each_step_by_itself():
     program = compose(Pushing(horizon=4, sigma=0.1), Penalty(stiffness=1e3), SemiImplicitEuler())
     problem = Numpy().compile(program)
     w = noise.draw(0, "pushing", 2, 16, 4, "cells")
-    values, decided = TotalPropagation().explained(problem, program.theta0, w)
+    values, decided = TotalPropagation().estimate_with_diagnostics(problem, program.theta0, w)
     single = w.reshape(32, 1, 4)
     first, zeroth = (e.estimate(problem, program.theta0, single).reshape(2, 16, 4) for e in (Fobg(), Reinforce()))
     v1, v0 = first.var(axis=1, ddof=1), zeroth.var(axis=1, ddof=1)

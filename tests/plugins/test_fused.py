@@ -26,7 +26,7 @@ class Kinks(FunctionScene):
     """Operations with ties, each on a coordinate of its own, and an angle."""
 
     name = "fused_kinks"
-    leaves_out: ClassVar[str] = "everything but kinks"
+    neglected_effects: ClassVar[str] = "everything but kinks"
     sigma: float = param(1e-3, "noise", positive=True)
     scale: float = param(2.0, "a parameter")
 
@@ -167,19 +167,19 @@ def test_machine_code_is_kept_on_disk(tmp_path, monkeypatch):
 
 def test_an_operation_without_scalar_form_is_refused_by_name():
     backend = registry.make("backends", "fused")
-    assert "no scalar code for sort" in str(backend.refuses(compose(Sorted())))
+    assert "no scalar code for sort" in str(backend.unsupported_reason(compose(Sorted())))
     pushed = compose(
         registry.make("scenes", "pushing"),
         registry.make("contacts", "complementarity"),
         registry.make("integrators", "semi_implicit_euler"),
     )
-    assert "no root finder" in str(backend.lacks(pushed))
+    assert "no root finder" in str(backend.incompatibility(pushed))
     surrogate = compose(
         registry.make("scenes", "pushing"),
         registry.make("contacts", "straight_through"),
         registry.make("integrators", "semi_implicit_euler"),
     )
-    assert "surrogate" in str(backend.lacks(surrogate))
+    assert "surrogate" in str(backend.incompatibility(surrogate))
 
 
 def test_formulas_of_a_step_are_found_along_the_horizon():

@@ -25,7 +25,7 @@ def test_open_loop_by_hand():
     """With only an end cost the cost to come is the whole cost, less the mean over the other samples."""
     problem = compiled(DoubleIntegrator(horizon=4, sigma=0.5))
     theta, noise = problem.program.theta0, np.random.default_rng(3).standard_normal((2, 9, 4))
-    found, decided = PER_ACTION.explained(problem, theta, noise)
+    found, decided = PER_ACTION.estimate_with_diagnostics(problem, theta, noise)
     for r in range(2):
         cost, first = problem.value(theta, noise[r].T), problem.grad(theta, noise[r].T)
         others = [np.delete(cost, n).mean() for n in range(9)]
@@ -65,6 +65,6 @@ def test_zeroth_order_per_action_has_the_policys_gradient_as_its_mean(policy, mo
 
 
 def test_actions_without_noise_of_their_own_are_refused():
-    assert "noise on the action" in PER_ACTION.refuses(compose(Pushing(hold=3), None, SemiImplicitEuler()))
-    assert "noise on the action" in PER_ACTION.refuses(compose(BouncingBall(), None, SemiImplicitEuler()))
-    assert PER_ACTION.refuses(compose(Pushing(), None, SemiImplicitEuler())) is None
+    assert "noise on the action" in PER_ACTION.unsupported_reason(compose(Pushing(hold=3), None, SemiImplicitEuler()))
+    assert "noise on the action" in PER_ACTION.unsupported_reason(compose(BouncingBall(), None, SemiImplicitEuler()))
+    assert PER_ACTION.unsupported_reason(compose(Pushing(), None, SemiImplicitEuler())) is None

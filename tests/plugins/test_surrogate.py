@@ -70,8 +70,8 @@ def test_a_surrogate_gradient_certifies_nothing_and_is_never_declared_unbiased(p
 
 def test_differences_cannot_give_a_surrogate():
     program = compose(Billiard(horizon=5), StraightThrough(), SemiImplicitEuler())
-    assert "surrogate" in Fobg().lacks(program, Numpy().provides, "numpy")
-    assert Fobg().lacks(program, Jax().provides, "jax") is None
+    assert "surrogate" in Fobg().incompatibility(program, Numpy().provides, "numpy")
+    assert Fobg().incompatibility(program, Jax().provides, "jax") is None
 
 
 def test_rows_tables_and_charts_say_it_in_words(tmp_path):
@@ -84,8 +84,8 @@ def test_rows_tables_and_charts_say_it_in_words(tmp_path):
     assert (said == ((rows["contact"] == "straight_through") & (rows["estimator"] == "fobg"))).all()
     folder = tmp_path / "custom"
     assert SURROGATE in (folder / "bias_variance.md").read_text()
+    from bench.experiment import config
     from bench.studies.bias_variance import charts
-    from bench.sweep import config
 
     figures = charts.figures(config.load([f"results_dir={tmp_path}", "sweep.sigma=[0.1,0.3]"]), rows)
     words = " ".join(text.get_text() for figure in figures.values() for sub in figure.subfigs for text in sub.texts)

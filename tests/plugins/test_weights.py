@@ -94,7 +94,7 @@ def test_clipped_by_hand(halves, by):
 def test_control_variate_by_hand(halves):
     """Each half takes the regression coefficient of the other one, which it has no part in."""
     problem, theta, noise, *_ = halves
-    found, said = ControlVariate().explained(problem, theta, noise)
+    found, said = ControlVariate().estimate_with_diagnostics(problem, theta, noise)
     g = problem.grad(theta, np.zeros((2, 1)))[:, 0]
     centre = problem.value(theta, np.zeros((2, 1)))[0]
     for r in range(REPEATS):
@@ -135,7 +135,7 @@ def test_total_propagation_by_hand(per):
     problem = Numpy().compile(compose(TwoBalls(horizon=3, dt=0.1, sigma=2.0), Penalty(), SemiImplicitEuler()))
     theta = problem.program.theta0
     noise = np.random.default_rng(1).standard_normal((2, 7, theta.size))
-    found, said = TotalPropagation(per=per).explained(problem, theta, noise)
+    found, said = TotalPropagation(per=per).estimate_with_diagnostics(problem, theta, noise)
     centre = problem.value(theta, np.zeros((theta.size, 1)))[0]
     for r in range(2):
         w = noise[r].T

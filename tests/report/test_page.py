@@ -17,15 +17,15 @@ from browser import CHROMIUM, chromium
 from helpers import experiment, row, small_rows, stiffness_rows, table
 
 from bench import cli, gallery
+from bench.experiment import config, grid
+from bench.experiment.columns import Columns
+from bench.experiment.study import Study
 from bench.model import registry
 from bench.report import reproduce, web
 from bench.report.web import document
+from bench.run.store import Store
 from bench.studies.bias_variance import page as bias_variance_page
 from bench.studies.bias_variance.columns import COLUMNS
-from bench.sweep import config, grid
-from bench.sweep.columns import Columns
-from bench.sweep.store import Store
-from bench.sweep.study import Study
 
 HOSTILE = (
     "<script>window.hacked=1</script>",

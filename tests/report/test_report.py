@@ -31,15 +31,15 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from bench.cli import main
+from bench.experiment.experiment import TableLayout
 from bench.report import views
 from bench.report.figures import save, styled
 from bench.report.plotted import plotted
 from bench.report.style import PALETTE, Look, axis_name, colour
 from bench.report.text import number
+from bench.run.store import Store
 from bench.studies.bias_variance import charts, findings, pivot, tables, terminal
 from bench.studies.bias_variance.columns import TABLE
-from bench.sweep.experiment import Layout
-from bench.sweep.store import Store
 
 
 @pytest.fixture
@@ -162,7 +162,7 @@ def test_terminal_output_fits_and_says_what_matters(rows, capsys, monkeypatch):
 def families(rows, column, **given):
     """The problems of rows along the axis of that column."""
     shown = views.arranged(experiment(**given), rows)
-    return views.families(shown, views.along(shown, named(shown, column)))
+    return views.split_by_problem(shown, views.along(shown, named(shown, column)))
 
 
 def named(shown, column):
@@ -430,7 +430,7 @@ def test_best_is_told_only_where_its_interval_is_apart_from_every_other_estimato
     def bold(made, **more):
         return [cell.best for cell in paper(made, **more).cells()]
 
-    by_backend = {"table": Layout(rows=("estimator", "backend"))}
+    by_backend = {"table": TableLayout(rows=("estimator", "backend"))}
     assert bold(rows((2.5, 4.0)), **by_backend) == [True, True, False, False]
     assert not any(bold(rows((1.9, 4.0)), **by_backend))
     assert not any(bold(rows((2.5, 4.0)).assign(variance_low=math.nan), **by_backend))
@@ -522,7 +522,7 @@ def test_no_cell_is_lost_where_a_swept_value_is_the_default_of_one_scene(capsys,
     shown = views.arranged(swept, rows)
     along = views.along(shown, named(shown, "damping"))
     assert sorted(along["x"]) == [0.0, 0.0, 1.0, 1.0, 10.0, 10.0]
-    assert [sorted(family.rows["x"]) for family in views.families(shown, along)] == [[0.0, 1.0, 10.0]] * 2
+    assert [sorted(family.rows["x"]) for family in views.split_by_problem(shown, along)] == [[0.0, 1.0, 10.0]] * 2
     found = findings.problems(shown)
     assert [(axis.column, len(family.rows)) for axis, family in found] == [("damping", 3)] * 2
     terminal.show(swept, rows)
@@ -539,7 +539,7 @@ def test_a_law_parameter_that_happens_to_equal_another_keeps_its_problem():
     rows = rows_of(swept, cells)
     shown = views.arranged(swept, rows)
     for column in ("stiffness", "damping"):
-        found = views.families(shown, views.along(shown, named(shown, column)))
+        found = views.split_by_problem(shown, views.along(shown, named(shown, column)))
         assert [len(family.rows) for family in found] == [2, 2]
     table = tables.readable(swept, rows)
     assert table.headers[:2] == ["stiffness", "damping"]
@@ -590,7 +590,7 @@ def test_a_swept_scene_parameter_is_a_number_in_every_table_and_title_at_its_def
     assert sorted(line[place] for line in found.body) == ["0.1", "0.1", "0.2", "0.2"]
     assert "| stiffness | mass | " in (swept.directory / "bias_variance.md").read_text()
     shown = views.arranged(swept, rows)
-    titles = [family.title() for family in views.families(shown, views.along(shown, named(shown, "stiffness")))]
+    titles = [family.title() for family in views.split_by_problem(shown, views.along(shown, named(shown, "stiffness")))]
     assert titles == ["mass=0.1", "mass=0.2"]
     with styled():
         panels = charts.figures(swept, rows)["bias_variance_stiffness"].axes
@@ -679,7 +679,7 @@ def test_titles_say_where_the_best_estimator_fails_and_what_never_does():
         given = experiment(sweep={"stiffness": [10.0, 1e3, 1e5]}, marks={"stiffness": marks})
         shown = views.arranged(given, table(made))
         axis = named(shown, "stiffness")
-        parts = [(part, views.lines(part.rows)) for part in views.families(shown, views.along(shown, axis))]
+        parts = [(part, views.lines(part.rows)) for part in views.split_by_problem(shown, views.along(shown, axis))]
         return findings.headline(parts, axis, marks)
 
     stiff = lambda contact, k: 9.0 if contact == "penalty" and k > 1e4 else 0.1  # noqa: E731
@@ -719,7 +719,7 @@ def test_twelve_estimators_stay_distinct_for_colour_blind_readers_too(eyes):
     seen = np.array(BLIND.get(eyes, np.eye(3)))
     names = [f"estimator_{i}" for i in range(12)]
     look = Look(table([row(estimator=name) for name in names]), names)
-    styles = [look.marked(views.Line(name, "", {}, pd.DataFrame(), {}, frozenset(), 0)) for name in names]
+    styles = [look.marked(views.Curve(name, "", {}, pd.DataFrame(), {}, frozenset(), 0)) for name in names]
     linear = [
         np.array([c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(s["color"])])
         for s in styles

@@ -7,8 +7,9 @@ import pandas as pd
 import pytest
 from helpers import described_by
 
+from bench.experiment import config
 from bench.measure.statistics import UNEXPLAINED
-from bench.report.views import Line
+from bench.report.views import Curve
 from bench.studies.bias_variance.charts import figures
 from bench.studies.bias_variance.costs import (
     EQUAL_ROLLOUTS,
@@ -19,10 +20,9 @@ from bench.studies.bias_variance.costs import (
     at_equal_cost,
     charged,
 )
-from bench.studies.bias_variance.fastest import leaders, reach, sentence, table
 from bench.studies.bias_variance.findings import winners
 from bench.studies.bias_variance.panels import apart
-from bench.sweep import config
+from bench.studies.bias_variance.time_to_accuracy import leaders, reach, sentence, table
 
 SAMPLES = (16, 64, 256)
 VARIANCE = 4.0
@@ -51,7 +51,7 @@ def rows(bias=0.0, resolved=None, **values):
 
 def line(**values):
     found = rows(**values)
-    return Line("e", "", {"b": True}, found.set_index("samples"), {"b": 1.0}, frozenset(), 0)
+    return Curve("e", "", {"b": True}, found.set_index("samples"), {"b": 1.0}, frozenset(), 0)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_unbiased_methods_follow_the_law(target, how, samples):
 def test_the_cheapest_sufficient_samples_are_taken_not_the_fewest():
     """Where 16 samples take 120 us and 256 take 64 us, both within the error, the answer is 64 us."""
     slow_start = line().rows.assign(time_s=[120e-6, 200e-6, 64e-6])
-    found = reach(Line("e", "", {"b": True}, slow_start, {"b": 1.0}, frozenset(), 0), 0.6, TIME)
+    found = reach(Curve("e", "", {"b": True}, slow_start, {"b": 1.0}, frozenset(), 0), 0.6, TIME)
     assert (found.cost, found.samples) == (64e-6, 256)
 
 
@@ -98,7 +98,7 @@ def test_findings_rank_at_equal_rollouts_and_at_equal_time_not_at_equal_samples(
     assert found[EQUAL_ROLLOUTS].tolist() == pytest.approx([0.5, 0.5 * math.sqrt(1.25)])
     assert found[EQUAL_TIME].tolist() == pytest.approx([0.5, 0.5 * math.sqrt(2.5)])
     lines = [
-        Line(n, "", {"b": True}, one.set_index("samples"), {}, frozenset(), 0) for n, one in found.groupby("estimator")
+        Curve(n, "", {"b": True}, one.set_index("samples"), {}, frozenset(), 0) for n, one in found.groupby("estimator")
     ]
     assert winners(lines) == {16: ["pairs"]}
     assert winners(lines, EQUAL_ROLLOUTS) == winners(lines, EQUAL_TIME) == {16: ["single"]}

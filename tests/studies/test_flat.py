@@ -6,11 +6,11 @@ import time
 import numpy as np
 import pytest
 
+from bench.experiment import config
+from bench.experiment.grid import cells
 from bench.measure import noise, statistics, timing
 from bench.model import compose, registry
 from bench.studies.bias_variance.estimates import Estimates
-from bench.sweep import config
-from bench.sweep.grid import cells
 
 ROUNDED = 1e-12
 """Relative difference allowed between sums in one go and in parts."""

@@ -12,14 +12,14 @@ from bench.plugins.scenes.double_integrator import DoubleIntegrator
 from bench.plugins.scenes.double_pendulum import DoublePendulum
 
 from bench.cli import main
+from bench.experiment import config
+from bench.experiment.grid import cells
 from bench.model import Jacobians, compose
 from bench.report.views import arranged
+from bench.run.store import Store
 from bench.studies.growth import report
 from bench.studies.growth.columns import COLUMNS
 from bench.studies.growth.measure import classify, products, rate
-from bench.sweep import config
-from bench.sweep.grid import cells
-from bench.sweep.store import Store
 
 
 def constant(matrix, horizon, batch=3):

@@ -7,12 +7,12 @@ import pytest
 from bench.plugins.optimizers.gauss_newton import GaussNewton
 
 import bench
+from bench.experiment import config
+from bench.experiment.grid import cells
 from bench.measure.identification import Information, product
+from bench.run.execute import store_of
+from bench.run.plan import plan
 from bench.studies.identify.measure import Fitting, fitted, information, measure, model_of, windows_of
-from bench.sweep import config
-from bench.sweep.execute import store_of
-from bench.sweep.grid import cells
-from bench.sweep.plan import plan
 
 SPRING = ("scenes=[mass_spring_damper]", "integrators=[rk4]")
 STEPPED = 1e-4

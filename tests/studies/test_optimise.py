@@ -19,18 +19,18 @@ from scipy.linalg import solve_discrete_lyapunov
 
 import bench
 from bench.cli import main
+from bench.experiment import config
+from bench.experiment.grid import cells
+from bench.experiment.study import study_of
 from bench.measure import performance
 from bench.measure.solve import solve
 from bench.model import Problem, State, compose
-from bench.studies.optimise import races, report
-from bench.studies.optimise.abreast import side_by_side
+from bench.run.execute import store_of
+from bench.run.plan import plan
+from bench.run.session import Session
+from bench.studies.optimise import aggregate, report
+from bench.studies.optimise.batched import side_by_side
 from bench.studies.optimise.measure import compared, scene_class
-from bench.sweep import config
-from bench.sweep.execute import store_of
-from bench.sweep.grid import cells
-from bench.sweep.plan import plan
-from bench.sweep.session import Session
-from bench.sweep.study import study_of
 
 CHECKED = 1e-6
 """Relative agreement with the checked optima."""
@@ -380,7 +380,7 @@ def test_tables_charts_and_page(finished):
     text = (folder / "optimise.md").read_text()
     assert "Best score" in text
     assert "not known" in text  # two methods on one problem say nothing about gradients in general
-    found = races.races(experiment, bench.load(folder))
+    found = aggregate.races(experiment, bench.load(folder))
     assert found.methods == ["fobg, gradient_descent", "cem[elites=5,population=20]", "reinforce, gradient_descent"]
     assert found.chosen[found.problems[0], "fobg, gradient_descent"] == "rate=0.1"
 
@@ -481,7 +481,7 @@ def test_smaller_noise_is_that_of_a_smaller_sigma():
     from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
     from bench.plugins.estimators.reinforce import Reinforce
 
-    from bench.studies.optimise.measure import Quieter
+    from bench.studies.optimise.measure import ScaledNoiseProblem
 
     noise = np.random.default_rng(0).standard_normal((2, 16, 5))
     for scene, policy in (("cubic", False), ("cartpole[horizon=5,sigma=0.4]", True)):
@@ -490,7 +490,7 @@ def test_smaller_noise_is_that_of_a_smaller_sigma():
         theta = wide.program.theta0
         for estimator in (Reinforce(), RandomizedSmoothing()):
             expected = estimator.estimate(narrow, theta, noise)
-            assert estimator.estimate(Quieter(wide, 0.25), theta, noise) == pytest.approx(expected, rel=1e-6)
+            assert estimator.estimate(ScaledNoiseProblem(wide, 0.25), theta, noise) == pytest.approx(expected, rel=1e-6)
 
 
 def test_quality_subtracts_noise():
@@ -575,14 +575,14 @@ def test_cells_differ_by_optimizer_parameters():
     assert len({cell.key for cell in made}) == 2
 
 
-def searches(finals: dict[tuple[str, str], list[float]]) -> races.Races:
+def searches(finals: dict[tuple[str, str], list[float]]) -> aggregate.RunSet:
     """One problem's searches: final costs by method and tuning, one for each seed."""
     rows = [
         {"problem": "p", "method": method, "tuning": tuning, "seed": seed, "final_cost": cost, "status": "ok"}
         for (method, tuning), costs in finals.items()
         for seed, cost in enumerate(costs)
     ]
-    return races.Races(pd.DataFrame(rows), ())
+    return aggregate.RunSet(pd.DataFrame(rows), ())
 
 
 def test_seeds_that_choose_a_tuning_do_not_score_it():
@@ -609,11 +609,11 @@ def test_quality_along_the_path_is_summed_up_over_seeds():
         path_quality_rmse_rel=[[0.1, 0.2, 0.4], [0.1, 0.3, 0.8], [0.1, 0.4, 0.6]],
         path_quality_cosine=[[1.0, 0.9, 0.5]] * 3,
     )
-    lines = races.path_quality(races.Races(rows, ()))
+    lines = aggregate.path_quality(aggregate.RunSet(rows, ()))
     error = lines[lines["quantity"] == "rmse_rel"]
     assert error["iteration"].tolist() == [0, 10, 20]
     assert error["value"].tolist() == pytest.approx([0.1, 0.3, 0.6])
     assert error["low"].iloc[2] == pytest.approx(np.quantile([0.4, 0.8, 0.6], 0.2))
-    assert len(report.path_figure(races.Races(rows, ()), 4.0).axes) == 2
+    assert len(report.path_figure(aggregate.RunSet(rows, ()), 4.0).axes) == 2
     alone = rows.assign(path_quality_iteration=[[0]] * 3)
-    assert report.path_figure(races.Races(alone, ()), 4.0) is None
+    assert report.path_figure(aggregate.RunSet(alone, ()), 4.0) is None

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from bench.sweep import config
-from bench.sweep.grid import cells
-from bench.sweep.session import Session
-from bench.sweep.study import study_of
+from bench.experiment import config
+from bench.experiment.grid import cells
+from bench.experiment.study import study_of
+from bench.run.session import Session
 
 FIXED = ("scenes=[pendulum_swing[dt=0.02]]", "backends=[jax]", "samples=100", "name=order", "timing=false")
 """200 steps of 0.02 s, 100 samples; each search takes 30 iterations."""

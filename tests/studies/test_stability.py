@@ -9,16 +9,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from bench.experiment import config
+from bench.experiment.cell import Cell
+from bench.experiment.grid import cells
 from bench.model import MechanicalScene, State, compose, registry
 from bench.model.parameters import build
+from bench.run import runner
+from bench.run.plan import plan
+from bench.run.session import Session
+from bench.run.store import Store
 from bench.studies.stability import Stability, report, summary
 from bench.studies.stability import measure as stability
-from bench.sweep import config, runner
-from bench.sweep.cell import Cell
-from bench.sweep.grid import cells
-from bench.sweep.plan import plan
-from bench.sweep.session import Session
-from bench.sweep.store import Store
 
 STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
 HORIZON, DT = 40, 0.05
@@ -66,7 +67,9 @@ def cell(tmp_path, *words):
     return cells(experiment(tmp_path, *words))[0]
 
 
-LIMITS = stability.Limits(**{name: getattr(Stability(), name) for name in stability.Limits.__annotations__})
+LIMITS = stability.StabilityLimits(
+    **{name: getattr(Stability(), name) for name in stability.StabilityLimits.__annotations__}
+)
 
 
 def measured(found: Cell, given):

@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from bench.studies.bias_variance.standing import best, standing
+from bench.studies.bias_variance.ranking import best, standing
 
 
 def cell(estimator, scene, bias, variance, **more):

@@ -12,13 +12,18 @@ import pandas as pd
 import pytest
 
 import bench.report
+from bench.experiment import config
+from bench.experiment.axes import axes, table
+from bench.experiment.grid import cells
+from bench.experiment.study import study_of
 from bench.measure.gradcheck import EPS
 from bench.model import registry
 from bench.report import reproduce, web
 from bench.report.plotted import plotted
-from bench.report.views import along, arranged, families
+from bench.report.views import along, arranged, split_by_problem
 from bench.report.web.content import Content, grouped, looks, problems
 from bench.report.web.document import data
+from bench.run.files import make_directory
 from bench.studies.gradient_check import matrix
 from bench.studies.gradient_check import report as gradient_check
 from bench.studies.growth import report as growth
@@ -27,11 +32,6 @@ from bench.studies.stability import report as stability
 from bench.studies.three_errors import page as three_errors_page
 from bench.studies.three_errors import report as three_errors
 from bench.studies.twins import report as twins
-from bench.sweep import config
-from bench.sweep.axes import axes, table
-from bench.sweep.files import make_directory
-from bench.sweep.grid import cells
-from bench.sweep.study import study_of
 
 SPRUNG = '''
 from dataclasses import dataclass
@@ -51,8 +51,8 @@ COUNTED = '''
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bench.sweep.columns import Column, Columns, Judged, text
-from bench.sweep.study import Study
+from bench.experiment.columns import Column, Columns, ComparisonRule, text
+from bench.experiment.study import Study
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Counted(Study):
     name = "counted"
     columns: ClassVar[Columns] = Columns.of(
         Column("weight", "how heavy it is", "kg"),
-        text("outcome", "how it ended", judged=Judged("verdict", "outcome", order=("bad", "good"))),
+        text("outcome", "how it ended", comparison=ComparisonRule("verdict", "outcome", order=("bad", "good"))),
     )
 
     def measure(self, cell, session):
@@ -314,7 +314,7 @@ def test_a_parameter_that_two_scenes_lend_to_their_law_keeps_every_row():
     (axis,) = shown.axes
     found = along(shown, axis)
     assert len(found) == 6
-    assert [len(family.rows) for family in families(shown, found)] == [3, 3]
+    assert [len(family.rows) for family in split_by_problem(shown, found)] == [3, 3]
     assert list(shown.rows["damping"]) == [0.0, 0.0, 1.0, 1.0, 10.0, 10.0]
 
 

@@ -13,15 +13,15 @@ from bench.plugins.scenes.bouncing_ball import BouncingBall
 from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
 
 from bench.cli import main
+from bench.experiment import config
+from bench.experiment.grid import cells
 from bench.model import compose
 from bench.report.views import arranged
+from bench.run.store import Store
 from bench.studies.three_errors import measure
 from bench.studies.three_errors.columns import COLUMNS
 from bench.studies.three_errors.measure import difference_check
 from bench.studies.three_errors.report import traps
-from bench.sweep import config
-from bench.sweep.grid import cells
-from bench.sweep.store import Store
 
 TRAP = Impulse(time_of_impact=False)
 

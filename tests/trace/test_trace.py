@@ -19,10 +19,10 @@ from bench.plugins.scenes.pendulum import Pendulum
 from bench.plugins.scenes.pushing import Pushing
 
 from bench.cli import main
+from bench.experiment import config
 from bench.measure import noise
 from bench.measure.contacts import acting, split
 from bench.model import Decision, FrictionScene, Jacobians, LoopOps, Unsupported, compose
-from bench.sweep import config
 from bench.trace.adjoints import adjoints
 from bench.trace.chart import chart
 from bench.trace.equations import Newton

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.optimize import brentq
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.ink import GREY, ink
-from bench.claims.pieces import centre, estimator, expectation, problem, rule, stochastic_descent
+from bench.claims.colours import GREY, ink
+from bench.claims.toolkit import centre, estimator, expectation, problem, rule, stochastic_descent
 from bench.model import Array, FunctionScene, Problem, param
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ class ThrownBall(Claim):
             if not baseline:
                 spread = float(each.std(ddof=1))
         code = estimator("alpha_order[gamma=0.01,delta=0.95,sharing=shared]")
-        decided = code.explained(at, np.array([0.1]), noise[:, 0, :50, None])[1]["alpha"]
+        decided = code.estimate_with_diagnostics(at, np.array([0.1]), noise[:, 0, :50, None])[1]["alpha"]
         share.append((float(np.mean(decided == 0)), 0.0))
         return ends, share, spread, path[::20, 0]
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.ink import GREY
-from bench.claims.pieces import problem
+from bench.claims.colours import GREY
+from bench.claims.toolkit import problem
 from bench.report.averages import summary
 
 if TYPE_CHECKING:

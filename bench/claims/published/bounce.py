@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.pieces import problem
+from bench.claims.toolkit import problem
 from bench.report.averages import summary
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import ndtr
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.pieces import estimator, moments, problem
+from bench.claims.toolkit import estimator, moments, problem
 from bench.model import Array, FunctionScene
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.ink import GREY
-from bench.claims.pieces import descend, native
+from bench.claims.colours import GREY
+from bench.claims.toolkit import descend, native
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.pieces import estimator, moments, problem
+from bench.claims.toolkit import estimator, moments, problem
 from bench.model import Array, FunctionScene, param
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.ink import GREY, ink
-from bench.claims.pieces import centre, expectation, problem, stochastic_descent
+from bench.claims.colours import GREY, ink
+from bench.claims.toolkit import centre, expectation, problem, stochastic_descent
 from bench.model import Array, FunctionScene, param
 
 if TYPE_CHECKING:

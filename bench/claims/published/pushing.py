@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.ink import bars, ink
-from bench.claims.pieces import estimator, problem, spread, terms
+from bench.claims.colours import bars, ink
+from bench.claims.toolkit import estimator, problem, spread, terms
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.ink import GREY, ink
-from bench.claims.pieces import centre, estimator, moments, problem
+from bench.claims.colours import GREY, ink
+from bench.claims.toolkit import centre, estimator, moments, problem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.ink import ink
-from bench.claims.pieces import estimator, moments, problem
+from bench.claims.colours import ink
+from bench.claims.toolkit import estimator, moments, problem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import ERRORS, Claim, Figure, Outcome
-from bench.claims.ink import GREY
-from bench.claims.pieces import estimator, problem
+from bench.claims.colours import GREY
 from bench.claims.published.ball_with_wall import BallWithWall
 from bench.claims.published.pivot import Pivot
+from bench.claims.toolkit import estimator, problem
 from bench.measure.reference import certify
 
 if TYPE_CHECKING:

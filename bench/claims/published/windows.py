@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.pieces import problem
+from bench.claims.toolkit import problem
 from bench.model import Array, FunctionScene, param
 
 if TYPE_CHECKING:

@@ -13,14 +13,14 @@ from typing import Any
 import pandas as pd
 
 from bench.errors import UserError
+from bench.experiment.experiment import Experiment
+from bench.experiment.study import study_of
 from bench.report import reproduce
 from bench.report.views import arranged
-from bench.report.web import anything
+from bench.report.web import generic
 from bench.report.web.content import Content
 from bench.report.web.document import assemble
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_whole
-from bench.sweep.study import study_of
+from bench.run.files import write_whole
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> Path:
@@ -37,7 +37,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     study = study_of(experiment)
     result = study.page(experiment, rows)
     if result is None:
-        result = anything.content(experiment, rows)
+        result = generic.content(experiment, rows)
     if not isinstance(result, Content):
         raise UserError(f"study {study.name}: page() must return a bench.report.web.content.Content or None")
     shown = arranged(experiment, rows)

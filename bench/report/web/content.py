@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.experiment import axes as sweep
+from bench.experiment.columns import IDENTITY
+from bench.experiment.grid import applies
 from bench.model import registry
 from bench.report.style import MARKERS, VARIANTS, colour, marker
 from bench.report.text import axis_value
-from bench.report.views import NUMBERS, Arranged, ran
-from bench.sweep import axes as sweep
-from bench.sweep.columns import IDENTITY
-from bench.sweep.grid import applies
+from bench.report.views import NUMBERS, Arranged, attempted
 
 SYMBOLS = dict(
     zip(
@@ -34,7 +34,7 @@ DARK = {"#000000": "#ffffff"}
 
 
 @dataclass(frozen=True)
-class Axis:
+class PlotAxis:
     """A column that can be an axis: its label, its scale, and the columns of its interval.
 
     Where the column ``limit`` is not 0 the value is an upper limit.
@@ -60,8 +60,8 @@ class Chart:
 
     title: str
     text: str
-    x: Sequence[Axis]
-    y: Sequence[Axis]
+    x: Sequence[PlotAxis]
+    y: Sequence[PlotAxis]
     table: str = "rows"
     series: str = "series"
     facet: str = ""
@@ -74,7 +74,7 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class Column:
+class TableColumn:
     """A column of the main table; ``kind``: text, number, seconds (``!`` if ``flag`` is not 0), limit (``<`` then)."""
 
     name: str
@@ -89,7 +89,7 @@ class Content:
 
     finding: str
     rows: pd.DataFrame
-    columns: list[Column]
+    columns: list[TableColumn]
     charts: list[Chart]
     answers: pd.DataFrame = field(default_factory=pd.DataFrame)
     """Texts: what to use where."""
@@ -115,21 +115,21 @@ def looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     return {name: look(colour(i), SYMBOLS[marker(i)]) for i, name in enumerate(dict.fromkeys(names))}
 
 
-def identity_columns(rows: pd.DataFrame, swept: Sequence[str] = ()) -> list[Column]:
+def identity_columns(rows: pd.DataFrame, swept: Sequence[str] = ()) -> list[TableColumn]:
     """Return the identity columns and the swept ones that vary; those whose values are numbers are shown as such."""
     names = [name for name in dict.fromkeys((*IDENTITY, *swept)) if name in rows]
     varying = [name for name in names if rows[name].nunique(dropna=False) > 1] or ["scene", "estimator"]
     texts = {name for name in varying if not pd.api.types.is_numeric_dtype(rows[name])}
-    return [Column(name, name.replace("_", " "), "text" if name in texts else "number") for name in varying]
+    return [TableColumn(name, name.replace("_", " "), "text" if name in texts else "number") for name in varying]
 
 
-STATUS = [Column("status", "status", "text"), Column("reason", "reason", "text")]
+STATUS = [TableColumn("status", "status", "text"), TableColumn("reason", "reason", "text")]
 """The last columns of every main table."""
 
 
-def numeric_axis(axis: sweep.Axis, column: str = "x", log: bool = True) -> Axis:
+def numeric_axis(axis: sweep.Axis, column: str = "x", log: bool = True) -> PlotAxis:
     """Return a swept parameter as an axis of a chart, named with its unit and what moves with it."""
-    return Axis(column, axis.title, log)
+    return PlotAxis(column, axis.title, log)
 
 
 def logarithmic(values: pd.Series) -> bool:
@@ -149,7 +149,7 @@ def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:
 
 def nothing_ran(rows: pd.DataFrame) -> str:
     """Return a sentence if there is no result at all; nothing if there is one."""
-    tried = ran(rows)
+    tried = attempted(rows)
     if (tried["status"] == "ok").any():
         return ""
     return "No cell gave a result: the table has the reason of each."
@@ -213,7 +213,7 @@ def constants(rows: pd.DataFrame, groups: pd.Series, names: Sequence[str]) -> pd
     return values.mask(one.nunique(dropna=False).reindex(values.index) > 1, "")
 
 
-def telling(
+def distinguishing_columns(
     rows: pd.DataFrame, groups: pd.Series, names: Sequence[str], always: Sequence[str] = ("scene",)
 ) -> list[str]:
     """Choose, of some columns, those that distinguish the groups, each only where the ones before it do not suffice."""
@@ -244,7 +244,7 @@ def problems(
     """
     rows = shown.rows if rows is None else rows
     groups = grouped(rows, parts, without)
-    columns = telling(rows, groups, columns_of(shown, parts, without), always)
+    columns = distinguishing_columns(rows, groups, columns_of(shown, parts, without), always)
     names: dict[Any, str] = {}
     for group, line in constants(rows, groups, columns).iterrows():
         name = ", ".join(filter(None, (_named(column, value) for column, value in line.items())))

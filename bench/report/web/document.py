@@ -17,10 +17,10 @@ from typing import Any
 
 import pandas as pd
 
+from bench.experiment.columns import IDENTITY
+from bench.experiment.experiment import Experiment
 from bench.report import reproduce
-from bench.report.web.content import Axis, Chart, Content
-from bench.sweep.columns import IDENTITY
-from bench.sweep.experiment import Experiment
+from bench.report.web.content import Chart, Content, PlotAxis
 
 HERE = Path(__file__).parent
 DIGITS = 6
@@ -106,7 +106,7 @@ def filtered(content: Content) -> list[str]:
 
 
 def _columns_of(chart: Chart) -> set[str]:
-    axes: list[Axis] = [*chart.x, *chart.y]
+    axes: list[PlotAxis] = [*chart.x, *chart.y]
     names = {name for axis in axes for name in (axis.column, axis.low, axis.high, axis.limit)}
     return names | {chart.series, chart.facet, chart.line, chart.front, chart.level}
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Columns
+from bench.experiment.experiment import Experiment
+from bench.experiment.session import Session
+from bench.experiment.study import Study
 from bench.model import param
 from bench.studies.bias_variance.columns import COLUMNS
-from bench.sweep.cell import Cell
-from bench.sweep.columns import Columns
-from bench.sweep.experiment import Experiment
-from bench.sweep.session import Session
-from bench.sweep.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,18 +44,18 @@ class BiasVariance(Study):
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         """Write the main table, error against time, the charts, the fastest methods, and who wins where."""
-        from bench.studies.bias_variance import charts, fastest, standing, tables
+        from bench.studies.bias_variance import charts, ranking, tables, time_to_accuracy
 
         paths = tables.write(experiment, rows) + charts.write(experiment, rows)
-        return paths + fastest.write(experiment, rows) + standing.write(experiment, rows)
+        return paths + time_to_accuracy.write(experiment, rows) + ranking.write(experiment, rows)
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
         """Print the digest: the main table, condensed where it is long, and the findings from it."""
-        from bench.studies.bias_variance import fastest, reported, terminal
+        from bench.studies.bias_variance import reported, terminal, time_to_accuracy
 
         terminal.show(experiment, rows)
         reported.show(rows)
-        fastest.show(experiment, rows)
+        time_to_accuracy.show(experiment, rows)
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
         """Return the finding, what to use where, and the charts."""

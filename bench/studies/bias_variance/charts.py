@@ -17,19 +17,19 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
+from bench.experiment.axes import Axis
+from bench.experiment.experiment import Experiment
 from bench.model import SURROGATE, registry
 from bench.report.cores import spread
 from bench.report.figures import save, styled
 from bench.report.style import Look, plain, symbol
-from bench.report.views import CATEGORIES, Family, along, arranged, families, ran
-from bench.studies.bias_variance import fastest
+from bench.report.views import CATEGORIES, Family, along, arranged, attempted, split_by_problem
+from bench.studies.bias_variance import time_to_accuracy
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost, charged
-from bench.studies.bias_variance.course import FEWEST, course
-from bench.studies.bias_variance.fastest import SAMPLES
-from bench.studies.bias_variance.glance import glance
+from bench.studies.bias_variance.error_against_time import FEWEST, course
 from bench.studies.bias_variance.panels import bias_variance, overview, speed_accuracy
-from bench.sweep.axes import Axis
-from bench.sweep.experiment import Experiment
+from bench.studies.bias_variance.summary_matrix import glance
+from bench.studies.bias_variance.time_to_accuracy import SAMPLES
 
 ROOM = 4
 """Number of problems beyond which a chart shows only some of them."""
@@ -78,11 +78,11 @@ def drawings(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[
     made: dict[str, Callable[[], Figure]] = {}
 
     def problems(axis: Axis | None, drawable: Callable[[pd.DataFrame], bool]) -> list[Family]:
-        return [p for p in families(shown, along(shown, axis)) if drawable(p.rows)]
+        return [p for p in split_by_problem(shown, along(shown, axis)) if drawable(p.rows)]
 
     swept = shown.swept()
     for axis in swept:
-        chosen, held = choose(problems(axis, lambda part: ran(part)["x"].nunique() > 1))
+        chosen, held = choose(problems(axis, lambda part: attempted(part)["x"].nunique() > 1))
         if chosen:
             made[file_name(axis)] = partial(bias_variance, chosen, held + merged, look, axis, shown.marks(axis))
     nothing_swept = not made
@@ -99,16 +99,18 @@ def drawings(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[
             ("rollouts_accuracy", ROLLOUTS),
         ):
             costed = problems(SAMPLES, partial(_costed, cost))
-            curves = [problem for problem in costed if ran(problem.rows)["x"].nunique() > 1]
+            curves = [problem for problem in costed if attempted(problem.rows)["x"].nunique() > 1]
             chosen, held = choose(curves or costed)
             if chosen and (cost is not ROLLOUTS or good["samples"].nunique() > 1):
                 made[name] = partial(_costs, chosen, held + merged, look, cost)
-        raced = problems(SAMPLES, lambda part: ran(part)["x"].nunique() > 1) if good["samples"].nunique() > 1 else []
+        raced = (
+            problems(SAMPLES, lambda part: attempted(part)["x"].nunique() > 1) if good["samples"].nunique() > 1 else []
+        )
         if raced:
             costs = [TIME, ROLLOUTS] if good["time_s"].notna().any() else [ROLLOUTS]
             made["at_a_glance"] = partial(glance, choose(raced, 2 * ROOM)[0], costs)
     if nothing_swept:
-        chosen = problems(None, lambda part: len(ran(part)) > 0)
+        chosen = problems(None, lambda part: len(attempted(part)) > 0)
         if chosen:
             made["overview"] = partial(overview, chosen, merged, look)
     return made
@@ -128,10 +130,10 @@ def _said(problems: Sequence[Family], cost: Cost) -> tuple[dict[int, str], str]:
     every: list[dict[str, Any]] = []
     for place, problem in enumerate(problems):
         if problem.rows["x"].nunique() > 1:
-            entries = [fastest.line(problem, target, kind, cost) for target in fastest.TARGETS]
-            said[place] = "\n".join(map(fastest.sentence, entries))
+            entries = [time_to_accuracy.line(problem, target, kind, cost) for target in time_to_accuracy.TARGETS]
+            said[place] = "\n".join(map(time_to_accuracy.sentence, entries))
             every += entries
-    return said, fastest.leaders(every) if every else fastest.front(problems, cost)
+    return said, time_to_accuracy.leaders(every) if every else time_to_accuracy.front(problems, cost)
 
 
 def _costed(cost: Cost, rows: pd.DataFrame) -> bool:

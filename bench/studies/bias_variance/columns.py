@@ -1,6 +1,6 @@
 """The columns of the main table, which users' scripts rely on."""
 
-from bench.sweep.columns import Column, Columns, Judged, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
 
 TABLE = (
     "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise",
@@ -16,11 +16,11 @@ COLUMNS = Columns.ordered(
     Column("reference_norm", "norm of the reference gradient"),
     text("reference_method", "how the reference was computed: closed_form, quadrature or sampling, with its settings"),
     Column("reference_se", "standard error of the reference, as the root of the trace of its covariance"),
-    Column("bias", "norm of the bias, corrected for its own noise", judged=Judged("interval", "bias")),
+    Column("bias", "norm of the bias, corrected for its own noise", comparison=ComparisonRule("interval", "bias")),
     Column("bias_low", "lower end of its 95% interval; 0 where the bias is not distinguishable from 0"),
     Column("bias_high", "upper end of its 95% interval"),
     Column("bias_rel", "bias / reference_norm"),
-    Column("variance", "trace of the covariance of one estimate", judged=Judged("spread", "variance")),
+    Column("variance", "trace of the covariance of one estimate", comparison=ComparisonRule("spread", "variance")),
     Column("variance_low", "lower end of its 95% interval", table=False),
     Column("variance_high", "upper end of its 95% interval", table=False),
     Column("variance_per_sample", "variance of one sample's term, from all of them where an estimate is a mean of terms; "
@@ -28,14 +28,14 @@ COLUMNS = Columns.ordered(
     Column("variance_per_sample_low", "lower end of its 95% interval", table=False),
     Column("variance_per_sample_high", "upper end of its 95% interval", table=False),
     Column("rmse", "root mean squared distance of one estimate from the reference",
-           judged=Judged("paired", "RMSE", mean="mean_estimate", variance="variance", reference="reference_gradient")),
+           comparison=ComparisonRule("paired", "RMSE", mean="mean_estimate", variance="variance", reference="reference_gradient")),
     Column("rmse_rel", "rmse / reference_norm; above 1 an estimate is worse than answering zero"),
     Column("cosine", "mean cosine between one estimate and the reference"),
     Column("sign_agreement", "share of coordinates of one estimate whose sign is the reference's"),
     Column("finite_fraction", "share of repeats that are finite"),
     Column("model_error", "norm of (program's gradient - physics' gradient) at w = 0"),
     Column("time_s", "one estimate of N samples without drawing noise, steady state, median over calls", "s", measured=True,
-           judged=Judged("time", "time")),
+           comparison=ComparisonRule("time", "time")),
     Column("time_iqr_s", "interquartile range over calls", "s", measured=True),
     Column("compile_s", "compilation that the estimates needed", "s", measured=True),
     Column("rollouts", "costs that one estimate evaluates"),

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from bench.experiment.cell import Cell
 from bench.measure import noise
 from bench.measure.timing import Pause
 from bench.model import Auxiliaries, Problem, SampleMean, columns, per_repeat
-from bench.sweep.cell import Cell
 
 KEPT = 100_000
 """Norms of single terms that are kept for their quantiles: as many of each repeat, the first ones."""
@@ -96,7 +96,7 @@ class Estimates:
         return noise.parts(cell.seed, cell.scene.name, repeat, cell.samples, self._width, "cells")
 
     def _explained(self, start: int, block: np.ndarray) -> np.ndarray:
-        result, self.decided[start] = self._estimator.explained(self._problem, self._theta, block)
+        result, self.decided[start] = self._estimator.estimate_with_diagnostics(self._problem, self._theta, block)
         result = self._real(result)
         self._check(result, (block.shape[0], self._problem.dim))
         return result

@@ -11,9 +11,9 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
+from bench.experiment.axes import Axis
 from bench.report.text import axis_value, number
-from bench.report.views import Arranged, Family, Line, along, families, ran
-from bench.sweep.axes import Axis
+from bench.report.views import Arranged, Curve, Family, along, attempted, split_by_problem
 
 TIE = 1.1
 """Relative RMSEs within this factor of the lowest share the first place: R repeats do not resolve less."""
@@ -31,22 +31,22 @@ def problems(shown: Arranged) -> list[tuple[Axis | None, Family]]:
     parts: list[tuple[Axis | None, Family]] = []
     seen: set[str] = set()
     for axis in (*sorted(swept, key=lambda a: -swept[a]), None):
-        for group in families(shown, along(shown, axis), ("scene", "contact")):
-            cells = ran(group.rows)
+        for group in split_by_problem(shown, along(shown, axis), ("scene", "contact")):
+            cells = attempted(group.rows)
             if set(cells["key"]) - seen and (axis is None or cells["x"].nunique() > 1):
                 seen |= set(cells["key"])
                 parts.append((axis, group))
     return parts
 
 
-def lowest(curves: Sequence[Line], error: str = "rmse_rel") -> dict[float, float]:
+def lowest(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, float]:
     """Return the lowest error at each ``x`` where there is one, in increasing order."""
     rows = pd.concat([line.rows for line in curves])
     good = rows[(rows["status"] == "ok") & np.isfinite(rows[error])]
     return good.groupby(level=0)[error].min().to_dict()
 
 
-def winners(curves: Sequence[Line], error: str = "rmse_rel") -> dict[float, list[str]]:
+def winners(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, list[str]]:
     """Return, at each ``x``, the estimators whose error is lowest or not distinguishable from the lowest.
 
     ``error`` is a column: ``rmse_rel`` compares at equal samples, those of :func:`~.costs.at_equal_cost` at equal cost.
@@ -74,7 +74,7 @@ def span(where: Mapping[float, bool]) -> str:
 
 
 def headline(
-    parts: Sequence[tuple[Family, Sequence[Line]]], axis: Axis, marks: Mapping[str, float] = MappingProxyType({})
+    parts: Sequence[tuple[Family, Sequence[Curve]]], axis: Axis, marks: Mapping[str, float] = MappingProxyType({})
 ) -> str:
     """Write where estimators fail, the one that is lowest most often first, and which never does.
 
@@ -99,7 +99,7 @@ def headline(
     return "; ".join(clauses) or f"No estimator is better than zero anywhere along {axis.column}"
 
 
-def tally(parts: Sequence[tuple[Family, Sequence[Line]]]) -> str:
+def tally(parts: Sequence[tuple[Family, Sequence[Curve]]]) -> str:
     """Write on how many problems the estimator that is lowest most often fails, and how many fail on none.
 
     Failing is what it is in :func:`headline`.
@@ -117,20 +117,20 @@ def tally(parts: Sequence[tuple[Family, Sequence[Line]]]) -> str:
     return f"{first} fails on {among}; {sound or 'none'} of {len(names)} estimators fail{'s' * (sound == 1)} on none"
 
 
-def _by_wins(parts: Sequence[tuple[Family, Sequence[Line]]]) -> list[str]:
+def _by_wins(parts: Sequence[tuple[Family, Sequence[Curve]]]) -> list[str]:
     """Return the estimators, the one that is lowest most often first."""
     wins = Counter(label for _, curves in parts for labels in winners(curves).values() for label in labels)
     return sorted(dict.fromkeys(line.label for _, curves in parts for line in curves), key=lambda name: -wins[name])
 
 
-def _change(line: Line) -> float:
+def _change(line: Curve) -> float:
     """Return the ratio of a line's largest to its smallest error; 1 where it has fewer than two."""
     rows = line.rows[line.rows["status"] == "ok"]
     errors = rows.loc[np.isfinite(rows["rmse_rel"]), "rmse_rel"]
     return float(errors.max() / errors.min()) if len(errors) > 1 and errors.min() > 0 else 1.0
 
 
-def _failures(curves: Sequence[Line], name: str) -> dict[float, bool]:
+def _failures(curves: Sequence[Curve], name: str) -> dict[float, bool]:
     """Return, at each ``x`` that an estimator was run at, whether it failed on any backend; refused cells are left out."""
     where: dict[float, bool] = {}
     for line in curves:
@@ -165,10 +165,10 @@ def _where(
         others = {str(f.identity.get(key, "")) for i, f in enumerate(families) if i not in failing and bad[i]}
         if others and not mine & others and not {"", "none"} & (mine | others):
             return f"{text} with {' and '.join(sorted(mine))}, not with {' and '.join(sorted(others))}".strip()
-    ran = sum(map(bool, bad))
-    if not beyond and len(failing) < ran and len(failing) <= NAMED:
+    n_run = sum(map(bool, bad))
+    if not beyond and len(failing) < n_run and len(failing) <= NAMED:
         return " and ".join(f"{_spoken(span(bad[i]), axis)} on {families[i].title()}" for i in failing)
     if not text and len(spans) == 1:
         text = "everywhere"
-    where = "" if len(failing) == ran else f" in {len(failing)} of {ran} problems"
+    where = "" if len(failing) == n_run else f" in {len(failing)} of {n_run} problems"
     return (text + where).strip() or "at some values"

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from bench.experiment.cell import Cell
+from bench.experiment.session import Session
 from bench.measure import noise, statistics, timing
 from bench.model import SURROGATE, Auxiliaries, Problem
 from bench.studies.bias_variance.estimates import Estimates
-from bench.sweep.cell import Cell
-from bench.sweep.session import Session
 
 
 def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> dict[str, Any]:

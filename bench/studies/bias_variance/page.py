@@ -9,31 +9,33 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
+from bench.experiment import axes
+from bench.experiment.experiment import Experiment
 from bench.model import registry
 from bench.report.style import Look
 from bench.report.text import axis_value, counted, duration, number
 from bench.report.views import (
     CATEGORIES,
     Arranged,
+    Curve,
     Family,
-    Line,
     along,
     arranged,
-    families,
+    attempted,
     lines,
-    ran,
     resolved,
     rmse_interval,
+    split_by_problem,
     unsteady,
 )
 from bench.report.web.content import (
     DASHES,
     STATUS,
     SYMBOLS,
-    Axis,
     Chart,
-    Column,
     Content,
+    PlotAxis,
+    TableColumn,
     identity_columns,
     look,
     nothing_ran,
@@ -43,29 +45,27 @@ from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, at_equal_cost
 from bench.studies.bias_variance.findings import lowest, problems, span, winners
 from bench.studies.bias_variance.panels import FLOOR
 from bench.studies.bias_variance.tables import problem
-from bench.sweep import axes
-from bench.sweep.experiment import Experiment
 
-BIAS = Axis(
+BIAS = PlotAxis(
     "bias_shown", "relative bias |bias| / |∇J|", True, "bias_from", "bias_to", "bias_limit", "larger than the gradient"
 )
-VARIANCE = Axis("variance_rel", "relative variance of one estimate", True, "variance_from", "variance_to")
-RMSE = Axis("rmse_rel", "relative RMSE of one estimate", above_one="worse than answering zero")
+VARIANCE = PlotAxis("variance_rel", "relative variance of one estimate", True, "variance_from", "variance_to")
+RMSE = PlotAxis("rmse_rel", "relative RMSE of one estimate", above_one="worse than answering zero")
 TIMES = (
-    Axis("time_s", "time of one estimate [s]"),
-    Axis("time_total_s", "time of the first estimate, with compilation [s]"),
-    Axis("rollouts", "rollouts of one estimate"),
+    PlotAxis("time_s", "time of one estimate [s]"),
+    PlotAxis("time_total_s", "time of the first estimate, with compilation [s]"),
+    PlotAxis("rollouts", "rollouts of one estimate"),
 )
 RESULTS = [
-    Column("bias_shown", "rel. bias", "limit", "bias_limit"),
-    Column("variance_rel", "rel. variance"),
-    Column("rmse_rel", "rel. RMSE"),
-    Column("cosine", "cosine"),
-    Column("compile_s", "compile", "seconds"),
-    Column("rollouts", "rollouts"),
+    TableColumn("bias_shown", "rel. bias", "limit", "bias_limit"),
+    TableColumn("variance_rel", "rel. variance"),
+    TableColumn("rmse_rel", "rel. RMSE"),
+    TableColumn("cosine", "cosine"),
+    TableColumn("compile_s", "compile", "seconds"),
+    TableColumn("rollouts", "rollouts"),
 ]
 POOLED = ("horizon", "dt", "stiffness", "sigma", "smoothing")
-TIME = Column("time_s", "time", "seconds", "unsteady")
+TIME = TableColumn("time_s", "time", "seconds", "unsteady")
 GOAL = 0.1
 """Relative RMSE for which the fastest method is named."""
 IN_SIGHT = 5
@@ -103,7 +103,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
             marks = dict(shown.marks(axis))
             text = "Bars are 95% intervals. A hollow marker is the upper limit of a bias that cannot be distinguished from 0."
             shape = {"table": name, "facet": "facet", "line": "line", "marks": marks}
-            x = [Axis("x", axis.title)]
+            x = [PlotAxis("x", axis.title)]
             charts.append(Chart(f"Bias and variance along {name}", text, x, [BIAS, VARIANCE, RMSE], **shape))  # type: ignore[arg-type]
     charts.append(
         Chart(
@@ -172,7 +172,7 @@ def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
     drawn = [BIAS.column, BIAS.low, BIAS.high, BIAS.limit, VARIANCE.column, VARIANCE.low, VARIANCE.high, RMSE.column]
     merged = rows["seed"].nunique() > 1
     parts = []
-    for family in families(shown, along(shown, axis), ("scene", "contact")):
+    for family in split_by_problem(shown, along(shown, axis), ("scene", "contact")):
         part = family.rows[family.rows["status"] == "ok"]
         if part["x"].nunique() > 1:
             part = part.sort_values(["line", "x"], kind="stable").assign(
@@ -187,7 +187,7 @@ def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
     styles = Look(rows, sorted(registry.entries()["estimators"]))
     looks = {}
     for estimator, params in dict.fromkeys(zip(rows["estimator"], rows["estimator_params"], strict=True)):
-        line = Line(estimator, params, {}, rows.iloc[:0], {}, frozenset(), 0)
+        line = Curve(estimator, params, {}, rows.iloc[:0], {}, frozenset(), 0)
         style = styles.marked(line)
         looks[line.label] = look(style["color"], SYMBOLS[style["marker"]], DASHES[str(style["linestyle"])])
     return looks
@@ -246,7 +246,7 @@ def failing(rows: pd.DataFrame) -> str:
     The estimator with the largest error comes first, at most :data:`NAMED` of them; nothing if none fails.
     """
     found = []
-    for label, part in ran(rows).groupby(_label(ran(rows)), sort=False):
+    for label, part in attempted(rows).groupby(_label(attempted(rows)), sort=False):
         good = part[(part["status"] == "ok") & np.isfinite(part["rmse_rel"])]
         bad = good[good["rmse_rel"] >= 1]
         lows = rmse_interval(bad)[0]
@@ -309,7 +309,7 @@ def fastest(rows: pd.DataFrame) -> str:
 
 def refused(rows: pd.DataFrame) -> str:
     """Write which backends refused every cell, with the commonest reason; nothing if none did."""
-    left = rows[(rows["status"] == "unsupported") & ~rows["backend"].isin(ran(rows)["backend"])]
+    left = rows[(rows["status"] == "unsupported") & ~rows["backend"].isin(attempted(rows)["backend"])]
     reasons = left.groupby("backend", sort=False)["reason"].agg(lambda reasons: reasons.mode().iloc[0])
     return "; ".join(f"{backend} refuses: {reason}" for backend, reason in reasons.items())
 

@@ -17,6 +17,7 @@ from matplotlib.patches import Patch
 from matplotlib.path import Path
 from matplotlib.transforms import Transform
 
+from bench.experiment.axes import Axis
 from bench.report.page import columns, page, shared
 from bench.report.scales import above, extent, log_axis, mark_values, scale_x, scale_y, shifts
 from bench.report.style import (
@@ -34,10 +35,9 @@ from bench.report.style import (
     quantity,
     twin,
 )
-from bench.report.views import Family, Line, lines, pareto, resolved, rmse_interval
+from bench.report.views import Curve, Family, lines, pareto, resolved, rmse_interval
 from bench.studies.bias_variance.costs import Cost
 from bench.studies.bias_variance.findings import headline, tally
-from bench.sweep.axes import Axis
 
 ALIKE = 0.03
 """Backends within this relative difference are one line: less could not be seen."""
@@ -87,7 +87,7 @@ def bias_variance(
     return figure
 
 
-def _deviation(line: Line, curves: Sequence[Line]) -> dict[str, Any]:
+def _deviation(line: Curve, curves: Sequence[Curve]) -> dict[str, Any]:
     """Return the line style of backends whose numbers differ from the first backend's."""
     place = twin(line, curves)
     return {"linestyle": DEVIANT[(place - 1) % len(DEVIANT)]} if place else {}
@@ -131,7 +131,7 @@ def _scale(rows: pd.DataFrame) -> np.ndarray:
     return np.where((norm > 0) & np.isfinite(norm), norm, 1.0)
 
 
-def _draw_errors(panel: Axes, line: Line, place: Transform, style: Mapping[str, Any], column: str, power: int) -> None:
+def _draw_errors(panel: Axes, line: Curve, place: Transform, style: Mapping[str, Any], column: str, power: int) -> None:
     """Draw one estimator's RMSE, bias or variance along the axis at ``place``, and crosses where cells were lost."""
     points, at = _estimates(line.rows, column, power), line.rows.index.to_numpy(float)
     curve = {**style, "marker": "", "alpha": 0.75}
@@ -168,7 +168,7 @@ def _draw_points(panel: Axes, at: np.ndarray, found: Points, style: Mapping[str,
 
 
 def _line_legends(
-    drawn: Sequence[Sequence[Line]], look: Look, axis: Axis, marks: Mapping[str, float]
+    drawn: Sequence[Sequence[Curve]], look: Look, axis: Axis, marks: Mapping[str, float]
 ) -> tuple[list[Any], list[Any]]:
     """Return legend handles: estimators, then the meaning of symbols."""
     every = [(line, curves) for curves in drawn for line in curves]
@@ -251,7 +251,7 @@ MARGIN = 0.75
 GUIDE: dict[str, Any] = {"color": "#b0b0b0", "linewidth": 0.8, "zorder": 0.4}
 
 
-def _draw_curve(panel: Axes, line: Line, cost: Cost, style: Mapping[str, Any]) -> None:
+def _draw_curve(panel: Axes, line: Curve, cost: Cost, style: Mapping[str, Any]) -> None:
     rows = cost.known(line.rows)
     if rows.empty:
         return
@@ -281,9 +281,9 @@ def _draw_guide(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
     )
 
 
-def _name_curves(panel: Axes, curves: Sequence[Line], cost: Cost, look: Look, width: float) -> None:
+def _name_curves(panel: Axes, curves: Sequence[Curve], cost: Cost, look: Look, width: float) -> None:
     """Write each estimator's name at the end of its cheapest curve, names apart and within the ``width`` in inches."""
-    ends: dict[str, tuple[float, float, Line]] = {}
+    ends: dict[str, tuple[float, float, Curve]] = {}
     for line in curves:
         rows = cost.known(line.rows)
         if not rows.empty:
@@ -358,12 +358,12 @@ def overview(problems: Sequence[Family], notes: Sequence[str], look: Look) -> Fi
     return figure
 
 
-def _row_label(line: Line, curves: Sequence[Line]) -> str:
+def _row_label(line: Curve, curves: Sequence[Curve]) -> str:
     unique = sum(other.label == line.label for other in curves) == 1
     return line.label if unique else f"{line.label}, {'/'.join(line.backends)}"
 
 
-def _draw_dot(panel: Axes, line: Line, height: int, colour: str) -> None:
+def _draw_dot(panel: Axes, line: Curve, height: int, colour: str) -> None:
     panel.axhline(height, color="#e5e5e5", linewidth=0.6, zorder=0)
     rows = line.rows
     error = rows["rmse"] / _scale(rows)

@@ -13,12 +13,12 @@ from functools import cache
 from typing import Any
 
 from bench.errors import unknown
+from bench.experiment.axes import Axis
+from bench.experiment.experiment import Experiment
 from bench.report.tables import escape_latex, escape_markdown
 from bench.report.text import axis_value, number
-from bench.report.views import Arranged, Family, along, families, lines, rmse_interval
+from bench.report.views import Arranged, Family, along, lines, rmse_interval, split_by_problem
 from bench.studies.bias_variance.findings import problems
-from bench.sweep.axes import Axis
-from bench.sweep.experiment import Experiment
 
 WIDTH = 504.0
 """Points of text width over two columns, 7 inches, as most journals and conferences have at least."""
@@ -41,7 +41,7 @@ FAILURES = {
 
 
 @dataclass(frozen=True)
-class Cell:
+class PivotCell:
     """One cell as strings, not yet escaped."""
 
     value: str = ""
@@ -60,7 +60,7 @@ class Block:
     title: str
     axis: str
     values: tuple[str, ...]
-    rows: tuple[tuple[str, tuple[Cell, ...]], ...]
+    rows: tuple[tuple[str, tuple[PivotCell, ...]], ...]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Pivot:
     title: str
     blocks: tuple[Block, ...]
 
-    def cells(self) -> Iterator[Cell]:
+    def cells(self) -> Iterator[PivotCell]:
         """Yield every cell."""
         return (cell for block in self.blocks for _, cells in block.rows for cell in cells)
 
@@ -80,7 +80,7 @@ def pivot(experiment: Experiment, shown: Arranged) -> Pivot:
     parts: Sequence[tuple[Axis | None, Family]] = problems(shown)
     if experiment.table.columns:
         axis = _axis(experiment.table.columns, shown)
-        parts = [(axis, family) for family in families(shown, along(shown, axis))]
+        parts = [(axis, family) for family in split_by_problem(shown, along(shown, axis))]
     apart = "backend" in experiment.table.rows
     blocks = tuple(_block(axis, family, apart) for axis, family in parts)
     return Pivot(f"{experiment.name}: relative RMSE of one estimate", blocks)
@@ -108,16 +108,16 @@ def _block(axis: Axis | None, family: Family, apart: bool) -> Block:
     return Block(family.title(), axis.title if axis is not None else "", across, tuple(rows))
 
 
-def _cell(row: Mapping[str, Any] | None, others: Sequence[Mapping[str, Any] | None]) -> Cell:
+def _cell(row: Mapping[str, Any] | None, others: Sequence[Mapping[str, Any] | None]) -> PivotCell:
     if row is None:
-        return Cell()
+        return PivotCell()
     if row["status"] != "ok":
-        return Cell(failure=str(row["status"]), noted=bool(row["reason"]))
+        return PivotCell(failure=str(row["status"]), noted=bool(row["reason"]))
     low, high = rmse_interval(row)
     interval = f"[{number(low)}, {number(high)}]" if math.isfinite(low + high) else ""
     rivals = [rmse_interval(other)[0] for other in others if other is not None and other["status"] == "ok"]
     best = row["rmse_rel"] < 1 and bool(rivals) and all(high < rival for rival in rivals)
-    return Cell(number(row["rmse_rel"]), interval, best, noted=bool(row["reason"]))
+    return PivotCell(number(row["rmse_rel"]), interval, best, noted=bool(row["reason"]))
 
 
 def notes(table: Pivot) -> list[str]:
@@ -148,7 +148,7 @@ def markdown(table: Pivot) -> str:
     return "\n".join([*out, *(f"- {sign} {what}" for sign, what in _failures(table, 0))]) + "\n"
 
 
-def _in_markdown(cell: Cell) -> str:
+def _in_markdown(cell: PivotCell) -> str:
     mark = "?" if cell.noted else ""
     if cell.failure:
         return FAILURES[cell.failure][0] + mark
@@ -204,7 +204,7 @@ def _tabular(block: Block) -> list[str]:
     ]  # fmt: skip
 
 
-def _in_latex(cell: Cell) -> str:
+def _in_latex(cell: PivotCell) -> str:
     mark = "?" if cell.noted else ""
     if cell.failure:
         return FAILURES[cell.failure][1] + mark

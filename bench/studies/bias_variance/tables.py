@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.experiment import axes
+from bench.experiment.columns import IDENTITY
+from bench.experiment.experiment import Experiment
 from bench.measure.statistics import UNEXPLAINED, unexplained
 from bench.report.tables import csv, escape_markdown
 from bench.report.text import axis_value, number
 from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, arranged, bias_text, pareto, unsteady
+from bench.run.files import write_all
 from bench.studies.bias_variance import pivot
-from bench.sweep import axes
-from bench.sweep.columns import IDENTITY
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_all
 
 DOUBTED = " ?"
 FOOTNOTES = [

@@ -13,12 +13,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from bench.experiment.axes import Axis
+from bench.experiment.experiment import Experiment
 from bench.measure.statistics import UNEXPLAINED, unexplained
 from bench.report.text import axis_value, duration, number, one_line
 from bench.report.views import (
     UNSTEADY,
+    Curve,
     Family,
-    Line,
     arranged,
     bias_text,
     lines,
@@ -28,8 +30,6 @@ from bench.report.views import (
 )
 from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, EQUAL_TIME, at_equal_cost
 from bench.studies.bias_variance.findings import TIE, lowest, problems, span, winners
-from bench.sweep.axes import Axis
-from bench.sweep.experiment import Experiment
 
 GOALS = (0.3, 0.1, 0.03)
 """Relative RMSEs for which the fastest method is named."""
@@ -138,22 +138,22 @@ def _rmse(row: Any, best: float) -> Text:
     return Text(number(value) + mark, "bold green" if mark and value < 1 else "red" if value >= 1 else "")
 
 
-def _backends(line: Line) -> list[str]:
+def _backends(line: Curve) -> list[str]:
     return [("" if exact else "~") + name for name, exact in line.backends.items()]
 
 
-def _times(line: Line) -> list[str]:
+def _times(line: Curve) -> list[str]:
     return [duration(seconds) + UNSTEADY * (name in line.noisy) for name, seconds in line.seconds.items()]
 
 
-def _timed_backends(line: Line, width: int) -> str:
+def _timed_backends(line: Curve, width: int) -> str:
     """Write ``jax 0.21ms, torch 12ms``, broken between backends."""
     times = [time.replace(" ", "") for time in _times(line)]
     text = ", ".join(f"{name}\0{time}" for name, time in zip(_backends(line), times, strict=True))
     return textwrap.fill(text, width, initial_indent="  ", subsequent_indent="  ").replace("\0", " ")
 
 
-def _values(curves: Sequence[Line]) -> list[float]:
+def _values(curves: Sequence[Curve]) -> list[float]:
     return sorted({x for line in curves for x in line.at})
 
 
@@ -217,7 +217,7 @@ def _show_verdict(console: Console, group: Family, axis: Axis | None) -> None:
         _print_wrapped(console, f"first to a relative RMSE of {'; '.join(parts)}", 4)
 
 
-def _winners(curves: Sequence[Line], error: str) -> str:
+def _winners(curves: Sequence[Curve], error: str) -> str:
     """Write the estimators of lowest error, and where along the axis they are; nothing where the cost is not known."""
     named = {x: ", ".join(labels) for x, labels in winners(curves, error).items()}
     ranges = {text: span({x: names == text for x, names in named.items()}) for text in named.values()}

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.experiment import Experiment
+from bench.experiment.session import Session
+from bench.experiment.study import Study
 from bench.measure.gradcheck import VERDICTS
 from bench.model import param
-from bench.sweep.cell import Cell
-from bench.sweep.columns import Column, Columns, Judged, numbers, text
-from bench.sweep.experiment import Experiment
-from bench.sweep.session import Session
-from bench.sweep.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,7 +32,11 @@ class GradientCheck(Study):
             "taylor_order", "order of the Taylor remainder along random directions: 2 for a right gradient, 1 if wrong"
         ),
         Column("cost_noise", "measured standard deviation of the cost's own noise"),
-        text("verdict", "the worst verdict of the checks", judged=Judged("verdict", "verdict", order=VERDICTS)),
+        text(
+            "verdict",
+            "the worst verdict of the checks",
+            comparison=ComparisonRule("verdict", "verdict", order=VERDICTS),
+        ),
         text("command", "a line for the shell that repeats the checks"),
         text("device", "what the program ran on"),
         numbers("component", "components of theta that were checked one by one"),
@@ -71,9 +75,9 @@ class GradientCheck(Study):
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Make all checks of one cell."""
-        from bench.studies.gradient_check.measure import Search, measure
+        from bench.studies.gradient_check.measure import SwitchSearch, measure
 
-        return measure(cell, session, Search(self.directions, self.drawn, self.reach, self.aside, self.around))
+        return measure(cell, session, SwitchSearch(self.directions, self.drawn, self.reach, self.aside, self.around))
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         """Write the tables and the matrix of verdicts."""

@@ -12,16 +12,16 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
+from bench.experiment.experiment import Experiment
 from bench.measure.gradcheck import BROKEN, FAULTS, TRUSTED, UNDECIDED, VERDICTS
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.style import PALETTE, plain
 from bench.report.text import counted
 from bench.report.views import Arranged, arranged
+from bench.run.files import write_whole
 from bench.studies.gradient_check.places import trusted
 from bench.studies.gradient_check.report import POINTS, by_point, problem_of
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_whole
 
 BLUE, BLACK, RED, GREEN, PINK, ORANGE, SKY, _ = PALETTE
 KINDS: dict[str, tuple[tuple[str, ...], str, str]] = {

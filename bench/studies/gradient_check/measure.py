@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from bench.experiment.cell import Cell
+from bench.experiment.session import Session
 from bench.measure import gradcheck, noise
 from bench.measure.contacts import acting
 from bench.model import SURROGATE, ContactScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
 from bench.report.reproduce import check_of
 from bench.studies.gradient_check.places import trusted
-from bench.sweep.cell import Cell
-from bench.sweep.session import Session
 
 COLUMNS_AT_ONCE = 128
 """Rollouts per evaluation, always the same number so that a compiling backend compiles once."""
@@ -39,7 +39,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Search:
+class SwitchSearch:
     """Where gradients are checked; see the parameters of the study."""
 
     directions: int
@@ -49,7 +49,7 @@ class Search:
     around: int = 8
 
 
-def measure(cell: Cell, session: Session, search: Search) -> dict[str, Any]:
+def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any]:
     """Make all checks of one cell."""
     problem = session.problem(cell)
     theta = problem.program.theta0
@@ -122,7 +122,7 @@ class Point:
     plus: Sequence[str]
 
 
-def start(problem: Problem, theta: np.ndarray, unit: float, search: Search, seed: int) -> gradcheck.Check:
+def start(problem: Problem, theta: np.ndarray, unit: float, search: SwitchSearch, seed: int) -> gradcheck.Check:
     """Check every component at theta without noise, random directions there and around it.
 
     Costs come in batches of one width, so that a compiling backend compiles once. A gradient is the last column of a
@@ -202,7 +202,7 @@ Modes = Callable[[np.ndarray, np.ndarray], list[str]]
 
 
 def examine(
-    problem: Problem, theta: np.ndarray, drawn: np.ndarray, directions: np.ndarray, unit: float, search: Search
+    problem: Problem, theta: np.ndarray, drawn: np.ndarray, directions: np.ndarray, unit: float, search: SwitchSearch
 ) -> tuple[list[Place], list[tuple[gradcheck.Sample, list[tuple[str, str]]]]]:
     """Make checks at ``theta (d,)``, without noise and with ``drawn (n_w,)``, along the first ``directions (D, d)``.
 
@@ -244,7 +244,7 @@ def examine(
 
 
 def boundary(
-    modes: Modes, theta: np.ndarray, direction: np.ndarray, w: np.ndarray, number: int, search: Search
+    modes: Modes, theta: np.ndarray, direction: np.ndarray, w: np.ndarray, number: int, search: SwitchSearch
 ) -> list[Place]:
     """Return places just before, at and just after the switch of contact mode nearest to theta, if there is one."""
     scale = scale_of(theta)

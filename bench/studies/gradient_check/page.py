@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import pandas as pd
 
+from bench.experiment.experiment import Experiment
 from bench.measure.gradcheck import UNTRUSTED, VERDICTS
 from bench.report.style import PALETTE
 from bench.report.text import counted, number
 from bench.report.views import Arranged, arranged
 from bench.report.web.content import (
     STATUS,
-    Axis,
     Chart,
-    Column,
     Content,
+    PlotAxis,
+    TableColumn,
     identity_columns,
     look,
     problems,
@@ -21,7 +22,6 @@ from bench.report.web.content import (
     together,
 )
 from bench.studies.gradient_check.report import PROBLEM, by_point, doubtful, long_table
-from bench.sweep.experiment import Experiment
 
 POINTS = {"start": 0, "before": 5, "at": 2, "after": 3}
 """Colours, as places in the palette, of the points at which gradients are checked."""
@@ -33,8 +33,8 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     chart = Chart(
         "Error against the step of the differences",
         "A right gradient falls with eps^2 until rounding takes over; one that is wrong stays on a level.",
-        [Axis("eps", "eps, in units of the natural scale")],
-        [Axis("relative_error", "relative error", above_one="larger than the gradient")],
+        [PlotAxis("eps", "eps, in units of the natural scale")],
+        [PlotAxis("relative_error", "relative error", above_one="larger than the gradient")],
         table="checks",
         facet="problem",
         line="line",
@@ -44,9 +44,9 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         rows=shown.rows.assign(series=rows["verdict"]),
         columns=[
             *identity_columns(shown.rows, [axis.column for axis in shown.axes]),
-            Column("verdict", "verdict", "text"),
-            Column("best_error", "best error"),
-            Column("best_eps", "at eps"),
+            TableColumn("verdict", "verdict", "text"),
+            TableColumn("best_error", "best error"),
+            TableColumn("best_eps", "at eps"),
             *STATUS,
         ],
         charts=[chart],

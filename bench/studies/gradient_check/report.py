@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.experiment.axes import parsed, with_axes
+from bench.experiment.columns import IDENTITY
+from bench.experiment.experiment import Experiment
 from bench.measure.gradcheck import VERDICTS
 from bench.report.tables import escape_markdown
 from bench.report.text import counted, number
 from bench.report.views import Arranged, arranged
-from bench.report.web.content import columns_of, grouped, problems, shown_as, telling, together
+from bench.report.web.content import columns_of, distinguishing_columns, grouped, problems, shown_as, together
+from bench.run.files import write_all
 from bench.studies.gradient_check import GradientCheck
 from bench.studies.gradient_check.places import trusted
-from bench.sweep.axes import parsed, with_axes
-from bench.sweep.columns import IDENTITY
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_all
 
 POINTS = ("start", "before", "at", "after")
 """The points at which gradients are checked."""
@@ -119,7 +119,7 @@ def markdown(shown: Arranged) -> str:
     title = shown.experiment.question or shown.experiment.name
     out = [f"# {escape_markdown(title)}", ""]
     always = (*PROBLEM, "horizon")
-    named = telling(rows, grouped(rows, PROBLEM), columns_of(shown, PROBLEM), always)
+    named = distinguishing_columns(rows, grouped(rows, PROBLEM), columns_of(shown, PROBLEM), always)
     named = [*always, *(name for name in named if name not in always)]
     headers = [*named, "point", "backends", "verdict", "best error", "best eps"]
     texts = [rows[name].map(type).eq(str).all() for name in named]

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Columns
+from bench.experiment.experiment import Experiment
+from bench.experiment.session import Session
+from bench.experiment.study import Study
 from bench.model import param
 from bench.studies.growth.columns import COLUMNS
-from bench.sweep.cell import Cell
-from bench.sweep.columns import Columns
-from bench.sweep.experiment import Experiment
-from bench.sweep.session import Session
-from bench.sweep.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,7 +1,7 @@
 """The columns of the growth study."""
 
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
 from bench.studies.growth.measure import QUANTILES
-from bench.sweep.columns import Column, Columns, Judged, numbers, text
 
 ORDERS = {"first_order": "first-order", "zeroth_order": "zeroth-order"}
 COLUMNS = Columns.of(
@@ -10,7 +10,7 @@ COLUMNS = Columns.of(
     Column("gradient_mean", "norm of the mean gradient"),
     Column("finite_fraction", "share of rollouts whose cost and gradient are finite"),
     Column("stretch_rate", "log of the largest singular value of dx_N/dx_0, per step",
-           judged=Judged("interval", "growth rate", neutral=True)),
+           comparison=ComparisonRule("interval", "growth rate", neutral=True)),
     Column("stretch_low", "lower end of its 95% interval"),
     Column("stretch_high", "upper end of its 95% interval"),
     Column("spectral_rate", "log of the spectral radius of dx_N/dx_0, per step"),

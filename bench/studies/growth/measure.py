@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from bench.experiment.cell import Cell
+from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import Jacobians, Problem, Rollout, columns
-from bench.sweep.cell import Cell
-from bench.sweep.session import Session
 
 QUANTILES = {"low": 0.05, "quarter": 0.25, "median": 0.5, "three_quarters": 0.75, "high": 0.95}
 """Quantiles over noise samples that are stored for heavy-tailed quantities."""

@@ -5,31 +5,31 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from bench.experiment.experiment import Experiment
 from bench.report.style import PALETTE
 from bench.report.text import axis_value, number
 from bench.report.views import Arranged, arranged
 from bench.report.web.content import (
     STATUS,
-    Axis,
     Chart,
-    Column,
     Content,
+    PlotAxis,
+    TableColumn,
     identity_columns,
     look,
     looks,
     nothing_ran,
 )
 from bench.studies.growth.report import grown, problem_of
-from bench.sweep.experiment import Experiment
 
-HORIZON = [Axis("time_horizon", "horizon [s]"), Axis("horizon", "horizon [steps]")]
+HORIZON = [PlotAxis("time_horizon", "horizon [s]"), PlotAxis("horizon", "horizon [steps]")]
 RESULTS = [
-    Column("growth", "growth", "text"),
-    Column("gradient_median", "|gradient|, median"),
-    Column("stretch_rate", "stretch / step"),
-    Column("spectral_rate", "spectral / step"),
-    Column("first_order_variance", "variance, first order"),
-    Column("zeroth_order_variance", "variance, zeroth order"),
+    TableColumn("growth", "growth", "text"),
+    TableColumn("gradient_median", "|gradient|, median"),
+    TableColumn("stretch_rate", "stretch / step"),
+    TableColumn("spectral_rate", "spectral / step"),
+    TableColumn("first_order_variance", "variance, first order"),
+    TableColumn("zeroth_order_variance", "variance, zeroth order"),
 ]
 ORDERS = {"first_order": "first order", "zeroth_order": "zeroth order"}
 
@@ -44,11 +44,11 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         "Median over noise samples; bars from 5% to 95% of them.",
         HORIZON,
         [
-            Axis("gradient_median", "norm of one sample's gradient", True, "gradient_low", "gradient_high"),
-            Axis(
+            PlotAxis("gradient_median", "norm of one sample's gradient", True, "gradient_low", "gradient_high"),
+            PlotAxis(
                 "spectral_rate", "growth per step: log of the spectral radius", False, "spectral_low", "spectral_high"
             ),
-            Axis(
+            PlotAxis(
                 "stretch_rate",
                 "growth per step: log of the largest singular value",
                 False,
@@ -62,7 +62,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         "Variance per sample of both orders",
         "Where the lines cross the zeroth order becomes the better one.",
         HORIZON,
-        [Axis("variance", "variance per sample", True, "low", "high")],
+        [PlotAxis("variance", "variance per sample", True, "low", "high")],
         table="variances",
         facet="problem",
         line="series",
@@ -70,8 +70,8 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     gains = Chart(
         "How far back does a gradient reach?",
         "Largest singular value of the Jacobian product over that many steps: median and 5% to 95% of the rollouts.",
-        [Axis("lag", "lag [steps]")],
-        [Axis("gain", "gain", True, "gain_low", "gain_high")],
+        [PlotAxis("lag", "lag [steps]")],
+        [PlotAxis("gain", "gain", True, "gain_low", "gain_high")],
         table="gains",
         line="line",
     )

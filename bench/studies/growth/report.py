@@ -17,18 +17,18 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
 
+from bench.experiment.axes import table
+from bench.experiment.experiment import Experiment
+from bench.report.colours import ink
 from bench.report.figures import save, styled
-from bench.report.ink import ink
 from bench.report.page import WIDTH
 from bench.report.scales import log_axis
 from bench.report.style import PALETTE, plain
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted, number
-from bench.report.views import Arranged, arranged, ran
-from bench.report.web.content import columns_of, grouped, problems, shown_as, telling, together
-from bench.sweep.axes import table
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_all
+from bench.report.views import Arranged, arranged, attempted
+from bench.report.web.content import columns_of, distinguishing_columns, grouped, problems, shown_as, together
+from bench.run.files import write_all
 
 NORM: dict[str, Any] = {"color": "#000000", "marker": "o"}
 SINGULAR: tuple[dict[str, Any], ...] = (
@@ -88,7 +88,7 @@ def problem_of(shown: Arranged, rows: pd.DataFrame | None = None) -> pd.Series:
 def named(shown: Arranged) -> list[str]:
     """Return the columns that distinguish the lines of the table, besides the horizon."""
     along = together(shown, "horizon")
-    return telling(
+    return distinguishing_columns(
         shown.rows, grouped(shown.rows, PROBLEM, along), columns_of(shown, PROBLEM, along), ("scene", "contact")
     )
 
@@ -166,7 +166,7 @@ def grown(growths: Mapping[str, str]) -> str:
 
 def figure(shown: Arranged) -> Figure | None:
     """Draw a column of panels per problem: norms of sampled gradients, the Jacobian product, variances per sample."""
-    rows = ran(shown.rows)
+    rows = attempted(shown.rows)
     rows = rows[np.isfinite(rows["gradient_median"])]
     groups = [
         (str(name), part.sort_values("time_horizon"))

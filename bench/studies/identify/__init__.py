@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.experiment import Experiment
+from bench.experiment.session import Session
+from bench.experiment.study import Study
 from bench.model import Identified, MechanicalScene, Optimizer, param
-from bench.sweep.cell import Cell
-from bench.sweep.columns import Column, Columns, Judged, numbers, text
-from bench.sweep.experiment import Experiment
-from bench.sweep.session import Session
-from bench.sweep.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,7 +28,7 @@ class Identify(Study):
         text("words", "what the record can and cannot tell"),
         Column("rank", "directions of the parameters that the record sees"),
         Column("condition", "largest singular value of the information over the smallest that is seen",
-               judged=Judged("exact", "condition number")),
+               comparison=ComparisonRule("exact", "condition number")),
         Column("fits", "records that were fitted"),
         Column("step_shift", "largest relative change of an estimate when the model's step is halved, without noise"),
         text("step_note", "whether the estimate holds for its time step only"),
@@ -65,7 +65,7 @@ class Identify(Study):
 
         return measure(cell, self)
 
-    def refuses(self, cell: Cell) -> str | None:
+    def unsupported_reason(self, cell: Cell) -> str | None:
         """Refuse scenes without unknowns or steps that NumPy can take, truths that are not positive, data of another length."""
         from bench.studies.identify.measure import read
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from bench.errors import Unsupported
+from bench.experiment.cell import Cell
 from bench.measure import noise, performance
 from bench.measure.identification import Information
 from bench.model import Answer, Decision, Identified, LoopOps, MechanicalScene, Optimizer, Rollout, State, compose
-from bench.sweep.cell import Cell
 
 STEP = 1e-5
 """Step of central differences in logarithms: errors about 1e-10 relative."""

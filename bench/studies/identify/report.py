@@ -11,16 +11,16 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from bench.experiment.axes import table
+from bench.experiment.experiment import Experiment
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.style import MARKERS, PALETTE, plain
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted, number
-from bench.report.views import Arranged, arranged, ran
+from bench.report.views import Arranged, arranged, attempted
 from bench.report.web.content import problems
-from bench.sweep.axes import table
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_all
+from bench.run.files import write_all
 
 PARTS = ("scene", "contact", "integrator")
 NOTES = (
@@ -50,7 +50,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 def flat(shown: Arranged) -> pd.DataFrame:
     """Return a line per problem, optimizer, seed and way of fitting."""
-    kept = ran(shown.rows)
+    kept = attempted(shown.rows)
     kept = kept[kept["status"] == "ok"]
     names = problems(shown, PARTS, rows=kept)
     names = names + (", " + kept["optimizer"] if kept["optimizer"].nunique() > 1 else "")

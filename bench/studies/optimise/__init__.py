@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.experiment import Experiment
+from bench.experiment.session import Session
+from bench.experiment.study import Study
 from bench.model import KnownOptimum, Optimizer, Plugin, param
 from bench.model.program import OWN
-from bench.sweep.cell import Cell
-from bench.sweep.columns import Column, Columns, Judged, numbers, text
-from bench.sweep.experiment import Experiment
-from bench.sweep.session import Session
-from bench.sweep.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,7 +36,7 @@ class Optimise(Study):
         Column("gradient_ratio", "seconds of a gradient over those of a rollout, measured", measured=True),
         Column("search_s", "seconds of the search, compilation and scores not counted", "s", measured=True),
         Column("start_cost", "objective at the start"),
-        Column("final_cost", "objective at the last theta", judged=Judged("exact", "final cost")),
+        Column("final_cost", "objective at the last theta", comparison=ComparisonRule("exact", "final cost")),
         Column("best_cost", "lowest objective on the path"),
         Column("optimum", "least cost known before the search, J*"),
         text("optimum_status", "how J* is known"),
@@ -73,10 +73,10 @@ class Optimise(Study):
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Search once; without timing, together with the seeds that come after, so that their rollouts are one batch."""
-        from bench.studies.optimise.abreast import measure_abreast
+        from bench.studies.optimise.batched import measure_batched
         from bench.studies.optimise.measure import measure
 
-        return measure(cell, session, self) if cell.timing else measure_abreast(cell, session, self)
+        return measure(cell, session, self) if cell.timing else measure_batched(cell, session, self)
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
         """Leave out the estimator where the optimizer looks at costs only: all would give the same search."""
@@ -85,7 +85,7 @@ class Optimise(Study):
             return given | {"estimator": None}
         return given
 
-    def refuses(self, cell: Cell) -> str | None:
+    def unsupported_reason(self, cell: Cell) -> str | None:
         """Refuse an optimizer whose needs nothing meets, and a target below the least cost."""
         optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
         assert isinstance(optimizer, Optimizer)

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 
 from bench.report.text import counted, number
-from bench.studies.optimise import races
-from bench.studies.optimise.races import Races
+from bench.studies.optimise import aggregate
+from bench.studies.optimise.aggregate import RunSet
 
 CHANCE = 0.05
 """Chance above which an order may be random."""
@@ -18,12 +18,17 @@ FEW_SEEDS = 5
 """Bootstrap intervals of fewer searches are too narrow: with two, half of the resamples are one search twice."""
 
 
-def sentences(found: Races, default: float) -> list[str]:
+def sentences(found: RunSet, default: float) -> list[str]:
     """Return the findings, the answer to the question first."""
     if not len(found.rows):
         return ["No search gave a result: the table has the reason of each."]
-    summed = races.summary(found, default)
-    said = [pays(races.correlations(races.quality(found, default))), ranking(summed), tuning(summed), stops(found)]
+    summed = aggregate.summary(found, default)
+    said = [
+        pays(aggregate.correlations(aggregate.quality(found, default))),
+        ranking(summed),
+        tuning(summed),
+        stops(found),
+    ]
     return [sentence for sentence in said if sentence]
 
 
@@ -129,7 +134,7 @@ def tuning(summed: pd.DataFrame) -> str:
     )
 
 
-def stops(found: Races) -> str:
+def stops(found: RunSet) -> str:
     """Say how many searches diverged."""
     lost = found.rows[found.rows["stopped"] == "diverged"]
     if lost.empty:

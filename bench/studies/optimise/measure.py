@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from bench.errors import StorageError
+from bench.experiment.cell import Cell
+from bench.experiment.session import Session
 from bench.measure import noise
 from bench.measure.solve import solve
 from bench.model import Answer, Estimator, KnownOptimum, Optimizer, Problem, Rollout
 from bench.model.program import OWN
-from bench.sweep.cell import Cell
-from bench.sweep.files import make_directory, write_whole
-from bench.sweep.session import Session
+from bench.run.files import make_directory, write_whole
 
 KEPT = 300
 """Points of a path that are kept, those of the first iterations all."""
@@ -28,7 +28,7 @@ Settings = Any
 """The study, whose parameters say how to search; it imports this module, so its type has no name here."""
 
 
-class Quieter(Problem):
+class ScaledNoiseProblem(Problem):
     """A problem whose noise is multiplied by a factor: the same compiled program, its sigma smaller by that factor."""
 
     def __init__(self, inner: Problem, factor: float) -> None:
@@ -83,7 +83,7 @@ class Path:
         return np.unique(np.append(spaced, np.nanargmin(self.cost)))
 
 
-class Search:
+class OptimizerRun:
     """One search on one problem, which can be stepped."""
 
     def __init__(self, cell: Cell, problem: Problem, settings: Settings) -> None:
@@ -135,7 +135,7 @@ class Search:
         assert self.estimator is not None
         problem = self.problem
         if self.settings.sigma_decay:
-            problem = Quieter(problem, iteration**-self.settings.sigma_decay)
+            problem = ScaledNoiseProblem(problem, iteration**-self.settings.sigma_decay)
         drawn = self._noise(iteration)
         return np.stack([self.estimator.estimate(problem, point, drawn)[0] for point in points.T], axis=1)
 
@@ -144,7 +144,7 @@ def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
     """Search until the budget, the target, a plateau or divergence."""
     problem = session.problem(cell)
     least, how = known_optimum(cell, problem, session, settings)
-    search = Search(cell, problem, settings)
+    search = OptimizerRun(cell, problem, settings)
     theta0 = np.array(problem.program.theta0, dtype=np.float64)
     found = qualities(search, theta0, settings, ("start",)) if settings.quality != "none" else {}
     state = search.optimizer.start(theta0)
@@ -193,7 +193,7 @@ PLACES = (0.25, 0.5, 0.75, 1.0)
 PATHS = ("iteration", "cost", "rollouts", "gradients")
 
 
-def walk(search: Search, state: dict[str, Any], settings: Settings) -> tuple[Path, str, list[np.ndarray]]:
+def walk(search: OptimizerRun, state: dict[str, Any], settings: Settings) -> tuple[Path, str, list[np.ndarray]]:
     """Return the path, what ended it, and theta at each of its points."""
     problem, path, thetas = search.problem, Path(), []
     problem.usage.rollouts = problem.usage.gradients = 0
@@ -315,7 +315,7 @@ _qualities: dict[tuple[Any, ...], dict[str, float]] = {}
 
 
 def qualities(
-    search: Search, theta: np.ndarray, settings: Settings, places: tuple[str, ...]
+    search: OptimizerRun, theta: np.ndarray, settings: Settings, places: tuple[str, ...]
 ) -> dict[str, dict[str, float]]:
     """Return, by place, the relative error, cosine and share of bias of the estimator's gradients at theta.
 

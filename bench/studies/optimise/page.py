@@ -7,17 +7,27 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.experiment.experiment import Experiment
 from bench.report.style import PALETTE
-from bench.report.web.content import STATUS, SYMBOLS, Axis, Chart, Column, Content, identity_columns, look, nothing_ran
-from bench.studies.optimise import findings, races
+from bench.report.web.content import (
+    STATUS,
+    SYMBOLS,
+    Chart,
+    Content,
+    PlotAxis,
+    TableColumn,
+    identity_columns,
+    look,
+    nothing_ran,
+)
+from bench.studies.optimise import aggregate, findings
 from bench.studies.optimise.report import default_ratio, looks, methods
-from bench.sweep.experiment import Experiment
 
 RESULTS = [
-    Column("method", "method", "text"), Column("stopped", "stopped", "text"), Column("scene_class", "class", "text"),
-    Column("final_cost", "final cost"), Column("least", "J*"), Column("score", "score"), Column("rollouts", "rollouts"),
-    Column("gradients", "gradients"), Column("search_s", "search", "seconds"),
-    Column("quality_rmse_rel", "gradient's error, relative"), Column("quality_bias_share", "share of bias"),
+    TableColumn("method", "method", "text"), TableColumn("stopped", "stopped", "text"), TableColumn("scene_class", "class", "text"),
+    TableColumn("final_cost", "final cost"), TableColumn("least", "J*"), TableColumn("score", "score"), TableColumn("rollouts", "rollouts"),
+    TableColumn("gradients", "gradients"), TableColumn("search_s", "search", "seconds"),
+    TableColumn("quality_rmse_rel", "gradient's error, relative"), TableColumn("quality_bias_share", "share of bias"),
 ]  # fmt: skip
 CLASS_COLOURS = dict(
     zip(("smooth", "stiff", "discontinuous", "chaotic", "identification"), (PALETTE[0], PALETTE[2], PALETTE[3], PALETTE[4], PALETTE[5]), strict=True)
@@ -26,14 +36,14 @@ CLASS_COLOURS = dict(
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return findings, charts and the table."""
-    found, default = races.races(experiment, rows), default_ratio(experiment)
+    found, default = aggregate.races(experiment, rows), default_ratio(experiment)
     ran = found.rows
     if not len(ran):
         return Content(nothing_ran(rows), rows, [*identity_columns(rows), *STATUS], [])
     table = rows.assign(**{name: ran[name] for name in ("problem", "method", "tuning", "least", "score")})
     table["score"], table["least"] = table["score"].astype(float), table["least"].astype(float)
     table = table.fillna({"problem": "", "method": "", "tuning": ""}).assign(series=lambda t: t["method"])
-    points = races.quality(found, default).assign(series=lambda t: t["scene_class"] if len(t) else [])
+    points = aggregate.quality(found, default).assign(series=lambda t: t["scene_class"] if len(t) else [])
     position = {index: place for place, index in enumerate(rows.index)}
     first = {(p, m): position[part.index[0]] for p, m, part in found.each()}
     if len(points):
@@ -44,15 +54,15 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         charts.append(Chart(
             "Does the better gradient arrive sooner?",
             "A point per problem and method: average runtime to a tenth of the first regret against the relative error of a gradient at the start. Methods that never arrived have no point.",
-            [Axis("rmse_rel", "relative error of a gradient at the start"), Axis("bias_share", "share of bias", False), Axis("cosine", "cosine", False)],
-            [Axis("art", "average runtime [rollouts]")], table="quality",
+            [PlotAxis("rmse_rel", "relative error of a gradient at the start"), PlotAxis("bias_share", "share of bias", False), PlotAxis("cosine", "cosine", False)],
+            [PlotAxis("art", "average runtime [rollouts]")], table="quality",
         ))  # fmt: skip
     charts.append(Chart(
         "Regret on the way", "Each method at its best tuning: median over seeds, 20% to 80%.",
-        [Axis("spent", "rollouts, a gradient at its time")], [Axis("regret", "J - J*", True, "low", "high")], table="paths",
+        [PlotAxis("spent", "rollouts, a gradient at its time")], [PlotAxis("regret", "J - J*", True, "low", "high")], table="paths",
         facet="problem", line="series",
     ))  # fmt: skip
-    tuned = races.rates(found)
+    tuned = aggregate.rates(found)
     tuned = tuned.assign(
         series=tuned["method"],
         row=[first.get((p, m), 0) for p, m in zip(tuned["problem"], tuned["method"], strict=True)],
@@ -60,7 +70,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     if len(tuned):
         charts.append(Chart(
             "How far does the tuning alone move each method?", "Median score over seeds, 20% to 80%.",
-            [Axis("value", "tuned parameter")], [Axis("score", "score", False, "low", "high")], table="rates",
+            [PlotAxis("value", "tuned parameter")], [PlotAxis("score", "score", False, "low", "high")], table="rates",
             facet="problem", line="series",
         ))  # fmt: skip
     return Content(
@@ -68,14 +78,14 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         rows=table,
         columns=[*identity_columns(table, [axis.column for axis in found.tuned]), *RESULTS, *STATUS],
         charts=charts,
-        answers=methods(races.summary(found, default)),
+        answers=methods(aggregate.summary(found, default)),
         answers_title="How each method did",
         tables={"quality": points, "paths": _paths(found, default, first), "rates": tuned},
         looks={**_looks(found), **{name: look(shade) for name, shade in CLASS_COLOURS.items()}},
     )
 
 
-def _looks(found: races.Races) -> dict[str, dict[str, Any]]:
+def _looks(found: aggregate.RunSet) -> dict[str, dict[str, Any]]:
     """Return the figures' looks, in the page's words; the context is dashed."""
     return {
         name: look(style["color"], SYMBOLS[style["marker"]], "solid" if ", " in name else "dash")
@@ -83,16 +93,16 @@ def _looks(found: races.Races) -> dict[str, dict[str, Any]]:
     }
 
 
-def _paths(found: races.Races, default: float, first: dict[tuple[str, str], int]) -> pd.DataFrame:
+def _paths(found: aggregate.RunSet, default: float, first: dict[tuple[str, str], int]) -> pd.DataFrame:
     lines = []
     for problem, method, part in found.each():
-        ratio = races.ratio_of(found.rows[found.rows["problem"] == problem], default)
-        places = [races.spent(row, ratio) for _, row in part.iterrows()]
+        ratio = aggregate.ratio_of(found.rows[found.rows["problem"] == problem], default)
+        places = [aggregate.spent(row, ratio) for _, row in part.iterrows()]
         ends = [place for place in places if len(place) > 1 and place[-1] > 0]
         if not ends:
             continue
         grid = np.geomspace(max(min(place[1] for place in ends), 1.0), max(place[-1] for place in ends), 40)
-        for x, low, middle, high in zip(grid, *races.curve(part, places, grid), strict=True):
+        for x, low, middle, high in zip(grid, *aggregate.curve(part, places, grid), strict=True):
             line = {"row": first[problem, method], "problem": problem, "series": method, "spent": x}
             lines.append(line | {"regret": middle, "low": low, "high": high})
     return pd.DataFrame(lines, columns=["row", "problem", "series", "spent", "regret", "low", "high"]).replace(

@@ -17,18 +17,18 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from bench.experiment.axes import table
+from bench.experiment.experiment import Experiment
+from bench.report.colours import ink, stamp
 from bench.report.figures import save, styled
-from bench.report.ink import ink, stamp
 from bench.report.page import WIDTH, columns
 from bench.report.scales import log_axis
 from bench.report.style import DEVIANT, MARKERS, VARIANTS, inches, plain, wrapped
 from bench.report.tables import plain_markdown
 from bench.report.text import counted, number
-from bench.studies.optimise import findings, races
-from bench.studies.optimise.races import Races
-from bench.sweep.axes import table
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_all
+from bench.run.files import write_all
+from bench.studies.optimise import aggregate, findings
+from bench.studies.optimise.aggregate import RunSet
 
 NOTES = (
     "score: share of the way from the first cost to J*, interquartile mean over searches, with a bootstrap interval "
@@ -54,7 +54,7 @@ DEPTH = 1e-7
 """Regrets below this share of the largest are not drawn: one search reaches 0 where J* is the lowest cost of any."""
 
 
-def notes(found: Races) -> list[str]:
+def notes(found: RunSet) -> list[str]:
     """Explain the columns, and say which seeds chose the tunings."""
     chosen = found.tuning_seeds
     seeds = (
@@ -70,12 +70,12 @@ def default_ratio(experiment: Experiment) -> float:
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``optimise`` (.csv, .md), ``targets.csv`` and ``summary.csv``, and the charts."""
-    found, default = races.races(experiment, rows), default_ratio(experiment)
+    found, default = aggregate.races(experiment, rows), default_ratio(experiment)
     contents = {"optimise.csv": table(experiment, rows).to_csv(index=False, lineterminator="\n")}
     if not len(found.rows):
         contents["optimise.md"] = f"# {experiment.name}\n\nNo search gave a result.\n"
         return write_all(experiment.directory, contents)
-    reached, summed = races.targets(found, default), races.summary(found, default)
+    reached, summed = aggregate.targets(found, default), aggregate.summary(found, default)
     contents["targets.csv"] = reached.to_csv(index=False, lineterminator="\n")
     contents["summary.csv"] = summed.to_csv(index=False, lineterminator="\n")
     texts = [f"# {experiment.name}: does a better gradient get there sooner?", *findings.sentences(found, default)]
@@ -129,7 +129,7 @@ def arrivals(reached: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def optima(found: Races) -> pd.DataFrame:
+def optima(found: RunSet) -> pd.DataFrame:
     """Return J* of each problem, and how it is known."""
     first = found.rows.drop_duplicates("problem")
     return pd.DataFrame({
@@ -148,9 +148,13 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
         console.width = max(console.width, 160)
     counts = ", ".join(f"{n} {status}" for status, n in rows["status"].value_counts().items())
     console.print(f"\n{experiment.name}: {experiment.question}\n{counted(len(rows), 'cell')}: {counts}")
-    found, default = races.races(experiment, rows), default_ratio(experiment)
+    found, default = aggregate.races(experiment, rows), default_ratio(experiment)
     if len(found.rows):
-        for lines in (methods(races.summary(found, default)), arrivals(races.targets(found, default)), optima(found)):
+        for lines in (
+            methods(aggregate.summary(found, default)),
+            arrivals(aggregate.targets(found, default)),
+            optima(found),
+        ):
             grid = Table(box=None, padding=(0, 2, 0, 0))
             for name in lines:
                 grid.add_column(str(name))
@@ -207,12 +211,12 @@ def _legend(drawn: Figure, names: dict[str, dict[str, Any]], extra: tuple[Any, .
     drawn.legend(handles=handles, loc="outside lower center", ncols=across, columnspacing=1.2)
 
 
-def quality_figure(found: Races, default: float) -> Figure | None:
+def quality_figure(found: RunSet, default: float) -> Figure | None:
     """Draw runtime to a tenth of the first regret against the gradient's error at the start, a panel per class of scene."""
-    points = races.quality(found, default)
+    points = aggregate.quality(found, default)
     if points.empty:
         return None
-    rho = races.correlations(points).set_index("scene_class")
+    rho = aggregate.correlations(points).set_index("scene_class")
     styles = {name: style for name, style in looks(found.methods).items() if name in set(points["method"])}
     marked = points["problem"] if points["problem"].nunique() <= len(MARKERS) else points["problem"].map(_scene)
     marks = {mark: MARKERS[i % len(MARKERS)] for i, mark in enumerate(dict.fromkeys(marked))}
@@ -257,12 +261,12 @@ def quality_figure(found: Races, default: float) -> Figure | None:
     return drawn
 
 
-def path_figure(found: Races, default: float) -> Figure | None:
+def path_figure(found: RunSet, default: float) -> Figure | None:
     """Draw the gradient's relative error and cosine along the path, a row of panels each: median and 20% to 80% of seeds.
 
     None where quality was measured at the start alone.
     """
-    lines = races.path_quality(found)
+    lines = aggregate.path_quality(found)
     if lines.empty:
         return None
     names = list(dict.fromkeys(lines["problem"]))
@@ -294,7 +298,7 @@ def path_figure(found: Races, default: float) -> Figure | None:
     return drawn
 
 
-def anytime_figure(found: Races, default: float) -> Figure:
+def anytime_figure(found: RunSet, default: float) -> Figure:
     """Draw regret against rollouts, and against seconds where they were measured: median and 20% to 80% of seeds."""
     units = ("rollouts", "seconds") if found.rows["search_s"].notna().any() else ("rollouts",)
     names, styles = found.problems, looks(found.methods)
@@ -302,7 +306,7 @@ def anytime_figure(found: Races, default: float) -> Figure:
     down = math.ceil(len(names) / across) * len(units)
     drawn = Figure(figsize=(WIDTH, 1.9 * down + 1.0), layout="constrained")
     FigureCanvasAgg(drawn)
-    title = findings.closest(races.summary(found, default))
+    title = findings.closest(aggregate.summary(found, default))
     drawn.suptitle(
         f"{textwrap.fill(title, LETTERS)}\nRegret on the way, each method at its best tuning",
         fontsize=9,
@@ -314,11 +318,11 @@ def anytime_figure(found: Races, default: float) -> Figure:
         spare.remove()
     for problem, panels in zip(names, blocks, strict=False):
         rows = found.rows[found.rows["problem"] == problem]
-        part, ratio = found.best[found.best["problem"] == problem], races.ratio_of(rows, default)
+        part, ratio = found.best[found.best["problem"] == problem], aggregate.ratio_of(rows, default)
         for unit, panel in zip(units, panels, strict=True):
             for method, own in part.groupby("method", sort=False):
                 places = [
-                    races.spent(row, ratio) if unit == "rollouts" else np.asarray(row["path_s"], dtype=float)
+                    aggregate.spent(row, ratio) if unit == "rollouts" else np.asarray(row["path_s"], dtype=float)
                     for _, row in own.iterrows()
                 ]
                 _draw_curve(panel, own, places, styles[str(method)])
@@ -359,14 +363,14 @@ def _draw_curve(panel: Axes, rows: pd.DataFrame, places: list[np.ndarray], style
     if not ends or max(ends) <= 0:
         return
     grid = np.geomspace(max(min(starts), 1e-6), max(ends), STEPS)
-    low, middle, high = np.where(np.isfinite(found := races.curve(rows, places, grid)), found, np.nan)
+    low, middle, high = np.where(np.isfinite(found := aggregate.curve(rows, places, grid)), found, np.nan)
     panel.fill_between(grid, low, high, color=style["color"], alpha=0.15, linewidth=0)
     panel.plot(grid, middle, **style, markevery=STEPS // 5, markersize=3)
 
 
-def targets_figure(found: Races, default: float) -> Figure:
+def targets_figure(found: RunSet, default: float) -> Figure:
     """Draw the share of problems, targets and restarts that are reached, against rollouts."""
-    styles, times = looks(found.methods), races.runtimes(found, default)
+    styles, times = looks(found.methods), aggregate.runtimes(found, default)
     drawn, (panel,) = _grid(
         1, 1, 2.6, findings.reaches({name: float(np.isfinite(t).mean()) for name, t in times.items()})
     )
@@ -389,9 +393,9 @@ def targets_figure(found: Races, default: float) -> Figure:
     return drawn
 
 
-def rates_figure(found: Races, default: float) -> Figure | None:
+def rates_figure(found: RunSet, default: float) -> Figure | None:
     """Draw the score against each tuned parameter, a panel per problem; None where nothing is tuned."""
-    lines = races.rates(found)
+    lines = aggregate.rates(found)
     lines = (
         lines[lines.groupby(["problem", "method", "axis"])["value"].transform("nunique") > 1] if len(lines) else lines
     )

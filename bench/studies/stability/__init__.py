@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.experiment import Experiment
+from bench.experiment.session import Session
+from bench.experiment.study import Study
 from bench.model import param
-from bench.sweep.cell import Cell
-from bench.sweep.columns import Column, Columns, Judged, numbers, text
-from bench.sweep.experiment import Experiment
-from bench.sweep.session import Session
-from bench.sweep.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,12 +29,16 @@ class Stability(Study):
         Column("growth_factor", "measured growth of the state per step, where the motion is linear"),
         Column("spectral_radius", "of one step on the cell's oscillator, in theory"),
         Column("stiffness_limit", "stiffness at which that radius leaves 1", "N/m"),
-        Column("relative_error", "norm of (gradient - truth) / norm of the truth", judged=Judged("exact", "error")),
+        Column(
+            "relative_error",
+            "norm of (gradient - truth) / norm of the truth",
+            comparison=ComparisonRule("exact", "error"),
+        ),
         Column("cosine", "cosine between gradient and truth"),
         Column("grad_norm", "norm of the gradient"),
         Column("truth_norm", "norm of the truth"),
         Column("truth_error", "relative change of the truth on its last refinement"),
-        text("verdict", "ok, or what is wrong", judged=Judged("verdict", "verdict", order=WORST_FIRST)),
+        text("verdict", "ok, or what is wrong", comparison=ComparisonRule("verdict", "verdict", order=WORST_FIRST)),
         text("truth", "how the truth was computed: physical or refined"),
         text("cause", "of a finite but wrong gradient: step (or how it is differentiated), law, both or unknown"),
         Column(
@@ -59,9 +63,11 @@ class Stability(Study):
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Return the verdict on one cell."""
-        from bench.studies.stability.measure import Limits, measure
+        from bench.studies.stability.measure import StabilityLimits, measure
 
-        return measure(cell, session, Limits(self.diverged, self.grown, self.inaccurate, self.fine_steps, self.finer))
+        return measure(
+            cell, session, StabilityLimits(self.diverged, self.grown, self.inaccurate, self.fine_steps, self.finer)
+        )
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         """Write the tables, the maps and their summary."""

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from bench.experiment.cell import Cell
+from bench.experiment.session import Session
 from bench.model import (
     Backend,
     ContactScene,
@@ -30,9 +32,7 @@ from bench.model import (
     Unsupported,
     rollout,
 )
-from bench.sweep.cell import Cell
-from bench.sweep.referees import reference_backends
-from bench.sweep.session import Session
+from bench.run.reference_backends import reference_backends
 
 NEGLIGIBLE = 1e-9
 """Share of the truth's norm below which one of its components counts as 0."""
@@ -43,7 +43,7 @@ REACH = np.logspace(-3, 4, 141)
 
 
 @dataclass(frozen=True)
-class Limits:
+class StabilityLimits:
     """When a rollout counts as diverged and a gradient as wrong, and how fine the truth is; see the parameters."""
 
     diverged: float
@@ -53,14 +53,14 @@ class Limits:
     finer: int
 
 
-def measure(cell: Cell, session: Session, limits: Limits) -> dict[str, Any]:
+def measure(cell: Cell, session: Session, limits: StabilityLimits) -> dict[str, Any]:
     """Return the verdict on one cell; raises :class:`Unsupported` without time steps, step states or a truth."""
     program = rollout(cell.program())
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows becomes a status
         return _measured(cell, program, session, limits)
 
 
-def _measured(cell: Cell, program: Rollout, session: Session, limits: Limits) -> dict[str, Any]:
+def _measured(cell: Cell, program: Rollout, session: Session, limits: StabilityLimits) -> dict[str, Any]:
     problem, scene = session.problem(cell), program.scene
     theta, still = program.theta0, np.zeros((problem.program.n_noise, 1))
     gradient = problem.grad(theta, still)[:, 0]
@@ -90,7 +90,7 @@ def _measured(cell: Cell, program: Rollout, session: Session, limits: Limits) ->
 
 
 def first_bad_step(
-    states: np.ndarray, largest: np.ndarray, growth: float, limits: Limits
+    states: np.ndarray, largest: np.ndarray, growth: float, limits: StabilityLimits
 ) -> tuple[int, str, str] | None:
     """Find the first bad step of ``states (T + 1, n)``, whether it ``diverged`` or is ``nonfinite``, and why; or None.
 
@@ -150,7 +150,7 @@ def bounds(program: Rollout, found: Trajectory, factor: float) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------------- truth
 
 
-def truth_of(cell: Cell, limits: Limits) -> tuple[str, np.ndarray, float]:
+def truth_of(cell: Cell, limits: StabilityLimits) -> tuple[str, np.ndarray, float]:
     """Return how the truth was obtained, the gradient ``(d,)``, and its relative error as far as known."""
     program = rollout(cell.program())
     physical = program.physical_gradient()
@@ -228,7 +228,9 @@ It moves an impact by many of the fine steps, so that the place of the impact wi
 """
 
 
-def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarray, limits: Limits) -> dict[str, Any]:
+def cause_of(
+    cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarray, limits: StabilityLimits
+) -> dict[str, Any]:
     """Return why a gradient is wrong: ``cause``, ``step_error`` and ``law_error``, both in units of the truth's norm.
 
     The law's own gradient is between the two: that of the same law and integrator at a far smaller step. What the cell
@@ -250,7 +252,7 @@ def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarra
     return {"cause": "both" if len(blamed) == 2 else blamed[0] if blamed else "step" if step >= law else "law"} | errors
 
 
-def law_gradient(cell: Cell, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
+def law_gradient(cell: Cell, limits: StabilityLimits) -> tuple[np.ndarray, np.ndarray]:
     """Return the gradient ``(d,)`` of the cell's law at a far smaller step, and one at half its resolution.
 
     Both are central differences of the cost over a span of theta (:data:`SPAN`): a derivative through a contact jumps

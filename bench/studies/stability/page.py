@@ -4,31 +4,31 @@ from __future__ import annotations
 
 import pandas as pd
 
+from bench.experiment.axes import parsed
+from bench.experiment.experiment import Experiment
 from bench.report.text import counted
-from bench.report.views import Arranged, ran
+from bench.report.views import Arranged, attempted
 from bench.report.web.content import (
     STATUS,
-    Axis,
     Chart,
-    Column,
     Content,
+    PlotAxis,
+    TableColumn,
     identity_columns,
     look,
     problems,
     together,
 )
 from bench.studies.stability.report import LOST, PLACES, STEP, VERDICTS, meaning, name_of, placed
-from bench.sweep.axes import parsed
-from bench.sweep.experiment import Experiment
 
 RESULTS = [
-    Column("verdict", "verdict", "text"),
-    Column("relative_error", "rel. error"),
-    Column("cosine", "cosine"),
-    Column("spectral_radius", "spectral radius"),
-    Column("stiffness_limit", "stiffness limit"),
-    Column("first_bad_step", "first bad step"),
-    Column("truth", "truth", "text"),
+    TableColumn("verdict", "verdict", "text"),
+    TableColumn("relative_error", "rel. error"),
+    TableColumn("cosine", "cosine"),
+    TableColumn("spectral_radius", "spectral radius"),
+    TableColumn("stiffness_limit", "stiffness limit"),
+    TableColumn("first_bad_step", "first bad step"),
+    TableColumn("truth", "truth", "text"),
 ]
 
 
@@ -45,16 +45,16 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     share = Chart(
         "How often is the gradient right?",
         f"Share of step sizes and stiffnesses at which the gradient is {meaning('ok', rows)}.",
-        [Axis("integrator", "integrator")],
-        [Axis("problem", "problem")],
+        [PlotAxis("integrator", "integrator")],
+        [PlotAxis("problem", "problem")],
         level="verdict",
         share="ok",
     )
     maps = Chart(
         "Where is it right?",
         "The verdict at every step size and stiffness; the worse one where backends disagree.",
-        [Axis("dt", "time step [s]")],
-        [Axis("stiffness", "stiffness [N/m]")],
+        [PlotAxis("dt", "time step [s]")],
+        [PlotAxis("stiffness", "stiffness [N/m]")],
         facet="panel",
         level="verdict",
     )
@@ -78,7 +78,7 @@ def shares(shown: Arranged) -> pd.DataFrame:
 
     Scenes are grouped by name; laws and integrators keep the parameters that distinguish them.
     """
-    judged = ran(shown.rows)
+    judged = attempted(shown.rows)
     judged = judged[judged["verdict"] != ""]
     step = problems(shown, ["contact", "integrator"], together(shown, *PLACES), ("contact", "integrator"), judged)
     scene = [name_of(given.get("scene")) for given in parsed(judged)]
@@ -95,7 +95,7 @@ def finding(shown: Arranged) -> str:
         first, last = part.iloc[0], part.iloc[-1]
         least = f", least with {last['step']} ({last['ok']:.0%})" if len(part) > 1 else ""
         parts.append(f"{scene}: right most often with {first['step']} ({first['ok']:.0%} of its cells){least}")
-    judged = ran(shown.rows)
+    judged = attempted(shown.rows)
     silent = int(judged["verdict"].isin(("inaccurate", "wrong_sign", "zero")).sum())
     lost = int(judged["verdict"].isin(LOST).sum())
     head = f"{silent} of {counted(len(judged), 'cell')} have a finite but wrong gradient, {lost} a state that diverges"

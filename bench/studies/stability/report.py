@@ -25,17 +25,17 @@ from matplotlib.ticker import FixedLocator, NullLocator
 from rich.console import Console
 from rich.table import Table
 
+from bench.experiment.axes import Axis, parsed, table
+from bench.experiment.columns import COMMON
+from bench.experiment.experiment import Experiment
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH, columns
 from bench.report.style import PALETTE, axis_name, plain
 from bench.report.tables import escape_markdown
 from bench.report.text import axis_value, counted
-from bench.report.views import Arranged, arranged, ran
-from bench.report.web.content import columns_of, grouped, problems, shown_as, telling, together
-from bench.sweep.axes import Axis, parsed, table
-from bench.sweep.columns import COMMON
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_all
+from bench.report.views import Arranged, arranged, attempted
+from bench.report.web.content import columns_of, distinguishing_columns, grouped, problems, shown_as, together
+from bench.run.files import write_all
 
 BLUE, BLACK, RED, GREEN, PINK, ORANGE, SKY, _ = PALETTE
 VERDICTS = {
@@ -135,7 +135,7 @@ def unstable(rows: pd.DataFrame) -> pd.Series:
 
 def judged(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of cells that have a verdict."""
-    rows = ran(rows)
+    rows = attempted(rows)
     return rows[rows["verdict"] != ""]
 
 
@@ -185,7 +185,7 @@ def panels(shown: Arranged) -> list[Panel]:
         groups: list[tuple[pd.DataFrame, list[str]]] = []
         for backend, mine in part.groupby("machine", sort=False):
             mine = mine.drop_duplicates(list(PLACES), keep="last").sort_values(list(PLACES))
-            if ran(mine).empty:
+            if attempted(mine).empty:
                 continue
             alike = next((g for g in groups if _same(g[0], mine)), None)
             if alike is None:
@@ -206,7 +206,11 @@ def more(shown: Arranged, over: Sequence[Axis]) -> list[str]:
     """Return the columns, besides integrator, scene and law, that two maps need to have different names."""
     basic = ("integrator", "scene", "contact")
     names = [*basic, *(name for name in columns_of(shown, STEP, over) if name not in (*basic, *PLACES, "horizon"))]
-    return [name for name in telling(shown.rows, grouped(shown.rows, STEP, over), names, basic) if name not in basic]
+    return [
+        name
+        for name in distinguishing_columns(shown.rows, grouped(shown.rows, STEP, over), names, basic)
+        if name not in basic
+    ]
 
 
 def name_of(part: Any) -> str:
@@ -254,7 +258,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 def shares(maps: Sequence[Panel]) -> dict[str, float]:
     """Return each verdict's share of the cells of some maps that ran, and the share of unstable ones."""
-    cells = pd.concat([ran(panel.rows) for panel in maps])
+    cells = pd.concat([attempted(panel.rows) for panel in maps])
     by_verdict = {name: float((cells["verdict"] == name).mean()) for name in VERDICTS if name}
     return by_verdict | {"unstable": float(unstable(cells).mean())}
 
@@ -269,7 +273,11 @@ def markdown(shown: Arranged, maps: Sequence[Panel]) -> str:
     out += ["| " + " | ".join(map(escape_markdown, heads)) + " |", rule]
     for panel in maps:
         cells = [panel.integrator, panel.scene, panel.contact, *panel.values.values(), ", ".join(panel.backends)]
-        cells += [str(len(ran(panel.rows))), *(_percent(share) for share in shares([panel]).values()), *_limits(panel)]
+        cells += [
+            str(len(attempted(panel.rows))),
+            *(_percent(share) for share in shares([panel]).values()),
+            *_limits(panel),
+        ]
         out.append("| " + " | ".join(map(escape_markdown, cells)) + " |")
     out += ["", *(f"- {escape_markdown(note)}" for note in notes(shown.rows))]
     return "\n".join(out) + "\n"
@@ -329,7 +337,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     table = _table(["integrator", "scene"], ["cells", *(name for name in VERDICTS if name), "unstable"])
     for kind in dict.fromkeys(panel.kind[:2] for panel in maps):
         mine = [panel for panel in maps if panel.kind[:2] == kind]
-        cells = [str(sum(len(ran(panel.rows)) for panel in mine)), *map(_percent, shares(mine).values())]
+        cells = [str(sum(len(attempted(panel.rows)) for panel in mine)), *map(_percent, shares(mine).values())]
         table.add_row(*kind, *cells)
     console.print(table)
     boundaries = _table(["integrator", "oscillator"], ["dt", "theory", "measured", "dt that agree"])

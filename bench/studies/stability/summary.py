@@ -10,12 +10,12 @@ import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from bench.experiment.experiment import Experiment
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.style import plain
+from bench.run.files import write_whole
 from bench.studies.stability.report import DARK, FILLS, LOST, VERDICTS, Panel, judged, looks, panels, placed, swatches
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_whole
 
 SHORT = {"by step": "step", "by law": "law", "by both": "both", "by unknown": "?"} | {
     name: VERDICTS[name][0] for name in LOST

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from bench.experiment.cell import Cell
+from bench.experiment.session import Session
 from bench.measure import noise, statistics
 from bench.model import Problem, Program
-from bench.sweep.cell import Cell
-from bench.sweep.session import Session
 
 SUMMARY = (
     "reference_norm", "reference_se", "bias", "bias_low", "bias_high", "bias_rel", "variance", "rmse_rel", "cosine",

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import pandas as pd
 
+from bench.experiment.experiment import Experiment
 from bench.report.text import counted, number
 from bench.report.views import Arranged, arranged
 from bench.report.web.content import (
     STATUS,
-    Axis,
     Chart,
-    Column,
     Content,
+    PlotAxis,
+    TableColumn,
     identity_columns,
     logarithmic,
     looks,
@@ -19,7 +20,6 @@ from bench.report.web.content import (
     numeric_axis,
     problems,
 )
-from bench.sweep.experiment import Experiment
 
 ERRORS = {
     "model_error_rel": "model error, relative",
@@ -42,8 +42,8 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         Chart(
             "The errors against each other",
             "High and to the left is the trap: right for the program, wrong for the physics.",
-            [Axis(name, text) for name, text in ERRORS.items() if name != "model_error_rel"],
-            [Axis("model_error_rel", ERRORS["model_error_rel"], above_one="larger than the gradient")],
+            [PlotAxis(name, text) for name, text in ERRORS.items() if name != "model_error_rel"],
+            [PlotAxis("model_error_rel", ERRORS["model_error_rel"], above_one="larger than the gradient")],
             facet="problem",
         )
     ]
@@ -52,7 +52,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
             "Errors along what was swept",
             "A model error that stays as the step shrinks is the contact model's, not the step's.",
             swept,
-            [Axis(name, text, above_one="larger than the gradient") for name, text in ERRORS.items()],
+            [PlotAxis(name, text, above_one="larger than the gradient") for name, text in ERRORS.items()],
             facet="problem",
         )
         charts.insert(0, along)
@@ -61,7 +61,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         rows=table,
         columns=[
             *identity_columns(table, [axis.column for axis in shown.axes]),
-            *(Column(name, text) for name, text in ERRORS.items()),
+            *(TableColumn(name, text) for name, text in ERRORS.items()),
             *STATUS,
         ],
         charts=charts,

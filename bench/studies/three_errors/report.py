@@ -16,17 +16,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
+from bench.experiment.axes import Axis, table
+from bench.experiment.experiment import Experiment
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.scales import log_axis
 from bench.report.style import GREY, MARKERS, SHADE, axis_name, colour, plain, symbol
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted, number
-from bench.report.views import Arranged, along, arranged, merge_seeds, ran
-from bench.report.web.content import columns_of, grouped, problems, shown_as, telling
-from bench.sweep.axes import Axis, table
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_all
+from bench.report.views import Arranged, along, arranged, attempted, merge_seeds
+from bench.report.web.content import columns_of, distinguishing_columns, grouped, problems, shown_as
+from bench.run.files import write_all
 
 FLOOR, CEILING = 1e-14, 1e3
 """Relative errors outside this range are drawn at the edge."""
@@ -100,7 +100,7 @@ def sections(shown: Arranged) -> list[Section]:
     """
     parts: list[Section] = []
     for axis in leading(shown):
-        part = ran(along(shown, axis))
+        part = attempted(along(shown, axis))
         for other in shown.axes:
             if other not in (axis, *_with(shown, axis)) and other.column != "seed" and not part.empty:
                 part = part[_at_commonest(part, other, shown)]
@@ -109,7 +109,7 @@ def sections(shown: Arranged) -> list[Section]:
         moving = part.groupby(grouped(part, PROGRAM, [axis, *_with(shown, axis)]))["x"].transform("nunique") > 1
         if moving.any():
             parts.append(Section(axis, part[moving].sort_values("x", kind="stable")))
-    rest = ran(merge_seeds(shown.rows)).assign(x=0.0)
+    rest = attempted(merge_seeds(shown.rows)).assign(x=0.0)
     still = grouped(rest, PROGRAM, shown.axes)
     listed = {key for part in parts for key in part.rows["key"]}
     rest = rest[~still.isin(still[rest["key"].isin(listed)])]
@@ -144,7 +144,7 @@ def readable(shown: Arranged, part: Section) -> pd.DataFrame:
     rows, axis = part.rows, part.axis
     without = [] if axis is None else [axis, *_with(shown, axis)]
     programs = grouped(rows, PROGRAM, without)
-    names = telling(rows, programs, columns_of(shown, PROGRAM, without), ("scene", "contact"))
+    names = distinguishing_columns(rows, programs, columns_of(shown, PROGRAM, without), ("scene", "contact"))
     labels = rows["estimator"].where(
         rows["estimator_params"] == "", rows["estimator"] + "[" + rows["estimator_params"] + "]"
     )

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.experiment import Experiment
+from bench.experiment.session import Session
+from bench.experiment.study import Study
 from bench.model import param
-from bench.sweep.cell import Cell
-from bench.sweep.columns import Column, Columns, Judged, numbers, text
-from bench.sweep.experiment import Experiment
-from bench.sweep.session import Session
-from bench.sweep.study import Study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,13 +25,13 @@ class Twins(Study):
     columns: ClassVar[Columns] = Columns.of(
         Column("state_difference", "largest difference of states over time and coordinates"),
         Column("state_difference_rel", "the same in units of the largest value of that coordinate",
-               judged=Judged("exact", "difference of states")),
+               comparison=ComparisonRule("exact", "difference of states")),
         Column("cost", "cost of the twin"),
         Column("own_cost", "cost of the scene's own program"),
         Column("cost_difference_rel", "difference of costs, relative"),
         Column("gradient_norm", "norm of the twin's gradient"),
         Column("own_gradient_norm", "norm of the own program's gradient"),
-        Column("gradient_difference_rel", "difference of gradients, relative", judged=Judged("exact", "difference of gradients")),
+        Column("gradient_difference_rel", "difference of gradients, relative", comparison=ComparisonRule("exact", "difference of gradients")),
         Column("gradient_cosine", "cosine between the gradients"),
         Column("value_s", "costs of `samples` rollouts", "s"),
         Column("gradient_s", "gradients of `samples` rollouts", "s"),

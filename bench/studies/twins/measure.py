@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from bench.experiment.cell import Cell
+from bench.experiment.session import Session
 from bench.measure import noise, timing
 from bench.model import Problem, Unsupported, rollout
-from bench.sweep.cell import Cell
-from bench.sweep.referees import ranked_backends
-from bench.sweep.session import Session
+from bench.run.reference_backends import ranked_backends
 
 
 def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from bench.experiment.experiment import Experiment
 from bench.report.text import duration, number
-from bench.report.web import anything
+from bench.report.web import generic
 from bench.report.web.content import Content, nothing_ran
-from bench.sweep.experiment import Experiment
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the largest differences and longest compilation in a sentence, a chart of any two numbers, the table."""
-    return replace(anything.content(experiment, rows), finding=nothing_ran(rows) or finding(rows))
+    return replace(generic.content(experiment, rows), finding=nothing_ran(rows) or finding(rows))
 
 
 def finding(rows: pd.DataFrame) -> str:

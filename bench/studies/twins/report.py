@@ -14,17 +14,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from bench.experiment.axes import table
+from bench.experiment.experiment import Experiment
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH, columns
 from bench.report.scales import log_axis
 from bench.report.style import colour, plain
 from bench.report.tables import plain_markdown
 from bench.report.text import number
-from bench.report.views import Arranged, arranged, ran
-from bench.report.web.content import columns_of, grouped, problems, shown_as, telling
-from bench.sweep.axes import table
-from bench.sweep.experiment import Experiment
-from bench.sweep.files import write_all
+from bench.report.views import Arranged, arranged, attempted
+from bench.report.web.content import columns_of, distinguishing_columns, grouped, problems, shown_as
+from bench.run.files import write_all
 
 SMALL = 1e-17
 """Differences below this, 0 included, are drawn here."""
@@ -65,9 +65,9 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 def readable(shown: Arranged) -> pd.DataFrame:
     """Return a table of texts, a line per scene and engine; a status where there are no numbers."""
-    rows = ran(shown.rows)
+    rows = attempted(shown.rows)
     always = ("scene", "contact", "backend")
-    named = telling(rows, grouped(rows, ENGINE), columns_of(shown, ENGINE), always)
+    named = distinguishing_columns(rows, grouped(rows, ENGINE), columns_of(shown, ENGINE), always)
     lines = []
     for row in rows.to_dict("records"):
         numbers = {name: number(row[name], 3) for name in HEADERS}

@@ -1,0 +1,204 @@
+"""A cell: one point of a sweep, what it is as JSON, and why it cannot run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, cast
+
+from bench.errors import Unsupported, UserError, failure, printable
+from bench.experiment.experiment import Budget
+from bench.experiment.keys import core_hash, fingerprint, hashed
+from bench.model import (
+    Backend,
+    ContactLaw,
+    Decision,
+    Estimator,
+    Integrator,
+    MechanicalScene,
+    Plugin,
+    Program,
+    Scene,
+    compose,
+    registry,
+)
+from bench.model.identity import described, label
+from bench.model.parameters import parameters, singular
+from bench.model.program import OWN
+
+VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype")
+"""Plugin parameters that have a column of their own and so are left out of identity strings."""
+
+
+def labels(parts: Mapping[str, Plugin | None], without: Mapping[str, Collection[str]] | None = None) -> dict[str, str]:
+    """Return identity strings by column, less the parameters with columns of their own and those in ``without``."""
+    without = without or {}
+    scene, law = parts.get("scene"), parts.get("contact")
+    given = dict(scene.contact_values) if isinstance(scene, MechanicalScene) else {}
+    shown = {axis: {*VIEWS, *without.get(axis, ())} for axis in parts}
+    if isinstance(law, ContactLaw):
+        shown["contact"].add(law.smoothing)
+        if "stiffness" in parameters(type(law)) and "stiffness" not in without.get("scene", ()):
+            shown["scene"].discard("stiffness")  # the column of that name is the law's
+    strings = {
+        a: label(p, given if a == "contact" else None, tuple(shown[a])) for a, p in parts.items() if a != "estimator"
+    }
+    estimator = parts.get("estimator")
+    if estimator is not None:
+        strings["estimator"] = estimator.name
+        hidden = without.get("estimator", ())
+        strings["estimator_params"] = label(estimator, None, tuple(hidden)).removeprefix(estimator.name).strip("[]")
+    return strings
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One point of a sweep: a plugin on each axis, counts, a seed, and what is measured."""
+
+    parts: Mapping[str, Plugin | None]
+    """Plugins by axis; None where the scene has no such part."""
+    samples: int
+    repeats: int
+    seed: int
+    study: Plugin
+    decision: Decision = OWN
+    timing: bool = True
+    """Whether the row records timings."""
+    budget: Budget | None = None
+    """Budget of its reference gradient; None where the study needs none."""
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return cast(Scene, self.parts["scene"])
+
+    @property
+    def contact(self) -> ContactLaw | None:
+        """The contact law, or None."""
+        return cast("ContactLaw | None", self.parts["contact"])
+
+    @property
+    def integrator(self) -> Integrator | None:
+        """The integrator, or None."""
+        return cast("Integrator | None", self.parts["integrator"])
+
+    @property
+    def backend(self) -> Backend:
+        """The backend."""
+        return cast(Backend, self.parts["backend"])
+
+    @property
+    def estimator(self) -> Estimator:
+        """The estimator; raises KeyError in a study without that axis."""
+        return cast(Estimator, self.parts["estimator"])
+
+    def with_part(self, axis: str, plugin: Plugin | None) -> Cell:
+        """Return this cell with another plugin on one axis."""
+        return dataclasses.replace(self, parts={**self.parts, axis: plugin})
+
+    # ---------------------------------------------------------------------------------------------- identity
+
+    @cached_property
+    def key(self) -> str:
+        """Hash of everything that decides the cell's numbers; library versions are columns instead."""
+        counts = [self.samples, self.repeats, self.seed, self.timing]
+        reference = None if self.budget is None else self.program_key
+        return hashed(
+            {axis: fingerprint(part) for axis, part in self.parts.items()}, counts, reference, self._budget(),
+            self._theta(), fingerprint(self.study), core_hash(),
+        )  # fmt: skip
+
+    @cached_property
+    def program_key(self) -> str:
+        """Hash of everything that decides the program."""
+        parts = [fingerprint(part) for part in (self.scene, self.contact, self.integrator)]
+        return hashed(parts, self._theta(), core_hash())
+
+    @cached_property
+    def parameters(self) -> dict[str, Any]:
+        """Every parameter of every plugin, defaults included, and whatever else decides the cell except its counts."""
+        entries: dict[str, Any] = {"study": described(self.study)}
+        entries |= {axis: described(part) for axis, part in self.parts.items()}
+        return entries | {"theta": self._theta(), "reference": self._budget()}
+
+    def _theta(self) -> dict[str, Any] | None:
+        return None if self.decision == OWN else dataclasses.asdict(self.decision)
+
+    def _budget(self) -> dict[str, Any] | None:
+        return None if self.budget is None else dataclasses.asdict(self.budget)
+
+    def columns(self) -> dict[str, Any]:
+        """Return the identity columns of the cell's row: views of its parameters and counts."""
+        law = self.contact
+        smoothing = getattr(law, law.smoothing) if law is not None and law.smoothing else math.nan
+        return {
+            **labels(self.parts),
+            "noise": "parameter" if self.decision.names else self.scene.noise,
+            "horizon": self._view("horizon", self.scene, default=0),
+            "dt": self._view("dt", self.scene),
+            "stiffness": self._view("stiffness", law, self.scene),
+            "sigma": self.scene.sigma,
+            "smoothing": smoothing,
+            "samples": self.samples,
+            "repeats": self.repeats,
+            "dim": self._dim(),
+            "seed": self.seed,
+            "dtype": self.backend.dtype,
+            "study": self.study.name,
+            "parameters": json.dumps(self.parameters, separators=(",", ":"), allow_nan=False),
+            "key": self.key,
+        }
+
+    def _view(self, name: str, *parts: Plugin | None, default: float = math.nan) -> float:
+        """Return the parameter of that name from the first part that has one."""
+        for part in parts:
+            if part is not None and name in parameters(type(part)):
+                return float(getattr(part, name)) if name != "horizon" else int(getattr(part, name))
+        return default
+
+    def _dim(self) -> float:
+        try:
+            return len(self.decision.names) or int(self.scene.theta0().size)
+        except KeyboardInterrupt:
+            raise
+        except BaseException:  # the error shows up in the cell's own row
+            return math.nan
+
+    # ----------------------------------------------------------------------------------------------- program
+
+    def program(self) -> Program:
+        """Compose the program; raises :class:`Unsupported` for a combination without meaning."""
+        return compose(self.scene, self.contact, self.integrator, self.decision)
+
+    def refusal(self) -> tuple[str, str] | None:
+        """Return status and reason if this cell cannot run, or None."""
+        try:
+            return self._refusal()
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            row = failure(error)
+            return row["status"], row["reason"]
+
+    def _refusal(self) -> tuple[str, str] | None:
+        for part in self.parts.values():
+            if part is not None:
+                entry = registry.find(part.kind, part.name)
+                if not entry.available:
+                    return "unavailable", f"{singular(part.kind)} {part.name} is {entry.reason}"
+        try:
+            program = self.program()
+        except (Unsupported, UserError) as error:  # other scenes of the sweep may have this theta
+            return "unsupported", printable(error)
+        backend, estimator = self.backend, self.parts.get("estimator")
+        if reason := backend.incompatibility(program):
+            return "unsupported", reason
+        if isinstance(estimator, Estimator) and (
+            reason := estimator.incompatibility(program, backend.provides, backend.name)
+        ):
+            return "unsupported", reason
+        return None

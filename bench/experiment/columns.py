@@ -1,0 +1,205 @@
+"""The columns of rows: their kinds, units and meanings, and what ``compare`` does with each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import InitVar, dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from bench import deprecated
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Kind = Literal["number", "text", "list"]
+
+
+@dataclass(frozen=True)
+class ComparisonRule:
+    """How ``compare`` decides whether a column got worse. Smaller is better unless ``neutral``.
+
+    - ``interval``: estimated, with columns ``<name>_low`` and ``<name>_high``; changed where the two intervals are
+      apart.
+    - ``spread``: an interval as above, and a ratio that has to be large enough to matter (a variance).
+    - ``paired``: an error estimated from noise that is the same in both results; changed where the mean estimate in
+      the column ``mean`` moved by more than rounding, judged by its distance from the gradient in ``reference`` before.
+    - ``exact``: computed without noise; changed by a ratio that matters and by more than rounding.
+    - ``time``: seconds, judged only when asked for, against the spread between runs.
+    - ``verdict``: one of ``order``, the worst first.
+    """
+
+    by: Literal["interval", "spread", "paired", "exact", "time", "verdict"]
+    called: str
+    """The column's name in the sentence."""
+    neutral: bool = False
+    """Whether a change is neither better nor worse."""
+    order: tuple[str, ...] = ()
+    mean: str = ""
+    variance: str = ""
+    reference: str = ""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a study's rows."""
+
+    name: str
+    doc: str = ""
+    unit: str = ""
+    kind: Kind = "number"
+    comparison: ComparisonRule | None = None
+    """How ``compare`` judges the column; None where it does not."""
+    table: bool = True
+    """Whether the CSV has this column; ``rows.parquet`` always does."""
+    measured: bool = False
+    """Whether the value depends on the machine and its load; it is missing where cells are not timed."""
+    judged: InitVar[ComparisonRule | None] = None
+    """The old name of ``comparison``."""
+
+    def __post_init__(self, judged: ComparisonRule | None) -> None:
+        if judged is not None:
+            deprecated.warn("Column(judged=...)", "comparison", 4)
+            object.__setattr__(self, "comparison", judged)
+
+
+def text(name: str, doc: str = "", **more: Any) -> Column:
+    """Make a column of strings."""
+    return Column(name, doc, kind="text", **more)
+
+
+def numbers(name: str, doc: str = "", unit: str = "", **more: Any) -> Column:
+    """Make a column whose values are lists of numbers or strings."""
+    return Column(name, doc, unit, kind="list", **more)
+
+
+FIRST = (
+    text("experiment", "the experiment that the row was made for"),
+    text("scene", "identity string of the scene: its name and the parameters that differ from their defaults"),
+    text("contact", "identity string of the contact law, `none` where the scene has no contact"),
+    text("integrator", "identity string of the integrator, `none` where the scene has no time steps"),
+    text("backend", "identity string of the backend"),
+    text("estimator", "name of the estimator"),
+    text("estimator_params", "parameters of the estimator that differ from their defaults"),
+    text("noise", "what the noise perturbs: `parameter` (theta) or `action`"),
+    Column("horizon", "number of time steps T", "steps"),
+    Column("dt", "length of a time step", "s"),
+    Column("stiffness", "stiffness of the contact law, else of the scene", "N/m"),
+    Column("sigma", "standard deviation of the noise in J"),
+    Column("smoothing", "smoothing parameter of the contact law: beta, kappa"),
+    Column("samples", "samples N in one estimate"),
+    Column("repeats", "independent estimates R that measure bias and variance"),
+    Column("seed", "seed of the noise"),
+    text("dtype", "floating-point type of the simulation"),
+)
+IDENTITY = tuple(column.name for column in FIRST[1:])
+"""The columns that show which cell a row is. The cell's whole identity is in ``parameters``."""
+DIM = Column("dim", "length d of theta")
+STATUS = (text("status", "ok, or how the cell failed"), text("reason", "why it failed, or what to bear in mind"))
+LAST = (
+    text("versions", "versions of the libraries that the numbers rest on"),
+    text("key", "hash of everything that decides the numbers"),
+)
+HIDDEN = (
+    text("study", "the study that made the row", table=False),
+    text(
+        "parameters", "JSON with every parameter of every plugin, defaults included: the cell's identity", table=False
+    ),
+    Column("wall_s", "seconds that the cell took in all", "s", table=False),
+    Column("stored_at", "when the row was stored, since 1970", "s", table=False),
+    Column(
+        "sequence",
+        "a count that grows with every storing; the row of a key with the largest is its newest",
+        table=False,
+    ),
+    text("machine", "processor, cores and system of the machine that made the row", table=False),
+)
+COMMON = {column.name: column for column in (*FIRST, DIM, *STATUS, *LAST, *HIDDEN)}
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of a study's rows, in the order of its table."""
+
+    all: tuple[Column, ...]
+    by_name: dict[str, Column] = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "by_name", {column.name: column for column in self.all})
+
+    @classmethod
+    def of(cls, *own: Column) -> Columns:
+        """Make columns: what identifies a cell, status and reason, then the study's own columns."""
+        return cls((*FIRST, DIM, *STATUS, *own, *LAST, *HIDDEN))
+
+    @classmethod
+    def ordered(cls, names: Sequence[str], *own: Column) -> Columns:
+        """Make columns in a given order; columns of ``own`` that are not named follow, only in ``rows.parquet``."""
+        by_name = COMMON | {column.name: column for column in own}
+        rest = [column for name, column in by_name.items() if name not in names]
+        return cls((*(by_name[name] for name in names), *rest))
+
+    @property
+    def table(self) -> list[str]:
+        """Names of the columns of the table."""
+        return [column.name for column in self.all if column.table]
+
+    @property
+    def stored(self) -> list[str]:
+        """Names of all columns of ``rows.parquet``."""
+        return [column.name for column in self.all]
+
+    @property
+    def measured(self) -> list[str]:
+        """Names of the columns that are missing where cells are not timed."""
+        return [column.name for column in self.all if column.measured]
+
+    @property
+    def compared(self) -> list[Column]:
+        """The columns that ``compare`` judges."""
+        return [column for column in self.all if column.comparison]
+
+    @property
+    def referenced(self) -> bool:
+        """Whether rows name a reference gradient that they are measured against."""
+        return "reference_method" in self.by_name
+
+    def named(self, kind: Kind) -> list[str]:
+        """Return the names of the columns of one kind."""
+        return [column.name for column in self.all if column.kind == kind]
+
+    def blank(self) -> dict[str, Any]:
+        """Return a row without any value."""
+        return {c.name: "" if c.kind == "text" else [] if c.kind == "list" else math.nan for c in self.all}
+
+    def typed(self, table: pd.DataFrame) -> pd.DataFrame:
+        """Return the table with its columns typed and in order, followed by unknown columns as they are."""
+        import pandas as pd
+
+        known = {column.name: _typed(table.get(column.name), column.kind, len(table)) for column in self.all}
+        unknown = {name: table[name] for name in table if name not in self.by_name}
+        return pd.DataFrame({**known, **unknown}, index=table.index)
+
+
+def _typed(values: pd.Series | None, kind: Kind, count: int) -> Any:
+    """Return a column in the type of its kind, as it is where it has that type; missing values where there is no column."""
+    import pandas as pd
+
+    if values is None:
+        return pd.array([""] * count, dtype="str") if kind == "text" else np.full(count, math.nan)
+    if kind == "number":
+        return values if values.dtype == np.float64 else pd.to_numeric(values, errors="coerce").astype("float64")
+    if kind == "text" and not (str(values.dtype) == "str" and values.notna().all()):
+        return values.astype(object).fillna("").astype(str)
+    return values.map(_numbers) if kind == "list" else values
+
+
+def _numbers(listed: Any) -> Any:
+    """Return a list as it was stored: Parquet writes one of nothing but NaN as a list of nothing."""
+    nothing = isinstance(listed, np.ndarray) and listed.dtype == object and len(listed) > 0
+    return np.full(len(listed), math.nan) if nothing and all(one is None for one in listed) else listed
+
+
+__getattr__ = deprecated.lookup(__name__, globals())

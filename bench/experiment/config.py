@@ -1,0 +1,399 @@
+"""Turns Hydra configuration into a checked :class:`~bench.experiment.experiment.Experiment`."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.errors import STATUSES, UserError, unknown
+from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
+from bench.experiment.grid import refuse_too_many, short, swept
+from bench.experiment.study import Study
+from bench.model import Decision, guard, registry
+from bench.model.identity import parse_identity
+from bench.model.parameters import build, coerce, remember, singular
+
+SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+BYTES = {"k": 2.0**10, "m": 2.0**20, "g": 2.0**30}
+
+
+def config_dir() -> Path:
+    """Return the folder of ``config.yaml`` and the experiments: beside the package in a checkout, else inside it."""
+    package = Path(__file__).resolve().parents[1]
+    inside = package / "conf"
+    return inside if inside.is_dir() else package.parent / "conf"
+
+
+def experiments(config_dirs: Sequence[Path] = ()) -> list[str]:
+    """Return the names of the experiments that come with the package, and of those in the user's folders."""
+    return sorted(
+        {path.stem for folder in (config_dir(), *config_dirs) for path in (folder / "experiment").glob("*.yaml")}
+    )
+
+
+def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experiment:
+    """Load the experiment that Hydra composes from overrides; raises :class:`UserError` for anything wrong in them.
+
+    ``config_dirs`` are folders with experiments of the user's own, as ``experiment/NAME.yaml``.
+    """
+    from hydra import compose, initialize_config_dir
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    for override in overrides:
+        key, _, value = override.lstrip("+").partition("=")
+        if key == "plugins":
+            for folder in _split(value):
+                registry.add_folder(Path(folder))
+    for place in config_dirs:
+        if not (place / "experiment").is_dir():
+            raise UserError(f"'{place}' has no folder 'experiment' with experiments in it, as experiment/NAME.yaml")
+    parser = OverridesParser.create()
+    prepared = []
+    for override in overrides:
+        word = _prepared(override, config_dirs)
+        try:
+            parser.parse_override(word)
+        except (HydraException, ValueError, RecursionError):  # ValueError: a number of 5000 digits
+            raise UserError(
+                f"'{override[:200]}' cannot be read: write key=value with lists as [a,b] and strings in quotes"
+            ) from None
+        prepared.append(word)
+    if config_dirs:
+        places = ",".join(f"'file://{folder.expanduser().absolute()}'" for folder in config_dirs)
+        prepared.insert(0, f"hydra.searchpath=[{places}]")
+    try:
+        with initialize_config_dir(str(config_dir()), version_base="1.3"):
+            config = compose("config", overrides=prepared)
+        plain = OmegaConf.to_container(config, resolve=False, throw_on_missing=True)
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # ValueError: a name as the index of a list
+        raise UserError(str(error).strip().splitlines()[0]) from None
+    assert isinstance(plain, dict)
+    return experiment({str(k): v for k, v in plain.items()})
+
+
+def _known_keys() -> frozenset[str]:
+    kinds = [kind for kind in registry.kinds() if kind != "studies"]
+    return _settings() | {*kinds, *map(singular, kinds)}
+
+
+LAYOUT = ("columns", "rows")
+"""Settings of ``table`` that may be given by their own names."""
+
+
+@remember
+def _settings() -> frozenset[str]:
+    import yaml
+
+    return frozenset(yaml.safe_load((config_dir() / "config.yaml").read_text())) - {"defaults"}
+
+
+def _prepared(override: str, config_dirs: Sequence[Path]) -> str:
+    """Return the override as Hydra wants it, with experiments and plugin parameters reachable without ``+``."""
+    if "=" not in override:
+        raise UserError(f"'{override}' is not an override: write key=value (commands come first: see --help)")
+    if "${" in override:
+        raise UserError(f"'{override}': interpolations are not resolved here, give the value itself")
+    key, _, value = override.partition("=")
+    bare = key.lstrip("+~")
+    if bare in LAYOUT:
+        bare = f"table.{bare}"
+    head = bare.partition(".")[0]
+    if head == "experiment":
+        if "," in value:
+            raise UserError(
+                f"'{override}': one command runs one experiment, with its own sweep; give a command to each"
+            )
+        names = experiments(config_dirs)
+        if value not in names:
+            raise unknown("experiment", value, names)
+        return f"+experiment={value}"
+    if head.partition("/")[0] == "hydra" or key.startswith("~"):
+        raise UserError(f"'{override}': Hydra's own settings cannot be changed here")
+    if head not in _known_keys():
+        raise unknown("setting", bare, {*_known_keys(), *LAYOUT, "experiment"})
+    kinds = registry.kinds()
+    if bare in kinds:
+        return f"++{bare}={_quoted(value)}"
+    if bare == "study":
+        return f"study={_quoted(value)[1:-1]}"
+    if head in map(singular, kinds) or head in ("sweep", "marks", "ray", "slurm"):
+        return f"++{bare}={value}"
+    if bare != head and (head not in ("reference", "table") or bare.count(".") > 1):
+        whole = bare.rpartition(".")[0]
+        raise UserError(f"'{bare}' is not a setting: '{whole}' has no parts")
+    return f"{bare}={value}"
+
+
+def notes(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
+    """Return sentences on what wins where both an experiment's file and the command line give a sweep."""
+    import yaml
+
+    split = [(key.lstrip("+"), value) for key, _, value in (word.partition("=") for word in overrides)]
+    chosen = [value for key, value in split if key == "experiment"]
+    given: list[str] = []
+    for key, value in split:
+        head, _, axis = key.partition(".")
+        if head == "sweep":
+            given.extend([axis] if axis else (yaml.safe_load(value.replace(":", ": ")) or {}))
+    if not chosen or not given:
+        return []
+    places = (folder / "experiment" / f"{chosen[-1]}.yaml" for folder in (*config_dirs, config_dir()))
+    own = yaml.safe_load(next(place for place in places if place.exists()).read_text()).get("sweep") or {}
+    wins = [f"{axis} of the command line replaces that of {chosen[-1]}" for axis in given if axis in own]
+    adds = [f"{axis} of the command line is multiplied with it" for axis in given if axis not in own]
+    kept = [f"{axis} of {chosen[-1]} stays" for axis in own if axis not in given]
+    return [f"sweep: {'; '.join(wins + kept + adds)}"] if own else []
+
+
+def _split(value: str) -> list[str]:
+    """Return the items of a value that may be one or a list: ``a``, ``[a,b]``."""
+    inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
+    return [item.strip().strip("'\"") for item in inner.split(",") if item.strip()]
+
+
+def _quoted(value: str) -> str:
+    """Quote each identity string of a list, since a shell eats the quotes that Hydra needs around brackets."""
+    inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
+    items, depth = [""], 0
+    for letter in inner:
+        depth += (letter == "[") - (letter == "]")
+        if letter == "," and depth == 0:
+            items.append("")
+        else:
+            items[-1] += letter
+    if depth != 0:
+        return value
+    names = [item.strip().strip("'\"") for item in items]
+    return "[" + ",".join(f"'{name}'" for name in names if name) + "]"
+
+
+FORMATS = ("png", "svg", "pdf")
+
+
+def experiment(config: Mapping[str, Any]) -> Experiment:
+    """Check a resolved configuration against the registry."""
+    extra = set(config) - _known_keys()
+    if extra:
+        raise unknown("setting", sorted(extra)[0], _known_keys())
+    name = "" if config["name"] is None else str(config["name"])
+    if not SAFE_NAME.fullmatch(name) or ".." in name:
+        raise UserError(f"name={name!r} must be letters, digits, '.', '_' and '-', since it names a folder")
+    for folder in _listed_or_none(config["plugins"]):
+        registry.add_folder(Path(str(folder)))
+    study = _study(config["study"])
+    axes = {axis: registry.kind_of(axis) for axis in study.axes}
+    choices = {axis: [_choice(kind, item) for item in _listed(config, kind)] for axis, kind in axes.items()}
+    values = {axis: _table(config, axis) for axis in axes}
+    for axis, kind in axes.items():
+        for plugin, given in values[axis].items():
+            entry = registry.find(kind, plugin)
+            if not isinstance(given, Mapping):
+                raise UserError(f"{axis}.{plugin}={given!r} must name a parameter: {axis}.{plugin}.parameter=value")
+            if entry.plugin is not None:
+                build(entry.plugin, given)
+    timing = config["timing"]
+    refuse_too_many(_table(config, "sweep"))
+    return Experiment(
+        name=name,
+        study=study,
+        columns=study.columns,
+        timing=study.timed if timing is None else coerce(bool, timing, "timing"),
+        execution=_execution(config),
+        choices=choices,
+        values=values,
+        sweep=_table(config, "sweep"),
+        decision=_decision(config),
+        results_dir=_folder(config["results_dir"]),
+        question=str(config["question"] or ""),
+        marks=_table(config, "marks"),
+        compile_time=coerce(bool, config["compile_time"], "compile_time"),
+        formats=tuple(_one_of("formats", item, FORMATS) for item in _listed_or_none(config["formats"])),
+        table=_layout(_table(config, "table"), _table(config, "sweep")),
+        average=_average(config["average"], _table(config, "sweep")),
+        reference=_budget(_table(config, "reference")),
+        compile_cache=_compile_cache(config["compile_cache"]),
+        plugins=registry.folders(),
+        **{key: coerce(int, config[key], key) for key in ("samples", "repeats", "seed")},
+    )
+
+
+def _study(text: Any) -> Study:
+    name, values = parse_identity(text)
+    study = build(registry.usable("studies", name), values)
+    if not isinstance(study, Study):
+        raise UserError(f"study '{name}' does not derive from bench.Study")
+    return study
+
+
+def _folder(value: Any) -> Path:
+    if not isinstance(value, str | Path) or not str(value).strip():
+        raise UserError(f"results_dir={value!r} must be a folder")
+    return Path(value).expanduser()
+
+
+def _budget(settings: Mapping[str, Any]) -> Budget:
+    for key in settings:
+        if key not in ("samples", "tolerance"):
+            raise unknown("setting of reference", key, ("samples", "tolerance"))
+    for key in ("samples", "tolerance"):
+        if key not in settings:
+            raise UserError(f"reference has no {key}: write reference.{key}=... and leave the other as it is")
+    samples = coerce(int, settings["samples"], "reference.samples")
+    tolerance = coerce(float, settings["tolerance"], "reference.tolerance")
+    if samples < 256 or not tolerance > 0:
+        raise UserError("reference.samples must be at least 256 and reference.tolerance greater than 0")
+    return Budget(samples, tolerance)
+
+
+ROWS = ("estimator", "backend")
+
+
+def _layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> TableLayout:
+    for key in settings:
+        if key not in LAYOUT:
+            raise unknown("setting of table", key, LAYOUT)
+    columns = "" if settings["columns"] is None else str(settings["columns"])
+    names = {part for name in swept(sweep) for part in (name, name.rpartition(".")[2])}
+    if columns and columns not in names:
+        raise unknown("axis for table.columns:", columns, names)
+    rows = tuple(_one_of("table.rows", row, ROWS) for row in _listed_or_none(settings["rows"]))
+    if "estimator" not in rows:
+        raise UserError(f"table.rows={list(rows)} must hold estimator; [estimator,backend] gives each backend a row")
+    return TableLayout(columns, rows)
+
+
+def _average(names: Any, sweep: Mapping[str, Any]) -> tuple[str, ...]:
+    known = {part for name in swept(sweep) for part in (name, short(name), name.partition(".")[0])}
+    for name in _listed_or_none(names):
+        if name not in known:
+            raise (
+                unknown("axis for average:", str(name), known)
+                if known
+                else UserError(f"average={name}: nothing is swept, so there is nothing to average over")
+            )
+    return tuple(map(str, _listed_or_none(names)))
+
+
+def _decision(config: Mapping[str, Any]) -> Decision:
+    names = [coerce(str, name, "theta") for name in _listed_or_none(config["theta"])]
+    at = config["theta0"]
+    values = None if at is None else tuple(coerce(float, value, "theta0") for value in _listed_or_none(at))
+    if values is not None and not all(map(math.isfinite, values)):
+        raise UserError(f"theta0={list(values)} must be finite")
+    return Decision(tuple(names), values)
+
+
+def _listed_or_none(value: Any) -> list[Any]:
+    return [] if value is None else list(value) if isinstance(value, list | tuple) else [value]
+
+
+def _compile_cache(value: Any) -> Path | None:
+    if value is None:
+        return None
+    if str(value) != "default":
+        return Path(str(value)).expanduser().absolute()
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "diffsim-bench" / "jax"
+
+
+def _execution(config: Mapping[str, Any]) -> Execution:
+    workers = config["workers"]
+    if workers is not None and coerce(int, workers, "workers") < 0:
+        raise UserError(f"workers={workers} must be at least 0, or null for the number of cores")
+    retry = config["retry"] if isinstance(config["retry"], list) else [config["retry"]]
+    return Execution(
+        workers=None if workers is None else coerce(int, workers, "workers"),
+        timeout=_amount("timeout", config["timeout"], SECONDS, "600, 10m"),
+        memory=_whole(_amount("memory", config["memory"], BYTES, "4g, 500m")),
+        stop=_one_of("on_error", config["on_error"], ("continue", "stop")) == "stop",
+        versions=_one_of("versions", config["versions"], ("ignore", "warn", "rerun")),
+        retry=tuple(_one_of("retry", status, STATUSES) for status in retry if status is not None),
+        launcher=_one_of("launcher", config["launcher"], tuple(CLUSTERS)),
+        cluster=_cluster(config, str(config["launcher"])),
+    )
+
+
+CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
+    "local": {},
+    "ray": {"address": (str, True), "cells": (int, False), "cpus": (float, False)},
+    "slurm": {
+        "cluster": (str, False), **dict.fromkeys(("cells", "minutes", "cpus", "parallel"), (int, False)),
+        **dict.fromkeys(("partition", "constraint", "account", "qos"), (str, True)),
+    },
+}  # fmt: skip
+"""Settings by launcher: the type of each, and whether it may be null."""
+
+
+def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
+    """Check the settings of all launchers; returns those of the chosen one."""
+    result: dict[str, dict[str, Any]] = {name: {} for name in CLUSTERS}
+    for one, known in CLUSTERS.items():
+        given = _table(config, one) if known else {}
+        for name in given:
+            if name not in known:
+                raise unknown(f"setting of {one}", name, known)
+        for name, (kind, empty) in known.items():
+            value = given.get(name)
+            result[one][name] = None if value is None and empty else coerce(kind, value, f"{one}.{name}")
+            if kind is not str and not result[one][name] >= 1:
+                raise UserError(f"{one}.{name}={value} must be at least 1")
+    _one_of("slurm.cluster", result["slurm"]["cluster"], ("slurm", "local"))
+    return result[launcher]
+
+
+def _one_of(key: str, value: Any, allowed: Sequence[str]) -> str:
+    if value not in allowed:
+        raise unknown(f"value for {key}:", value, allowed)
+    return str(value)
+
+
+def _amount(key: str, value: Any, units: Mapping[str, float], example: str) -> float | None:
+    """Return a positive number with one of the units, or None for no limit."""
+    if value is None:
+        return None
+    text = str(value).strip().lower()
+    number, unit = (text[:-1], text[-1:]) if text[-1:] in units else (text, "")
+    try:
+        amount = float(number) * units.get(unit, 1.0)
+    except ValueError:
+        amount = math.nan
+    if isinstance(value, bool) or not 0 < amount < math.inf:
+        raise UserError(f"{key}={value!r} must be an amount such as {example}, greater than 0, or null for no limit")
+    return amount
+
+
+def _whole(amount: float | None) -> int | None:
+    return None if amount is None else math.ceil(amount)
+
+
+def _table(config: Mapping[str, Any], key: str) -> dict[str, Any]:
+    value = {} if config.get(key) is None else config[key]
+    if not isinstance(value, Mapping):
+        raise UserError(f"{key}={value!r} must be a table of settings: {key}.name=value")
+    return {str(k): v for k, v in value.items()}
+
+
+def _listed(config: Mapping[str, Any], kind: str) -> list[Any]:
+    value = config.get(kind)
+    listed = value if isinstance(value, list) else [value]
+    if not listed or value is None:
+        raise UserError(f"{kind} is empty: give at least one of {', '.join(sorted(registry.entries()[kind]))}")
+    return listed
+
+
+def _choice(kind: str, text: Any) -> Choice:
+    name, values = parse_identity(text)
+    entry = registry.find(kind, name)
+    if entry.plugin is not None:
+        # a plugin that leaves the working folder would take relative paths with it
+        with guard.quiet(f"{singular(kind)} {name}"), guard.guarded():
+            build(entry.plugin, values)
+    return Choice(entry, tuple(sorted(values.items())))

@@ -1,0 +1,141 @@
+"""An experiment: a named sweep, resolved once when configuration is read."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bench.experiment.columns import Columns
+from bench.model import Decision, registry
+from bench.model.identity import described, identity
+from bench.model.parameters import Plugin
+from bench.model.program import OWN
+from bench.model.registry import Entry
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A plugin chosen on an axis, with the parameters that its identity string set."""
+
+    entry: Entry
+    values: tuple[tuple[str, Any], ...] = ()
+
+    def __str__(self) -> str:
+        return identity(self.entry.name, dict(self.values))
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How cells are run; it decides none of their numbers."""
+
+    workers: int | None = None
+    """Number of processes; None for the number of cores, 0 to work in this process."""
+    timeout: float | None = None
+    """Seconds that a cell may take."""
+    memory: int | None = None
+    """Bytes that a worker may hold."""
+    stop: bool = False
+    """Whether the first failed cell ends the run."""
+    versions: str = "warn"
+    """How to treat stored rows made with other library versions: ``ignore``, ``warn`` or ``rerun``."""
+    retry: tuple[str, ...] = ()
+    """Statuses of stored rows that are run again."""
+    launcher: str = "local"
+    """Where cells run: ``local``, ``ray`` or ``slurm``."""
+    cluster: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of that launcher."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much is spent on a reference gradient."""
+
+    samples: int = 1 << 18
+    """Most samples of a sampled reference."""
+    tolerance: float = 0.005
+    """Standard error, relative to the gradient, at which sampling stops."""
+
+
+@dataclass(frozen=True)
+class TableLayout:
+    """How the table of a paper is laid out; it decides no number."""
+
+    columns: str = ""
+    """The swept axis across; empty for the longest."""
+    rows: tuple[str, ...] = ("estimator",)
+    """What gets a row of its own: estimators, with those backends on one row that agree, or also each backend."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A named sweep: which plugins, which parameters, how many samples, and what is measured."""
+
+    name: str
+    study: Plugin
+    """What to measure in each cell: a :class:`bench.experiment.study.Study`."""
+    columns: Columns
+    """The columns of its rows, which are those of the study."""
+    choices: Mapping[str, Sequence[Choice]]
+    """By axis (``scene``, ...), in the order of the study's axes."""
+    values: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
+    """Parameters set for plugins by axis, plugin name and parameter."""
+    sweep: Mapping[str, Any] = field(default_factory=dict)
+    decision: Decision = OWN
+    """The meaning of theta, and the point at which gradients are taken."""
+    samples: int = 256
+    repeats: int = 64
+    seed: int = 0
+    results_dir: Path = Path("results")
+    question: str = ""
+    marks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Per axis, named values to draw as lines in the charts."""
+    compile_time: bool = False
+    """Whether charts of error against time add compilation to it."""
+    formats: tuple[str, ...] = ("png",)
+    """File formats of the charts."""
+    table: TableLayout = TableLayout()
+    average: tuple[str, ...] = ()
+    """Swept axes over which averages are written; it decides no number."""
+    reference: Budget = Budget()
+    compile_cache: Path | None = None
+    """Folder of compiled programs kept between runs."""
+    plugins: tuple[Path, ...] = ()
+    """Folders with the user's own plugins."""
+    timing: bool = False
+    """Whether cells are timed, each by itself on the machine."""
+    execution: Execution = Execution()
+
+    @property
+    def budget(self) -> Budget | None:
+        """Budget of a cell's reference gradient; None where the study needs none."""
+        return self.reference if self.columns.referenced else None
+
+    @property
+    def directory(self) -> Path:
+        """Folder of the experiment's files."""
+        return self.results_dir / self.name
+
+    def record(self) -> dict[str, Any]:
+        """Return the whole experiment as JSON-like values, for ``run.json``."""
+        return {
+            "name": self.name,
+            "study": described(self.study),
+            "question": self.question,
+            **{registry.kind_of(axis): [str(choice) for choice in some] for axis, some in self.choices.items()},
+            "parameters": self.values,
+            "sweep": self.sweep,
+            "theta": list(self.decision.names),
+            "theta0": None if self.decision.at is None else list(self.decision.at),
+            **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks", "compile_time")},
+            "formats": list(self.formats),
+            "average": list(self.average),
+            "table": dataclasses.asdict(self.table),
+            "reference": dataclasses.asdict(self.reference),
+            "results_dir": str(self.results_dir),
+            "compile_cache": None if self.compile_cache is None else str(self.compile_cache),
+            "plugins": [str(path) for path in self.plugins],
+            "execution": dataclasses.asdict(self.execution),
+        }

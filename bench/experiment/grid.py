@@ -1,0 +1,309 @@
+"""Expands an experiment's axes into cells."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bench.errors import Unsupported, UserError, unknown
+from bench.experiment.cell import Cell
+from bench.experiment.experiment import Choice, Experiment
+from bench.experiment.study import study_of
+from bench.model import Decision, MechanicalScene, Plugin, Scene, compose
+from bench.model.parameters import build, coerce, parameters, singular
+from bench.model.program import OWN
+
+MOST = 1_000_000
+"""Cells of the largest sweep: planning them takes minutes."""
+COUNTS = ("samples", "repeats", "seed")
+"""What a sweep can vary besides plugin parameters, and besides :data:`THETA`."""
+THETA = "theta0"
+"""The axis of where gradients are taken: whole thetas, or ``theta0.2`` for one coordinate of it."""
+
+
+def of_theta(axis: str) -> bool:
+    """Return whether an axis is theta0 or one of its coordinates.
+
+    >>> [of_theta(axis) for axis in ("theta0", "theta0.2", "heaviside.theta", "theta0.x")]
+    [True, True, False, False]
+    """
+    name, dot, coordinate = axis.partition(".")
+    return name == THETA and (not dot or coordinate.isdecimal())
+
+
+def short(axis: str) -> str:
+    """Return the parameter's own name: ``gamma`` of ``alpha_order.gamma``; a coordinate of theta0 has no shorter one."""
+    return axis if of_theta(axis) else axis.rpartition(".")[2]
+
+
+def cells(experiment: Experiment) -> list[Cell]:
+    """Return the cells of an experiment, each once, in sweep order; raises :class:`UserError` for impossible ones."""
+    refuse_too_many(experiment.sweep, math.prod(len(some) for some in experiment.choices.values()))
+    _check_axes(experiment)
+    unique: dict[str, Cell] = {}
+    expansion = _Expansion(experiment)
+    for point in points(experiment.sweep):
+        for choices in itertools.product(*experiment.choices.values()):
+            cell = expansion.cell(point, dict(zip(experiment.choices, choices, strict=True)))
+            unique.setdefault(cell.key, cell)
+    if not unique:
+        raise UserError("the experiment has no cells: choose at least one of each of scenes, backends, estimators")
+    if any(cell.decision != OWN for cell in unique.values()):
+        _check_theta(list(unique.values()))
+    return list(unique.values())
+
+
+def _check_theta(cells: Sequence[Cell]) -> None:
+    """Raise the error of theta if no cell can take it; if some can, the others report it in their rows."""
+    first: UserError | None = None
+    for cell in cells:
+        try:
+            cell.program()
+        except UserError as error:
+            first = first or error
+        except Unsupported:
+            continue
+        else:
+            return
+    if first is not None:
+        raise first
+
+
+def refuse_too_many(sweep: Mapping[str, Any], each: int = 1) -> None:
+    """Raise :class:`UserError` for a sweep of more than :data:`MOST` cells, ``each`` of them at a point."""
+    size = _size(sweep) * each
+    if size > MOST:
+        raise UserError(
+            f"the sweep has {size} cells, and more than {MOST} are not run at once: give it fewer values, or split it"
+        )
+
+
+def _size(sweep: Mapping[str, Any]) -> int:
+    """Return the number of points of a sweep without expanding it."""
+    size = 1
+    for axis, value in sweep.items():
+        if axis == "product":
+            size *= _size(_mapping(value, "sweep.product"))
+        elif axis == "zip":
+            size *= max((len(_values(n, v)) for n, v in _flat(_mapping(value, "sweep.zip")).items()), default=1)
+        elif axis == "union":
+            size *= (
+                sum(_size(_mapping(part, "sweep.union")) for part in value) if isinstance(value, list | tuple) else 1
+            )
+        else:
+            size *= math.prod(len(_values(name, values)) for name, values in _flat({axis: value}).items())
+    return size
+
+
+def points(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Expand a sweep into points: named axes are multiplied, ``zip`` pairs its axes, ``union`` concatenates sweeps.
+
+    >>> points({"a": [1, 2], "b": [3]})
+    [{'a': 1, 'b': 3}, {'a': 2, 'b': 3}]
+    >>> points({"zip": {"c": [4, 5], "d": [6, 7]}})
+    [{'c': 4, 'd': 6}, {'c': 5, 'd': 7}]
+    >>> points({"union": [{"a": [1]}, {"b": [2]}]})
+    [{'a': 1}, {'b': 2}]
+    """
+    factors: list[list[dict[str, Any]]] = []
+    for axis, value in sweep.items():
+        if axis == "product":
+            factors.append(points(_mapping(value, "sweep.product")))
+        elif axis == "zip":
+            columns = {name: _values(name, v) for name, v in _flat(_mapping(value, "sweep.zip")).items()}
+            lengths = {name: len(v) for name, v in columns.items()}
+            if len(set(lengths.values())) > 1:
+                raise UserError(f"zipped axes must be equally long, given {lengths}")
+            factors.append([dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)])
+        elif axis == "union":
+            if not isinstance(value, list | tuple):
+                raise UserError("sweep.union must be a list of sweeps")
+            factors.append([point for part in value for point in points(_mapping(part, "sweep.union"))])
+        else:
+            factors.extend([{name: v} for v in _values(name, vs)] for name, vs in _flat({axis: value}).items())
+    return [_joined(combo) for combo in itertools.product(*factors)]
+
+
+def _joined(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    point = dict(itertools.chain(*(part.items() for part in parts)))
+    if len(point) < sum(map(len, parts)):
+        name = next(name for name in point if sum(name in part for part in parts) > 1)
+        raise UserError(f"sweep axis '{name}' is given twice: once by itself and once in a zip, union or product")
+    return point
+
+
+def swept(sweep: Mapping[str, Any]) -> list[str]:
+    """Return the names of the axes of a sweep, in order."""
+    return list(dict.fromkeys(name for point in points(sweep) for name in point))
+
+
+def _mapping(value: Any, where: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise UserError(f"{where} must be axes with lists of values, not {value!r}")
+    return value
+
+
+def _flat(sweep: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in sweep.items():
+        path = f"{prefix}{name}"
+        flat.update(_flat(value, path + ".") if isinstance(value, Mapping) else {path: value})
+    return flat
+
+
+def _values(axis: str, values: Any) -> list[Any]:
+    listed = list(values) if isinstance(values, list | tuple) else [values]
+    if not listed:
+        raise UserError(f"sweep.{axis} is empty: give at least one value")
+    return listed
+
+
+def coerce_finite(values: Any, name: str) -> tuple[float, ...]:
+    """Return one number or a list as finite floats; raises :class:`UserError` otherwise."""
+    numbers = tuple(coerce(float, value, name) for value in (values if isinstance(values, list | tuple) else [values]))
+    if not all(map(math.isfinite, numbers)):
+        raise UserError(f"{name}={list(numbers)} must be finite")
+    if "." in name and len(numbers) != 1:
+        raise UserError(f"{name} takes one number at a time, not {list(numbers)}")
+    return numbers
+
+
+def applies(axis: str, kind: str, plugin: str, known: Mapping[str, Any]) -> str | None:
+    """Return the parameter of a plugin that a sweep axis names, or None.
+
+    ``known`` are the plugin's parameters; ``gamma``, ``alpha_order.gamma`` and
+    ``estimator.alpha_order.gamma`` name the same parameter.
+
+    >>> applies("alpha_order.gamma", "estimators", "alpha_order", {"gamma": 1.0})
+    'gamma'
+    """
+    *path, parameter = axis.split(".")
+    if parameter not in known:
+        return None
+    return parameter if path in ([], [plugin], [singular(kind), plugin], [singular(kind)]) else None
+
+
+def _applies(axis: str, plugin: type[Plugin]) -> str | None:
+    return applies(axis, plugin.kind, plugin.name, parameters(plugin))
+
+
+def _check_axes(experiment: Experiment) -> None:
+    chosen = [c.entry.plugin for some in experiment.choices.values() for c in some if c.entry.plugin]
+    names = {name for plugin in chosen for name in parameters(plugin)} | {*COUNTS, THETA}
+    for axis in swept(experiment.sweep):
+        if axis not in COUNTS and not of_theta(axis) and not any(_applies(axis, plugin) for plugin in chosen):
+            raise unknown("sweep axis", axis, names)
+
+
+class _Expansion:
+    """Makes the cells of an experiment, building each plugin once for all cells that share its values."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._experiment = experiment
+        self._axes: dict[tuple[type[Plugin], tuple[str, ...]], list[tuple[str, str]]] = {}
+        self._made: dict[tuple[int, str], Plugin] = {}
+
+    def cell(self, point: Mapping[str, Any], choices: Mapping[str, Choice]) -> Cell:
+        """Make the cell of these choices at a point of the sweep."""
+        used: dict[str, str] = {}
+        parts: dict[str, Plugin | None] = {}
+        scene: Plugin | None = None
+        for axis, choice in choices.items():
+            given: Mapping[str, Any] | None = None
+            if axis in ("contact", "integrator") and not isinstance(scene, MechanicalScene):
+                parts[axis] = None
+                continue
+            if axis == "contact" and isinstance(scene, MechanicalScene):
+                if not scene.n_contacts:
+                    parts[axis] = None
+                    continue
+                given = scene.contact_values
+            parts[axis] = self._plugin(axis, choice, point, used, given)
+            if axis == "scene":
+                scene = parts[axis]
+                assert isinstance(scene, Scene)
+        experiment = self._experiment
+        return Cell(
+            study_of(experiment).parts(parts), **self._counts(point), study=experiment.study,
+            decision=self._decision(point, parts), timing=experiment.timing, budget=experiment.budget,
+        )  # fmt: skip
+
+    def _decision(self, point: Mapping[str, Any], parts: Mapping[str, Plugin | None]) -> Decision:
+        """Return what theta is at a point of the sweep; coordinates that are not swept stay where they are."""
+        decision = self._experiment.decision
+        given = {name: coerce_finite(values, name) for name, values in point.items() if of_theta(name)}
+        if not given:
+            return decision
+        if THETA in given:
+            if len(given) > 1:
+                raise UserError(f"the sweep gives theta0 and {', '.join(given.keys() - {THETA})}: give one of them")
+            return dataclasses.replace(decision, at=given[THETA])
+        try:
+            scene, contact, integrator = (parts.get(axis) for axis in ("scene", "contact", "integrator"))
+            at = compose(scene, contact, integrator, decision).theta0.tolist()  # type: ignore[arg-type]
+        except (Unsupported, UserError):  # the cell says so itself
+            return decision
+        for name, values in given.items():
+            coordinate = int(name.partition(".")[2])
+            if coordinate >= len(at):
+                raise UserError(f"sweep axis '{name}': theta has {len(at)} coordinates, counted from 0")
+            (at[coordinate],) = values
+        return dataclasses.replace(decision, at=tuple(at))
+
+    def _counts(self, point: Mapping[str, Any]) -> dict[str, int]:
+        counts: dict[str, int] = {}
+        for name, low in (("samples", 1), ("repeats", 2), ("seed", 0)):
+            count = coerce(int, point.get(name, getattr(self._experiment, name)), name)
+            if count < low:
+                raise UserError(f"{name}={count} must be at least {low}")
+            counts[name] = count
+        return counts
+
+    def _plugin(
+        self,
+        group: str,
+        choice: Choice,
+        point: Mapping[str, Any],
+        used: dict[str, str],
+        given: Mapping[str, Any] | None,
+    ) -> Plugin:
+        plugin = choice.entry.plugin
+        if plugin is None:
+            raise UserError(f"{group} '{choice.entry.name}' cannot be used: {choice.entry.reason}")
+        axes = self._axes_of(plugin, tuple(point))
+        for axis, parameter in axes:
+            if axis in used:
+                raise UserError(
+                    f"sweep axis '{axis}' is a parameter of both {used[axis]} and {plugin.name}: "
+                    f"write sweep.{used[axis]}.{parameter} or sweep.{plugin.name}.{parameter}"
+                )
+            used[axis] = plugin.name
+        key = (id(choice), repr([point[axis] for axis, _ in axes] + [given]))
+        if key not in self._made:
+            values = {k: v for k, v in (given or {}).items() if k in parameters(plugin)}
+            # later ones win: the scene's contact values, settings, identity string, sweep
+            values |= self._experiment.values.get(group, {}).get(plugin.name, {})
+            values |= dict(choice.values) | {parameter: point[axis] for axis, parameter in axes}
+            self._made[key] = _build(plugin, sorted(values.items()))
+        return self._made[key]
+
+    def _axes_of(self, plugin: type[Plugin], names: tuple[str, ...]) -> list[tuple[str, str]]:
+        """Return the axes that are parameters of the plugin, and which."""
+        if (plugin, names) not in self._axes:
+            pairs = [(name, _applies(name, plugin)) for name in names if name not in COUNTS]
+            self._axes[plugin, names] = [(axis, parameter) for axis, parameter in pairs if parameter is not None]
+        return self._axes[plugin, names]
+
+
+_built: dict[tuple[type[Plugin], str], Plugin] = {}
+
+
+def _build(plugin: type[Plugin], values: Sequence[tuple[str, Any]]) -> Plugin:
+    """Return the one instance with these values; 1, 1.0 and True are distinct, since a parameter may refuse some."""
+    key = (plugin, repr(values))
+    if key not in _built:
+        _built[key] = build(plugin, dict(values))
+    return _built[key]

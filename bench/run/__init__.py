@@ -1,0 +1,1 @@
+"""From cells to rows: plan, workers, launchers, references and the store."""

@@ -1,0 +1,89 @@
+"""``run.json``: what was run, with what, on what, and how it ended."""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+import sys
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.experiment.experiment import Experiment
+from bench.measure import timing
+from bench.run.files import write_whole
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LIBRARIES = ("numpy", "scipy", "jax", "jaxlib", "torch", "optimistix", "lineax", "hydra-core", "pandas", "pyarrow")
+
+
+def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds: float, simulated: bool) -> Path:
+    """Write ``run.json``: what was run, with what, on what, and how it ended.
+
+    A run that found all its rows stored keeps the record of the last run that simulated the same configuration.
+    """
+    content: dict[str, Any] = {
+        "command": " ".join(["python -m bench", *words]),
+        "experiment": experiment.name,
+        "study": experiment.study.name,
+        "question": experiment.question,
+        "config": experiment.record(),
+        "seeds": sorted({int(seed) for seed in rows["seed"]}),
+        "counts": {str(k): int(v) for k, v in rows["status"].value_counts().items()},
+        "duration_s": round(seconds, 3),
+        "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "python": platform.python_version(),
+        "versions": {name: _version(name) for name in LIBRARIES},
+        **_compilations(rows),
+        "machine": {**machine(), "load_average_start": timing.load_at_start()},
+        "git_commit": _commit(),
+        "argv": [Path(sys.argv[0]).name, *words],
+    }
+    path = experiment.directory / "run.json"
+    text = json.dumps(content, indent=1, default=str) + "\n"
+    if simulated or _is_other(path, json.loads(text)):
+        write_whole(path, text.encode())
+    return path
+
+
+def _is_other(path: Path, made: dict[str, Any]) -> bool:
+    """Return whether a record is of another configuration, missing or unreadable."""
+    try:
+        return bool(json.loads(path.read_text())["config"] != made["config"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return True
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def machine() -> dict[str, Any]:
+    """Return the system, and the conditions that its times depend on."""
+    return {"system": platform.system(), **timing.conditions()}
+
+
+def _compilations(rows: pd.DataFrame) -> dict[str, int]:
+    """Return the compilations that the rows took, and the number of distinct structures, functions and shapes."""
+    if "compilations" not in rows:
+        return {}
+    shapes = {shape for text in rows["shapes"] for shape in text.split()}
+    return {"compilations": int(rows["compilations"].sum()), "distinct_shapes": len(shapes)}
+
+
+def _commit() -> str | None:
+    try:
+        where = Path(__file__).resolve().parent
+        done = subprocess.run(
+            ["git", "-C", str(where), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

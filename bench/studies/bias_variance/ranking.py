@@ -1,0 +1,135 @@
+"""Where each estimator wins and where it fails: relative errors with intervals, one column per problem."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from bench.experiment.experiment import Experiment
+from bench.report.tables import csv, plain_markdown
+from bench.report.text import number
+from bench.run.files import write_all
+
+LEAST = 3
+"""Estimators from which on the table is written: with fewer the main table shows it at a glance."""
+WORTHLESS = 0.99
+"""Relative RMSE from which on an estimate is no better than answering zero."""
+MANY = 2.5
+"""Evaluations per sample from which on they are printed."""
+WINS, FAILS, BIASED = "wins", "fails", "biased"
+
+
+def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
+    """Write the table as Markdown and CSV; nothing where few estimators ran, or something was swept."""
+    table = standing(rows)
+    if table.empty:
+        return []
+    texts = pd.DataFrame(
+        {"estimator": list(dict.fromkeys(table["label"]))}
+        | {problem: _column(table, problem) for problem in dict.fromkeys(table["problem"])}
+    )
+    legend = (
+        "\n\nRelative RMSE [95% interval] at equal samples, not at equal rollouts. *wins*: not distinguishable from the lowest "
+        "of its column. *fails*: no better than answering zero. *biased*: more than half of the error is bias. *(40x)*: it "
+        "evaluates 40 costs and gradients per sample, where others take one or two.\n"
+    )
+    contents = {"standing.md": plain_markdown(texts) + legend + _best_text(best(table)), "standing.csv": csv(table)}
+    return write_all(experiment.directory, contents)
+
+
+def best(table: pd.DataFrame) -> pd.DataFrame:
+    """Return, per estimator and problem, the setting of least error at equal evaluations, and how it stands.
+
+    An estimate of as many evaluations (costs and gradients) as there are samples has the bias as measured, and the
+    variance times the evaluations per sample: fewer samples fit. Choosing the best of several settings flatters an
+    estimator by about its interval.
+    """
+    good = table[(table["status"] == "ok") & np.isfinite(table["equal"])]
+    good = good.assign(estimator=good["label"].str.partition("[")[0])
+    if good.empty:
+        return good
+    chosen = good.loc[good.groupby(["estimator", "problem"], sort=False)["equal"].idxmin()]
+    lowest = chosen.groupby("problem")["equal_high"].min()
+    wins = chosen["equal_low"].to_numpy() <= lowest.reindex(chosen["problem"]).to_numpy()
+    stands = np.select([chosen["equal"] >= WORTHLESS, wins], [FAILS, WINS], "")
+    return chosen.assign(stands=stands).reset_index(drop=True)
+
+
+def _best_text(table: pd.DataFrame) -> str:
+    """Write each estimator's best setting on each problem, where some estimator has more than one."""
+    if table.empty or not table["label"].str.contains("[", regex=False).any():
+        return ""
+    texts = {
+        (row.estimator, row.problem): f"{number(row.equal)} [{number(row.equal_low)}, {number(row.equal_high)}]"
+        + (f" {row.stands}" if row.stands else "")
+        + (f" ({row.label.partition('[')[2][:-1]})" if "[" in row.label else "")
+        for row in table.itertuples()
+    }
+    names, problems = dict.fromkeys(table["estimator"]), dict.fromkeys(table["problem"])
+    wide = pd.DataFrame(
+        {"estimator": list(names)} | {p: [texts.get((name, p), "") for name in names] for p in problems}
+    )
+    return (
+        "\nEach estimator at its best setting (in parentheses), and at equal work: relative RMSE of an estimate of as many "
+        "costs and gradients together as there are samples, from the measured bias and variance; below, the same words.\n\n"
+        + plain_markdown(wide)
+        + "\n"
+    )
+
+
+def _column(table: pd.DataFrame, problem: str) -> list[str]:
+    part = table[table["problem"] == problem].set_index("label")
+    return [part["text"].get(label, "") for label in dict.fromkeys(table["label"])]
+
+
+def standing(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one row per cell: estimator, problem, relative RMSE with its interval, and how it stands.
+
+    Empty unless at least three estimators ran on each of several problems, once each. The interval combines those of
+    bias and variance: rmse^2 is their sum.
+    """
+    rows = rows.assign(
+        label=np.where(
+            rows["estimator_params"] == "", rows["estimator"], rows["estimator"] + "[" + rows["estimator_params"] + "]"
+        ),
+        problem=np.where(rows["contact"] == "none", rows["scene"], rows["scene"] + ", " + rows["contact"]),
+    )
+    once = not rows.duplicated(["label", "problem"]).any()
+    if not once or rows["label"].nunique() < LEAST or rows["problem"].nunique() < 2:
+        return pd.DataFrame()
+    norm = rows["reference_norm"]
+    low = np.sqrt(rows["bias_low"] ** 2 + rows["variance_low"]) / norm
+    high = np.sqrt(rows["bias_high"] ** 2 + rows["variance_high"]) / norm
+    table = rows[["label", "problem", "status", "rmse_rel", "rollouts", "gradients"]].assign(
+        low=low, high=high, share=(rows["bias_low"] / rows["rmse"]) ** 2,
+        evaluations=(work := (rows["rollouts"] + rows["gradients"]) / rows["samples"]),
+        equal=np.sqrt(rows["bias"] ** 2 + rows["variance"] * work) / norm,
+        equal_low=np.sqrt(rows["bias_low"] ** 2 + rows["variance_low"] * work) / norm,
+        equal_high=np.sqrt(rows["bias_high"] ** 2 + rows["variance_high"] * work) / norm,
+    )  # fmt: skip
+    good = table["status"] == "ok"
+    lowest = table[good].groupby("problem")["high"].min()
+    table["stands"] = [_stands(row, lowest.get(row.problem, math.nan)) for row in table.itertuples()]
+    table["text"] = [_text(row) for row in table.itertuples()]
+    return table.reset_index(drop=True)
+
+
+def _stands(row: object, lowest: float) -> str:
+    status, low, share, rmse = (getattr(row, name) for name in ("status", "low", "share", "rmse_rel"))
+    if status != "ok":
+        return str(status)
+    wins = low <= lowest
+    said = [WINS] if wins and rmse < WORTHLESS else [FAILS] if rmse >= WORTHLESS else []
+    return ", ".join([*said, *([BIASED] if share > 0.5 else [])])
+
+
+def _text(row: object) -> str:
+    status, stands = getattr(row, "status"), getattr(row, "stands")  # noqa: B009, rows of a table have no type
+    if status != "ok":
+        return str(status)
+    middle, low, high = (number(float(getattr(row, name))) for name in ("rmse_rel", "low", "high"))
+    times = float(getattr(row, "evaluations"))  # noqa: B009
+    return f"{middle} [{low}, {high}]" + (f" {stands}" if stands else "") + (f" ({times:.0f}x)" if times > MANY else "")

@@ -1,0 +1,198 @@
+"""Words, plugins and files that nobody should write: one line that says what is wrong, and status 2."""
+
+import os
+import subprocess
+import sys
+import time
+
+import pandas as pd
+import pytest
+
+from bench.cli import main
+from bench.experiment.axes import table
+from bench.experiment.config import load
+from bench.experiment.grid import cells
+from bench.model import registry
+from bench.run import tasks
+
+BASE = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg]", "samples=4", "repeats=3", "workers=0", "timing=false", "--quiet"]  # fmt: skip
+MANY = ",".join(map(str, range(2, 220)))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["estimators=[fobg[x=!!python/object:os.system]]"], ["estimators=[fobg[a={]]"], ["scenes=[heaviside[sigma=@]]"],
+        ["scenes=[heaviside[sigma=2020-13-45]]"], ["sweep={"], ["sweep={a:!x}"], ["reference=null"],
+        ["seed=" + "9" * 400], ["seed=" + "9" * 5000], ["samples=" + "9" * 400], [f"sweep.seed=[{'9' * 400}]"],
+        ["scene.heaviside.sigma=" + "9" * 400], [f"seed={2**53 + 1}"], ["plugins=[~nosuchuser]"],
+        ["results_dir='~nosuchuser/x'"], ["--config-dir", "~nosuchuser"], ["results_dir=null"], ["results_dir=[]"],
+        ["results_dir=''"], ["name=null"],
+    ],
+    ids=lambda words: words[-1][:30],
+)  # fmt: skip
+def test_odd_words_are_refused_in_one_line(tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    assert main(["plan", *BASE, *words]) == 2
+    said = capsys.readouterr().err.strip()
+    assert said.startswith("bench: ")
+    assert len(said.splitlines()) == 1
+    assert len(said) < 2000
+    assert not list(tmp_path.iterdir())
+
+
+def test_ten_million_cells_are_refused_before_they_are_expanded(capsys):
+    started = time.monotonic()
+    assert main(["plan", *BASE, f"sweep.seed=[{MANY}]", f"sweep.samples=[{MANY}]", f"sweep.repeats=[{MANY}]"]) == 2
+    assert time.monotonic() - started < 10
+    assert "the sweep has 10360232 cells" in capsys.readouterr().err
+
+
+def test_the_size_of_a_sweep_is_known_without_expanding_it():
+    from bench.experiment.grid import _size, points
+
+    for sweep in ({}, {"a": [1, 2], "b": 3}, {"zip": {"a": [1, 2], "b": [3, 4]}, "c": [1, 2]},
+                  {"union": [{"a": [1, 2]}, {"b": [1], "c": {"d": [1, 2, 3]}}]}, {"product": {"a": [1, 2], "b": [1, 2, 3]}}):  # fmt: skip
+        assert _size(sweep) == len(points(sweep))
+
+
+@pytest.mark.parametrize(
+    "columns", [["key"], ["key", "study"], ["key", "study", "parameters"], ["bias"], ["key", "scene", "status"]]
+)
+def test_compare_of_files_with_missing_columns_is_one_line(tmp_path, capsys, monkeypatch, columns):
+    monkeypatch.chdir(tmp_path)
+    for side in ("a", "b"):
+        (tmp_path / side / "x").mkdir(parents=True)
+        pd.DataFrame([dict.fromkeys(columns, "bias_variance")]).to_parquet(tmp_path / side / "x" / "rows.parquet")
+    assert main(["compare", "a", "b"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1
+
+
+# -------------------------------------------------------------------------------------------------------------- rows
+
+
+def one():
+    made = load([*BASE[:-1], "study=bias_variance"])
+    return made, cells(made)[0]
+
+
+def test_a_reason_is_one_line_of_a_length_that_can_be_read():
+    made, cell = one()
+    row = tasks.row_of(made, cell, {"status": "error", "reason": "\x1b[31m\0\n" + "x" * 3_000_000})
+    assert len(row["reason"]) < 2100
+    assert row["reason"].isprintable()
+    assert row["reason"].endswith("letters)")
+
+
+@pytest.mark.parametrize("start", "=+-@")
+def test_a_table_holds_no_formulas(start):
+    made, cell = one()
+    rows = made.columns.typed(pd.DataFrame([tasks.row_of(made, cell, {"status": "error", "reason": f"{start}1+1"})]))
+    assert table(made, rows)["reason"].iloc[0] == f"'{start}1+1"
+
+
+def test_windows_is_refused_in_words():
+    code = "import sys; sys.platform = 'win32'; import bench.errors"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "bench runs on Linux and macOS" in done.stderr
+
+
+# ------------------------------------------------------------------------------------------------------ bad plugins
+
+HEAD = '''
+"""A plugin."""
+import sys
+from dataclasses import dataclass
+from bench.model import SampleMean, param
+
+@dataclass(frozen=True)
+class Mine(SampleMean):
+    """One."""
+    name = "mine"
+    needs = frozenset({"grad"})
+    def terms(self, problem, theta, w):
+        """G."""
+        return problem.grad(theta, w)
+'''
+BAD = {
+    "exits": "import sys; sys.exit(0)",
+    "exits_loudly": "import sys; sys.exit('\\x1b[31m' + 'x' * 5000000)",
+    "raises": "raise BaseException('no')",
+    "divides": "1/0",
+    "syntax": "def (",
+    "absent": "import no_such_library_anywhere",
+    "recursion": "f = lambda: f()\nf()",
+    "name_number": HEAD.replace('name = "mine"', "name = 7"),
+    "name_brackets": HEAD.replace('name = "mine"', 'name = "a[b]"'),
+    "name_escape": HEAD.replace('name = "mine"', 'name = "\\x1b[31m"'),
+    "name_taken": HEAD.replace('name = "mine"', 'name = "fobg"'),
+    "requires_none": HEAD.replace('name = "mine"', 'name = "r1"\n    requires = None'),
+    "requires_numbers": HEAD.replace('name = "mine"', 'name = "r2"\n    requires = (1, 2)'),
+    "annotation": HEAD.replace('name = "mine"', 'name = "a1"\n    x: "Nowhere" = 1'),
+    "annotation_list": HEAD.replace('name = "mine"', 'name = "a2"\n    x: list = None'),
+    "kind_odd": HEAD.replace('name = "mine"', 'name = "k1"\n    kind = "a b"'),
+    "kind_number": HEAD.replace('name = "mine"', 'name = "k2"\n    kind = 3'),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_a_bad_plugin_is_listed_with_its_reason_and_disables_nothing_else(tmp_path, capsys, fault):
+    (tmp_path / "good.py").write_text(HEAD)
+    (tmp_path / f"{fault}.py").write_text(BAD[fault])
+    try:
+        assert main(["list", "estimators", f"plugins={tmp_path}"]) == 0
+        said = capsys.readouterr().out
+        entries = [e for kind in registry.entries().values() for e in kind.values() if not e.available]
+        assert len(entries) == 1
+        assert "UNAVAILABLE" in said
+        assert "\x1b" not in said
+        assert len(said) < 50_000
+        assert main(["plan", *BASE, f"plugins=[{tmp_path}]", "estimators=[fobg,mine]"]) == 0
+        assert "2 cells" in capsys.readouterr().out
+    finally:
+        for name in [name for name in sys.modules if name.startswith("bench_folder_")]:
+            del sys.modules[name]
+
+
+def test_an_estimator_that_exits_ends_its_own_cell_in_this_process_too(tmp_path, capsys):
+    text = HEAD.replace("return problem.grad(theta, w)", "sys.exit(0)")
+    (tmp_path / "mine.py").write_text(text)
+    words = [*BASE, f"plugins=[{tmp_path}]", "estimators=[fobg,mine]", f"results_dir={tmp_path / 'out'}"]
+    assert main(words) == 1
+    rows = pd.read_parquet(tmp_path / "out" / "custom" / "rows.parquet").set_index("estimator")
+    assert rows["status"].to_dict() == {"fobg": "ok", "mine": "error"}
+    assert "SystemExit" in rows["reason"]["mine"]
+    assert os.getpid()
+
+
+@pytest.mark.parametrize("fault", ["raise BaseException('no')", "sys.exit(0)", "raise ValueError('two\\nlines')"])
+def test_a_plugin_that_cannot_be_made_is_refused_in_one_line(tmp_path, capsys, fault):
+    made = HEAD.replace("    def terms", f"    def __post_init__(self):\n        {fault}\n    def terms")
+    (tmp_path / "mine.py").write_text(made)
+    assert main(["plan", *BASE, f"plugins=[{tmp_path}]", "estimators=[fobg,mine]"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "estimator 'mine' cannot be made" in said
+    assert len(said.splitlines()) == 1
+
+
+@pytest.mark.parametrize("word", ["table.rows.sigma=[estimator]", "reference.samples.x=300"])
+def test_parts_of_what_has_none_are_no_settings(word, capsys):
+    assert main(["plan", "scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg]", word]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "is not a setting" in said
+    assert len(said.splitlines()) == 1
+
+
+def test_a_study_is_not_asked_about_cells_without_a_program(tmp_path, capsys):
+    words = [
+        "study=identify",
+        "scenes=[hopper]",
+        "contacts=[impulse]",
+        "integrators=[stormer_verlet]",
+        "backends=[numpy]",
+    ]
+    status = main([*words, "theta=[body_mass]", "optimizers=[adam]", "workers=0", "--quiet", f"results_dir={tmp_path}"])
+    said = capsys.readouterr()
+    assert status in (0, 2)
+    assert "no place for the impulses of contact law impulse" in said.out + said.err

@@ -1,0 +1,224 @@
+"""What makes two cells the same: parameters to their last bit, sources, settings; and what does not."""
+
+import itertools
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from trees import ROOT, Tree
+
+from bench.cli import main
+from bench.experiment import config, grid
+from bench.experiment.cell import Cell
+from bench.experiment.keys import BOOKKEEPING, fingerprint
+from bench.model.sources import sources
+from bench.run import plan, tasks
+from bench.run.store import Store
+from bench.studies.bias_variance.columns import COLUMNS
+
+PLAIN = ["scenes=[pushing]", "contacts=[penalty]", "backends=[numpy]", "estimators=[fobg,alpha_order]"]
+
+
+def cells(*words: str) -> list[Cell]:
+    return grid.cells(config.load([*PLAIN, *words]))
+
+
+def test_ten_thousand_near_equal_configurations_have_as_many_keys():
+    """Floats a bit apart, numbers of all sizes, and seeds."""
+    near = list(itertools.accumulate(range(999), lambda x, _: math.nextafter(x, math.inf), initial=1000.0))
+    experiment = config.load([*PLAIN, "estimators=[fobg]"])
+    sweep = {"stiffness": near, "sigma": [0.1, math.nextafter(0.1, 1)], "seed": [0, 1, 2, 3, 4]}
+    found = grid.cells(replace(experiment, sweep=sweep))
+    assert len(found) == 1000 * 2 * 5
+    assert len({cell.key for cell in found}) == 10_000
+
+
+def test_the_same_value_written_otherwise_is_the_same_cell():
+    written = ["1", "1.0", "1e0", "10e-1"]
+    assert len({cells(f"scene.pushing.mass={value}")[0].key for value in written}) == 1
+    assert cells("sweep.stiffness=[1, 1.0]")[0].key == cells("sweep.stiffness=[1]")[0].key
+    assert len(cells("sweep.stiffness=[1, 1.0]")) == 2
+
+
+def test_texts_that_look_like_numbers_are_not_numbers(capsys):
+    """A value that a parameter refuses is refused too when an equal one of another type was taken before."""
+    words = ["plan", "scenes=[bounce_once]", "contacts=[impulse]", "backends=[numpy]"]
+    assert main([*words, "contact.impulse.time_of_impact=true"]) == 0
+    capsys.readouterr()
+    assert main([*words, "sweep.time_of_impact=[1]"]) == 2
+    assert "must be true or false" in capsys.readouterr().err
+    assert main([*words, "sweep.time_of_impact=['true']"]) == 2
+
+
+@pytest.mark.parametrize("word", ["seed=1", "samples=255", "repeats=63", "reference.samples=8192", "reference.tolerance=0.01",
+                                  "timing=false", "scene.pushing.mass=0.2", "backend.numpy.dtype=float32", "study=growth",
+                                  "study=bias_variance[timed_calls=6]", "theta=[mass]", "theta0=[" + ",".join(["0.5"] * 30) + "]"])  # fmt: skip
+def test_what_decides_numbers_is_in_the_key(word):
+    before = {cell.key for cell in cells()}
+    assert before.isdisjoint(cell.key for cell in cells(word))
+
+
+@pytest.mark.parametrize("word", ["name=other", "results_dir=elsewhere", "workers=1", "timeout=1m", "memory=1g",
+                                  "on_error=stop", "versions=rerun", "question=why"])  # fmt: skip
+def test_what_decides_none_is_not(word):
+    assert [cell.key for cell in cells()] == [cell.key for cell in cells(word)]
+
+
+def test_budget_of_references_is_no_part_of_studies_without_them():
+    study = "study=gradient_check"
+    assert [c.key for c in cells(study)] == [c.key for c in cells(study, "reference.samples=8192")]
+
+
+def test_sign_of_zero_is_seen():
+    plus, minus = (replace(cells()[0].contact, damping=zero) for zero in (0.0, -0.0))
+    assert plus == minus
+    assert fingerprint(plus) != fingerprint(minus)
+
+
+def test_refused_cells_have_keys():
+    words = ["scenes=[pushing]", "contacts=[complementarity]", "backends=[numpy]", "integrators=[event_driven]"]
+    assert all(cell.key for cell in cells(*words))
+
+
+# -------------------------------------------------------------------------------------------------- sources
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory) -> Tree:
+    made = Tree(tmp_path_factory.mktemp("identity"))
+    helper = (made.root / "plugins/estimators/fobg.py").read_text()
+    made.add(
+        "plugins/estimators/with_helper.py",
+        helper.replace("fobg", "with_helper").replace(
+            "from bench.model import",
+            "from bench.plugins.estimators import gain_of_helper  # noqa\nfrom bench.model import",
+        ),
+    )
+    made.add("plugins/estimators/gain_of_helper.py", "GAIN = 1.0\n")
+    done = made.run(*EDITED)
+    assert done.returncode == 0, done.stderr
+    return made
+
+
+EDITED = ["scenes=[quadratic,linear]", "backends=[numpy]", "estimators=[fobg,reinforce,with_helper]", "samples=8",
+          "repeats=4", "name=mine", "results_dir=out"]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("path", "missing"),
+    [
+        ("plugins/estimators/reinforce.py", 2),
+        ("plugins/estimators/gain_of_helper.py", 2),
+        ("plugins/scenes/quadratic.py", 3),
+        ("plugins/scenes/cubic.py", 0),
+        ("plugins/backends/numpy.py", 6),
+        ("bench/model/program.py", 6),
+        ("bench/measure/statistics.py", 6),
+        ("bench/studies/bias_variance/measure.py", 6),
+        ("bench/studies/bias_variance/page.py", 0),
+        ("bench/studies/growth/measure.py", 0),
+        ("bench/report/tables.py", 0),
+        ("bench/run/runner.py", 0),
+        ("bench/run/pool.py", 0),
+        ("bench/run/store.py", 0),
+        ("bench/measure/timing.py", 6),
+        ("bench/measure/gradcheck/direction.py", 0),
+    ],
+)
+def test_editing_a_file_reruns_what_it_decides_and_only_that(tree, path, missing):
+    assert missing_after(tree, path, "\nEDITED = 1\n") == missing
+
+
+@pytest.mark.parametrize("path", ["plugins/estimators/reinforce.py", "bench/model/program.py"])
+def test_comments_and_docstrings_rerun_nothing(tree, path):
+    assert missing_after(tree, path, "\n# edited\n", ('"""', '"""Edited: ')) == 0
+
+
+def missing_after(tree, path, added, replaced=("", "")) -> int:
+    """The cells to run again after an edit of a file, which is undone."""
+    file: Path = tree.root / path
+    before = file.read_text()
+    file.write_text(before.replace(*replaced, 1) + added)
+    try:
+        said = tree.run("plan", *EDITED).stdout
+    finally:
+        file.write_text(before)
+    found = re.search(r"6 cells, (\d) stored, (\d) to run", said)
+    assert found is not None, said
+    assert int(found[1]) + int(found[2]) == 6
+    return int(found[2])
+
+
+STUDIES = [
+    (
+        "gradient_check",
+        {"measure/gradcheck/direction", "measure/noise", "measure/contacts", "studies/gradient_check/measure"},
+    ),
+    (
+        "three_errors",
+        {"measure/noise", "measure/statistics", "studies/three_errors/measure"},
+    ),
+]
+
+
+@pytest.mark.parametrize(("study", "files"), STUDIES)
+def test_a_study_is_known_by_what_it_imports(study, files):
+    paths = sources(f"bench.studies.{study}.measure", BOOKKEEPING)
+    found = {str(path.relative_to(ROOT / "bench").with_suffix("")) for path in paths}
+    assert files <= found
+    assert not [name for name in found if name.startswith(("sweep/", "model/", "report/"))]
+
+
+# -------------------------------------------------------------------------------------------------- policies
+
+TINY = [
+    "scenes=[heaviside]",
+    "backends=[numpy]",
+    "estimators=[fobg,reinforce]",
+    "samples=8",
+    "repeats=4",
+    "name=tiny",
+    "workers=0",
+]
+
+
+def test_other_versions_are_reported_and_rerun_when_asked(tmp_path, capsys, monkeypatch):
+    words = [*TINY, f"results_dir={tmp_path}"]
+    assert main(words) == 0
+    capsys.readouterr()
+    for module in (plan, tasks):
+        monkeypatch.setattr(module, "versions", lambda backend: "numpy=9.9")
+    assert main(["plan", *words]) == 0
+    assert "2 stored, 0 to run" in capsys.readouterr().out
+    assert main(words) == 0
+    assert "2 stored rows were made with numpy=" in capsys.readouterr().err
+    assert main([*words, "versions=ignore"]) == 0
+    assert "were made with" not in capsys.readouterr().err
+    assert main([*words, "versions=rerun"]) == 0
+    assert set(Store(tmp_path / "tiny", COLUMNS).load()["versions"]) == {"numpy=9.9"}
+    assert main(["plan", *words]) == 0
+    assert "2 stored, 0 to run" in capsys.readouterr().out
+
+
+def test_failed_rows_stay_until_they_are_retried(tmp_path, capsys):
+    words = [*TINY, "estimators=[fobg,inverse_variance]", "samples=1", f"results_dir={tmp_path}"]
+    assert main(words) == 1
+    capsys.readouterr()
+    assert main(["plan", *words]) == 0
+    assert "2 stored, 0 to run" in capsys.readouterr().out
+    assert main(["plan", *words, "retry=[error]"]) == 0
+    assert "1 stored, 1 to run" in capsys.readouterr().out
+
+
+def test_what_was_unavailable_runs_once_it_is_installed(tmp_path, capsys):
+    words = [*TINY, f"results_dir={tmp_path}"]
+    assert main(words) == 0
+    rows = Store(tmp_path / "tiny", COLUMNS).load().iloc[0].to_dict()
+    Store(tmp_path / "tiny", COLUMNS).append(
+        {k: v for k, v in rows.items() if k not in COLUMNS.named("list")} | {"status": "unavailable"}
+    )
+    capsys.readouterr()
+    assert main(["plan", *words]) == 0
+    assert "1 stored, 1 to run" in capsys.readouterr().out

@@ -1,0 +1,257 @@
+"""Kills runs at random moments of every phase and looks for what is lost: ``python tests/run/kill.py COUNT [SEED]``.
+
+A round starts in an empty folder and goes through the phases of a run: its references, its cells, its tables, its page, and
+then a comparison with the sweep that nobody killed. In each it is killed a few times and started again. A kill takes a
+victim (the run, a child of it, its process group), a signal and a moment that is drawn within the phase, and counts if it
+found its victim alive; by the phase that the run was in then. Prints one line; status 1 for any loss.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import psutil
+from exact import by_key, differences
+
+from bench.run.files import TEMPORARY
+from bench.run.store import Store
+from bench.studies.bias_variance.columns import COLUMNS
+
+KILLS = {"references": 4, "cells": 6, "tables": 2, "page": 3, "compare": 3}
+"""Kills of each phase in a round."""
+CELLS = 64
+WORDS = [
+    "scenes=[soft_heaviside,pushing]", "backends=[numpy]", "estimators=[fobg,reinforce]", "repeats=4", "samples=1024",
+    "timing=false", "workers=2", "--quiet", "name=sweep", "reference.samples=4096", "results_dir=.",
+    "sweep.sigma=[0.1,0.11,0.12,0.13]", "sweep.seed=[0,1,2,3]",
+]  # fmt: skip
+START = """
+import os, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it in its background jobs
+signal.signal(signal.SIGTERM, signal.SIG_DFL)
+def mark(phase):
+    with open(os.environ["PHASES"], "a") as file:
+        file.write(f"{phase} {time.time()}\\n")
+def marked(owner, name, phase):
+    real = getattr(owner, name)
+    def call(*given, **more):
+        mark(phase)
+        return real(*given, **more)
+    setattr(owner, name, call)
+from bench import compare
+from bench.report import finish, web
+from bench.run import execute, runner
+answers = runner._Run._answers
+def told(self, tasks, pool):
+    if tasks:
+        mark("references" if tasks[0].reference else "cells")
+    return answers(self, tasks, pool)
+runner._Run._answers = told
+marked(execute, "_compact", "folding")
+marked(finish, "write", "tables")
+marked(web, "write", "page")
+marked(compare, "main", "compare")
+import runpy
+try:
+    runpy.run_module("bench", run_name="__main__")
+finally:
+    mark("end")
+"""
+"""The command, which notes when it comes to a phase and is else what it always is."""
+
+
+class Run:
+    """A command in a folder, and the phase that it is in."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        self.folder, self._phases = folder, folder.with_name("phases.txt")
+        self._phases.write_text("")
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", START, *words], cwd=folder, env=os.environ | {"PHASES": str(self._phases)},
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        )  # fmt: skip
+
+    def phases(self) -> list[tuple[str, float]]:
+        """Return the phases that it came to, and when."""
+        lines = [line.split() for line in self._phases.read_text().splitlines()]
+        return [(line[0], float(line[1])) for line in lines if len(line) == 2]
+
+    def reaches(self, phase: str) -> bool:
+        """Wait for a phase; False if the command ends without it."""
+        while phase not in dict(self.phases()):
+            if self.process.poll() is not None:
+                return phase in dict(self.phases())
+            time.sleep(0.005)
+        return True
+
+    def end(self) -> str:
+        """Wait for its end; returns what it said."""
+        return self.process.communicate(timeout=600)[1]
+
+
+def words_of(phase: str) -> list[str]:
+    return ["compare", "sweep", "../whole/sweep"] if phase == "compare" else WORDS
+
+
+def left_in(folder: Path) -> list[psutil.Process]:
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if process.cwd() == str(folder) and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process)
+        except psutil.Error:
+            continue
+    return found
+
+
+def rows_of(folder: Path) -> dict[str, dict[str, Any]]:
+    return by_key(Store(folder / "sweep", COLUMNS).load())
+
+
+def broken(path: Path) -> bool:
+    """Whether a file is not the whole of one."""
+    ends = {".png": b"IEND\xaeB\x60\x82", ".html": b"</html>", ".csv": b"\n", ".md": b"\n"}
+    try:
+        content = path.read_bytes()
+        if path.suffix == ".json":
+            json.loads(content)
+        elif path.suffix == ".parquet":
+            pd.read_parquet(path)
+    except FileNotFoundError:
+        return False
+    except Exception:
+        return True
+    end = ends.get(path.suffix, b"")
+    return not (content.endswith(end) or content.rstrip().endswith(end))
+
+
+class Kills:
+    """Kills so many times and counts what went wrong."""
+
+    def __init__(self, place: Path, seed: int) -> None:
+        self.whole, self.cut, self.dice = place / "whole", place / "cut", random.Random(seed)
+        self.done: Counter[str] = Counter()
+        self.by: Counter[str] = Counter()
+        self.rounds = 0
+        names = ("lost", "changed", "orphans", "temporary", "half files", "tracebacks", "failed")
+        self.faults = dict.fromkeys(names, 0)
+        self.whole.mkdir()
+        self._lasts: dict[str, float] = {}
+        for phase in ("cells", "compare"):
+            run = Run(self.whole, *(["compare", "sweep", "sweep"] if phase == "compare" else WORDS))
+            said = run.end()
+            assert run.process.returncode == 0, said
+            came = run.phases()
+            self._lasts |= {one: end - start for (one, start), (_, end) in itertools.pairwise(came)}
+        self.truth = rows_of(self.whole)
+        assert len(self.truth) == CELLS
+
+    def fault(self, what: str, more: str) -> None:
+        """Count a fault and say what it was."""
+        self.faults[what] += 1
+        print(f"{what}: {more[-1500:]}", flush=True)
+
+    def compare(self, rows: dict[str, dict[str, Any]], what: str) -> None:
+        """Count a fault if rows are not to the last bit those of the sweep that nobody killed."""
+        if found := differences(rows, self.truth):
+            self.fault("changed", f"{what}: {len(found)} values, {found[:5]}")
+
+    def round(self, count: int) -> None:
+        """Kill in every phase, then see that the sweep comes to what it is without."""
+        self.cut.mkdir()
+        for phase, times in KILLS.items():
+            for _ in range(times):
+                if self.done.total() < count:
+                    self.kill(phase)
+        for phase in ("cells", "compare"):  # folds, and tidies what a kill has left
+            run = Run(self.cut, *words_of(phase))
+            said = run.end()
+            if run.process.returncode not in (0, 1):
+                self.fault("failed", f"{phase} {run.process.returncode} {said}")
+        self.compare(whole := rows_of(self.cut), "the whole sweep")
+        if len(whole) != CELLS:
+            self.fault("lost", f"the whole sweep has {len(whole)} rows")
+        for path in self.cut.rglob(".*"):
+            if TEMPORARY.fullmatch(path.name):
+                self.fault("temporary", str(path))
+        shutil.rmtree(self.cut)
+        self.rounds += 1
+
+    def room_for(self, phase: str) -> None:
+        """Have the command come to a phase again where a run that outlived its kill has done all of it."""
+        if phase in ("references", "cells") and len(rows_of(self.cut)) == CELLS:
+            for name in ("references", "sweep") if phase == "references" else ("sweep",):
+                shutil.rmtree(self.cut / name, ignore_errors=True)
+
+    def kill(self, phase: str) -> None:
+        """Kill once, if the command comes to the phase."""
+        self.room_for(phase)
+        run = Run(self.cut, *words_of(phase))
+        if run.reaches(phase):
+            time.sleep(self.dice.uniform(0.0, 0.6 * self._lasts.get(phase, 0.5)))  # the next run has less to do
+        before, process = rows_of(self.cut), run.process
+        children = psutil.Process(process.pid).children() if process.poll() is None else []
+        victim = self.dice.choice(["run", "child", "group"] if children else ["run", "group"])
+        sent = self.dice.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGSTOP])
+        at, alive = (run.phases() or [("start", 0.0)])[-1][0], process.poll() is None
+        try:
+            if victim == "run":
+                process.send_signal(sent)
+            elif victim == "group":
+                os.killpg(process.pid, sent)
+            else:
+                self.dice.choice(children).send_signal(sent)
+        except (ProcessLookupError, psutil.Error):
+            alive = False
+        if sent == signal.SIGSTOP and victim != "child":
+            time.sleep(0.3)
+            process.kill()
+        said = run.end()
+        what = f"{sent.name} to {victim} in {at}"
+        if alive and at != "end":
+            self.done[at] += 1
+            self.by[f"{sent.name[3:]} {victim}"] += 1
+        if "Traceback" in said:
+            self.fault("tracebacks", f"{what}: {said}")
+        after = rows_of(self.cut)
+        lost = before.keys() - after.keys()
+        if lost:
+            self.fault("lost", f"{what}: {len(lost)} rows")
+        self.compare(after, what)
+        until = time.monotonic() + 5.0
+        while left_in(self.cut) and time.monotonic() < until:
+            time.sleep(0.05)
+        for orphan in left_in(self.cut):
+            self.fault("orphans", f"{what}: {orphan}")
+        for path in self.cut.rglob("[!.]*"):
+            if path.is_file() and broken(path):
+                self.fault("half files", f"{what}: {path}")
+
+
+def main(count: int, seed: int) -> int:
+    with tempfile.TemporaryDirectory() as place:
+        kills = Kills(Path(place).resolve(), seed)
+        while kills.done.total() < count:
+            kills.round(count)
+            print(f"{kills.done.total()} kills", flush=True)
+        print(
+            f"{kills.done.total()} kills ({dict(kills.done)}; {dict(kills.by)}), {kills.rounds} rounds: {kills.faults}"
+        )
+        return 1 if any(kills.faults.values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0))

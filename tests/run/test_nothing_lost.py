@@ -1,0 +1,446 @@
+"""Rows that must not be lost, changed or blamed: studies under one name, wrong clocks, full pipes, late deaths."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pandas as pd
+import psutil
+import pytest
+from trees import hearing_signals
+
+from bench.cli import main
+from bench.errors import StorageError, UserError
+from bench.run import files
+from bench.run.channel import Broken, Channel
+from bench.run.files import TEMPORARY, temporary, tidy
+from bench.run.pool import Pool, ResourceLimits
+from bench.run.store import Store
+from bench.studies.bias_variance.columns import COLUMNS
+
+TINY = ["scenes=[heaviside]", "backends=[numpy]", "samples=8", "repeats=4", "timing=false", "workers=0", "--quiet"]
+FOBG = [*TINY, "estimators=[fobg]"]
+
+
+def row(key="a", **values) -> dict:
+    return COLUMNS.blank() | {"key": key, "status": "ok", "study": "bias_variance", **values}
+
+
+# ---------------------------------------------------------------------------------------------------- one directory
+
+
+@pytest.mark.parametrize("verb", ["run", "plan", "report"])
+def test_a_directory_of_another_study_is_refused_and_left_alone(tmp_path, capsys, verb):
+    store = Store(tmp_path / "custom", COLUMNS)
+    store.prepare()
+    store.append(row(study="growth", rate_max=2.0))
+    held = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert main([verb, *FOBG, f"results_dir={tmp_path}"]) == 2
+    said = capsys.readouterr().err
+    assert "holds rows of study growth, and this is study bias_variance" in said
+    assert "name=" in said
+    assert held == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+
+def test_of_two_studies_that_start_in_an_empty_directory_one_is_refused(tmp_path, capsys, monkeypatch):
+    from bench.run import execute
+
+    first, planned = [*FOBG, f"results_dir={tmp_path}"], execute.plan
+
+    def late(experiment, store):
+        cells = planned(experiment, store)
+        if experiment.study.name != "growth":  # the other one starts now, when this one has read an empty directory
+            other = Store(tmp_path / "custom", COLUMNS, "growth")
+            other.load()
+            other.prepare()
+        return cells
+
+    monkeypatch.setattr(execute, "plan", late)
+    assert main(first) == 2
+    assert "a run of study growth has started" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.json"))
+    other = Store(tmp_path / "custom", COLUMNS, "growth")  # killed before its first row, it goes on
+    other.prepare()
+    other.append(row(study="growth"))
+    other.compact()
+    assert sorted(path.name for path in (tmp_path / "custom").iterdir()) == ["rows.parquet"]
+
+
+def test_a_study_that_came_and_went_meanwhile_is_seen(tmp_path):
+    mine, other = (Store(tmp_path, COLUMNS, study) for study in ("bias_variance", "growth"))
+    assert mine.load().empty
+    other.prepare()
+    other.append(row(study="growth"))
+    other.compact()
+    with pytest.raises(UserError, match="holds rows of study growth"):
+        mine.prepare()
+    other.prepare()  # the refused one has left no claim
+    other.compact()
+    assert [path.name for path in tmp_path.iterdir()] == ["rows.parquet"]
+
+
+def test_a_file_without_keys_is_unreadable_and_never_overwritten(tmp_path):
+    table = tmp_path / "rows.parquet"
+    pd.DataFrame([{"bias": 1.0}]).to_parquet(table)
+    before, store = table.read_bytes(), Store(tmp_path, COLUMNS)
+    for act in (store.load, store.compact, lambda: store.append(row())):
+        with pytest.raises(StorageError, match="has no keys"):
+            act()
+    assert table.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [[1], ["a"], {"a": 1}, [{"key": None}], [{"key": ""}], 7, None])
+def test_a_small_file_that_holds_no_rows_is_unreadable(tmp_path, content):
+    path = tmp_path / "pending" / "x.json"
+    path.parent.mkdir()
+    path.write_text(json.dumps(content))
+    with pytest.raises(StorageError, match="cannot be read as JSON rows"):
+        Store(tmp_path, COLUMNS).compact()
+    assert json.loads(path.read_text()) == content
+
+
+def test_a_number_that_is_none_does_not_turn_into_a_missing_one(tmp_path):
+    pd.DataFrame([row() | {"bias": "large"}]).to_parquet(tmp_path / "rows.parquet")
+    with pytest.raises(StorageError, match="'bias' that are no numbers"):
+        Store(tmp_path, COLUMNS).compact()
+
+
+def test_a_row_dated_in_the_future_is_replaced_by_the_next_one(tmp_path, monkeypatch):
+    store = Store(tmp_path, COLUMNS)
+    monkeypatch.setattr("time.time", lambda: 4e9)
+    store.append(row(bias=1.0))
+    monkeypatch.undo()
+    Store(tmp_path, COLUMNS).append(row(bias=2.0))
+    assert list(Store(tmp_path, COLUMNS).load()["bias"]) == [2.0]
+    Store(tmp_path, COLUMNS).compact()
+    Store(tmp_path, COLUMNS).append(row(bias=3.0))
+    assert list(Store(tmp_path, COLUMNS).load()["bias"]) == [3.0]
+
+
+@pytest.mark.parametrize("dated", [0, 1])
+def test_of_two_rows_without_a_count_the_one_with_a_date_wins(tmp_path, dated):
+    (tmp_path / "pending").mkdir()
+    for i in range(2):
+        old = {name: value for name, value in row(bias=float(i)).items() if name not in ("stored_at", "sequence")}
+        (tmp_path / "pending" / f"{i}.json").write_text(json.dumps([old | ({"stored_at": 1e9} if i == dated else {})]))
+    assert list(Store(tmp_path, COLUMNS).load()["bias"]) == [float(dated)]
+
+
+@pytest.mark.parametrize("count", [float("inf"), 1e300, -5.0, float("nan")])
+def test_a_count_that_no_run_has_written_wins_nothing(tmp_path, count):
+    (tmp_path / "pending").mkdir()
+    (tmp_path / "pending" / "x.json").write_text(json.dumps([row(bias=1.0, sequence=count, stored_at=4e9)]))
+    Store(tmp_path, COLUMNS).append(row(bias=2.0))
+    assert list(Store(tmp_path, COLUMNS).load()["bias"]) == [2.0]
+
+
+# ------------------------------------------------------------------------------------------------------------- files
+
+
+def test_half_written_files_of_dead_processes_go_and_those_of_living_ones_stay(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    mine, other = temporary(tmp_path / "a.png"), tmp_path / ".mine"
+    dead = mine.with_name(mine.name.replace(f"-{os.getpid()}-", f"-{gone.pid}-"))
+    far = mine.with_name(mine.name.replace("-bench-", "-bench-").replace(files._machine(), "0" * 8))
+    for path in (mine, dead, far, other):
+        assert path is other or TEMPORARY.fullmatch(path.name)
+        path.write_text("")
+    tidy(tmp_path)
+    assert set(tmp_path.iterdir()) == {mine, far, other}
+    os.utime(far, (0, 0))
+    tidy(tmp_path)
+    assert set(tmp_path.iterdir()) == {mine, other}
+
+
+def test_a_run_tidies_every_folder_that_it_writes_to(tmp_path):
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    for place in ("custom", "custom/pending", "references"):
+        (tmp_path / place).mkdir(parents=True, exist_ok=True)
+        left = temporary(tmp_path / place / "x")
+        left.with_name(left.name.replace(f"-{os.getpid()}-", f"-{gone.pid}-")).write_text("half")
+    assert main([*FOBG, f"results_dir={tmp_path}"]) == 0
+    assert not [path for path in tmp_path.rglob(".*")]
+
+
+def test_the_disk_is_told_to_empty_its_cache_where_fsync_does_not(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(files.fcntl, "F_FULLFSYNC", 51, raising=False)
+    monkeypatch.setattr(files.fcntl, "fcntl", lambda descriptor, what: asked.append(what))
+    files.write_whole(tmp_path / "x", b"1")
+    assert asked == [51, 51]  # the file and its folder
+
+
+# ----------------------------------------------------------------------------------------------------------- workers
+
+
+class Handler:
+    """Does what an item says, in the worker."""
+
+    def __init__(self, argument):
+        pass
+
+    def prepare(self, item):
+        pass
+
+    def __call__(self, item):
+        what = item[0]
+        if what == "dies late":
+            import threading
+
+            threading.Timer(0.15, os._exit, [3]).start()
+        elif what == "dies":
+            os._exit(4)
+        elif what == "hangs":
+            time.sleep(1000)
+        elif what == "writes":
+            for descriptor in range(3, 30):
+                try:
+                    os.write(descriptor, b"garbage" * 10)
+                except OSError:
+                    continue
+        elif what == "slow":
+            time.sleep(0.4)
+        return {"status": "ok"}
+
+
+def answers(items, limits=None, **more):
+    with Pool(1, Handler, None, limits or ResourceLimits(), folders=(), **more) as pool:
+        found = [answer for some in pool.run([items]) for answer in some]
+    return {str(answer.item[0]): answer.result for answer in found}, found
+
+
+def test_a_late_death_is_not_blamed_on_the_next_cell():
+    results, found = answers([("dies late",), ("slow",), ("sound",)])
+    assert len(found) == 3
+    assert {result["status"] for result in results.values()} == {"ok"}
+
+
+def test_a_cell_that_dies_twice_is_blamed_and_its_neighbours_are_not():
+    results, _ = answers([("sound",), ("dies",), ("other",)])
+    assert results["dies"]["status"] == "crashed"
+    assert "exit status 4, in two workers" in results["dies"]["reason"]
+    assert results["sound"]["status"] == results["other"]["status"] == "ok"
+
+
+def test_large_items_behind_a_hanging_one_do_not_hold_up_the_clock():
+    big = "x" * 600_000
+    started = time.monotonic()
+    results, found = answers(
+        [("sound", big), ("hangs", big), *((f"more{i}", big) for i in range(6))], ResourceLimits(1.0)
+    )
+    assert time.monotonic() - started < 30
+    assert results["hangs"]["status"] == "timeout"
+    assert len(found) == 8
+
+
+def test_a_plugin_that_writes_into_descriptors_costs_its_own_cell():
+    results, _ = answers([("sound",), ("writes",), ("other",)])
+    assert results["writes"]["status"] == "crashed"
+    assert "wrote into the descriptors" in results["writes"]["reason"]
+    assert results["sound"]["status"] == results["other"]["status"] == "ok"
+
+
+@pytest.mark.parametrize("sent", [b"garbage", b"\0" * 40])
+def test_bytes_that_are_no_message_are_noticed(sent):
+    import socket
+
+    one, two = socket.socketpair()
+    with one, two:
+        two.send(sent)
+        with pytest.raises(Broken, match="descriptors"):
+            Channel(one, b"t" * 16).receive()
+
+
+HELD = """
+import ctypes, os, subprocess, sys
+from bench.run.pool import Pool, ResourceLimits
+
+class Holds:
+    def __init__(self, argument):
+        pass
+    def prepare(self, item):
+        pass
+    def __call__(self, item):
+        subprocess.Popen(["sleep", "600"], start_new_session=True)
+        print("at work", file=open(item, "w"))
+        ctypes.PyDLL(None).sleep(600)  # in C, with the interpreter lock
+        return {"status": "ok"}
+
+if __name__ == "__main__":
+    import held
+    with Pool(1, held.Holds, None, ResourceLimits()) as pool:
+        list(pool.run([[sys.argv[1]]]))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="finds processes by /proc")
+def test_workers_that_hold_the_interpreter_lock_end_with_their_run(tmp_path):
+    (tmp_path / "held.py").write_text(HELD)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    run = subprocess.Popen([sys.executable, str(tmp_path / "held.py"), "begun"], cwd=tmp_path, env=environment)
+
+    def left() -> list[psutil.Process]:
+        found = []
+        for process in psutil.process_iter():
+            try:
+                if process.cwd() == str(tmp_path) and process.status() != psutil.STATUS_ZOMBIE:
+                    found.append(process)
+            except psutil.Error:
+                continue
+        return found
+
+    for _ in range(600):
+        if (tmp_path / "begun").exists():
+            break
+        time.sleep(0.05)
+    assert len(left()) >= 4  # the run, its guardian, the worker and what it started
+    run.kill()
+    run.wait()
+    for _ in range(100):  # within 5 s
+        if not left():
+            return
+        time.sleep(0.05)
+    assert not left()
+
+
+def test_workers_that_cannot_be_made_say_why():
+    with Pool(1, _no_handler, None, ResourceLimits()) as pool, pytest.raises(UserError, match="no handler today"):
+        list(pool.run([[1]]))
+
+
+def _no_handler(argument):
+    raise RuntimeError("no handler today")
+
+
+INTERRUPTS = """
+import os, signal, sys
+
+class Interrupts:
+    "Sends Ctrl-C when a module is about to be imported."
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupts())
+"""
+
+
+@pytest.mark.parametrize("module", ["bench.errors", "bench.experiment.study", "bench.cli"])
+def test_an_interrupt_while_the_command_is_imported_is_quiet(tmp_path, module):
+    (tmp_path / "sitecustomize.py").write_text(INTERRUPTS.format(module=module))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    done = subprocess.run(hearing_signals("list"), env=environment, capture_output=True, text=True)
+    assert done.returncode == 130
+    assert done.stderr == "\nbench: stopped\n"
+
+
+def test_a_library_leaves_the_signals_of_its_program_alone():
+    code = "import signal, bench; assert signal.getsignal(signal.SIGINT) is signal.default_int_handler"
+    subprocess.run(
+        [sys.executable, "-c", f"import signal; signal.signal(2, signal.default_int_handler); {code}"], check=True
+    )
+
+
+COLLECTED = """
+import gc, os, signal
+from bench.cli import _stopped_by_signals
+from bench.model.guard import guarded
+
+def struck(*_):
+    gc.callbacks.remove(struck)
+    os.kill(os.getpid(), signal.SIGTERM)
+    for _ in range(10):
+        pass
+
+with _stopped_by_signals():
+    gc.callbacks.append(struck)
+    try:
+        with guarded():
+            gc.collect()
+    except KeyboardInterrupt:
+        print("stopped")
+"""
+
+
+def test_a_signal_in_the_garbage_collector_stops_the_run_after_the_cell_and_prints_nothing():
+    done = subprocess.run([sys.executable, "-c", COLLECTED], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("stopped\n", "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("times", [1, 2])
+def test_signals_stop_a_run_in_peace(tmp_path, sent, times):
+    seeds = ",".join(map(str, range(400)))
+    words = [*FOBG[:-1], f"sweep.seed=[{seeds}]", "samples=20000", f"results_dir={tmp_path}"]
+    with subprocess.Popen(hearing_signals(*words), stderr=subprocess.PIPE, text=True) as run:
+        for _ in range(600):
+            if list(tmp_path.glob("custom/pending/*.json")):
+                break
+            time.sleep(0.05)
+        for _ in range(times):
+            run.send_signal(getattr(signal, sent))
+            time.sleep(0.005)
+        try:
+            said = run.communicate(timeout=30)[1]
+        finally:
+            run.kill()
+    assert run.returncode in ((130,) if times == 1 else (130, -getattr(signal, sent)))
+    assert "Traceback" not in said
+    assert "KeyboardInterrupt" not in said
+    assert not Store(tmp_path / "custom", COLUMNS).load().empty
+
+
+MOVES = """
+import os
+from dataclasses import dataclass
+from bench.plugins.backends.numpy import Numpy
+
+@dataclass(frozen=True)
+class Moves(Numpy):
+    "Leaves the working folder, and a copy of the process, wherever it is asked."
+    name = "moves"
+    def __post_init__(self):
+        os.fork()
+    def refuses(self, *given):
+        os.chdir({elsewhere!r})
+        return super().refuses(*given)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_backend_asked_for_references_moves_and_doubles_nothing(tmp_path, workers):
+    for name in ("mine", "here", "elsewhere"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "mine" / "moves.py").write_text(MOVES.format(elsewhere=str(tmp_path / "elsewhere")))
+    words = ["scenes=[soft_heaviside]", *TINY[1:-2], f"workers={workers}", "reference.samples=4096", "results_dir=out"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, "-m", "bench", *words, f"plugins={tmp_path / 'mine'}", "estimators=[fobg]"],
+        cwd=tmp_path / "here", env=environment, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("Written:") == 1
+    assert (tmp_path / "here" / "out" / "custom" / "rows.parquet").exists()
+    assert list((tmp_path / "here" / "out" / "references").glob("*.parquet"))
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_two_studies_that_start_at_once_in_an_empty_folder_do_not_mix(tmp_path):
+    first, second = (Store(tmp_path / "mine", COLUMNS, study) for study in ("bias_variance", "growth"))
+    for store in (first, second):
+        assert store.load().empty
+    first.prepare()
+    with pytest.raises(UserError, match="a run of study bias_variance has started"):
+        second.prepare()
+    first.append(COLUMNS.blank() | {"key": "1", "study": "bias_variance"})
+    first.compact()
+    assert not (tmp_path / "mine" / "pending").exists()
+    with pytest.raises(UserError, match="holds rows of study bias_variance"):
+        second.prepare()

@@ -1,0 +1,77 @@
+"""Backends that fail at a program give way to the next, and a scene may name those it runs on."""
+
+import numpy as np
+import pytest
+from bench.plugins.backends.jax import Jax
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.scenes.cubic import Cubic
+from bench.plugins.scenes.heaviside import Heaviside
+from helpers import loaded
+
+from bench.experiment.problems import Problems
+from bench.measure.reference import Reference
+from bench.model import compose
+from bench.run import references
+from bench.run.references import References, load, save
+
+
+@pytest.fixture
+def made(tmp_path):
+    experiment, cells = loaded("scenes=[cubic]", "backends=[numpy]", "estimators=[fobg]", f"results_dir={tmp_path}")
+    return References(experiment, Problems()), cells[0]
+
+
+def failing(names, monkeypatch):
+    """Let certifying fail on the backends of these names."""
+    plain, tried = references.reference.certify, []
+
+    def certify(problem, *given):
+        name = type(problem).__name__.removesuffix("Problem").lower()
+        tried.append(name)
+        if name in names:
+            raise TypeError(f"{name} cannot branch on a traced value")
+        return plain(problem, *given)
+
+    monkeypatch.setattr(references.reference, "certify", certify)
+    return tried
+
+
+def test_next_backend_computes_the_reference(made, monkeypatch):
+    found, cell = made
+    tried = failing({"jax"}, monkeypatch)
+    reference = found.of(cell)
+    assert len(tried) > 1
+    assert np.isfinite(reference.gradient).all()
+    assert "after a failure of" in reference.note
+    assert "TypeError" in reference.note
+    # and what was stored is the same
+    assert load(found._path(cell)).note == reference.note
+
+
+def test_first_error_is_raised_where_none_can(made, monkeypatch):
+    found, cell = made
+    failing({"jax", "torch", "numpy", "implicit", "fused"}, monkeypatch)
+    with pytest.raises(TypeError, match="jax cannot branch"):
+        found.of(cell)
+    assert not found.stored(cell)
+
+
+def test_stored_reference_is_the_same(tmp_path):
+    batches = np.random.default_rng(0).standard_normal((64, 3))
+    reference = Reference(batches, "sampling[n=64]", 0.1, np.ones(3), np.zeros(3), "a note")
+    save(reference, tmp_path / "r.parquet")
+    again = load(tmp_path / "r.parquet")
+    assert np.array_equal(again.batches, batches)
+    assert (again.method, again.error, again.note) == ("sampling[n=64]", 0.1, "a note")
+    assert again.known().standard_error == reference.known().standard_error > 0.1
+    assert again.model_error == reference.model_error == pytest.approx(3**0.5)
+
+
+def test_scene_names_its_backends():
+    class Plain(Cubic):
+        backends = ("numpy", "torch")
+
+    program = compose(Plain())
+    assert Numpy().incompatibility(program) is None
+    assert Jax().incompatibility(program) == "scene cubic runs on numpy and torch only"
+    assert Jax().incompatibility(compose(Heaviside())) is None

@@ -1,0 +1,521 @@
+"""Rows outlast kills, full disks and runs side by side."""
+
+import errno
+import json
+import math
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from helpers import loaded
+
+from bench.cli import main
+from bench.errors import StorageError, UserError
+from bench.model.parameters import values
+from bench.run import files, tasks
+from bench.run import store as store_module
+from bench.run.runner import blank
+from bench.run.store import Store
+from bench.studies.bias_variance.columns import COLUMNS
+
+TINY = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg]", "samples=8", "repeats=4", "timing=false"]
+
+
+def row(number: int, **values) -> dict:
+    return COLUMNS.blank() | {"key": f"{number:032x}", "status": "ok", "bias": float(number), **values}
+
+
+def keys(store: Store) -> list[int]:
+    return sorted(int(key, 16) for key in store.load()["key"])
+
+
+def test_lists_of_missing_numbers_come_back_as_numbers(tmp_path):
+    """In a column where every list holds NaN alone, Parquet has no type for them."""
+    name = COLUMNS.named("list")[0]
+    store = Store(tmp_path, COLUMNS)
+    store.append(row(1, **{name: [math.nan, math.nan]}), row(2, **{name: []}))
+    for _ in range(2):
+        found = dict(zip(keys(store), store.load().sort_values("key")[name], strict=True))
+        assert np.asarray(found[1], dtype=float).shape == (2,)
+        assert all(math.isnan(one) for one in found[1])
+        assert len(found[2]) == 0
+        store.compact()
+
+
+def test_rows_come_back_to_the_last_bit(tmp_path):
+    store = Store(tmp_path / "s", COLUMNS)
+    store.prepare()
+    values = [0.1 + 0.2, 5e-324, -0.0, float("inf"), 1 / 3]
+    store.append(*(row(i, bias=value) for i, value in enumerate(values)))
+    store.append(row(9, bias=float("nan"), reason='a "quoted", line | ünï'))
+    for _ in range(2):
+        table = store.load().set_index("key")["bias"].sort_index().to_numpy()
+        assert table[:5].tobytes() == np.array(values).tobytes()
+        assert np.isnan(table[5])
+        store.compact()
+    assert [path.name for path in (tmp_path / "s").iterdir()] == ["rows.parquet"]
+
+
+def test_newest_row_of_a_key_wins_wherever_it_lies(tmp_path):
+    store = Store(tmp_path, COLUMNS)
+    store.append(row(1, bias=1.0))
+    store.compact()
+    store.append(row(1, bias=2.0))
+    assert list(store.load()["bias"]) == [2.0]
+    store.append(row(1, bias=3.0))
+    store.compact()
+    assert list(store.load()["bias"]) == [3.0]
+
+
+def test_rows_stay_in_the_order_of_their_file_whenever_they_were_stored(tmp_path):
+    store = Store(tmp_path, COLUMNS)
+    for i in (1, 2, 3):
+        store.append(row(i))
+    keys = [row(i)["key"] for i in (3, 1, 2)]
+    store.compact(keys)
+    store.append(row(4))
+    assert list(store.load()["key"]) == [*keys, row(4)["key"]]
+    # those asked for are last, in their order
+    assert list(store_module.ordered(store.load(), keys[::-1])["key"]) == [row(4)["key"], *keys[::-1]]
+    assert list(store_module.ordered(store.load(), keys[:1])["key"]) == [*keys[1:], row(4)["key"], keys[0]]
+    store.compact()
+    assert list(pd.read_parquet(tmp_path / "rows.parquet")["key"]) == [*keys, row(4)["key"]]
+
+
+def test_rows_of_an_older_store_are_read(tmp_path):
+    (tmp_path / "pending").mkdir()
+    old = {k: v for k, v in row(1).items() if k not in ("wall_s", "stored_at")}
+    (tmp_path / "pending" / "abc.json").write_text(json.dumps(old))
+    pd.DataFrame([old | {"key": "b" * 32}]).to_parquet(tmp_path / "rows.parquet")
+    store = Store(tmp_path, COLUMNS)
+    assert len(store.load()) == 2
+    store.compact()
+    assert len(pd.read_parquet(tmp_path / "rows.parquet")) == 2
+
+
+def test_columns_that_are_not_known_are_kept(tmp_path):
+    """A newer version, or a study of one's own, has stored more than this one knows."""
+    store = Store(tmp_path, COLUMNS)
+    store.append(row(1, heat=0.5, study="mine", parameters="{}"), row(2, colour="blue"))
+    for _ in range(2):
+        table = store.load().set_index("key").sort_index()
+        assert table["heat"].iloc[0] == 0.5
+        assert math.isnan(table["heat"].iloc[1])
+        assert table["colour"].iloc[1] == "blue"
+        assert list(table["study"]) == ["mine", ""]
+        store.compact()
+    store.append(row(3))
+    store.compact()
+    table = pd.read_parquet(tmp_path / "rows.parquet").set_index("key").sort_index()
+    assert table["heat"].tolist()[0] == 0.5
+    assert table["colour"].tolist()[1] == "blue"
+
+
+@pytest.mark.parametrize("study", ["bias_variance", "growth", "stability"])
+def test_a_row_says_which_study_made_it_and_every_parameter_of_its_cell(study):
+    made, cells = loaded(
+        f"study={study}", "scenes=[pushing]", "backends=[numpy]", "estimators=[fobg]", "sweep.mass=[0.1,0.3]"
+    )
+    for cell, mass in zip(cells, (0.1, 0.3), strict=True):
+        stored = blank(made, cell)
+        assert stored["study"] == study
+        told = json.loads(stored["parameters"])
+        assert told["study"]["name"] == study
+        assert told["scene"] == {"name": "pushing"} | values(cell.scene)
+        assert told["scene"]["mass"] == mass
+        assert set(told) == {"study", *cell.parts, "theta", "reference"}
+
+
+@pytest.mark.parametrize("step", range(1, 14))
+def test_compaction_cut_short_at_any_step_loses_nothing(tmp_path, monkeypatch, step):
+    """Every change of the directory is a step; after ``step`` of them the process is gone."""
+
+    class Gone(BaseException):
+        pass
+
+    store = Store(tmp_path, COLUMNS)
+    store.append(row(1), row(2))
+    store.compact()
+    store.append(row(3))
+    store.append(row(4))
+    left = [step]
+
+    def cut(real):
+        def call(*words, **more):
+            left[0] -= 1
+            if left[0] < 0:
+                raise Gone
+            return real(*words, **more)
+
+        return call
+
+    for name in ("rename", "link", "replace", "fsync"):
+        monkeypatch.setattr(store_module.os, name, cut(getattr(os, name)))
+    monkeypatch.setattr(store_module.Path, "unlink", cut(store_module.Path.unlink))
+    try:
+        store.compact()
+    except Gone:
+        pass
+    else:
+        assert step >= 10, "so many steps are cut short"
+    monkeypatch.undo()
+    assert keys(store) == [1, 2, 3, 4]
+    store.compact()
+    assert keys(store) == [1, 2, 3, 4]
+    assert len(pd.read_parquet(tmp_path / "rows.parquet")) == 4
+
+
+def test_a_table_that_another_run_has_put_there_meanwhile_is_read_before_it_is_replaced(tmp_path, monkeypatch):
+    store, real = Store(tmp_path, COLUMNS), os.rename
+    store.append(row(1))
+    store.compact()
+    store.append(row(2))
+
+    def fold():
+        """Fold what the other run had read before the part with row 2 was there."""
+        table = pd.read_parquet(tmp_path / "rows.parquet")
+        pd.concat([table, table.assign(key=row(3)["key"])]).to_parquet(tmp_path / "other")
+        os.replace(tmp_path / "other", tmp_path / "rows.parquet")
+
+    overtake = once(fold)
+    monkeypatch.setattr(os, "rename", lambda path, to: (path.name == "rows.parquet" and overtake(), real(path, to))[1])
+    store.compact()
+    assert keys(store) == [1, 2, 3]
+
+
+def test_two_columns_of_one_name_are_refused(tmp_path):
+    frame = pd.DataFrame([row(1)])
+    parts = [pa.array(frame["key"]), pa.array([1.0]), pa.array([2.0])]
+    pq.write_table(pa.Table.from_arrays(parts, ["key", "bias", "bias"]), tmp_path / "rows.parquet")
+    with pytest.raises(StorageError, match=r"cannot be read as Parquet .*bias"):
+        Store(tmp_path, COLUMNS).load()
+
+
+@pytest.mark.slow
+def test_writers_readers_and_compactions_side_by_side(tmp_path):
+    """Four threads store and fold, one reads: what was stored stays, and is never missed for a moment."""
+    stored: set[int] = set()
+    faults: list[str] = []
+    done = threading.Event()
+
+    def write(writer: int) -> None:
+        store = Store(tmp_path, COLUMNS)
+        for i in range(25):
+            store.append(row(writer * 100 + i))
+            stored.add(writer * 100 + i)
+            if i % 3 == 0:
+                store.compact()
+        store.compact()
+
+    def read() -> None:
+        while not done.is_set():
+            before = set(stored)
+            lost = before - set(keys(Store(tmp_path, COLUMNS)))
+            if lost:
+                faults.append(f"{lost} not seen")
+
+    reader = threading.Thread(target=read)
+    writers = [threading.Thread(target=write, args=(i,)) for i in range(4)]
+    reader.start()
+    for thread in writers:
+        thread.start()
+    for thread in writers:
+        thread.join()
+    done.set()
+    reader.join()
+    assert not faults
+    Store(tmp_path, COLUMNS).compact()
+    table = pd.read_parquet(tmp_path / "rows.parquet")
+    assert len(table) == 100
+    assert table["key"].is_unique
+
+
+def once(act):
+    """Return a function that acts the first time that it is called."""
+    left = [act]
+    return lambda: left.pop()() if left else None
+
+
+@pytest.mark.parametrize("name", ["listdir", "scandir"])
+def test_the_folder_of_small_files_may_go_while_it_is_listed(tmp_path, monkeypatch, name):
+    store, real = Store(tmp_path, COLUMNS), getattr(os, name)
+    store.append(row(1))
+    store.compact()
+    (tmp_path / "pending").mkdir()
+    remove = once((tmp_path / "pending").rmdir)
+    monkeypatch.setattr(os, name, lambda path: (str(path).endswith("pending") and remove(), real(path))[1])
+    assert keys(store) == [1]
+
+
+@pytest.mark.parametrize("moment", ["it was there", "it has just been made"])
+@pytest.mark.parametrize("act", ["append", "prepare"])
+def test_the_folder_of_small_files_may_go_while_a_file_is_added(tmp_path, monkeypatch, act, moment):
+    store, real = Store(tmp_path, COLUMNS, "mine"), os.mkdir
+    store.load()
+    (tmp_path / "pending").mkdir()
+    remove = once((tmp_path / "pending").rmdir)
+
+    def mkdir(path, *more):
+        if not str(path).endswith("pending"):
+            return real(path, *more)
+        if moment == "it was there":
+            try:
+                return real(path, *more)
+            finally:
+                remove()
+        remove()
+        real(path, *more)
+        gone()
+
+    gone = once((tmp_path / "pending").rmdir)
+    monkeypatch.setattr(os, "mkdir", mkdir)
+    store.append(row(1, study="mine")) if act == "append" else store.prepare()
+    assert keys(store) == [1] * (act == "append")
+    assert (tmp_path / "pending").is_dir()
+
+
+def test_a_file_folded_by_another_run_before_it_is_in_place_is_no_fault(tmp_path, monkeypatch):
+    """Both fold: the one that is slow finds its own file gone, into that of the other."""
+    store, other, real = Store(tmp_path, COLUMNS), Store(tmp_path, COLUMNS), os.link
+    store.append(row(1))
+    overtake = once(other.compact)
+    monkeypatch.setattr(os, "link", lambda *words: (overtake(), real(*words))[1])
+    store.compact()
+    assert keys(store) == [1]
+    assert [path.name for path in tmp_path.iterdir()] == ["rows.parquet"]
+
+
+def test_rows_that_a_listing_has_missed_in_both_places_are_read_again(tmp_path, monkeypatch):
+    """A folder is listed while it changes: an old file may be gone already, and the new one not be there yet."""
+    store, real = Store(tmp_path, COLUMNS), os.listdir
+    store.append(row(1))
+    old = [path.name for path in (tmp_path / "pending").iterdir()]
+    store._add("parquet", pd.DataFrame(store.load()).to_parquet(index=False))
+    (tmp_path / "pending" / old[0]).unlink()
+    first = [[]]
+    monkeypatch.setattr(os, "listdir", lambda path: first.pop() if first else real(path))
+    assert keys(store) == [1]
+
+
+def test_a_folder_that_may_not_be_read_is_not_taken_for_an_empty_one(tmp_path, monkeypatch):
+    def refuse(path):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    Store(tmp_path, COLUMNS).append(row(1))
+    monkeypatch.setattr(os, "listdir", refuse)
+    monkeypatch.setattr(os, "scandir", refuse)
+    with pytest.raises(StorageError, match="cannot be read: Permission denied"):
+        Store(tmp_path, COLUMNS).load()
+
+
+@pytest.fixture(params=["with exclusive renames", "without"])
+def no_hard_links(request, monkeypatch):
+    """A file system that has no hard links, and perhaps no renames that refuse to overwrite."""
+
+    def refuse(*_):
+        raise OSError(errno.EPERM, "not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    if request.param == "without":
+        monkeypatch.setattr(files.ctypes, "CDLL", lambda *_, **more: object())
+
+
+def test_a_file_system_without_hard_links(tmp_path, no_hard_links):
+    store = Store(tmp_path, COLUMNS)
+    store.append(row(1))
+    store.compact()
+    store.append(row(2))
+    store.compact()
+    assert len(pd.read_parquet(tmp_path / "rows.parquet")) == 2
+
+
+def test_without_hard_links_nothing_of_another_run_is_overwritten(tmp_path, no_hard_links):
+    mine, other = tmp_path / "part", tmp_path / "rows.parquet"
+    mine.write_text("mine")
+    other.write_text("other")
+    with pytest.raises(FileExistsError, match="File exists"):
+        files.place(mine, other)
+    assert (mine.read_text(), other.read_text()) == ("mine", "other")
+    with pytest.raises(FileNotFoundError):
+        files.place(tmp_path / "gone", tmp_path / "new")
+    files.place(mine, tmp_path / "new")
+    assert (tmp_path / "new").read_text() == "mine"
+
+
+def test_without_hard_links_one_of_two_studies_is_refused_too(tmp_path, no_hard_links):
+    first, second = (Store(tmp_path, COLUMNS, study) for study in ("bias_variance", "growth"))
+    first.prepare()
+    with pytest.raises(UserError, match="a run of study bias_variance has started"):
+        second.prepare()
+
+
+# ------------------------------------------------------------------------------------------------ commands
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", "truncated"])
+@pytest.mark.parametrize("place", ["rows.parquet", "pending/part.parquet", "pending/row.json"])
+@pytest.mark.parametrize("verb", ["run", "plan", "report"])
+def test_unreadable_file_is_named_and_left_alone(tmp_path, capsys, place, content, verb):
+    path = tmp_path / "tiny" / place
+    path.parent.mkdir(parents=True)
+    if content == "truncated":
+        whole = tmp_path / "whole"
+        pd.DataFrame([row(1)]).to_parquet(whole)
+        content = whole.read_bytes()[:-100]
+    path.write_bytes(content)
+    assert main([verb, *TINY, "name=tiny", f"results_dir={tmp_path}"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert str(path) in said
+    assert len(said.splitlines()) == 1
+    assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("after", [0, 1, 2])
+def test_disk_that_fills(tmp_path, capsys, monkeypatch, after):
+    """The disk is full after so many files of rows: exit status 2, what was stored stays, and the run goes on later."""
+    monkeypatch.setattr(tasks, "TOGETHER_S", 0.0)  # a file per row
+    words = [*TINY, "name=tiny", "sweep.sigma=[0.1,0.2,0.3,0.4]", f"results_dir={tmp_path}", "workers=0"]
+    real, left = files.replace_file, [after]
+
+    def write(path, content):
+        if path.parent.name == "pending":
+            left[0] -= 1
+        if left[0] < 0:
+            raise StorageError(f"'{path}' cannot be written: {os.strerror(errno.ENOSPC)}")
+        real(path, content)
+
+    for module in (files, store_module):
+        monkeypatch.setattr(module, "replace_file", write)
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert "No space left on device" in said
+    assert "Traceback" not in said
+    monkeypatch.undo()
+    assert len(Store(tmp_path / "tiny", COLUMNS).load()) == after
+    assert main(words) == 0
+    assert len(pd.read_parquet(tmp_path / "tiny" / "rows.parquet")) == 4
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount")
+def test_small_disk(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", str(disk)], capture_output=True).returncode:
+        pytest.skip("no mount here")
+    try:
+        words = [*TINY, f"sweep.sigma=[{','.join(str(s / 100) for s in range(1, 101))}]", "name=tiny", "--quiet"]
+        done = bench(*words, f"results_dir={disk}")
+        assert done.returncode == 2
+        assert "Traceback" not in done.stderr
+        assert "No space left on device" in done.stderr
+        stored = Store(disk / "tiny", COLUMNS).load()
+        assert 0 < len(stored) <= 100
+        shutil.copytree(disk / "tiny", tmp_path / "tiny")
+        again = bench(*words, f"results_dir={tmp_path}")
+        assert again.returncode == 0
+        assert len(Store(tmp_path / "tiny", COLUMNS).load()) == 100
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_directory_without_permission(tmp_path, capsys):
+    tmp_path.chmod(0o500)
+    assert main([*TINY, "name=tiny", f"results_dir={tmp_path}"]) == 2
+    assert "Permission denied" in capsys.readouterr().err
+
+
+def test_directory_that_refuses(tmp_path, capsys, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(store_module.Path, "mkdir", refuse)
+    assert main([*TINY, "name=tiny", f"results_dir={tmp_path}"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "cannot be written: Permission denied" in said
+    assert len(said.splitlines()) == 1
+
+
+# ---------------------------------------------------------------------------------------- kills and company
+
+
+def bench(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "bench", *words], capture_output=True, text=True)
+
+
+def start(*words: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "bench", *words]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def sweep(cells: int) -> list[str]:
+    sigmas = ",".join(f"{0.01 * (i + 1):.2f}" for i in range(cells // 2))
+    words = [w for w in TINY if not w.startswith(("estimators", "samples"))]
+    return [*words, "estimators=[fobg,reinforce]", "samples=4096", f"sweep.sigma=[{sigmas}]", "name=sweep", "workers=2"]
+
+
+def table(directory) -> pd.DataFrame:
+    return pd.read_parquet(directory / "sweep" / "rows.parquet").drop(columns=["stored_at", "wall_s", "sequence"])
+
+
+@pytest.mark.slow
+def test_any_number_of_workers_gives_the_same_bytes(tmp_path):
+    """References by quadrature and sampling too, on two backends, one of them compiling."""
+    words = [
+        "scenes=[bouncing_ball,pushing]", "contacts=[penalty]", "backends=[jax,numpy]", "estimators=[fobg,reinforce]",
+        "scene.pushing.horizon=5", "scene.bouncing_ball.horizon=5", "samples=16", "repeats=4", "reference.samples=4096",
+        "timing=false", "name=sweep", "--quiet",
+    ]  # fmt: skip
+    for workers in (0, 2):
+        assert main([*words, f"workers={workers}", f"results_dir={tmp_path / str(workers)}"]) == 0
+    csv = [(tmp_path / str(workers) / "sweep" / "bias_variance.csv").read_bytes() for workers in (0, 2)]
+    assert csv[0] == csv[1]
+    assert table(tmp_path / "2")["time_s"].isna().all()
+
+
+@pytest.mark.slow
+def test_two_runs_of_one_experiment_at_once(tmp_path):
+    words = [*sweep(40), f"results_dir={tmp_path}"]
+    runs = [start(*words) for _ in range(2)]
+    assert [run.wait(timeout=120) for run in runs] == [0, 0]
+    found = table(tmp_path)
+    assert len(found) == 40
+    assert found["key"].is_unique
+    assert [path.name for path in (tmp_path / "sweep").glob("*pending*")] == []
+
+
+@pytest.mark.slow
+def test_killed_at_twenty_moments(tmp_path):
+    """A 200-cell sweep is killed 20 times: no finished row is lost, and the table is that of an uninterrupted run."""
+    words = sweep(200)
+    assert bench(*words, f"results_dir={tmp_path / 'whole'}").returncode == 0
+    store = Store(tmp_path / "cut" / "sweep", COLUMNS)
+    dice = random.Random(0)
+    had: set[str] = set()
+    for _ in range(20):
+        run = start(*words, f"results_dir={tmp_path / 'cut'}")
+        had_at_start = len(had)
+        deadline = time.monotonic() + 30
+        while run.poll() is None and time.monotonic() < deadline and len(store.load()) < had_at_start + 5:
+            time.sleep(0.02)
+        time.sleep(dice.uniform(0, 0.3))
+        run.send_signal(signal.SIGKILL)
+        run.wait()
+        have = set(store.load()["key"])
+        assert had <= have
+        had = have
+    assert bench(*words, f"results_dir={tmp_path / 'cut'}").returncode == 0
+    pd.testing.assert_frame_equal(table(tmp_path / "cut"), table(tmp_path / "whole"), check_exact=True)
+    names = [tmp_path / run / "sweep" / "bias_variance.csv" for run in ("cut", "whole")]
+    assert names[0].read_bytes() == names[1].read_bytes()

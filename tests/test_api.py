@@ -1,0 +1,217 @@
+"""The Python face, used as in a notebook; and what plugin authors import."""
+
+import ast
+import doctest
+import importlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import SPRINGY
+
+import bench
+import bench.model
+from bench.api import _words
+from bench.experiment import config, grid
+
+ROOT = Path(__file__).resolve().parents[1]
+TINY = {
+    "backends": ["numpy"],
+    "samples": 8,
+    "repeats": 4,
+    "workers": 0,
+    "timing": False,
+    "reference": {"samples": 4096},
+}
+
+
+def cells(*words, **overrides):
+    """The cells that :func:`bench.run` would run."""
+    return grid.cells(config.load([*words, *(word for key, value in overrides.items() for word in _words(key, value))]))
+
+
+# ---------------------------------------------------------------------------------------------------- a notebook
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """A folder whose name a shell or Hydra would take apart."""
+    return tmp_path_factory.mktemp("my results, [v1]")
+
+
+@pytest.fixture(scope="module")
+def rows(results):
+    return bench.run(
+        name="notes", scenes=["quadratic"], estimators=["fobg", "reinforce[baseline=none]"], results_dir=results,
+        sweep={"sigma": np.array([0.1, 0.2]), "condition": [np.float64(10.0), np.int64(100)]},
+        scene={"quadratic": {"dimension": 3}}, **TINY,
+    )  # fmt: skip
+
+
+def test_run_returns_a_row_per_cell_and_writes_everything(rows, results):
+    assert len(rows) == 8
+    assert set(rows["status"]) == {"ok"}
+    assert sorted(set(rows["condition"])) == [10.0, 100.0]
+    assert sorted(set(rows["sigma"])) == [0.1, 0.2]
+    assert set(rows["estimator_params"]) == {"", "baseline=none"}
+    assert set(rows["dim"]) == {3.0}
+    names = {path.name for path in (results / "notes").iterdir()}
+    assert {"rows.parquet", "bias_variance.csv", "bias_variance.md", "report.html", "run.json"} <= names
+    told = json.loads((results / "notes" / "run.json").read_text())
+    assert "scene.quadratic.dimension=3" in told["argv"]
+    assert "sweep={sigma:[0.1,0.2],condition:[10.0,100]}" in told["argv"]
+
+
+def test_load_gives_the_same_rows_with_a_number_for_every_swept_axis(rows, results):
+    found = bench.load(results / "notes")
+    assert len(found) == len(rows)
+    for name in ("condition", "sigma"):
+        assert found[name].dtype == np.float64
+        assert list(found[name]) == list(rows[name])
+    assert list(found["key"]) == list(rows["key"])
+    told = [json.loads(text) for text in found["parameters"]]
+    assert [one["scene"]["condition"] for one in told] == list(found["condition"])
+    assert set(found["study"]) == {"bias_variance"}
+    ratio = found.pivot_table(index="condition", columns="estimator", values="variance")
+    assert (ratio["reinforce"] > ratio["fobg"]).all()
+
+
+def test_run_returns_its_own_rows_and_load_all_that_are_stored(rows, results):
+    again = bench.run(
+        name="notes", scenes=["quadratic"], estimators=["fobg"], results_dir=results, sweep={"sigma": [0.3]}, **TINY
+    )
+    assert len(again) == 1
+    assert len(bench.load(results / "notes")) == len(rows) + 1
+
+
+def test_load_of_a_scene_parameter_named_like_one_of_the_law(tmp_path):
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "springy.py").write_text(SPRINGY)
+    given = {"sweep": {"springy": {"stiffness": [1, 2, 3]}}, "estimators": ["fobg"], "plugins": tmp_path / "plugins"}
+    bench.run(name="own", scenes=["springy"], results_dir=str(tmp_path / "out"), **given, **TINY)
+    found = bench.load(str(tmp_path / "out" / "own"))
+    assert list(found["springy.stiffness"]) == [1.0, 2.0, 3.0]
+    assert list(found["stiffness"]) == [1000.0] * 3
+
+
+def test_problem_and_estimate():
+    problem = bench.problem("quadratic[dimension=3]", backend="numpy")
+    theta = problem.program.theta0
+    w = np.zeros((problem.program.n_noise, 2))
+    assert problem.value(theta, w).shape == (2,)
+    assert problem.grad(theta, w).shape == (3, 2)
+    found = bench.estimate(problem, "fobg", samples=16, repeats=8, seed=1, reference_samples=4096)
+    assert found.values.shape == (8, 3)
+    assert found.reference_method.startswith("closed_form")
+    np.testing.assert_allclose(found.values.mean(axis=0), found.reference, rtol=0.5)
+    assert found.as_dict()["bias_low"] <= found.as_dict()["bias_high"]
+    assert "8 estimates: bias" in str(found)
+
+
+def test_estimate_is_that_of_a_cell(rows):
+    cell = rows[(rows["estimator"] == "fobg") & (rows["sigma"] == 0.1) & (rows["condition"] == 10.0)].iloc[0]
+    problem = bench.problem("quadratic[dimension=3]", backend="numpy")
+    found = bench.estimate(problem, "fobg", samples=8, repeats=4, seed=0, reference_samples=4096).as_dict()
+    for name in ("bias", "variance", "rmse"):
+        assert found[name] == pytest.approx(cell[name], rel=1e-9)
+
+
+def test_theta_can_be_named_parameters():
+    problem = bench.problem("pushing[horizon=3]", backend="numpy", theta=["mass", "stiffness"], theta0=[0.2, 500.0])
+    assert list(problem.program.theta0) == [0.2, 500.0]
+    assert problem.dim == 2
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: bench.run("stiffness_swep"), "did you mean 'stiffness_sweep'"),
+        (lambda: bench.run(sampels=8), "did you mean 'samples'"),
+        (lambda: bench.run(scenes=["pushin"]), "did you mean 'pushing'"),
+        (lambda: bench.run(scene={"pushing": {"mas": 1.0}}), "did you mean 'mass'"),
+        (lambda: bench.run(sweep={"stifness": [1.0]}), "did you mean 'stiffness'"),
+        (lambda: bench.problem("quadratc"), "did you mean 'quadratic'"),
+        (lambda: bench.problem("quadratic[sgima=1]"), "did you mean 'sigma'"),
+        (lambda: bench.problem("pushing", contact="penaltie"), "did you mean 'penalty'"),
+        (lambda: bench.problem("quadratic", backend="numpi"), "did you mean 'numpy'"),
+        (lambda: bench.estimate(bench.problem("quadratic", backend="numpy"), "fob"), "did you mean 'fobg'"),
+        (lambda: bench.load("no_such_folder"), "no rows are stored in 'no_such_folder'"),
+    ],
+)  # fmt: skip
+def test_bad_names_are_told_with_the_nearest_one(call, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(bench.UserError, match=said):
+        call()
+
+
+def test_what_cannot_work_is_unsupported():
+    with pytest.raises(bench.Unsupported):
+        bench.problem("pushing", contact="complementarity", backend="numpy")
+
+
+# ------------------------------------------------------------------------------------------------------ keywords
+
+
+def test_keywords_are_the_words_of_the_command_line():
+    same = [
+        (["samples=8", "sweep.stiffness=[100,1e4]"], {"samples": np.int64(8), "sweep": {"stiffness": np.array([100, 1e4])}}),
+        (["sweep.seed=[0,1,2]"], {"sweep": {"seed": range(3)}}),
+        (["sweep.zip={stiffness:[1,2],dt:[0.01,0.001]}"], {"sweep": {"zip": {"stiffness": [1, 2], "dt": (0.01, 0.001)}}}),
+        (["sweep.union=[{stiffness:[1]},{mass:[2]}]"], {"sweep": {"union": [{"stiffness": [1]}, {"mass": [2]}]}}),
+        (["scene.pushing.mass=0.2"], {"scene": {"pushing": {"mass": np.float64(0.2)}}}),
+        (["estimators=[reinforce[baseline=none]]"], {"estimators": ["reinforce[baseline=none]"]}),
+        (["estimators=[alpha_order[delta=0.1,gamma=4]]"], {"estimators": "alpha_order[delta=0.1,gamma=4]"}),
+        (["study=bias_variance[timed_calls=3]"], {"study": "bias_variance[timed_calls=3]"}),
+        (["theta=[mass]", "theta0=[0.3]"], {"theta": ["mass"], "theta0": np.array([0.3])}),
+        (["timing=false", "reference.samples=8192"], {"timing": np.bool_(False), "reference": {"samples": 8192}}),
+        (["sweep.bound=[null,1.0]", "estimators=[alpha_order]"], {"sweep": {"bound": [None, 1.0]}, "estimators": ["alpha_order"]}),
+        (["sweep.penalty.stiffness=[1,2]"], {"sweep": {"penalty.stiffness": [1, 2]}}),
+    ]  # fmt: skip
+    for words, overrides in same:
+        assert [cell.key for cell in cells(*words)] == [cell.key for cell in cells(**overrides)], overrides
+
+
+@pytest.mark.parametrize(
+    "text", ["what, if: anything [x] 'quoted' {a}? \\ b\\' c\\", "ünï", "100% $x #1", 'a "b"', "", "a b"]
+)
+def test_texts_come_through_as_they_are(text):
+    made = config.load(_words("question", text) + _words("results_dir", Path(f"/{text}")))
+    assert made.question == text
+    assert made.results_dir == Path(f"/{text}")
+
+
+def test_marks_are_a_table_with_names_of_any_kind():
+    marks = {"stiffness": {"step size limit": 6400, "a: (b), [c]=1": 2}}
+    assert config.load(_words("marks", marks)).marks == marks
+
+
+# -------------------------------------------------------------------------------------------------- public names
+
+
+def test_every_public_name_exists_and_every_contract_is_public():
+    assert len(bench.__all__) == len(set(bench.__all__))
+    assert set(bench.model.__all__) < set(bench.__all__)
+    for name in bench.__all__:
+        assert getattr(bench, name) is not None
+    for name in bench.model.__all__:
+        assert getattr(bench, name) is getattr(bench.model, name)
+    public = {name for name, value in vars(bench.model).items() if not name.startswith("_") and getattr(value, "__module__", "") != "bench.model" and not hasattr(value, "__path__") and type(value).__name__ != "module"}  # fmt: skip
+    assert public == set(bench.model.__all__)
+
+
+def test_plugins_import_public_names_only():
+    asked = set()
+    for path in (ROOT / "plugins").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module == "bench.model":
+                asked |= {alias.name for alias in node.names}
+    assert len(asked) > 20
+    assert asked <= set(bench.model.__all__)
+
+
+@pytest.mark.parametrize("name", ["model.parameters", "model.identity", "report.text", "experiment.grid", "errors"])
+def test_examples_in_docstrings(name):
+    done = doctest.testmod(importlib.import_module(f"bench.{name}"))
+    assert done.attempted > 0
+    assert done.failed == 0
