@@ -8,15 +8,14 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from bench.claims import toolkit
 from bench.claims.claim import UNDECIDED, Claim, Figure, verdict
 from bench.errors import Unsupported
+from bench.experiment.keys import module_hash, plugin_hash
 from bench.model import registry
-from bench.model.sources import hash_of, source_hash, sources
 from bench.run.files import write_whole
 
 FAILED = "failed"
@@ -70,15 +69,10 @@ def measured(claim: type[Claim]) -> ClaimResult:
 
 def key_of(claim: type[Claim], used: tuple[tuple[str, str], ...]) -> str:
     """Return the hash of the claim's code, of what claims are made of, and of the plugins used."""
-    digest = hashlib.sha256((_code(claim.__module__) + _code(toolkit.__name__)).encode())
+    digest = hashlib.sha256(module_hash(claim.__module__, toolkit.__name__).encode())
     for kind, name in used:
-        digest.update(source_hash(registry.usable(kind, name)).encode())
+        digest.update(plugin_hash(registry.usable(kind, name)).encode())
     return digest.hexdigest()
-
-
-@cache
-def _code(module: str) -> str:
-    return hash_of(sources(module))
 
 
 def path_of(directory: Path, name: str) -> Path:

@@ -12,7 +12,7 @@ from typing import Any, cast
 
 from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
-from bench.experiment.keys import core_hash, fingerprint, hashed
+from bench.experiment.keys import PROGRAM, REFERENCE, fingerprint, hashed, module_hash
 from bench.model import (
     Backend,
     ContactLaw,
@@ -106,17 +106,17 @@ class Cell:
     def key(self) -> str:
         """Hash of everything that decides the cell's numbers; library versions are columns instead."""
         counts = [self.samples, self.repeats, self.seed, self.timing]
-        reference = None if self.budget is None else self.program_key
+        reference = None if self.budget is None else [self.program_key, module_hash(REFERENCE)]
         return hashed(
             {axis: fingerprint(part) for axis, part in self.parts.items()}, counts, reference, self._budget(),
-            self._theta(), fingerprint(self.study), core_hash(),
+            self._theta(), fingerprint(self.study), module_hash(PROGRAM),
         )  # fmt: skip
 
     @cached_property
     def program_key(self) -> str:
         """Hash of everything that decides the program."""
         parts = [fingerprint(part) for part in (self.scene, self.contact, self.integrator)]
-        return hashed(parts, self._theta(), core_hash())
+        return hashed(parts, self._theta(), module_hash(PROGRAM))
 
     @cached_property
     def parameters(self) -> dict[str, Any]:

@@ -1,35 +1,47 @@
-"""Decides when two results are the same: hashes of plugins, of the core's own code, and of what a study measures."""
+"""Decides when two results are the same: hashes of plugins, of their parameters, and of all code behind their numbers.
+
+All code that a plugin, its base classes, the reference or a study's ``measure`` imports counts, from its own package and
+from bench, unless :data:`HARMLESS` lists it.
+"""
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
-from importlib.util import find_spec
+import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from bench import measure, model
+from bench.model import CallableScene
 from bench.model.parameters import Plugin, remember, values
-from bench.model.sources import hash_of, source_hash, sources
+from bench.model.sources import code_of, file_of, hash_of, hash_of_tree, imports_of_tree
 
-CORE = {
-    model: (
-        "backend",
-        "callables",
-        "contact",
-        "dynamics",
-        "estimator",
-        "integrator",
-        "ops",
-        "problem",
-        "program",
-        "scene",
-    ),
-    measure: ("batches", "jumps", "noise", "quadrature", "reference", "smoothed", "statistics"),
+HARMLESS = {
+    "bench.deprecated": "old names of the same things",
+    "bench.errors": "statuses and the wording of messages",
+    "bench.experiment": "describes cells and rows; all that it passes on to plugins is in the key",
+    "bench.model.guard": "protects the process from plugins, and sees none of their numbers",
+    "bench.model.identity": "plugins as text",
+    "bench.model.parameters": "declares and checks parameters, whose values are in the key",
+    "bench.model.registry": "finds plugins, whose code is in the key",
+    "bench.model.sources": "the hashes of code themselves",
+    "bench.model.trial": "imports new plugin files in a process of their own",
+    "bench.report": "shows rows",
+    "bench.run.files": "writes files as they are given",
+    "bench.run.reference_backends": "chooses the backend of a reference, which is in the key",
+    "bench.studies.bias_variance.columns": "names, units and meanings of columns",
+    "bench.studies.growth.columns": "names, units and meanings of columns",
+    "bench.studies.three_errors.columns": "names, units and meanings of columns",
 }
-"""Modules that decide numbers in every study."""
-BOOKKEEPING = ("bench.errors", "bench.model", "bench.experiment", "bench.run", "bench.report")
-"""What a study imports without effect on its numbers, or what :data:`CORE` has already."""
+"""Modules and packages that decide no number though code that does imports them, each with the reason."""
+REFERENCE = "bench.run.references"
+"""The module that computes reference gradients."""
+PROGRAM = "bench.model.program"
+"""The module that composes scene, contact law and integrator."""
+DISPLAY = ("write", "show", "page", "chart", "faults")
+"""Methods of a study that only show its rows."""
 
 _fingerprints: dict[int, tuple[Plugin, str]] = {}
 """Hashes by identity of the plugin, since equal plugins may differ in their numbers: -0.0 equals 0.0, and False 0."""
@@ -40,16 +52,15 @@ def fingerprint(plugin: Plugin | None) -> str:
     if plugin is None:
         return ""
     if id(plugin) not in _fingerprints:
-        text = json.dumps([plugin.kind, plugin.name, dict(sorted(values(plugin).items())), _code(plugin)], default=repr)
+        parameters = dict(sorted(values(plugin).items()))
+        hashes = [
+            plugin_hash(type(plugin)),
+            *([files_hash(plugin.files())] if isinstance(plugin, CallableScene) else []),
+        ]
+        text = json.dumps([plugin.kind, plugin.name, parameters, hashes], default=repr)
         # the plugin is kept alive, so that its id is not given to another object
         _fingerprints[id(plugin)] = (plugin, hashlib.sha256(text.encode()).hexdigest())
     return _fingerprints[id(plugin)][1]
-
-
-def _code(plugin: Plugin) -> str:
-    if isinstance(plugin, model.CallableScene):
-        return source_hash(type(plugin)) + hash_of(plugin.files())
-    return study_hash(type(plugin)) if plugin.kind == "studies" else source_hash(type(plugin))
 
 
 def hashed(*parts: Any) -> str:
@@ -57,20 +68,68 @@ def hashed(*parts: Any) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
-@remember
-def core_hash() -> str:
-    """Return the hash of the harness's own code that decides numbers in every study."""
-    return hash_of(
-        Path(str(package.__file__)).with_name(f"{name}.py") for package, names in CORE.items() for name in names
-    )
+def code(*modules: str) -> dict[str, Path]:
+    """Return the files that decide numbers among modules and all that they import, by module name."""
+    return code_of(modules, HARMLESS)
+
+
+def files_hash(files: Iterable[Path]) -> str:
+    """Return the hash of a user's files and of what they import from bench."""
+    paths = list(files)
+    modules = [name for path in paths for name in imports_of_tree(ast.parse(path.read_bytes()), path.stem, path)]
+    return hash_of([*paths, *code(*(name for name in modules if name.startswith("bench."))).values()])
 
 
 @remember
-def study_hash(study: type[Plugin]) -> str:
-    """Return the hash of the measuring code: the study's module ``measure`` (or its own) and what that imports."""
-    module = f"{study.__module__}.measure"
-    try:
-        beside = find_spec(module) is not None
-    except ModuleNotFoundError:
-        beside = False
-    return hash_of(sources(module if beside else study.__module__, BOOKKEEPING))
+def module_hash(*modules: str) -> str:
+    """Return the hash of the code of modules and of all that they import, as far as it decides numbers."""
+    return hash_of(code(*modules).values())
+
+
+@remember
+def plugin_hash(plugin: type[Plugin]) -> str:
+    """Return the hash of the code behind a plugin: its own, that of its base classes, and all that these import."""
+    return hash_of(plugin_code(plugin).values()) + (_class_hash(plugin) if plugin.kind == "studies" else "")
+
+
+def plugin_code(plugin: type[Plugin]) -> dict[str, Path]:
+    """Return the files that decide a plugin's numbers, by module name; of a study's own module, only what it imports."""
+    modules = _defining(plugin)
+    if plugin.kind != "studies":
+        return code(*modules)
+    return code(*(name for module in modules for name in imports_of_tree(_measuring(module), module, _file(module))))
+
+
+def _defining(plugin: type[Plugin]) -> list[str]:
+    """Return the modules that define a plugin's class and its base classes, without those of Python itself."""
+    modules = dict.fromkeys(cls.__module__ for cls in plugin.__mro__)
+    return [m for m in modules if m.partition(".")[0] not in sys.stdlib_module_names and file_of(m) is not None]
+
+
+def _file(module: str) -> Path:
+    path = file_of(module)
+    assert path is not None
+    return path
+
+
+def _class_hash(study: type[Plugin]) -> str:
+    """Return the hash of the modules that define a study, without what only shows rows."""
+    return "".join(hash_of_tree(_measuring(module)) for module in _defining(study) if module in code(module))
+
+
+def _measuring(module: str) -> ast.Module:
+    """Return the syntax tree of a study's module without its columns and the methods that only show its rows."""
+    tree = ast.parse(_file(module).read_bytes())
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef):
+            node.body = [part for part in node.body if not _shows(part)] or [ast.Pass()]
+    return tree
+
+
+def _shows(part: ast.stmt) -> bool:
+    """Return whether a part of a study's class is a method that shows rows, or its declaration of columns."""
+    if isinstance(part, ast.FunctionDef):
+        return part.name in DISPLAY
+    targets: Iterable[ast.expr] = part.targets if isinstance(part, ast.Assign) else ()
+    targets = [part.target] if isinstance(part, ast.AnnAssign) else targets
+    return any(isinstance(target, ast.Name) and target.id == "columns" for target in targets)

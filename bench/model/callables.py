@@ -5,12 +5,14 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from bench.model.scene import Scene
-from bench.model.simulator import Simulator
+
+if TYPE_CHECKING:
+    from bench.model.simulator import Simulator
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a result depends on: hashes of the parsed source of modules that ignore docstrings and comments."""
+"""Hashes of the code that a result depends on: modules, and all that they import from their own package and from bench."""
 
 from __future__ import annotations
 
@@ -6,18 +6,36 @@ import ast
 import hashlib
 import importlib.util
 from collections.abc import Collection, Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
-from bench.model.parameters import Plugin, remember
-
-PACKAGES = ("bench.plugins",)
-"""Subpackages that count as packages of their own: what built-in plugins import from ``bench`` belongs to the core."""
+from bench.model.parameters import remember
 
 
-@remember
-def source_hash(plugin: type[Plugin]) -> str:
-    """Return the hash of a plugin's code: its own module and those it imports from its own package."""
-    return hash_of(sources(plugin.__module__))
+def code_of(modules: Iterable[str], harmless: Collection[str] = ()) -> dict[str, Path]:
+    """Return the files of modules and of all that they import from their own package and from bench, by module name.
+
+    Modules in or below ``harmless`` are left out, and so is what only they import. Imports for type checking do not
+    count. ``from package import name`` leads to the module that defines the name where the package only passes it on.
+    """
+    paths: dict[str, Path] = {}
+    waiting = list(modules)
+    while waiting:
+        name = waiting.pop()
+        path = None if name in paths or is_below(name, harmless) else file_of(name)
+        if path is not None:
+            paths[name] = path
+            waiting.extend(imports(name))
+    return paths
+
+
+def is_below(module: str, packages: Iterable[str]) -> bool:
+    """Return whether a module is one of some packages or in one.
+
+    >>> is_below("bench.report.tables", ["bench.report"]), is_below("bench.reports", ["bench.report"])
+    (True, False)
+    """
+    return any(module == package or module.startswith(f"{package}.") for package in packages)
 
 
 def hash_of(paths: Iterable[Path]) -> str:
@@ -31,13 +49,17 @@ def hash_of(paths: Iterable[Path]) -> str:
 @remember
 def code_hash(path: Path) -> str:
     """Return the hash of a file's syntax tree without docstrings, so that rewording one reruns no cell."""
-    tree = ast.parse(path.read_bytes())
+    return hash_of_tree(ast.parse(path.read_bytes()))
+
+
+def hash_of_tree(tree: ast.Module) -> str:
+    """Return the hash of a syntax tree without docstrings, which are removed from it."""
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
             # a body of only a docstring becomes `pass`, as if it had been written that way
-            kept = [part for part in body if not _is_text(part)]
-            node.body = kept or [ast.Pass()]  # type: ignore[attr-defined]
+            code = [part for part in body if not _is_text(part)]
+            node.body = code or [ast.Pass()]  # type: ignore[attr-defined]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
 
 
@@ -46,36 +68,65 @@ def _is_text(node: ast.stmt) -> bool:
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
-def sources(module: str, without: Collection[str] = ()) -> set[Path]:
-    """Return the files of a module and of all its imports from its own package, except modules under ``without``."""
-    paths: dict[str, Path] = {}
-    waiting = [module]
-    while waiting:
-        name = waiting.pop()
-        skipped = name in paths or any(name == other or name.startswith(f"{other}.") for other in without)
-        path = None if skipped else _file(name)
-        if path is not None:
-            paths[name] = path
-            waiting.extend(_imports(name, path))
-    return set(paths.values())
+@cache
+def imports(module: str) -> tuple[str, ...]:
+    """Return the modules that a module imports, at its top or later, from its own package and from bench."""
+    path = file_of(module)
+    return () if path is None else tuple(imports_of_tree(ast.parse(path.read_bytes()), module, path))
 
 
-def _imports(module: str, path: Path) -> Iterator[str]:
-    """Yield names a file imports from its package; ``from a import b`` may mean module ``a.b`` or a name in ``a``."""
-    package = next((p for p in PACKAGES if module.startswith(f"{p}.")), module.partition(".")[0])
+def imports_of_tree(tree: ast.AST, module: str, path: Path) -> Iterator[str]:
+    """Yield the modules that a part of a module's syntax tree imports from its own package and from bench."""
+    packages = {module.partition(".")[0], "bench"}
     parent = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    for node in ast.walk(ast.parse(path.read_text())):
-        names = []
+    for node in _run_time_nodes(tree):
+        names: list[str] = []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = importlib.util.resolve_name("." * node.level + (node.module or ""), parent)
-            names = [base, *(f"{base}.{alias.name}" for alias in node.names)]
-        yield from (name for name in names if f"{name}.".startswith(f"{package}."))
+            names = [origin for alias in node.names for origin in _origins(base, alias.name)]
+        yield from (name for name in names if name.partition(".")[0] in packages and name != module)
+
+
+def _run_time_nodes(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield the nodes of a tree except those under ``if TYPE_CHECKING``."""
+    if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+        return
+    yield node
+    for child in ast.iter_child_nodes(node):
+        yield from _run_time_nodes(child)
+
+
+def _origins(base: str, name: str) -> list[str]:
+    """Return the modules that ``from base import name`` depends on."""
+    if file_of(f"{base}.{name}") is not None:
+        return [f"{base}.{name}"]
+    path = file_of(base)
+    if path is not None and path.name == "__init__.py":
+        origins = _passed_on(base).get(name)
+        return [base] if origins is None else origins
+    return [base]
+
+
+@cache
+def _passed_on(package: str) -> dict[str, list[str]]:
+    """Return the names that a package's ``__init__`` imports from elsewhere, each with the modules that define it."""
+    path = file_of(package)
+    assert path is not None
+    names: dict[str, list[str]] = {}
+    for node in ast.parse(path.read_bytes()).body:
+        if isinstance(node, ast.ImportFrom):
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+            for alias in node.names:
+                if base != package and alias.name != "*":
+                    names[alias.asname or alias.name] = _origins(base, alias.name)
+    return names
 
 
 @remember
-def _file(module: str) -> Path | None:
+def file_of(module: str) -> Path | None:
+    """Return the Python file of a module; None where there is none."""
     try:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):

@@ -7,13 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from trees import ROOT, Tree
+from trees import Tree
 
 from bench.cli import main
 from bench.experiment import config, grid
 from bench.experiment.cell import Cell
-from bench.experiment.keys import BOOKKEEPING, fingerprint
-from bench.model.sources import sources
+from bench.experiment.keys import fingerprint
 from bench.run import plan, tasks
 from bench.run.store import Store
 from bench.studies.bias_variance.columns import COLUMNS
@@ -149,26 +148,6 @@ def missing_after(tree, path, added, replaced=("", "")) -> int:
     assert found is not None, said
     assert int(found[1]) + int(found[2]) == 6
     return int(found[2])
-
-
-STUDIES = [
-    (
-        "gradient_check",
-        {"measure/gradcheck/direction", "measure/noise", "measure/contacts", "studies/gradient_check/measure"},
-    ),
-    (
-        "three_errors",
-        {"measure/noise", "measure/statistics", "studies/three_errors/measure"},
-    ),
-]
-
-
-@pytest.mark.parametrize(("study", "files"), STUDIES)
-def test_a_study_is_known_by_what_it_imports(study, files):
-    paths = sources(f"bench.studies.{study}.measure", BOOKKEEPING)
-    found = {str(path.relative_to(ROOT / "bench").with_suffix("")) for path in paths}
-    assert files <= found
-    assert not [name for name in found if name.startswith(("sweep/", "model/", "report/"))]
 
 
 # -------------------------------------------------------------------------------------------------- policies

@@ -1,0 +1,204 @@
+"""Every file that can decide a number is in the keys of the cells whose numbers it can decide, and in no other."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from trees import ROOT
+
+from bench.experiment import config, grid, keys
+from bench.experiment.cell import Cell
+from bench.experiment.keys import HARMLESS, PROGRAM, REFERENCE, code, plugin_code
+from bench.model import registry, sources
+from bench.model.sources import file_of, is_below
+
+PUSH = ["scenes=[pushing]", "contacts=[penalty]", "integrators=[semi_implicit_euler]", "backends=[numpy]"]
+OPTIMISE = ["study=optimise", *PUSH, "estimators=[fobg]"]
+CELLS = {
+    "fobg": [*PUSH, "estimators=[fobg]"],
+    "windowed": [*PUSH, "estimators=[windowed]"],
+    "total_propagation": [*PUSH, "estimators=[total_propagation]"],
+    "callable": ["scenes=[callable]", f"scene.callable.cost={ROOT}/examples/numpy_loop.py:cost", "backends=[callable]",
+                 "estimators=[fobg]"],
+    "adam": [*OPTIMISE, "optimizers=[adam]"],
+    "cem": [*OPTIMISE, "optimizers=[cem]"],
+    **{study: [f"study={study}", *PUSH] for study in ("gradient_check", "growth", "stability", "three_errors", "twins")},
+    "identify": ["study=identify", "scenes=[spring_record]", "integrators=[rk4]", "backends=[numpy]"],
+}  # fmt: skip
+"""One cell of every kind whose keys are compared."""
+BIAS = "fobg windowed total_propagation callable"
+REFERENCED = f"{BIAS} three_errors"
+ESTIMATED = f"{BIAS} adam cem gradient_check growth stability three_errors twins"
+MOVED = {
+    "measure/__init__": "",
+    "measure/batches": REFERENCED,
+    "measure/contacts": "gradient_check",
+    "measure/gradcheck/__init__": "gradient_check",
+    "measure/gradcheck/causes": "gradient_check",
+    "measure/gradcheck/check": "gradient_check",
+    "measure/gradcheck/direction": "gradient_check",
+    "measure/gradcheck/roughness": "gradient_check",
+    "measure/gradcheck/sampling": "gradient_check",
+    "measure/gradcheck/verdicts": "gradient_check",
+    "measure/identification": "identify",
+    "measure/jumps": REFERENCED,
+    "measure/noise": f"{BIAS} adam cem gradient_check growth three_errors twins identify",
+    "measure/performance": "identify",
+    "measure/quadrature": REFERENCED,
+    "measure/reference": REFERENCED,
+    "measure/smoothed": REFERENCED,
+    "measure/solve": "adam cem",
+    "measure/statistics": REFERENCED,
+    "measure/timing": f"{BIAS} twins",
+    "model/__init__": "",
+    "model/adjoint": "windowed total_propagation",
+    "model/estimator": ESTIMATED,
+    "model/known_solutions": "windowed adam cem identify",
+    "model/loaded": "callable",
+    "model/optimizer": "adam cem identify",
+    "model/simulator/__init__": "",
+    "model/simulator/clock": "callable",
+    "model/simulator/example": "",
+    "model/simulator/imports": "callable",
+    "model/simulator/mjcf": "",
+    "model/simulator/simulator": "callable",
+    "model/simulator/tree": "callable",
+    "run/references": REFERENCED,
+    "studies/bias_variance/measure": BIAS,
+    "studies/gradient_check/measure": "gradient_check",
+    "studies/growth/measure": "growth",
+    "studies/identify/measure": "identify",
+    "studies/optimise/measure": "adam cem",
+    "studies/stability/measure": "stability",
+    "studies/three_errors/measure": "three_errors",
+    "studies/twins/measure": "twins",
+}
+"""Files, each with the cells whose keys its code is in. A file that is not listed must be in all keys, or harmless."""
+HALVES = (
+    "model",
+    "measure",
+    "run/references",
+    *(f"studies/{path.parent.name}/measure" for path in ROOT.glob("bench/studies/*/measure.py")),
+)
+FILES = sorted(path for path in (ROOT / "bench").rglob("*.py")
+               if str(path.relative_to(ROOT / "bench").with_suffix("")).startswith(HALVES))  # fmt: skip
+"""Every file of ``model`` (the user's simulator included), of ``measure``, and of each study's measuring half."""
+
+
+@pytest.fixture(scope="module")
+def cells() -> dict[str, Cell]:
+    return {name: grid.cells(config.load(words))[0] for name, words in CELLS.items()}
+
+
+def keys_of(cells: dict[str, Cell]) -> dict[str, str]:
+    """Return the keys of cells, computed anew."""
+    keys.module_hash.cache_clear()
+    keys.plugin_hash.cache_clear()
+    keys._fingerprints.clear()
+    return {name: replace(cell).key for name, cell in cells.items()}
+
+
+def moved(cells: dict[str, Cell], planted: Path, monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Return the names of the cells whose keys a constant planted in a file changes."""
+    before = keys_of(cells)
+    read = sources.code_hash
+    with monkeypatch.context() as patch:
+        patch.setattr(sources, "code_hash", lambda path: read(path) + ("PLANTED = 1" if path == planted else ""))
+        after = keys_of(cells)
+    keys_of(cells)
+    return {name for name in cells if before[name] != after[name]}
+
+
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_constant_planted_in_a_file_changes_the_keys_that_it_can_decide(path, cells, monkeypatch):
+    name = str(path.relative_to(ROOT / "bench").with_suffix(""))
+    changed = moved(cells, path, monkeypatch)
+    if is_below(module_of(path), HARMLESS):
+        assert not changed
+    elif name not in MOVED:
+        assert changed == set(CELLS), f"{name} changes the keys of {changed} only"
+    else:
+        assert changed == set(MOVED[name].split())
+
+
+def test_the_table_names_files_that_exist():
+    names = {str(path.relative_to(ROOT / "bench").with_suffix("")) for path in FILES}
+    assert set(MOVED) <= names
+    assert not [
+        name for name in MOVED if is_below(f"bench.{name.replace('/', '.').removesuffix('.__init__')}", HARMLESS)
+    ]
+
+
+def test_every_harmless_module_is_imported_by_code_that_decides_numbers(monkeypatch):
+    """The list does not outlive its reasons."""
+    reasons = dict(HARMLESS)
+    monkeypatch.setattr(keys, "HARMLESS", {})
+    plugins = [entry.plugin for table in registry.entries().values() for entry in table.values() if entry.plugin]
+    reached = {*code(PROGRAM, REFERENCE), *(name for plugin in plugins for name in plugin_code(plugin))}
+    for name, reason in reasons.items():
+        assert file_of(name) is not None, f"there is no module {name}"
+        assert any(is_below(module, [name]) for module in reached), f"nothing imports {name} any more"
+        assert reason
+
+
+def test_base_classes_of_another_package_count(tmp_path, monkeypatch):
+    base, derived = tmp_path / "some_base.py", tmp_path / "some_scene.py"
+    base.write_text("from bench.plugins.scenes.quadratic import Quadratic\n\n\nclass Base(Quadratic):\n    pass\n")
+    derived.write_text("import some_base\n\n\nclass Derived(some_base.Base):\n    name = 'derived'\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    import some_scene  # type: ignore[import-not-found]
+
+    assert {"some_base", "some_scene", "bench.plugins.scenes.quadratic", "bench.model.scene"} <= set(
+        plugin_code(some_scene.Derived)
+    )
+
+
+def test_what_a_users_file_imports_from_bench_counts(tmp_path):
+    file = tmp_path / "sim.py"
+    file.write_text("from bench import Mjcf\n\n\ndef cost(theta):\n    return theta\n")
+    mjcf = file_of("bench.model.simulator.mjcf")
+    before = keys.files_hash([file])
+    with pytest.MonkeyPatch.context() as patch:
+        read = sources.code_hash
+        patch.setattr(sources, "code_hash", lambda path: read(path) + ("PLANTED" if path == mjcf else ""))
+        assert keys.files_hash([file]) != before
+    file.write_text("def cost(theta):\n    return theta\n")
+    assert mjcf not in code(*keys.code("sim")).values()
+
+
+STUDY = """
+from dataclasses import dataclass
+
+from bench import Column, Columns, Study
+
+GAIN = {gain}
+
+@dataclass(frozen=True)
+class Small(Study):
+    name = "small"
+    axes = ("scene", "backend")
+    columns = Columns.of(Column("size", "{doc}"))
+
+    def measure(self, cell, session):
+        return {{"status": "ok", "reason": "", "size": GAIN}}
+
+    def write(self, experiment, rows):
+        return [{written}]
+"""
+
+
+def test_a_study_of_one_file_is_known_by_all_but_what_shows_rows(tmp_path, monkeypatch):
+    def hash_after(name: str, **changes: str) -> str:
+        text = STUDY.format(**{"gain": "1.0", "doc": "size", "written": "", **changes})
+        (tmp_path / f"{name}.py").write_text(text)
+        monkeypatch.syspath_prepend(tmp_path)
+        return keys.plugin_hash(__import__(name).Small)
+
+    plain = hash_after("small_study")
+    assert hash_after("small_reworded", doc="length") == plain
+    assert hash_after("small_shown", written="1") == plain
+    assert hash_after("small_changed", gain="2.0") != plain
