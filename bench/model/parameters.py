@@ -62,12 +62,6 @@ class Plugin(ABC):  # noqa: B024, each kind has abstract methods of its own
         super().__init_subclass__(**arguments)
         deprecated.rename_members(cls)
 
-    def __getattr__(self, name: str) -> Any:
-        if name in deprecated.MEMBERS and hasattr(type(self), deprecated.MEMBERS[name]):
-            deprecated.warn(f"{type(self).__name__}.{name}", deprecated.MEMBERS[name])
-            return getattr(self, deprecated.MEMBERS[name])
-        raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
-
 
 @dataclass(frozen=True)
 class Parameter:
