@@ -140,7 +140,7 @@ def messages(caught):
 
 
 def test_an_old_estimator_runs_on_old_scenes(settings):
-    with pytest.warns(DeprecationWarning) as caught:
+    with pytest.warns(DeprecationWarning, match="is now called") as caught:
         rows = bench.run(
             scenes=["windy", "held", "quadratic"], estimators=["fobg", "old"], samples=8, repeats=4, **settings
         )
@@ -164,7 +164,7 @@ def test_an_old_estimator_runs_on_old_scenes(settings):
 
 
 def test_an_old_study_runs(settings):
-    with pytest.warns(DeprecationWarning) as caught:
+    with pytest.warns(DeprecationWarning, match="is now called") as caught:
         rows = bench.run(study="norm", scenes=["held", "linear"], **settings).set_index("scene")
     assert rows.loc["held", "norm"] > 0
     assert rows.loc["linear", "reason"] == "norm refuses linear"
@@ -248,14 +248,14 @@ def test_an_old_name_that_the_kind_never_had_is_the_authors_own():
     ],
 )
 def test_a_module_by_its_old_name_is_the_new_one(old, new):
-    with pytest.warns(DeprecationWarning) as caught:  # of the package too
+    with pytest.warns(DeprecationWarning, match="is now called") as caught:  # of the package too
         assert importlib.import_module(old) is importlib.import_module(new)
     assert f"{old} is now called {new};" in messages(caught)
     assert sources._file(old) == sources._file(new)
 
 
 def test_a_module_that_never_was_is_not_found():
-    with pytest.warns(DeprecationWarning), pytest.raises(ModuleNotFoundError):
+    with pytest.warns(DeprecationWarning, match="bench.sweep is now called"), pytest.raises(ModuleNotFoundError):
         importlib.import_module("bench.sweep.never")
     with pytest.raises(AttributeError, match="module 'bench' has no attribute 'Never'"):
         bench.Never  # noqa: B018
