@@ -16,8 +16,9 @@ NAMES = {
     "GustyScene": "ProcessNoiseScene",
     "HeldScene": "ZeroOrderHoldScene",
     "Judged": "ComparisonRule",
+    "simulator_of": "load_simulator",
 }
-"""Public classes: old names and new ones."""
+"""Public classes and functions: old names and new ones."""
 MEMBERS = {
     "leaves_out": "neglected_effects",
     "across_jumps": "unbiased_at_discontinuities",
@@ -26,11 +27,13 @@ MEMBERS = {
     "explained": "estimate_with_diagnostics",
     "refuses": "unsupported_reason",
     "lacks": "incompatibility",
+    "wants": "required_fields",
 }
 """Members of plugins: old names and new ones."""
 MODULES = {
     "bench.face": ("bench.api",),
     "bench.model.known": ("bench.model.known_solutions",),
+    "bench.model.loaded": ("bench.model.simulator.imports",),
     "bench.simulator.columns": ("bench.model.simulator.simulator",),
     "bench.simulator.layout": ("bench.model.simulator.tree",),
     "bench.simulator.source": ("bench.model.simulator.imports",),
@@ -50,7 +53,7 @@ def warn(old: str, new: str, level: int = 3) -> None:
 
 
 def lookup(module: str, namespace: Mapping[str, Any]) -> Callable[[str], Any]:
-    """Return a ``__getattr__`` for a module that resolves the old names of public classes."""
+    """Return a ``__getattr__`` for a module that resolves the old names of public classes and functions."""
 
     def resolve(name: str) -> Any:
         if name not in NAMES or NAMES[name] not in namespace:
