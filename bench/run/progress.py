@@ -132,7 +132,7 @@ def print_versions(planned: Sequence[Planned], policy: str) -> None:
 
 def print_machines(planned: Sequence[Planned], launcher: str) -> None:
     """Print where stored times are of another kind of machine than those that are about to be measured here."""
-    from bench.experiment.machine import kind_of_machine
+    from bench.run.record import kind_of_machine
 
     here = kind_of_machine()
     others = Counter(item.machine for item in planned if item.machine not in ("", here))

@@ -24,7 +24,7 @@ from bench.errors import StorageError, UserError
 from bench.model.parameters import values
 from bench.run import files, tasks
 from bench.run import store as store_module
-from bench.run.runner import blank
+from bench.run.launchers import launcher
 from bench.run.store import Store
 from bench.studies.bias_variance.columns import COLUMNS
 
@@ -127,7 +127,7 @@ def test_a_row_says_which_study_made_it_and_every_parameter_of_its_cell(study):
         f"study={study}", "scenes=[pushing]", "backends=[numpy]", "estimators=[fobg]", "sweep.mass=[0.1,0.3]"
     )
     for cell, mass in zip(cells, (0.1, 0.3), strict=True):
-        stored = blank(made, cell)
+        stored = tasks.blank_row(made, cell)
         assert stored["study"] == study
         told = json.loads(stored["parameters"])
         assert told["study"]["name"] == study
@@ -383,7 +383,7 @@ def test_unreadable_file_is_named_and_left_alone(tmp_path, capsys, place, conten
 @pytest.mark.parametrize("after", [0, 1, 2])
 def test_disk_that_fills(tmp_path, capsys, monkeypatch, after):
     """The disk is full after so many files of rows: exit status 2, what was stored stays, and the run goes on later."""
-    monkeypatch.setattr(tasks, "TOGETHER_S", 0.0)  # a file per row
+    monkeypatch.setattr(launcher, "BATCH_S", 0.0)  # a file per row
     words = [*TINY, "name=tiny", "sweep.sigma=[0.1,0.2,0.3,0.4]", f"results_dir={tmp_path}", "workers=0"]
     real, left = files.replace_file, [after]
 
