@@ -15,7 +15,7 @@ from trees import hearing_signals
 from bench.cli import main
 from bench.errors import StorageError, UserError
 from bench.run import files
-from bench.run.files import TEMPORARY, temporary, tidy
+from bench.run.files import TEMPORARY, remove_stale, temporary
 from bench.run.pool import Pool, ResourceLimits
 from bench.run.store import Store
 from bench.run.worker import Channel, ConnectionLost, MalformedMessage
@@ -104,7 +104,7 @@ def test_a_small_file_that_holds_no_rows_is_unreadable(tmp_path, content):
 
 def test_a_number_that_is_none_does_not_turn_into_a_missing_one(tmp_path):
     pd.DataFrame([row() | {"bias": "large"}]).to_parquet(tmp_path / "rows.parquet")
-    with pytest.raises(StorageError, match="'bias' that are no numbers"):
+    with pytest.raises(StorageError, match="'bias' that are not numbers"):
         Store(tmp_path, COLUMNS).compact()
 
 
@@ -149,10 +149,10 @@ def test_half_written_files_of_dead_processes_go_and_those_of_living_ones_stay(t
     for path in (mine, dead, far, other):
         assert path is other or TEMPORARY.fullmatch(path.name)
         path.write_text("")
-    tidy(tmp_path)
+    remove_stale(tmp_path)
     assert set(tmp_path.iterdir()) == {mine, far, other}
     os.utime(far, (0, 0))
-    tidy(tmp_path)
+    remove_stale(tmp_path)
     assert set(tmp_path.iterdir()) == {mine, other}
 
 

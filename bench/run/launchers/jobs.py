@@ -12,10 +12,10 @@ from typing import Any
 
 from bench.errors import UserError
 from bench.experiment.experiment import Experiment
-from bench.run.record import kind_of_machine
 from bench.model import registry
 from bench.run.launchers.launcher import local_launcher, without_grid
 from bench.run.pool import Answer
+from bench.run.record import kind_of_machine
 from bench.run.store import Store
 from bench.run.tasks import Task, result_of, row_of
 

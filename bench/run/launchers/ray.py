@@ -14,9 +14,9 @@ from typing import Any
 
 from bench.errors import UserError, printable
 from bench.experiment.experiment import Experiment
-from bench.run.record import kind_of_machine
 from bench.run.launchers.jobs import Job, Losses, import_path, pack, read_message, run_job, split, unavailable
 from bench.run.pool import Answer
+from bench.run.record import kind_of_machine
 from bench.run.tasks import Task
 
 TICK = 0.1
