@@ -21,7 +21,7 @@ from bench.experiment.grid import cells
 from bench.model import registry
 from bench.model.identity import parse_identity
 from bench.model.parameters import parameters
-from bench.run.runner import blank
+from bench.run.tasks import blank_row
 from bench.studies.bias_variance import BiasVariance
 from bench.studies.bias_variance.columns import COLUMNS
 
@@ -79,7 +79,7 @@ def rows_of(made: Experiment, of: Sequence[Cell]) -> pd.DataFrame:
     """Rows of real cells with made-up results; a cell that would be refused is refused."""
     rows = []
     for cell in of:
-        row = blank(made, cell)
+        row = blank_row(made, cell)
         refused = cell.refusal()
         if refused is not None:
             rows.append(row | dict(zip(("status", "reason"), refused, strict=True)))

@@ -15,7 +15,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.grid import cells
 from bench.run.execute import store_of
 from bench.run.plan import plan
-from bench.run.tasks import blank
+from bench.run.tasks import blank_row
 
 SIDE, QUICK_SIDE = 100, 5
 """Values on each of the two axes of the planned sweep."""
@@ -49,7 +49,7 @@ def store_all(experiment: Experiment) -> None:
     """Store a row for every cell of an experiment, so that a plan of it resumes all of them and runs none."""
     store = store_of(experiment)
     store.prepare()
-    store.append(*(blank(experiment, cell) | {"status": "ok"} for cell in cells(experiment)))
+    store.append(*(blank_row(experiment, cell) | {"status": "ok"} for cell in cells(experiment)))
     store.compact()
     assert all(item.stored for item in plan(experiment, store)), "cells that are stored are planned again"
 

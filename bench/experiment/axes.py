@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from bench.errors import UserError
 from bench.experiment.cell import labels
 from bench.experiment.experiment import Experiment
-from bench.experiment.grid import COUNTS, THETA, applies, of_theta, points, short, swept
+from bench.experiment.grid import COUNTS, THETA, applies, expand, is_theta_axis, parameter_name, swept
 from bench.model import Plugin, registry
 from bench.model.parameters import Parameter, build, parameters
 
@@ -40,7 +40,7 @@ class Axis:
     @property
     def short(self) -> str:
         """The parameter's own name: ``gamma`` of ``alpha_order.gamma``."""
-        return short(self.column)
+        return parameter_name(self.column)
 
     @property
     def title(self) -> str:
@@ -62,7 +62,7 @@ def _parsed(text: str) -> Mapping[str, Any]:
 
 def value_of(name: str, given: Mapping[str, Any]) -> Any:
     """Return the value that a row's parameters give to a name in a sweep; None if it applies to none of its plugins."""
-    if of_theta(name):
+    if is_theta_axis(name):
         return _coordinate(name, (given.get("theta") or {}).get("at") or ())
     for group, part in given.items():
         if _is_part(group, part):
@@ -137,7 +137,7 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
     names = [part for name in swept(sweep) for part in (coordinates if name == THETA else (name,))]
     groups: dict[str, list[str]] = {}
     for name in names:
-        groups.setdefault(short(name), []).append(name)
+        groups.setdefault(parameter_name(name), []).append(name)
     result = []
     for own_name, members in groups.items():
         clash = any(sum(value_of(name, one) is not None for name in members) > 1 for one in given)
@@ -176,7 +176,7 @@ def _together(sweep: Mapping[str, Any]) -> list[frozenset[str]]:
     groups = []
     for name, value in sweep.items():
         if name == "zip":
-            groups.append(frozenset(points({"zip": value})[0]))
+            groups.append(frozenset(expand({"zip": value})[0]))
         elif name == "product":
             groups += _together(value)
         elif name == "union":
@@ -218,7 +218,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     extra = [axis.column for axis in axes(experiment.sweep, rows) if axis.column not in rows]
     wide = with_axes(experiment, rows)
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
-    texts = [name for name in experiment.columns.named("text") if name in wide]
+    texts = [name for name in experiment.columns.of_kind("text") if name in wide]
     return wide.assign(**{name: wide[name].map(_harmless) for name in texts})
 
 

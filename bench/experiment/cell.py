@@ -1,4 +1,4 @@
-"""A cell: one point of a sweep, what it is as JSON, and why it cannot run."""
+"""A cell, one point of a sweep: its plugins and counts, its identity as JSON and as a hash, and why it cannot run."""
 
 from __future__ import annotations
 
@@ -31,21 +31,23 @@ from bench.model.parameters import parameters, singular
 from bench.model.program import OWN
 
 VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype")
-"""Plugin parameters that have a column of their own and so are left out of identity strings."""
+"""Plugin parameters that have a column of their own and are therefore omitted from identity strings."""
 
 
 def labels(parts: Mapping[str, Plugin | None], without: Mapping[str, Collection[str]] | None = None) -> dict[str, str]:
-    """Return identity strings by column, less the parameters with columns of their own and those in ``without``."""
+    """Return identity strings by column, without the parameters in :data:`VIEWS` and those in ``without``."""
     without = without or {}
     scene, law = parts.get("scene"), parts.get("contact")
-    given = dict(scene.contact_values) if isinstance(scene, MechanicalScene) else {}
-    shown = {axis: {*VIEWS, *without.get(axis, ())} for axis in parts}
+    scene_values = dict(scene.contact_values) if isinstance(scene, MechanicalScene) else {}
+    omitted = {axis: {*VIEWS, *without.get(axis, ())} for axis in parts}
     if isinstance(law, ContactLaw):
-        shown["contact"].add(law.smoothing)
+        omitted["contact"].add(law.smoothing)
         if "stiffness" in parameters(type(law)) and "stiffness" not in without.get("scene", ()):
-            shown["scene"].discard("stiffness")  # the column of that name is the law's
+            omitted["scene"].discard("stiffness")  # the column of that name is the law's
     strings = {
-        a: label(p, given if a == "contact" else None, tuple(shown[a])) for a, p in parts.items() if a != "estimator"
+        axis: label(part, scene_values if axis == "contact" else None, tuple(omitted[axis]))
+        for axis, part in parts.items()
+        if axis != "estimator"
     }
     estimator = parts.get("estimator")
     if estimator is not None:
@@ -57,7 +59,7 @@ def labels(parts: Mapping[str, Plugin | None], without: Mapping[str, Collection[
 
 @dataclass(frozen=True)
 class Cell:
-    """One point of a sweep: a plugin on each axis, counts, a seed, and what is measured."""
+    """One point of a sweep: a plugin on each axis, counts, a seed, and the study that measures it."""
 
     parts: Mapping[str, Plugin | None]
     """Plugins by axis; None where the scene has no such part."""
@@ -104,7 +106,7 @@ class Cell:
 
     @cached_property
     def key(self) -> str:
-        """Hash of everything that decides the cell's numbers; library versions are columns instead."""
+        """Hash of everything that decides the cell's numbers, except library versions, which have a column."""
         counts = [self.samples, self.repeats, self.seed, self.timing]
         reference = None if self.budget is None else [self.program_key, module_hash(REFERENCE)]
         return hashed(
@@ -120,7 +122,7 @@ class Cell:
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
-        """Every parameter of every plugin, defaults included, and whatever else decides the cell except its counts."""
+        """Every parameter of every plugin, defaults included, with the study, theta and the reference budget."""
         entries: dict[str, Any] = {"study": described(self.study)}
         entries |= {axis: described(part) for axis, part in self.parts.items()}
         return entries | {"theta": self._theta(), "reference": self._budget()}
@@ -165,26 +167,27 @@ class Cell:
             return len(self.decision.names) or int(self.scene.theta0().size)
         except KeyboardInterrupt:
             raise
-        except BaseException:  # the error shows up in the cell's own row
+        except BaseException:  # the cell's row reports the error
             return math.nan
 
     # ----------------------------------------------------------------------------------------------- program
 
     def program(self) -> Program:
-        """Compose the program; raises :class:`Unsupported` for a combination without meaning."""
+        """Compose the program; raises :class:`Unsupported` if the parts do not fit together."""
         return compose(self.scene, self.contact, self.integrator, self.decision)
 
     def refusal(self) -> tuple[str, str] | None:
-        """Return status and reason if this cell cannot run, or None."""
+        """Return status and reason if this cell cannot run, or None; an error of a plugin is a reason."""
         try:
-            return self._refusal()
+            return self._incompatibility()
         except KeyboardInterrupt:
             raise
         except BaseException as error:
-            row = failure(error)
-            return row["status"], row["reason"]
+            result = failure(error)
+            return result["status"], result["reason"]
 
-    def _refusal(self) -> tuple[str, str] | None:
+    def _incompatibility(self) -> tuple[str, str] | None:
+        """Return status and reason of the first plugin that is unavailable or does not fit the others, or None."""
         for part in self.parts.values():
             if part is not None:
                 entry = registry.find(part.kind, part.name)
@@ -192,7 +195,7 @@ class Cell:
                     return "unavailable", f"{singular(part.kind)} {part.name} is {entry.reason}"
         try:
             program = self.program()
-        except (Unsupported, UserError) as error:  # other scenes of the sweep may have this theta
+        except (Unsupported, UserError) as error:  # another scene of the sweep may have this theta
             return "unsupported", printable(error)
         backend, estimator = self.backend, self.parts.get("estimator")
         if reason := backend.incompatibility(program):

@@ -21,19 +21,18 @@ Kind = Literal["number", "text", "list"]
 class ComparisonRule:
     """How ``compare`` decides whether a column got worse. Smaller is better unless ``neutral``.
 
-    - ``interval``: estimated, with columns ``<name>_low`` and ``<name>_high``; changed where the two intervals are
-      apart.
-    - ``spread``: an interval as above, and a ratio that has to be large enough to matter (a variance).
-    - ``paired``: an error estimated from noise that is the same in both results; changed where the mean estimate in
-      the column ``mean`` moved by more than rounding, judged by its distance from the gradient in ``reference`` before.
+    - ``interval``: estimated, with columns ``<name>_low`` and ``<name>_high``; changed if the intervals do not overlap.
+    - ``spread``: changed if the intervals do not overlap and the ratio is large enough to matter (a variance).
+    - ``paired``: an error estimated from noise that is the same in both results; changed if the mean estimate in the
+      column ``mean`` moved by more than rounding, relative to its previous distance from the gradient in ``reference``.
     - ``exact``: computed without noise; changed by a ratio that matters and by more than rounding.
-    - ``time``: seconds, judged only when asked for, against the spread between runs.
-    - ``verdict``: one of ``order``, the worst first.
+    - ``time``: seconds, compared on request only, and relative to the spread between runs.
+    - ``verdict``: one of ``order``, which starts with the worst.
     """
 
     by: Literal["interval", "spread", "paired", "exact", "time", "verdict"]
     called: str
-    """The column's name in the sentence."""
+    """The column's name in sentences."""
     neutral: bool = False
     """Whether a change is neither better nor worse."""
     order: tuple[str, ...] = ()
@@ -51,11 +50,11 @@ class Column:
     unit: str = ""
     kind: Kind = "number"
     comparison: ComparisonRule | None = None
-    """How ``compare`` judges the column; None where it does not."""
+    """How ``compare`` decides whether the column got worse; None to ignore the column."""
     table: bool = True
     """Whether the CSV has this column; ``rows.parquet`` always does."""
     measured: bool = False
-    """Whether the value depends on the machine and its load; it is missing where cells are not timed."""
+    """Whether the value depends on the machine and its load; it is missing if cells are not timed."""
     judged: InitVar[ComparisonRule | None] = None
     """The old name of ``comparison``."""
 
@@ -66,12 +65,12 @@ class Column:
 
 
 def text(name: str, doc: str = "", **more: Any) -> Column:
-    """Make a column of strings."""
+    """Return a column of strings."""
     return Column(name, doc, kind="text", **more)
 
 
 def numbers(name: str, doc: str = "", unit: str = "", **more: Any) -> Column:
-    """Make a column whose values are lists of numbers or strings."""
+    """Return a column whose values are lists of numbers or strings."""
     return Column(name, doc, unit, kind="list", **more)
 
 
@@ -131,12 +130,12 @@ class Columns:
 
     @classmethod
     def of(cls, *own: Column) -> Columns:
-        """Make columns: what identifies a cell, status and reason, then the study's own columns."""
+        """Return the columns that identify a cell, status and reason, then the study's own columns."""
         return cls((*FIRST, DIM, *STATUS, *own, *LAST, *HIDDEN))
 
     @classmethod
     def ordered(cls, names: Sequence[str], *own: Column) -> Columns:
-        """Make columns in a given order; columns of ``own`` that are not named follow, only in ``rows.parquet``."""
+        """Return columns in the order of ``names``; the other columns follow."""
         by_name = COMMON | {column.name: column for column in own}
         rest = [column for name, column in by_name.items() if name not in names]
         return cls((*(by_name[name] for name in names), *rest))
@@ -153,29 +152,34 @@ class Columns:
 
     @property
     def measured(self) -> list[str]:
-        """Names of the columns that are missing where cells are not timed."""
+        """Names of the columns that are missing if cells are not timed."""
         return [column.name for column in self.all if column.measured]
 
     @property
     def compared(self) -> list[Column]:
-        """The columns that ``compare`` judges."""
+        """The columns that ``compare`` compares."""
         return [column for column in self.all if column.comparison]
 
     @property
     def referenced(self) -> bool:
-        """Whether rows name a reference gradient that they are measured against."""
+        """Whether rows are measured against a reference gradient."""
         return "reference_method" in self.by_name
 
-    def named(self, kind: Kind) -> list[str]:
-        """Return the names of the columns of one kind."""
+    def of_kind(self, kind: Kind) -> list[str]:
+        """Return the names of the columns of one kind: ``number``, ``text`` or ``list``."""
         return [column.name for column in self.all if column.kind == kind]
 
+    def named(self, kind: Kind) -> list[str]:
+        """Call :meth:`of_kind` by its old name."""
+        deprecated.warn("Columns.named", "Columns.of_kind")
+        return self.of_kind(kind)
+
     def blank(self) -> dict[str, Any]:
-        """Return a row without any value."""
+        """Return a row in which every value is missing: NaN, an empty string or an empty list."""
         return {c.name: "" if c.kind == "text" else [] if c.kind == "list" else math.nan for c in self.all}
 
     def typed(self, table: pd.DataFrame) -> pd.DataFrame:
-        """Return the table with its columns typed and in order, followed by unknown columns as they are."""
+        """Return the table with its columns in order and of their types, followed by unknown columns unchanged."""
         import pandas as pd
 
         known = {column.name: _typed(table.get(column.name), column.kind, len(table)) for column in self.all}
@@ -184,7 +188,7 @@ class Columns:
 
 
 def _typed(values: pd.Series | None, kind: Kind, count: int) -> Any:
-    """Return a column in the type of its kind, as it is where it has that type; missing values where there is no column."""
+    """Return a column converted to the type of its kind; without a column, ``count`` missing values."""
     import pandas as pd
 
     if values is None:
@@ -197,9 +201,9 @@ def _typed(values: pd.Series | None, kind: Kind, count: int) -> Any:
 
 
 def _numbers(listed: Any) -> Any:
-    """Return a list as it was stored: Parquet writes one of nothing but NaN as a list of nothing."""
-    nothing = isinstance(listed, np.ndarray) and listed.dtype == object and len(listed) > 0
-    return np.full(len(listed), math.nan) if nothing and all(one is None for one in listed) else listed
+    """Return a list with NaN where all its values are None, which is how Parquet stores a list of NaN."""
+    is_object = isinstance(listed, np.ndarray) and listed.dtype == object and len(listed) > 0
+    return np.full(len(listed), math.nan) if is_object and all(value is None for value in listed) else listed
 
 
 __getattr__ = deprecated.lookup(__name__, globals())

@@ -11,7 +11,7 @@ from typing import Any
 
 from bench.errors import STATUSES, UserError, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
-from bench.experiment.grid import refuse_too_many, short, swept
+from bench.experiment.grid import parameter_name, refuse_too_many, swept
 from bench.experiment.study import Study
 from bench.model import Decision, guard, registry
 from bench.model.identity import parse_identity
@@ -271,7 +271,7 @@ def _layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> TableLayou
 
 
 def _average(names: Any, sweep: Mapping[str, Any]) -> tuple[str, ...]:
-    known = {part for name in swept(sweep) for part in (name, short(name), name.partition(".")[0])}
+    known = {part for name in swept(sweep) for part in (name, parameter_name(name), name.partition(".")[0])}
     for name in _listed_or_none(names):
         if name not in known:
             raise (

@@ -16,36 +16,36 @@ from bench.model import Decision, MechanicalScene, Plugin, Scene, compose
 from bench.model.parameters import build, coerce, parameters, singular
 from bench.model.program import OWN
 
-MOST = 1_000_000
-"""Cells of the largest sweep: planning them takes minutes."""
+MAX_CELLS = 1_000_000
+"""Cells of the largest sweep; planning it takes minutes."""
 COUNTS = ("samples", "repeats", "seed")
-"""What a sweep can vary besides plugin parameters, and besides :data:`THETA`."""
+"""Settings that a sweep can vary besides plugin parameters and :data:`THETA`."""
 THETA = "theta0"
-"""The axis of where gradients are taken: whole thetas, or ``theta0.2`` for one coordinate of it."""
+"""The axis of the point at which gradients are taken: ``theta0``, or ``theta0.2`` for one of its coordinates."""
 
 
-def of_theta(axis: str) -> bool:
+def is_theta_axis(axis: str) -> bool:
     """Return whether an axis is theta0 or one of its coordinates.
 
-    >>> [of_theta(axis) for axis in ("theta0", "theta0.2", "heaviside.theta", "theta0.x")]
+    >>> [is_theta_axis(axis) for axis in ("theta0", "theta0.2", "heaviside.theta", "theta0.x")]
     [True, True, False, False]
     """
     name, dot, coordinate = axis.partition(".")
     return name == THETA and (not dot or coordinate.isdecimal())
 
 
-def short(axis: str) -> str:
-    """Return the parameter's own name: ``gamma`` of ``alpha_order.gamma``; a coordinate of theta0 has no shorter one."""
-    return axis if of_theta(axis) else axis.rpartition(".")[2]
+def parameter_name(axis: str) -> str:
+    """Return the last part of an axis: ``gamma`` for ``alpha_order.gamma``, but ``theta0.2`` for a coordinate of theta0."""
+    return axis if is_theta_axis(axis) else axis.rpartition(".")[2]
 
 
 def cells(experiment: Experiment) -> list[Cell]:
-    """Return the cells of an experiment, each once, in sweep order; raises :class:`UserError` for impossible ones."""
+    """Return the cells of an experiment, each once, in sweep order; raises :class:`UserError` for invalid values."""
     refuse_too_many(experiment.sweep, math.prod(len(some) for some in experiment.choices.values()))
     _check_axes(experiment)
     unique: dict[str, Cell] = {}
     expansion = _Expansion(experiment)
-    for point in points(experiment.sweep):
+    for point in expand(experiment.sweep):
         for choices in itertools.product(*experiment.choices.values()):
             cell = expansion.cell(point, dict(zip(experiment.choices, choices, strict=True)))
             unique.setdefault(cell.key, cell)
@@ -57,7 +57,7 @@ def cells(experiment: Experiment) -> list[Cell]:
 
 
 def _check_theta(cells: Sequence[Cell]) -> None:
-    """Raise the error of theta if no cell can take it; if some can, the others report it in their rows."""
+    """Raise the first error of theta if it is valid in no cell; otherwise invalid cells report the error in their rows."""
     first: UserError | None = None
     for cell in cells:
         try:
@@ -72,12 +72,12 @@ def _check_theta(cells: Sequence[Cell]) -> None:
         raise first
 
 
-def refuse_too_many(sweep: Mapping[str, Any], each: int = 1) -> None:
-    """Raise :class:`UserError` for a sweep of more than :data:`MOST` cells, ``each`` of them at a point."""
-    size = _size(sweep) * each
-    if size > MOST:
+def refuse_too_many(sweep: Mapping[str, Any], cells_per_point: int = 1) -> None:
+    """Raise :class:`UserError` for a sweep of more than :data:`MAX_CELLS` cells, with ``cells_per_point`` at each point."""
+    size = _size(sweep) * cells_per_point
+    if size > MAX_CELLS:
         raise UserError(
-            f"the sweep has {size} cells, and more than {MOST} are not run at once: give it fewer values, or split it"
+            f"the sweep has {size} cells, and more than {MAX_CELLS} are not allowed: give it fewer values, or split it"
         )
 
 
@@ -98,20 +98,20 @@ def _size(sweep: Mapping[str, Any]) -> int:
     return size
 
 
-def points(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:
+def expand(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Expand a sweep into points: named axes are multiplied, ``zip`` pairs its axes, ``union`` concatenates sweeps.
 
-    >>> points({"a": [1, 2], "b": [3]})
+    >>> expand({"a": [1, 2], "b": [3]})
     [{'a': 1, 'b': 3}, {'a': 2, 'b': 3}]
-    >>> points({"zip": {"c": [4, 5], "d": [6, 7]}})
+    >>> expand({"zip": {"c": [4, 5], "d": [6, 7]}})
     [{'c': 4, 'd': 6}, {'c': 5, 'd': 7}]
-    >>> points({"union": [{"a": [1]}, {"b": [2]}]})
+    >>> expand({"union": [{"a": [1]}, {"b": [2]}]})
     [{'a': 1}, {'b': 2}]
     """
     factors: list[list[dict[str, Any]]] = []
     for axis, value in sweep.items():
         if axis == "product":
-            factors.append(points(_mapping(value, "sweep.product")))
+            factors.append(expand(_mapping(value, "sweep.product")))
         elif axis == "zip":
             columns = {name: _values(name, v) for name, v in _flat(_mapping(value, "sweep.zip")).items()}
             lengths = {name: len(v) for name, v in columns.items()}
@@ -121,28 +121,29 @@ def points(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:
         elif axis == "union":
             if not isinstance(value, list | tuple):
                 raise UserError("sweep.union must be a list of sweeps")
-            factors.append([point for part in value for point in points(_mapping(part, "sweep.union"))])
+            factors.append([point for part in value for point in expand(_mapping(part, "sweep.union"))])
         else:
             factors.extend([{name: v} for v in _values(name, vs)] for name, vs in _flat({axis: value}).items())
-    return [_joined(combo) for combo in itertools.product(*factors)]
+    return [_join(combo) for combo in itertools.product(*factors)]
 
 
-def _joined(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _join(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return one point that has the axes of all parts; raises :class:`UserError` for an axis in two of them."""
     point = dict(itertools.chain(*(part.items() for part in parts)))
     if len(point) < sum(map(len, parts)):
         name = next(name for name in point if sum(name in part for part in parts) > 1)
-        raise UserError(f"sweep axis '{name}' is given twice: once by itself and once in a zip, union or product")
+        raise UserError(f"sweep axis '{name}' is given twice: once on its own and once in a zip, union or product")
     return point
 
 
 def swept(sweep: Mapping[str, Any]) -> list[str]:
     """Return the names of the axes of a sweep, in order."""
-    return list(dict.fromkeys(name for point in points(sweep) for name in point))
+    return list(dict.fromkeys(name for point in expand(sweep) for name in point))
 
 
 def _mapping(value: Any, where: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise UserError(f"{where} must be axes with lists of values, not {value!r}")
+        raise UserError(f"{where} must map axes to lists of values, given {value!r}")
     return value
 
 
@@ -167,14 +168,14 @@ def coerce_finite(values: Any, name: str) -> tuple[float, ...]:
     if not all(map(math.isfinite, numbers)):
         raise UserError(f"{name}={list(numbers)} must be finite")
     if "." in name and len(numbers) != 1:
-        raise UserError(f"{name} takes one number at a time, not {list(numbers)}")
+        raise UserError(f"{name} takes one number, given {list(numbers)}")
     return numbers
 
 
 def applies(axis: str, kind: str, plugin: str, known: Mapping[str, Any]) -> str | None:
     """Return the parameter of a plugin that a sweep axis names, or None.
 
-    ``known`` are the plugin's parameters; ``gamma``, ``alpha_order.gamma`` and
+    ``known`` are the plugin's parameters by name. ``gamma``, ``alpha_order.gamma`` and
     ``estimator.alpha_order.gamma`` name the same parameter.
 
     >>> applies("alpha_order.gamma", "estimators", "alpha_order", {"gamma": 1.0})
@@ -194,20 +195,20 @@ def _check_axes(experiment: Experiment) -> None:
     chosen = [c.entry.plugin for some in experiment.choices.values() for c in some if c.entry.plugin]
     names = {name for plugin in chosen for name in parameters(plugin)} | {*COUNTS, THETA}
     for axis in swept(experiment.sweep):
-        if axis not in COUNTS and not of_theta(axis) and not any(_applies(axis, plugin) for plugin in chosen):
+        if axis not in COUNTS and not is_theta_axis(axis) and not any(_applies(axis, plugin) for plugin in chosen):
             raise unknown("sweep axis", axis, names)
 
 
 class _Expansion:
-    """Makes the cells of an experiment, building each plugin once for all cells that share its values."""
+    """Creates the cells of an experiment, and builds each plugin once for all cells that share its values."""
 
     def __init__(self, experiment: Experiment) -> None:
         self._experiment = experiment
         self._axes: dict[tuple[type[Plugin], tuple[str, ...]], list[tuple[str, str]]] = {}
-        self._made: dict[tuple[int, str], Plugin] = {}
+        self._plugins: dict[tuple[int, str], Plugin] = {}
 
     def cell(self, point: Mapping[str, Any], choices: Mapping[str, Choice]) -> Cell:
-        """Make the cell of these choices at a point of the sweep."""
+        """Return the cell of these choices at a point of the sweep."""
         used: dict[str, str] = {}
         parts: dict[str, Plugin | None] = {}
         scene: Plugin | None = None
@@ -232,9 +233,9 @@ class _Expansion:
         )  # fmt: skip
 
     def _decision(self, point: Mapping[str, Any], parts: Mapping[str, Plugin | None]) -> Decision:
-        """Return what theta is at a point of the sweep; coordinates that are not swept stay where they are."""
+        """Return the meaning and value of theta at a point of the sweep; coordinates that are not swept keep their values."""
         decision = self._experiment.decision
-        given = {name: coerce_finite(values, name) for name, values in point.items() if of_theta(name)}
+        given = {name: coerce_finite(values, name) for name, values in point.items() if is_theta_axis(name)}
         if not given:
             return decision
         if THETA in given:
@@ -244,7 +245,7 @@ class _Expansion:
         try:
             scene, contact, integrator = (parts.get(axis) for axis in ("scene", "contact", "integrator"))
             at = compose(scene, contact, integrator, decision).theta0.tolist()  # type: ignore[arg-type]
-        except (Unsupported, UserError):  # the cell says so itself
+        except (Unsupported, UserError):  # the cell reports it in its row
             return decision
         for name, values in given.items():
             coordinate = int(name.partition(".")[2])
@@ -282,16 +283,16 @@ class _Expansion:
                 )
             used[axis] = plugin.name
         key = (id(choice), repr([point[axis] for axis, _ in axes] + [given]))
-        if key not in self._made:
+        if key not in self._plugins:
             values = {k: v for k, v in (given or {}).items() if k in parameters(plugin)}
             # later ones win: the scene's contact values, settings, identity string, sweep
             values |= self._experiment.values.get(group, {}).get(plugin.name, {})
             values |= dict(choice.values) | {parameter: point[axis] for axis, parameter in axes}
-            self._made[key] = _build(plugin, sorted(values.items()))
-        return self._made[key]
+            self._plugins[key] = _build(plugin, sorted(values.items()))
+        return self._plugins[key]
 
     def _axes_of(self, plugin: type[Plugin], names: tuple[str, ...]) -> list[tuple[str, str]]:
-        """Return the axes that are parameters of the plugin, and which."""
+        """Return the axes that are parameters of the plugin, each with the parameter's name."""
         if (plugin, names) not in self._axes:
             pairs = [(name, _applies(name, plugin)) for name in names if name not in COUNTS]
             self._axes[plugin, names] = [(axis, parameter) for axis, parameter in pairs if parameter is not None]
@@ -302,7 +303,7 @@ _built: dict[tuple[type[Plugin], str], Plugin] = {}
 
 
 def _build(plugin: type[Plugin], values: Sequence[tuple[str, Any]]) -> Plugin:
-    """Return the one instance with these values; 1, 1.0 and True are distinct, since a parameter may refuse some."""
+    """Return the instance with these values, built once; 1, 1.0 and True differ, since a parameter may accept only one."""
     key = (plugin, repr(values))
     if key not in _built:
         _built[key] = build(plugin, dict(values))

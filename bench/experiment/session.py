@@ -1,14 +1,37 @@
-"""What a study may ask of the run that it measures a cell in."""
+"""What a study uses to measure a cell: problems compiled once for all cells of a run, and reference gradients."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Protocol
 
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
-from bench.experiment.problems import Problems
+from bench.experiment.keys import fingerprint
 from bench.measure.reference import Reference
-from bench.model import Compilations, Problem
+from bench.model import Backend, Compilations, Problem
+
+
+class Problems:
+    """The problems compiled last, shared by cells with one program and backend, and the count of compilations."""
+
+    KEPT = 4
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self.compilations = Compilations(folder)
+        self._kept: dict[tuple[str, str], Problem] = {}
+
+    def of(self, backend: Backend, cell: Cell) -> Problem:
+        """Return the cell's program, compiled on a backend."""
+        key = (fingerprint(backend), cell.program_key)
+        problem = self._kept.pop(key, None)
+        if problem is None:
+            problem = backend.compile(cell.program())
+            problem.compilations, problem.provides = self.compilations, backend.provides
+        self._kept[key] = problem
+        if len(self._kept) > self.KEPT:
+            del self._kept[next(iter(self._kept))]
+        return problem
 
 
 class ReferenceSource(Protocol):

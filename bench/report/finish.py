@@ -17,14 +17,14 @@ from bench.report.cores import spread
 from bench.report.views import latest
 from bench.run.execute import Finished, store_of
 from bench.run.record import record
-from bench.run.store import ordered
+from bench.run.store import sort_rows
 
 
 def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, list[Path]]:
     """Write the files of a run (the record first); returns its rows in the order of its cells, and the files."""
     keys = finished.keys
     rows = finished.store.load()
-    rows = ordered(rows[rows["key"].isin(keys)], keys)
+    rows = sort_rows(rows[rows["key"].isin(keys)], keys)
     simulated = any(item.runs for item in finished.planned)
     path = record(finished.experiment, rows, list(words), finished.seconds, simulated)
     return rows, [*write(finished.experiment, rows), path]

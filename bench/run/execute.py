@@ -1,4 +1,4 @@
-"""Runs one experiment from plan to files, for both the command line and the Python face."""
+"""Runs one experiment from its plan to its stored rows, for both the command line and Python."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.measure import timing
 from bench.run import progress, runner
-from bench.run.files import tidy
+from bench.run.files import remove_stale
 from bench.run.plan import Planned, plan
 from bench.run.store import Store
 
 
 @dataclass(frozen=True, eq=False)
 class Finished:
-    """A run that ended by itself: its experiment, its stored rows, and how long it took."""
+    """A complete run: its experiment, its stored rows, and its duration."""
 
     experiment: Experiment
     store: Store
@@ -40,21 +40,21 @@ def store_of(experiment: Experiment) -> Store:
 def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     """Run the missing cells of an experiment and fold their rows into ``rows.parquet``.
 
-    Raises :class:`runner.Stopped` after a failed cell where the experiment says so, KeyboardInterrupt when interrupted
-    (every cell finished by then is stored), and :class:`UserError` where the study refuses every cell.
+    Raises :class:`runner.Stopped` after a failed cell in an experiment with ``on_error=stop``, KeyboardInterrupt if
+    interrupted (every cell finished by then is stored), and :class:`UserError` if the study supports no cell.
     """
     started = time.time()
-    # asked now, before the run itself loads the machine
+    # measured before the run itself loads the machine
     timing.load_at_start()
     store = store_of(experiment)
     planned = plan(experiment, store)
-    refuse_nothing(experiment, planned)
+    _refuse_without_supported_cells(experiment, planned)
     progress.print_versions(planned, experiment.execution.versions)
     progress.print_machines(planned, experiment.execution.launcher)
     store.prepare()
     for folder in (experiment.directory, experiment.directory / "pending", experiment.results_dir / "references"):
-        tidy(folder)
-    with progress.of(experiment.name, planned, quiet) as shown:
+        remove_stale(folder)
+    with progress.show_progress(experiment.name, planned, quiet) as shown:
         try:
             runner.run(experiment, planned, store, shown.finished, shown.working)
         finally:
@@ -62,21 +62,21 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     return Finished(experiment, store, planned, time.time() - started)
 
 
-def refuse_nothing(experiment: Experiment, planned: Sequence[Planned]) -> None:
-    """Raise :class:`UserError` where the study refuses every cell: then it is the experiment that is wrong, not a cell."""
+def _refuse_without_supported_cells(experiment: Experiment, planned: Sequence[Planned]) -> None:
+    """Raise :class:`UserError` if the study supports no cell: then the experiment is wrong, and no single cell."""
     if any(item.refusal is None for item in planned):
         return
     study = study_of(experiment)
     try:
         reasons = dict.fromkeys(study.unsupported_reason(item.cell) for item in planned)
     except (Unsupported, UserError):
-        return  # a cell without a program says so in its row, and no study is asked about it
+        return  # a cell without a program reports the reason in its row
     if reasons and None not in reasons:
         raise UserError(f"no cell can be run: {'; '.join(map(str, reasons))}")
 
 
 def _compact(store: Store, planned: Sequence[Planned]) -> None:
-    """Fold small files; a full disk must not hide why a run ended, and rows can be read from small files as well."""
+    """Fold the small files. A failure is only printed: it must not hide why a run ended, and no row depends on it."""
     try:
         store.compact([item.cell.key for item in planned])
     except StorageError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 from bench.experiment.cell import Cell
+from bench.experiment.defaults import completed_json, missing_parameters
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import cells
 from bench.experiment.study import study_of
@@ -20,6 +22,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+Identity = tuple[str, float, float, float]
+"""Completed parameters as JSON, samples, repeats and seed: the identity of a cell apart from the code that computes it."""
+
+
 @dataclass(frozen=True)
 class Planned:
     """A cell, and whether it is stored already, refused or due to run."""
@@ -27,10 +33,14 @@ class Planned:
     cell: Cell
     stored: bool
     refusal: tuple[str, str] | None
-    aged: str = ""
-    """Library versions that made the stored row, if they differ from the installed ones."""
+    other_versions: str = ""
+    """Library versions of the stored row, if they differ from the installed ones."""
     machine: str = ""
     """The kind of machine that timed the stored row."""
+    by_older_code: bool = False
+    """Whether the cell has to run although it is stored, since code that decides its numbers has changed."""
+    added: tuple[str, ...] = ()
+    """Parameters added since the row of older code was stored, as ``plugin.parameter``."""
 
     @property
     def runs(self) -> bool:
@@ -39,45 +49,76 @@ class Planned:
 
 
 def plan(experiment: Experiment, store: Store) -> list[Planned]:
-    """Return every cell of the experiment in order, with its state; raises :class:`UserError` for a bad one."""
+    """Return every cell of the experiment in order, with its state; raises :class:`UserError` for an invalid one."""
     rows = store.load()
     facts = zip(rows["status"], rows["versions"], rows["machine"], strict=True)
     stored = dict(zip(rows["key"], facts, strict=True))
     with guard.capture_output("a plugin"), guard.protect_process():
-        return [_planned(experiment, cell, stored) for cell in cells(experiment)]
+        every = cells(experiment)
+        older = _rows_of_older_code(experiment, rows, {cell.key for cell in every})
+        return [_planned(experiment, cell, stored, older) for cell in every]
 
 
-def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, str, str]]) -> Planned:
-    refusal = cell.refusal() or _refused(experiment, cell)
+def _planned(
+    experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, str, str]], older: dict[Identity, str]
+) -> Planned:
+    refusal = cell.refusal() or _refusal_of_study(experiment, cell)
     if cell.key not in stored:
-        return Planned(cell, False, refusal)
-    status, made_by, machine = stored[cell.key]
+        text = older.get(_identity_of(cell)) if older else None
+        added = () if text is None else tuple(missing_parameters(json.loads(text)))
+        return Planned(cell, False, refusal, by_older_code=text is not None, added=added)
+    status, row_versions, machine = stored[cell.key]
     rules = experiment.execution
-    aged = made_by if rules.versions != "ignore" and status == "ok" and made_by != versions(cell.backend) else ""
-    again = status in rules.retry or (bool(aged) and rules.versions == "rerun")
-    # a plugin that was missing when the row was stored is there now
-    installed = status == "unavailable" and refusal is None
+    is_current = rules.versions == "ignore" or status != "ok" or row_versions == versions(cell.backend)
+    again = status in rules.retry or (not is_current and rules.versions == "rerun")
+    # a plugin that was missing when the row was stored is installed now
+    is_installed = status == "unavailable" and refusal is None
     timed = machine if cell.timing and status == "ok" and not again else ""
-    return Planned(cell, not (again or installed), refusal, aged, timed)
+    return Planned(cell, not (again or is_installed), refusal, "" if is_current else row_versions, timed)
 
 
-def _refused(experiment: Experiment, cell: Cell) -> tuple[str, str] | None:
+def _rows_of_older_code(experiment: Experiment, rows: pd.DataFrame, keys: set[str]) -> dict[Identity, str]:
+    """Return the parameters, as stored, of the rows under other keys than ``keys``, by the identity of their cells.
+
+    A parameter that a row lacks counts as its present default. Rows that are timed while the experiment is not, or the
+    reverse, are other cells.
+    """
+    rows = rows[~rows["key"].isin(keys) & (rows["parameters"] != "")]
+    seconds = [column.name for column in experiment.columns.all if column.measured and column.kind == "number"]
+    if seconds:
+        is_timed = rows.reindex(columns=seconds).notna().any(axis=1)
+        rows = rows[(is_timed == experiment.timing) | (rows["status"] != "ok")]
+    identities = zip(
+        rows["parameters"].map(completed_json), rows["samples"], rows["repeats"], rows["seed"], strict=True
+    )
+    return dict(zip(identities, rows["parameters"], strict=True))
+
+
+def _identity_of(cell: Cell) -> Identity:
+    parameters = json.dumps(cell.parameters, separators=(",", ":"))
+    return completed_json(parameters), float(cell.samples), float(cell.repeats), float(cell.seed)
+
+
+def _refusal_of_study(experiment: Experiment, cell: Cell) -> tuple[str, str] | None:
     reason = study_of(experiment).unsupported_reason(cell)
     return None if reason is None else ("unsupported", reason)
 
 
 def expected_seconds(runs: Sequence[Planned], rows: pd.DataFrame) -> float:
-    """Estimate the seconds the cells take, from stored times of like cells scaled to their samples; NaN without any."""
+    """Estimate the seconds that the cells take, from the stored times of similar cells and the number of samples.
+
+    Cells are similar if backend and estimator have the same names. Returns NaN where no times are stored.
+    """
     if not runs:
         return 0.0
     history = rows[(rows["status"] == "ok") & (rows["wall_s"] > 0)]
     if history.empty:
         return math.nan
     rate = history["wall_s"] / (history["samples"] * history["repeats"])
-    like = rate.groupby([history["backend"].str.partition("[")[0], history["estimator"]]).median().to_dict()
+    similar = rate.groupby([history["backend"].str.partition("[")[0], history["estimator"]]).median().to_dict()
     typical = float(rate.median())
     names = [(item.cell, item.cell.parts.get("estimator")) for item in runs]
-    return sum(like.get((c.backend.name, e.name if e else ""), typical) * c.samples * c.repeats for c, e in names)
+    return sum(similar.get((c.backend.name, e.name if e else ""), typical) * c.samples * c.repeats for c, e in names)
 
 
 def versions(backend: Backend) -> str:

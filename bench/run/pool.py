@@ -1,8 +1,8 @@
-"""Runs work in processes that can be killed: one item at a time, with limits on its time and memory.
+"""Runs items in worker processes that can be killed, one item at a time, with limits on its time and memory.
 
-A worker is a process in a session of its own. It builds a handler once, then handles items as they come, so that imports
-and compilations are paid once. It answers in JSON, and what it prints comes back through a pipe: nothing that a worker
-sends is executed here. (Pools of the standard library lose all their items when one worker dies.)
+A worker is a process in a session of its own. It builds a handler once and then handles items as they arrive, so that
+imports and compilations are paid for once. It answers in JSON, and its printed output arrives through a separate pipe:
+nothing that a worker sends is executed here. (Pools of the standard library lose all their items when one worker dies.)
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import os
 import pickle
-import secrets
 import select
 import signal
 import socket
@@ -22,39 +21,39 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import psutil
 
 from bench.errors import StorageError, UserError, failure
-from bench.run import worker as process
-from bench.run.channel import BOUND, TOKEN, Broken, Channel
-from bench.run.reaper import MARK, Guardian, kill_marked
-from bench.run.worker import READY, Handler
+from bench.run.reaper import MARK, Reaper, kill_marked_processes
+from bench.run.worker import Channel, ConnectionLost, Handler, MalformedMessage, command, first_message
 
 TICK = 0.05
-"""Seconds between looks at the time and memory that items take."""
+"""Seconds between checks of the time and memory that items take."""
 AHEAD_S = 0.05
-"""Seconds of work that a worker gets ahead, so that it need not wait while results are written."""
-AHEAD = 16
-"""Most items that a worker gets ahead."""
+"""Seconds of work that a worker is sent ahead, so that it does not wait while results are written."""
+MAX_AHEAD = 16
+"""Most items that a worker is sent ahead."""
+MAX_UNSENT = 1 << 16
+"""Bytes that may wait to be sent to a worker before it is sent no more items ahead."""
 STEAL_S = 5.0
-"""Seconds of work that a group must have left before an idle worker takes half of it and compiles again."""
+"""Seconds of work that a worker must have left before an idle worker takes half of it and compiles again."""
 START_S = 60.0
-"""Seconds granted to a worker for starting, and for importing what an item needs, beyond the item's own time."""
+"""Seconds that a worker may take to start, and to import an item's libraries, beyond the item's own time."""
 TAIL = 16000
-"""Bytes of a worker's output that are kept."""
-GONE_S = 5.0
-"""Seconds granted to a process for ending once it has closed its connection."""
-STARTS = 3
-"""Workers in a row that may be killed while they start; more is no accident."""
-SINGLE = {
+"""Bytes of a worker's printed output that are kept."""
+EXIT_S = 5.0
+"""Seconds that a process may take to end once it has closed its connection."""
+MAX_FAILED_STARTS = 3
+"""Workers in a row that may be killed while they start; after as many, the run ends with an error."""
+SINGLE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "NPROC": "1",
 }
-"""Settings that keep numerical libraries to one thread, if set before these are imported."""
+"""Environment variables that keep numerical libraries to one thread, if set before these are imported."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +68,11 @@ class ResourceLimits:
 
 @dataclass(frozen=True)
 class Answer:
-    """The outcome of an item: its result, or why there is none."""
+    """The result of an item, or the reason why it has none."""
 
     item: Any
     result: dict[str, Any]
-    """The handler's result; ``status`` and ``reason`` where the worker was killed or died."""
+    """The handler's result; ``status`` and ``reason`` if the worker was killed or died."""
     seconds: float
     output: str = ""
     """The last lines printed while the item was handled."""
@@ -83,7 +82,7 @@ class Answer:
     """Whether that machine has stored the row."""
 
 
-# ------------------------------------------------------------------------------------------------ the pool
+# ---------------------------------------------------------------------------------------------------------- a worker
 
 
 @dataclass(eq=False)
@@ -91,75 +90,145 @@ class _Worker:
     process: subprocess.Popen[bytes]
     channel: Channel
     output: int
-    """Descriptor of what it prints."""
-    facts: psutil.Process
+    """Descriptor from which its printed output is read."""
+    usage: psutil.Process
     mark: str
-    group: deque[Any] = field(default_factory=deque)
-    """Items it will get next."""
-    given: deque[Any] = field(default_factory=deque)
-    """Items it got and has not answered; it works on the first."""
+    queue: deque[Any] = field(default_factory=deque)
+    """Items that will be sent to it."""
+    sent: deque[Any] = field(default_factory=deque)
+    """Items that were sent to it and are not answered; it works on the first."""
     since: float = field(default_factory=time.monotonic)
-    ready: bool = False
+    """When the first item was sent, or when its own time began."""
+    is_ready: bool = False
     """Whether it has built its handler."""
-    begun: bool = False
-    """Whether it has imported what the current item needs."""
+    is_prepared: bool = False
+    """Whether it has imported the libraries of the current item, so that the item's own time has begun."""
     pace: float = 1.0
-    """Seconds the last item took."""
-    tail: bytes = b""
-    handled: int = 0
-    """Items it has answered."""
-    broken: str = ""
-    """Why nothing more is expected of it."""
+    """Seconds that the last item took."""
+    printed: bytes = b""
+    n_answered: int = 0
+    fault: ConnectionLost | MalformedMessage | None = None
+    """Why it can answer no more items."""
 
     @property
-    def room(self) -> int:
-        """How many more items it should get."""
-        if self.given and self.channel.waiting > BOUND:
+    def capacity(self) -> int:
+        """Number of items that may still be sent to it."""
+        if self.sent and self.channel.n_unsent > MAX_UNSENT:
             return 0
-        return 1 + min(AHEAD, int(AHEAD_S / max(self.pace, 1e-6))) - len(self.given)
+        return 1 + min(MAX_AHEAD, int(AHEAD_S / max(self.pace, 1e-6))) - len(self.sent)
 
-    def listen(self) -> None:
-        """Keep the end of the printed output."""
+    def send_next(self) -> Answer | None:
+        """Send the next item of the queue; returns its answer at once if it cannot be pickled."""
+        item = self.queue.popleft()
+        try:
+            message = pickle.dumps(item)
+        except Exception as error:
+            return Answer(item, dict(failure(error)), 0.0)
+        if not self.sent:
+            self.since, self.is_prepared = time.monotonic(), False
+        self.sent.append(item)
+        with suppress(ConnectionLost):  # the next check of the worker reports its end
+            self.channel.send(message)
+        return None
+
+    def read_output(self) -> None:
+        """Read what it has printed, and keep the end of it."""
         with suppress(OSError):
             while chunk := os.read(self.output, 1 << 16):
-                self.tail = (self.tail + chunk)[-TAIL:]
+                self.printed = (self.printed + chunk)[-TAIL:]
                 if len(chunk) < 1 << 16:
                     return
 
     def take_output(self) -> str:
         """Return the last lines printed since the last call, or the first of Python's dump of a crash, on one line."""
-        _, crash, dump = self.tail.decode(errors="replace").rpartition("(most recent call first):")
-        self.tail = b""
-        printable = ("".join(letter for letter in line if letter.isprintable()).strip() for line in dump.split("\n"))
+        _, crash, dump = self.printed.decode(errors="replace").rpartition("(most recent call first):")
+        self.printed = b""
+        printable = ("".join(c for c in line if c.isprintable()).strip() for line in dump.split("\n"))
         lines = [line for line in printable if line]
         return " | ".join(lines[:3] if crash else lines[-4:])[-600:]
+
+    def receive(self) -> list[Answer]:
+        """Return the answers that have arrived. A fault of the connection or of a message is kept in ``fault``."""
+        answers: list[Answer] = []
+        try:
+            while self.fault is None and self.sent and (messages := self.channel.receive()):
+                for message in messages:
+                    answers += self._read(message)
+        except (ConnectionLost, MalformedMessage) as error:
+            self.fault = error
+        self.read_output()
+        return answers
+
+    def _read(self, message: bytes) -> list[Answer]:
+        """Return the answer in a message, if it is one; raises :class:`MalformedMessage` and :class:`StorageError`."""
+        try:
+            content = json.loads(message)
+            match content["event"]:
+                case "ready":
+                    self.is_ready = True
+                    return []
+                case "started":
+                    self.since, self.is_prepared = time.monotonic(), True
+                    return []
+                case "storage":
+                    raise StorageError(content["reason"])
+                case "answer":
+                    result, seconds = dict(content["result"]), float(content["seconds"])
+                    item = self.sent.popleft()
+                case _:
+                    raise MalformedMessage
+        except (ValueError, LookupError, TypeError) as error:
+            raise MalformedMessage from error
+        self.read_output()
+        answer = Answer(item, result, seconds, self.take_output())
+        self.pace, self.since, self.is_prepared = seconds, time.monotonic(), False
+        self.n_answered += 1
+        return [answer]
+
+    def kill(self) -> None:
+        """Kill the worker and everything that it has started."""
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.kill()
+        self.process.wait()
+        kill_marked_processes(self.mark)
+        self.read_output()
+
+    def close(self) -> None:
+        """Close the descriptors of a worker that has ended."""
+        self.channel.close()
+        with suppress(OSError):
+            os.close(self.output)
+
+
+# ---------------------------------------------------------------------------------------------------------- the pool
 
 
 class Pool:
     """Workers that share groups of items: a context manager that leaves no process behind.
 
-    ``make(argument)`` builds the handler in each worker, which finds plugins in ``folders`` too. With ``single``,
-    numerical libraries keep to one thread.
+    ``make(argument)`` builds the handler in each worker, which imports plugins from ``folders`` too. With
+    ``single_thread``, numerical libraries use one thread.
     """
 
     def __init__(
         self,
-        count: int,
+        n_workers: int,
         make: Callable[[Any], Handler],
         argument: Any,
         limits: ResourceLimits,
-        single: bool = True,
+        single_thread: bool = True,
         folders: Sequence[Path] = (),
     ) -> None:
-        self._count, self._make, self._limits, self._single = count, make, limits, single
-        self._argument, self._folders = pickle.dumps(argument), tuple(folders)
+        self._n_workers, self._limits, self._single_thread = n_workers, limits, single_thread
+        self._first_message = first_message(make, pickle.dumps(argument), tuple(folders))
         self._workers: list[_Worker] = []
-        self._unsent: list[Answer] = []
-        self._again: deque[deque[Any]] = deque()
+        self._unpicklable: list[Answer] = []
+        self._retries: deque[deque[Any]] = deque()
         self._crashed: set[int] = set()
-        self._unready = 0
+        self._n_failed_starts = 0
         self._mark = uuid.uuid4().hex
-        self._guardian: Guardian | None = None
+        self._reaper: Reaper | None = None
 
     def __enter__(self) -> Pool:
         return self
@@ -167,154 +236,143 @@ class Pool:
     def __exit__(self, *_: object) -> None:
         while self._workers:
             worker = self._workers.pop()
-            _end(worker)
-            _close(worker)
-        if self._guardian is not None:
-            self._guardian.dismiss()
-            self._guardian = None
+            worker.kill()
+            worker.close()
+        if self._reaper is not None:
+            self._reaper.close()
+            self._reaper = None
 
     def run(self, groups: Sequence[Sequence[Any]]) -> Iterator[list[Answer]]:
-        """Yield answers as they come, each item once, and an empty list now and then.
+        """Yield answers as they arrive, each item once, and an empty list every now and then.
 
-        The items of a group go to one worker, in order, while that pays.
+        The items of a group go to one worker, in order, unless another worker is idle.
         """
         waiting = deque(deque(group) for group in groups if group)
         while True:
-            self._share(waiting)
-            busy = [worker for worker in self._workers if worker.given]
-            if not busy and not self._unsent:
+            self._assign(waiting)
+            busy = [worker for worker in self._workers if worker.sent]
+            if not busy and not self._unpicklable:
                 return
-            _wait(busy, 0 if self._unsent else TICK)
-            answers, self._unsent = self._unsent, []
-            yield answers + [answer for worker in busy for answer in self._look_after(worker, waiting)]
+            _wait(busy, 0 if self._unpicklable else TICK)
+            answers, self._unpicklable = self._unpicklable, []
+            yield answers + [answer for worker in busy for answer in self._collect(worker, waiting)]
 
     @property
     def current(self) -> list[Any]:
         """The items being worked on."""
-        return [worker.given[0] for worker in self._workers if worker.given]
+        return [worker.sent[0] for worker in self._workers if worker.sent]
 
-    def _share(self, waiting: deque[deque[Any]]) -> None:
-        """Give every worker something to do, and start more workers while items are waiting."""
+    def _assign(self, waiting: deque[deque[Any]]) -> None:
+        """Give work to every idle worker, and start more workers while groups are waiting."""
         for worker in self._workers:
-            if not worker.group and not worker.given:
-                worker.group = waiting.popleft() if waiting else self._half()
-        # what a worker died of may be what it did before: the item at work then gets a worker of its own
-        for groups in (self._again, waiting):
-            while groups and len(self._workers) < self._count:
-                worker = self._start()
-                worker.group = groups.popleft()
+            if not worker.queue and not worker.sent:
+                worker.queue = waiting.popleft() if waiting else self._take_half()
+        # an earlier item may have caused the death of a worker, so the item it died on is retried in a new worker
+        for groups in (self._retries, waiting):
+            while groups and len(self._workers) < self._n_workers:
+                worker = self._start_worker()
+                worker.queue = groups.popleft()
                 self._workers.append(worker)
         for worker in self._workers:
-            while worker.group and worker.room > 0:
-                self._give(worker)
+            while worker.queue and worker.capacity > 0:
+                if (answer := worker.send_next()) is not None:
+                    self._unpicklable.append(answer)
 
-    def _half(self) -> deque[Any]:
-        """Take the second half of the longest group that another worker has left."""
-        longest = max(self._workers, key=lambda worker: len(worker.group) * worker.pace)
-        taken: deque[Any] = deque()
-        if len(longest.group) * longest.pace > STEAL_S:
-            for _ in range(len(longest.group) // 2):
-                taken.appendleft(longest.group.pop())
-        return taken
+    def _take_half(self) -> deque[Any]:
+        """Take the second half of the longest queue away from its worker, if it is long enough, and return it."""
+        longest = max(self._workers, key=lambda worker: len(worker.queue) * worker.pace)
+        half: deque[Any] = deque()
+        if len(longest.queue) * longest.pace > STEAL_S:
+            for _ in range(len(longest.queue) // 2):
+                half.appendleft(longest.queue.pop())
+        return half
 
-    def _give(self, worker: _Worker) -> None:
-        item = worker.group.popleft()
-        try:
-            message = pickle.dumps(item)
-        except Exception as error:
-            self._unsent.append(Answer(item, dict(failure(error)), 0.0))
-            return
-        if not worker.given:
-            worker.since, worker.begun = time.monotonic(), False
-        worker.given.append(item)
-        with suppress(Broken):  # _look_after finds a worker that has died
-            worker.channel.send(message)
-
-    def _start(self) -> _Worker:
-        if self._guardian is None:
-            self._guardian = Guardian(self._mark)
+    def _start_worker(self) -> _Worker:
+        if self._reaper is None:
+            self._reaper = Reaper(self._mark)
         ours, theirs = socket.socketpair()
         output, printed = os.pipe()
-        # listen() reads what there is and never waits
+        # reading the output must never wait
         os.set_blocking(output, False)
-        token, mark = secrets.token_bytes(TOKEN), f"{self._mark}-{uuid.uuid4().hex}"
-        started = subprocess.Popen(
-            process.command(theirs.fileno(), token), pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
+        mark = f"{self._mark}-{uuid.uuid4().hex}"
+        process = subprocess.Popen(
+            command(theirs.fileno()), pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
             stdout=printed, stderr=printed, start_new_session=True,
-            env=os.environ | {MARK: mark} | (SINGLE if self._single else {}),
+            env=os.environ | {MARK: mark} | (SINGLE_THREAD if self._single_thread else {}),
         )  # fmt: skip
         # a socket reports its end only when every copy of the other side is closed, this one too
         theirs.close()
         os.close(printed)
-        worker = _Worker(started, Channel(ours, token), output, psutil.Process(started.pid), mark)
-        with suppress(Broken):
-            worker.channel.send(process.first(self._make, self._argument, self._folders))
+        worker = _Worker(process, Channel(ours), output, psutil.Process(process.pid), mark)
+        with suppress(ConnectionLost):
+            worker.channel.send(self._first_message)
         return worker
 
-    def _look_after(self, worker: _Worker, waiting: deque[deque[Any]]) -> list[Answer]:
-        answers = _received(worker)
-        verdict = self._verdict(worker)
-        if verdict is None:
+    def _collect(self, worker: _Worker, waiting: deque[deque[Any]]) -> list[Answer]:
+        """Return a worker's new answers; one that has died or exceeds a limit is removed, and its items are reassigned."""
+        answers = worker.receive()
+        end = self._check(worker)
+        if end is None:
             return answers
-        by_signal = verdict[0] == "stopped" or (worker.process.returncode or 0) < 0
-        _end(worker)
-        answers += _received(worker)  # answers sent before it died still count
-        _close(worker)
+        kind, reason = end
+        was_killed = kind == "stopped" or (worker.process.returncode or 0) < 0
+        worker.kill()
+        answers += worker.receive()  # answers sent before it died still count
+        worker.close()
         self._workers.remove(worker)
-        self._unready = 0 if worker.ready else self._unready + 1
-        if not worker.ready and (self._unready == STARTS or not by_signal):
-            raise UserError(f"a worker cannot start: {verdict[1]}; last output: {worker.take_output() or 'none'}")
-        if worker.given and worker.ready:
-            guilty, seconds = worker.given.popleft(), time.monotonic() - worker.since
-            if self._once_more(worker, guilty, verdict[0]):
-                self._again.append(deque([guilty, *worker.given, *worker.group]))
+        self._n_failed_starts = 0 if worker.is_ready else self._n_failed_starts + 1
+        if not worker.is_ready and (self._n_failed_starts == MAX_FAILED_STARTS or not was_killed):
+            raise UserError(f"a worker cannot start: {reason}; last output: {worker.take_output() or 'none'}")
+        if worker.sent and worker.is_ready:
+            item, seconds = worker.sent.popleft(), time.monotonic() - worker.since
+            if self._may_retry(worker, item, kind):
+                self._crashed.add(id(item))
+                self._retries.append(deque([item, *worker.sent, *worker.queue]))
                 return answers
-            twice = ", in two workers" if id(guilty) in self._crashed else ""
-            status = "timeout" if verdict[0] == "timeout" else "crashed"
-            result = {"status": status, "reason": verdict[1] + twice}
-            answers.append(Answer(guilty, result, seconds, worker.take_output()))
-        # the items behind the guilty one did nothing wrong
-        left = deque([*worker.given, *worker.group])
-        if left:
-            waiting.appendleft(left)
+            twice = ", in two workers" if id(item) in self._crashed else ""
+            status = "timeout" if kind == "timeout" else "crashed"
+            answers.append(Answer(item, {"status": status, "reason": reason + twice}, seconds, worker.take_output()))
+        # the items behind that one have not run
+        rest = deque([*worker.sent, *worker.queue])
+        if rest:
+            waiting.appendleft(rest)
         return answers
 
-    def _once_more(self, worker: _Worker, item: Any, status: str) -> bool:
-        """Return whether an item should have another worker before it is blamed.
+    def _may_retry(self, worker: _Worker, item: Any, kind: str) -> bool:
+        """Return whether an item gets a second worker before the worker's death counts as the item's result.
 
-        What the worker did before may have killed it, or someone from outside; too much memory may be that of items
-        before.
+        An earlier item, or someone outside, may have killed the worker; earlier items may hold the memory.
         """
-        if id(item) in self._crashed or status == "timeout" or (status == "memory" and not worker.handled):
+        if id(item) in self._crashed or kind == "timeout":
             return False
-        self._crashed.add(id(item))
-        return True
+        return kind != "memory" or worker.n_answered > 0
 
-    def _verdict(self, worker: _Worker) -> tuple[str, str] | None:
-        """Return what ended a worker (``crashed``, ``stopped``, ``timeout``, ``memory``) and the reason, or None."""
+    def _check(self, worker: _Worker) -> tuple[Literal["crashed", "stopped", "timeout", "memory"], str] | None:
+        """Return why a worker has to be replaced, as a kind and a reason; None if it goes on."""
         code = worker.process.poll()
-        if code is None and worker.broken:
+        if code is None and isinstance(worker.fault, ConnectionLost):
             with suppress(subprocess.TimeoutExpired):
-                code = worker.process.wait(0 if "descriptors" in worker.broken else GONE_S)
+                code = worker.process.wait(EXIT_S)
         if code is not None:
-            return "crashed", died(code)
-        if worker.broken:
-            return "crashed", worker.broken
-        if not worker.given:
+            return "crashed", describe_exit(code)
+        if worker.fault is not None:
+            malformed = isinstance(worker.fault, MalformedMessage)
+            return "crashed", "sent a malformed message" if malformed else "closed its connection"
+        if not worker.sent:
             return None
         timeout, memory = self._limits.timeout, self._limits.memory
-        if timeout is not None and time.monotonic() - worker.since > timeout + (0 if worker.begun else START_S):
+        if timeout is not None and time.monotonic() - worker.since > timeout + (0 if worker.is_prepared else START_S):
             return "timeout", f"no result within {timeout:g} s"
         with suppress(psutil.Error):
-            if memory is not None and worker.facts.memory_info().rss > memory:
+            if memory is not None and worker.usage.memory_info().rss > memory:
                 return "memory", f"stopped for using more than {memory / 2**30:.3g} GiB of memory"
-            if worker.facts.status() == psutil.STATUS_STOPPED:
+            if worker.usage.status() == psutil.STATUS_STOPPED:
                 return "stopped", "stopped by a signal"
         return None
 
 
-def died(code: int) -> str:
-    """Describe what an exit code says about a process that ended by itself."""
+def describe_exit(code: int) -> str:
+    """Return in words how a process ended, from its exit code; negative codes are signals."""
     if code >= 0:
         return f"the process ended with exit status {code}"
     name = signal.Signals(-code).name
@@ -322,64 +380,13 @@ def died(code: int) -> str:
 
 
 def _wait(workers: Sequence[_Worker], seconds: float) -> None:
-    """Wait until a worker sends or prints something, or can take more of what waits for it."""
+    """Wait until a worker sends or prints something, or can take more of the bytes that wait to be sent."""
     poll = select.poll()
     for worker in workers:
-        poll.register(worker.channel, select.POLLIN | (select.POLLOUT if worker.channel.waiting else 0))
+        poll.register(worker.channel, select.POLLIN | (select.POLLOUT if worker.channel.n_unsent else 0))
         poll.register(worker.output, select.POLLIN)
     poll.poll(1000 * seconds)
     for worker in workers:
-        with suppress(Broken):
+        with suppress(ConnectionLost):
             worker.channel.flush()
-        worker.listen()
-
-
-def _received(worker: _Worker) -> list[Answer]:
-    answers: list[Answer] = []
-    while not worker.broken and worker.given:
-        try:
-            messages = worker.channel.receive()
-        except Broken as error:
-            worker.broken = str(error)
-            break
-        if not messages:
-            break
-        for message in messages:
-            answers += _answer(worker, message)
-    worker.listen()
-    return answers
-
-
-def _answer(worker: _Worker, message: bytes) -> list[Answer]:
-    if message == READY:
-        worker.ready = True
-        return []
-    if not message:
-        worker.since, worker.begun = time.monotonic(), True
-        return []
-    content = json.loads(message)
-    if "storage" in content:
-        raise StorageError(content["storage"])
-    worker.listen()
-    worker.pace, item = content["seconds"], worker.given.popleft()
-    answer = Answer(item, content["result"], worker.pace, worker.take_output())
-    worker.since, worker.begun = time.monotonic(), False
-    worker.handled += 1
-    return [answer]
-
-
-def _end(worker: _Worker) -> None:
-    """Kill a worker and everything it has started."""
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(worker.process.pid, signal.SIGKILL)
-    worker.process.kill()
-    worker.process.wait()
-    kill_marked(worker.mark)
-    worker.listen()
-
-
-def _close(worker: _Worker) -> None:
-    """Close the descriptors of a worker that has ended."""
-    worker.channel.close()
-    with suppress(OSError):
-        os.close(worker.output)
+        worker.read_output()

@@ -1,7 +1,7 @@
-"""Kills what a run has started once the run is gone, however it went: a process that does nothing else.
+"""Kills the processes that a run has started once the run has ended, for any reason: a process that does nothing else.
 
-A worker cannot see to it by itself: a plugin may hold the interpreter lock, or the worker may be stopped. On Linux the
-kernel kills workers with their run as well, but not what these have started.
+A worker cannot do this itself: a plugin may hold the interpreter lock, or the worker may be stopped. On Linux the kernel
+kills the workers of a run that has ended, but not the processes that they have started.
 """
 
 from __future__ import annotations
@@ -14,25 +14,28 @@ import time
 from contextlib import suppress
 
 MARK = "BENCH_WORKER"
-"""Environment variable that marks all processes started by a worker, wherever they have gone."""
-AGAIN_S = 0.2
-"""Seconds after which it looks once more, for processes that were started meanwhile."""
+"""Environment variable that marks a worker and every process it starts, also those that leave its session."""
+PASSES, PAUSE_S = 5, 0.2
+"""Number of searches for marked processes, since one may start another meanwhile, and seconds after each."""
+PROGRAM = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.reaper import main; main()"
 
 
-class Guardian:
-    """The other end of a pipe that closes when this process ends, in whichever way."""
+class Reaper:
+    """Kills every process marked with ``mark`` when this process ends, also if it is killed.
+
+    The reaper's process waits on a pipe that the system closes when this process ends.
+    """
 
     def __init__(self, mark: str) -> None:
         environment = {name: value for name, value in os.environ.items() if name != MARK}
-        code = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.reaper import main; main()"
         self._process = subprocess.Popen(
-            [sys.executable, "-S", "-c", code, mark, chr(0x1F).join(sys.path)],
+            [sys.executable, "-S", "-c", PROGRAM, mark, chr(0x1F).join(sys.path)],
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment,
             start_new_session=True,
         )  # fmt: skip
 
-    def dismiss(self) -> None:
-        """End it, after the workers."""
+    def close(self) -> None:
+        """End the reaper's process. The workers have to be ended before."""
         self._process.kill()
         self._process.wait()
         assert self._process.stdin is not None
@@ -40,17 +43,17 @@ class Guardian:
 
 
 def main() -> None:
-    """Wait for the end of standard input, then kill all processes whose mark starts with the one given."""
+    """Wait until standard input is closed, then kill all processes whose mark starts with the first argument."""
     for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(name, signal.SIG_IGN)
     sys.stdin.buffer.read()
-    for _ in range(5):
-        kill_marked(sys.argv[1])
-        time.sleep(AGAIN_S)
+    for _ in range(PASSES):
+        kill_marked_processes(sys.argv[1])
+        time.sleep(PAUSE_S)
 
 
-def kill_marked(mark: str) -> None:
-    """Kill the other processes whose mark is this one or starts with it."""
+def kill_marked_processes(mark: str) -> None:
+    """Kill all other processes whose mark is ``mark`` or starts with it."""
     import psutil
 
     for process in psutil.process_iter():

@@ -1,8 +1,9 @@
-"""``run.json``: what was run, with what, on what, and how it ended."""
+"""``run.json``, the record of a run: configuration, versions, machine and counts; and the kind of this machine."""
 
 from __future__ import annotations
 
 import json
+import os
 import platform
 import subprocess
 import sys
@@ -11,8 +12,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from bench.errors import printable
 from bench.experiment.experiment import Experiment
 from bench.measure import timing
+from bench.model.parameters import remember
 from bench.run.files import write_whole
 
 if TYPE_CHECKING:
@@ -22,9 +25,9 @@ LIBRARIES = ("numpy", "scipy", "jax", "jaxlib", "torch", "optimistix", "lineax",
 
 
 def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds: float, simulated: bool) -> Path:
-    """Write ``run.json``: what was run, with what, on what, and how it ended.
+    """Write ``run.json``: configuration, versions, machine, counts of rows by status, and duration.
 
-    A run that found all its rows stored keeps the record of the last run that simulated the same configuration.
+    A run that simulated nothing keeps the existing record if that has the same configuration.
     """
     content: dict[str, Any] = {
         "command": " ".join(["python -m bench", *words]),
@@ -45,17 +48,17 @@ def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds
     }
     path = experiment.directory / "run.json"
     text = json.dumps(content, indent=1, default=str) + "\n"
-    if simulated or _is_other(path, json.loads(text)):
+    if simulated or _configuration(path) != json.loads(text)["config"]:
         write_whole(path, text.encode())
     return path
 
 
-def _is_other(path: Path, made: dict[str, Any]) -> bool:
-    """Return whether a record is of another configuration, missing or unreadable."""
+def _configuration(path: Path) -> Any:
+    """Return the configuration in a record, or None if the record is missing or unreadable."""
     try:
-        return bool(json.loads(path.read_text())["config"] != made["config"])
+        return json.loads(path.read_text())["config"]
     except (OSError, ValueError, TypeError, KeyError):
-        return True
+        return None
 
 
 def _version(name: str) -> str | None:
@@ -66,12 +69,20 @@ def _version(name: str) -> str | None:
 
 
 def machine() -> dict[str, Any]:
-    """Return the system, and the conditions that its times depend on."""
+    """Return the system and the timing conditions: processor, available cores and threads, load."""
     return {"system": platform.system(), **timing.conditions()}
 
 
+@remember
+def kind_of_machine() -> str:
+    """Return processor, available cores and system: times of one kind can share a table. It contains no host name."""
+    facts = timing.conditions()
+    n_cores = len(facts["affinity"] or ()) or os.cpu_count() or 1
+    return f"{printable(facts['processor']) or platform.machine()}, {n_cores} cores, {platform.system()}"
+
+
 def _compilations(rows: pd.DataFrame) -> dict[str, int]:
-    """Return the compilations that the rows took, and the number of distinct structures, functions and shapes."""
+    """Return the total number of compilations in the rows, and of distinct compiled structures and shapes."""
     if "compilations" not in rows:
         return {}
     shapes = {shape for text in rows["shapes"] for shape in text.split()}

@@ -12,7 +12,7 @@ import numpy as np
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint
-from bench.experiment.problems import Problems
+from bench.experiment.session import Problems
 from bench.measure import reference, smoothed
 from bench.measure.reference import Reference
 from bench.model import Backend

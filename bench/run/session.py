@@ -1,16 +1,16 @@
-"""A session: the compiled problems and reference gradients that the cells of one run share."""
+"""The session of a run: the compiled problems and reference gradients that its cells share."""
 
 from __future__ import annotations
 
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
-from bench.experiment.problems import Problems
+from bench.experiment.session import Problems
 from bench.model import Compilations, Problem
 from bench.run.references import References
 
 
 class Session:
-    """The problems and references of one run."""
+    """The compiled problems and reference gradients of one run."""
 
     def __init__(self, experiment: Experiment) -> None:
         self.experiment = experiment
@@ -23,5 +23,5 @@ class Session:
 
     @property
     def compilations(self) -> Compilations:
-        """What the run's problems have compiled since the count was restarted."""
+        """Compilations of the run's problems since the count was restarted."""
         return self.problems.compilations

@@ -1,4 +1,4 @@
-"""The process in which items are handled: it builds a handler once, then answers one item after the other."""
+"""The worker process, which builds a handler once and then answers one item after another, and its message channel."""
 
 from __future__ import annotations
 
@@ -9,98 +9,189 @@ import os
 import pickle
 import signal
 import socket
+import struct
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 from bench.errors import StorageError, failure
 from bench.model import guard, registry
-from bench.run.channel import Broken, Channel
 
-READY = b"ready"
-"""The message of a worker that can take items."""
-CODE = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.worker import main; main()"
-"""The program of a worker: it finds modules where its run does, and does not import the run's own script."""
+LENGTH = struct.Struct(">Q")
+"""The length of a message in bytes, which precedes the message."""
+CHUNK = 1 << 18
+"""Bytes read from the socket in one call."""
+MAX_MESSAGE = 1 << 30
+"""Bytes of the longest valid message."""
+PROGRAM = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.worker import main; main()"
+"""The program of a worker: it has the import path of its run, and does not import the run's own script."""
 DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of prctl(2)."""
+
+
+class ConnectionLost(Exception):
+    """Raised when the other end of a channel is closed."""
+
+
+class MalformedMessage(Exception):
+    """Raised when the bytes that arrived are not a message."""
+
+
+class Channel:
+    """One end of a socket for messages, each preceded by its length. The worker's end is ``blocking``.
+
+    The run's end never waits. Bytes that do not fit into the socket are kept here until there is room, so a worker that
+    reads nothing delays neither the other workers nor the clock. The socket is a descriptor of its own: output that a
+    plugin prints does not reach it.
+    """
+
+    def __init__(self, connection: socket.socket, blocking: bool = False) -> None:
+        self._connection = connection
+        connection.setblocking(blocking)
+        self._received = bytearray()
+        self._unsent = bytearray()
+
+    def fileno(self) -> int:
+        """Return the socket's descriptor."""
+        return self._connection.fileno()
+
+    @property
+    def n_unsent(self) -> int:
+        """Number of bytes that are still to be sent."""
+        return len(self._unsent)
+
+    def send(self, message: bytes) -> None:
+        """Send a message, or as much of it as fits: :meth:`flush` sends the rest."""
+        self._unsent += LENGTH.pack(len(message)) + message
+        self.flush()
+
+    def flush(self) -> None:
+        """Send the bytes that are kept: all of them if the socket blocks, otherwise as many as fit."""
+        while self._unsent:
+            try:
+                n_sent = self._connection.send(self._unsent)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                raise ConnectionLost from error
+            del self._unsent[:n_sent]
+
+    def receive(self) -> list[bytes]:
+        """Return the messages that have arrived: at least one if the socket blocks, otherwise possibly none.
+
+        Raises :class:`ConnectionLost` or :class:`MalformedMessage` once all messages before the fault were returned.
+        """
+        while not (messages := self._split()):
+            try:
+                chunk = self._connection.recv(CHUNK)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                raise ConnectionLost from error
+            if not chunk:
+                raise ConnectionLost
+            self._received += chunk
+        return messages
+
+    def _split(self) -> list[bytes]:
+        """Remove the complete messages from the received bytes and return them."""
+        messages: list[bytes] = []
+        while len(self._received) >= LENGTH.size:
+            end = LENGTH.size + LENGTH.unpack_from(self._received)[0]
+            if end > MAX_MESSAGE and not messages:
+                raise MalformedMessage
+            if len(self._received) < end:
+                break
+            messages.append(bytes(self._received[LENGTH.size : end]))
+            del self._received[:end]
+        return messages
+
+    def close(self) -> None:
+        """Close this end."""
+        self._connection.close()
 
 
 class Handler(Protocol):
     """Handles items in a worker."""
 
     def prepare(self, item: Any) -> None:
-        """Import what the item needs; the time is not counted as the item's."""
+        """Import the libraries that the item needs; this time does not count as the item's."""
 
     def __call__(self, item: Any) -> dict[str, Any]:
         """Return the item's result, to be sent as JSON."""
 
 
-def command(descriptor: int, token: bytes) -> list[str]:
-    """Return the command that starts a worker with one end of a socket."""
-    return [sys.executable, "-c", CODE, str(descriptor), token.hex(), str(os.getpid()), chr(0x1F).join(sys.path)]
+def command(descriptor: int) -> list[str]:
+    """Return the command that starts a worker, which talks to its run over the socket ``descriptor``."""
+    return [sys.executable, "-c", PROGRAM, str(descriptor), str(os.getpid()), chr(0x1F).join(sys.path)]
 
 
-def first(make: Any, argument: bytes, folders: tuple[Path, ...]) -> bytes:
-    """Return the first message to a worker: how it builds its handler."""
+def first_message(make: Callable[[Any], Handler], argument: bytes, folders: tuple[Path, ...]) -> bytes:
+    """Return the first message to a worker: how to build its handler."""
     return pickle.dumps((folders, make, argument))
 
 
 def main() -> None:
-    """Answer items until there are none; called with descriptor, token and the run's process number as arguments."""
-    descriptor, token, parent = sys.argv[1:4]
-    _die_with(int(parent))
+    """Answer items until the run closes the channel; called with a descriptor and the run's process id as arguments."""
+    descriptor, run = map(int, sys.argv[1:3])
+    _die_with(run)
     # Ctrl-C reaches the run, which ends its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable(all_threads=False)
-    channel = Channel(socket.socket(fileno=int(descriptor)), bytes.fromhex(token), blocking=True)
     sys.argv[:] = ["bench-worker"]
-    with suppress(Broken):
-        _serve(channel)
+    with suppress(ConnectionLost):
+        _serve(Channel(socket.socket(fileno=descriptor), blocking=True))
 
 
-def _die_with(parent: int) -> None:
-    """Have the kernel kill this process when its run has gone, whatever it is doing (Linux; see the guardian)."""
+def _die_with(run: int) -> None:
+    """Have the kernel kill this process when its run ends, even in the middle of an item (Linux; see the reaper)."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None, use_errno=True).prctl(DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:
+    if os.getppid() != run:
         os._exit(1)
 
 
 def _serve(channel: Channel) -> None:
-    """Build the handler as the first message says, then answer the others."""
-    waiting = channel.receive()
-    # the argument is pickled by itself, as its classes may come from folders of plugins
-    folders, make, argument = pickle.loads(waiting.pop(0))
+    """Build the handler that the first message describes, then answer all later messages."""
+    messages = channel.receive()
+    # the argument is pickled separately, since its classes may come from the folders of plugins
+    folders, make, argument = pickle.loads(messages.pop(0))
     for folder in folders:
         registry.add_folder(folder)
-    own, handle = os.getpid(), make(pickle.loads(argument))
-    channel.send(READY)
+    pid, handle = os.getpid(), make(pickle.loads(argument))
+    channel.send(_encode("ready"))
     while True:
-        waiting = waiting or channel.receive()
-        answer = _answered(channel, handle, waiting.pop(0))
-        guard.exit_if_forked(own)
+        messages = messages or channel.receive()
+        answer = _answer(channel, handle, messages.pop(0))
+        guard.exit_if_forked(pid)
         guard.kill_children()
         with suppress(Exception):
             sys.stdout.flush()
         channel.send(answer)
 
 
-def _answered(channel: Channel, handle: Handler, message: bytes) -> bytes:
-    own, started = os.getpid(), time.perf_counter()
+def _encode(event: str, **content: Any) -> bytes:
+    """Return a message to the run as JSON; its event is ``ready``, ``started``, ``answer`` or ``storage``."""
+    return json.dumps({"event": event, **content}).encode()
+
+
+def _answer(channel: Channel, handle: Handler, message: bytes) -> bytes:
+    """Handle the item in a message and return the message that answers it."""
+    pid, started = os.getpid(), time.perf_counter()
     try:
         item = pickle.loads(message)
         handle.prepare(item)
-        # an empty message: the imports are done and the item's own time begins
-        channel.send(b"")
+        # the imports are done, and the item's own time begins
+        channel.send(_encode("started"))
         started = time.perf_counter()
-        text = json.dumps({"result": handle(item), "seconds": time.perf_counter() - started})
-    except Broken:
+        return _encode("answer", result=handle(item), seconds=time.perf_counter() - started)
+    except ConnectionLost:
         raise
     except StorageError as error:
-        text = json.dumps({"storage": str(error)})
+        return _encode("storage", reason=str(error))
     except BaseException as error:
-        guard.exit_if_forked(own)
-        text = json.dumps({"result": failure(error), "seconds": time.perf_counter() - started})
-    return text.encode()
+        guard.exit_if_forked(pid)
+        return _encode("answer", result=failure(error), seconds=time.perf_counter() - started)

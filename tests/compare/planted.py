@@ -86,7 +86,7 @@ def rows(scene: str, fault: str) -> tuple[Any, pd.DataFrame]:
         for cell in found:
             refused = cell.refusal()
             if refused is None:
-                table.append(tasks.blank(made, cell) | tasks.outcome(cell, session, made.study))
+                table.append(tasks.blank_row(made, cell) | tasks.measure_cell(cell, session, made.study))
     return made.columns, made.columns.typed(pd.DataFrame(table))
 
 

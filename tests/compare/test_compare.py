@@ -22,7 +22,7 @@ from bench.experiment import axes
 from bench.experiment.columns import Columns
 from bench.model import registry
 from bench.report.tables import csv
-from bench.run.runner import blank
+from bench.run.tasks import blank_row
 from bench.studies.bias_variance.columns import COLUMNS
 
 MACHINE = {"processor": "a chip", "cores": 2, "system": "Linux", "load_average": [0.1, 0.1, 0.1]}
@@ -44,7 +44,7 @@ def compared(before, after, timings=False, columns: Columns = COLUMNS, again=())
 def of_study(name, *words):
     """The columns of a study, and blank rows of one of its cells per word of ``scenes``."""
     made, found = loaded(f"study={name}", "backends=[jax]", "estimators=[fobg]", *words)
-    rows = pd.DataFrame([blank(made, cell) | {"status": "ok"} for cell in found])
+    rows = pd.DataFrame([blank_row(made, cell) | {"status": "ok"} for cell in found])
     return made.columns, made.columns.typed(rows)
 
 

@@ -196,7 +196,7 @@ def test_what_was_unavailable_runs_once_it_is_installed(tmp_path, capsys):
     assert main(words) == 0
     rows = Store(tmp_path / "tiny", COLUMNS).load().iloc[0].to_dict()
     Store(tmp_path / "tiny", COLUMNS).append(
-        {k: v for k, v in rows.items() if k not in COLUMNS.named("list")} | {"status": "unavailable"}
+        {k: v for k, v in rows.items() if k not in COLUMNS.of_kind("list")} | {"status": "unavailable"}
     )
     capsys.readouterr()
     assert main(["plan", *words]) == 0

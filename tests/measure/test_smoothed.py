@@ -15,7 +15,7 @@ from bench.plugins.estimators.reinforce import Reinforce
 from bench.plugins.estimators.sphere_smoothing import SphereSmoothing
 from helpers import loaded
 
-from bench.experiment.problems import Problems
+from bench.experiment.session import Problems
 from bench.measure.reference import certify
 from bench.measure.smoothed import over_ball, widened
 from bench.model import DisturbedScene, FunctionScene, compose

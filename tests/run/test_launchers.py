@@ -12,7 +12,8 @@ import pytest
 
 from bench.cli import main
 from bench.errors import UserError
-from bench.experiment import config, machine
+from bench.experiment import config
+from bench.run import record
 from bench.run.execute import execute, store_of
 from bench.run.launchers import jobs
 from bench.run.tasks import Task
@@ -130,7 +131,7 @@ def test_submitit_leaves_other_peoples_logging_alone(tmp_path):
         "import logging, sys\n"
         f"handler = logging.FileHandler({str(tmp_path / 'log')!r}); handler.acquire(); stream = handler.stream\n"
         "from bench.run.launchers import slurm\n"
-        "slurm._imported()\n"
+        "slurm.import_submitit()\n"
         "sys.exit(stream.closed)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
@@ -141,15 +142,15 @@ def test_every_row_says_which_kind_of_machine_made_it(tmp_path):
         [*WORDS[:-2], "estimators=[fobg,alpha_order]", "timing=false", "workers=0", f"results_dir={tmp_path}"]
     )
     found = execute(made).store.load()
-    assert set(found["machine"]) == {machine.kind_of_machine()}
-    assert os.uname().nodename not in machine.kind_of_machine()
+    assert set(found["machine"]) == {record.kind_of_machine()}
+    assert os.uname().nodename not in record.kind_of_machine()
 
 
 def test_times_of_another_kind_of_machine_are_announced(tmp_path, capsys, monkeypatch):
     words = [*WORDS[:-2], "estimators=[fobg]", "workers=0", f"results_dir={tmp_path}", "--quiet"]
     assert main(words) == 0
     assert "timed on" not in capsys.readouterr().err
-    monkeypatch.setattr(machine, "kind_of_machine", lambda: "another, 8 cores, Linux")
+    monkeypatch.setattr(record, "kind_of_machine", lambda: "another, 8 cores, Linux")
     assert main([*words, "sweep.seed=[0,1]"]) == 0
     said = capsys.readouterr().err
     assert "1 stored rows were timed on" in said
@@ -163,12 +164,12 @@ def test_a_job_on_another_kind_of_machine_measures_nothing(tmp_path):
     from bench.experiment.grid import cells
 
     tasks = [Task(cell) for cell in cells(made)]
-    job = jobs.Job((), jobs.packed(made), pickle.dumps(tasks), True, "another kind", stores=True)
-    said = list(jobs.answers(job))
+    job = jobs.Job((), jobs.pack(made), pickle.dumps(tasks), True, "another kind", stores=True)
+    said = list(jobs.run_job(job))
     assert [place for place, _ in said] == [-1]
     assert store_of(made).load().empty
     with pytest.raises(UserError, match="times of two kinds are not mixed"):
-        jobs.answer(tasks[0], said[0][1], "another kind")
+        jobs.read_message(tasks[0], said[0][1], "another kind")
 
 
 # --------------------------------------------------------------------------------------------------------------- slow

@@ -15,10 +15,10 @@ from trees import hearing_signals
 from bench.cli import main
 from bench.errors import StorageError, UserError
 from bench.run import files
-from bench.run.channel import Broken, Channel
-from bench.run.files import TEMPORARY, temporary, tidy
+from bench.run.files import TEMPORARY, remove_stale, temporary
 from bench.run.pool import Pool, ResourceLimits
 from bench.run.store import Store
+from bench.run.worker import Channel, ConnectionLost, MalformedMessage
 from bench.studies.bias_variance.columns import COLUMNS
 
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "samples=8", "repeats=4", "timing=false", "workers=0", "--quiet"]
@@ -104,7 +104,7 @@ def test_a_small_file_that_holds_no_rows_is_unreadable(tmp_path, content):
 
 def test_a_number_that_is_none_does_not_turn_into_a_missing_one(tmp_path):
     pd.DataFrame([row() | {"bias": "large"}]).to_parquet(tmp_path / "rows.parquet")
-    with pytest.raises(StorageError, match="'bias' that are no numbers"):
+    with pytest.raises(StorageError, match="'bias' that are not numbers"):
         Store(tmp_path, COLUMNS).compact()
 
 
@@ -149,10 +149,10 @@ def test_half_written_files_of_dead_processes_go_and_those_of_living_ones_stay(t
     for path in (mine, dead, far, other):
         assert path is other or TEMPORARY.fullmatch(path.name)
         path.write_text("")
-    tidy(tmp_path)
+    remove_stale(tmp_path)
     assert set(tmp_path.iterdir()) == {mine, far, other}
     os.utime(far, (0, 0))
-    tidy(tmp_path)
+    remove_stale(tmp_path)
     assert set(tmp_path.iterdir()) == {mine, other}
 
 
@@ -178,6 +178,28 @@ def test_the_disk_is_told_to_empty_its_cache_where_fsync_does_not(tmp_path, monk
 # ----------------------------------------------------------------------------------------------------------- workers
 
 
+def framed(text: bytes) -> bytes:
+    return len(text).to_bytes(8, "big") + text
+
+
+MALFORMED = {
+    "noise": b"garbage" * 10,
+    "length": (1 << 40).to_bytes(8, "big"),
+    "json": framed(b"{"),
+    "event": framed(b'{"event": "of no kind"}'),
+    "result": framed(b'{"event": "answer", "result": 7, "seconds": "x"}'),
+}
+
+
+def _is_socket(descriptor: int) -> bool:
+    import stat
+
+    try:
+        return stat.S_ISSOCK(os.fstat(descriptor).st_mode)
+    except OSError:
+        return False
+
+
 class Handler:
     """Does what an item says, in the worker."""
 
@@ -197,12 +219,9 @@ class Handler:
             os._exit(4)
         elif what == "hangs":
             time.sleep(1000)
-        elif what == "writes":
-            for descriptor in range(3, 30):
-                try:
-                    os.write(descriptor, b"garbage" * 10)
-                except OSError:
-                    continue
+        elif what == "malformed":
+            descriptor = int(next(d for d in os.listdir("/dev/fd") if _is_socket(int(d))))
+            os.write(descriptor, MALFORMED[item[1]])
         elif what == "slow":
             time.sleep(0.4)
         return {"status": "ok"}
@@ -238,22 +257,37 @@ def test_large_items_behind_a_hanging_one_do_not_hold_up_the_clock():
     assert len(found) == 8
 
 
-def test_a_plugin_that_writes_into_descriptors_costs_its_own_cell():
-    results, _ = answers([("sound",), ("writes",), ("other",)])
-    assert results["writes"]["status"] == "crashed"
-    assert "wrote into the descriptors" in results["writes"]["reason"]
+@pytest.mark.parametrize("content", ["noise", "length", "json", "event", "result"])
+def test_a_malformed_message_counts_as_a_crash_of_its_cell(content):
+    results, _ = answers([("sound",), ("malformed", content), ("other",)])
+    assert results["malformed"]["status"] == "crashed"
+    assert "malformed message, in two workers" in results["malformed"]["reason"]
     assert results["sound"]["status"] == results["other"]["status"] == "ok"
 
 
-@pytest.mark.parametrize("sent", [b"garbage", b"\0" * 40])
-def test_bytes_that_are_no_message_are_noticed(sent):
+def test_messages_before_a_malformed_one_still_count():
     import socket
 
     one, two = socket.socketpair()
     with one, two:
-        two.send(sent)
-        with pytest.raises(Broken, match="descriptors"):
-            Channel(one, b"t" * 16).receive()
+        run, worker = Channel(one), Channel(two)
+        worker.send(b"first")
+        worker.send(b"second")
+        two.send(b"garbage" * 10)
+        assert run.receive() == [b"first", b"second"]
+        with pytest.raises(MalformedMessage):
+            run.receive()
+
+
+def test_an_open_connection_without_messages_is_not_a_fault():
+    import socket
+
+    one, two = socket.socketpair()
+    with one:
+        assert Channel(one).receive() == []
+        two.close()
+        with pytest.raises(ConnectionLost):
+            Channel(one).receive()
 
 
 HELD = """
@@ -298,7 +332,7 @@ def test_workers_that_hold_the_interpreter_lock_end_with_their_run(tmp_path):
         if (tmp_path / "begun").exists():
             break
         time.sleep(0.05)
-    assert len(left()) >= 4  # the run, its guardian, the worker and what it started
+    assert len(left()) >= 4  # the run, its reaper, the worker and what it started
     run.kill()
     run.wait()
     for _ in range(100):  # within 5 s

@@ -8,7 +8,7 @@ from bench.plugins.scenes.cubic import Cubic
 from bench.plugins.scenes.heaviside import Heaviside
 from helpers import loaded
 
-from bench.experiment.problems import Problems
+from bench.experiment.session import Problems
 from bench.measure.reference import Reference
 from bench.model import compose
 from bench.run import references

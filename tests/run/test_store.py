@@ -24,7 +24,7 @@ from bench.errors import StorageError, UserError
 from bench.model.parameters import values
 from bench.run import files, tasks
 from bench.run import store as store_module
-from bench.run.runner import blank
+from bench.run.launchers import launcher
 from bench.run.store import Store
 from bench.studies.bias_variance.columns import COLUMNS
 
@@ -41,7 +41,7 @@ def keys(store: Store) -> list[int]:
 
 def test_lists_of_missing_numbers_come_back_as_numbers(tmp_path):
     """In a column where every list holds NaN alone, Parquet has no type for them."""
-    name = COLUMNS.named("list")[0]
+    name = COLUMNS.of_kind("list")[0]
     store = Store(tmp_path, COLUMNS)
     store.append(row(1, **{name: [math.nan, math.nan]}), row(2, **{name: []}))
     for _ in range(2):
@@ -86,8 +86,8 @@ def test_rows_stay_in_the_order_of_their_file_whenever_they_were_stored(tmp_path
     store.append(row(4))
     assert list(store.load()["key"]) == [*keys, row(4)["key"]]
     # those asked for are last, in their order
-    assert list(store_module.ordered(store.load(), keys[::-1])["key"]) == [row(4)["key"], *keys[::-1]]
-    assert list(store_module.ordered(store.load(), keys[:1])["key"]) == [*keys[1:], row(4)["key"], keys[0]]
+    assert list(store_module.sort_rows(store.load(), keys[::-1])["key"]) == [row(4)["key"], *keys[::-1]]
+    assert list(store_module.sort_rows(store.load(), keys[:1])["key"]) == [*keys[1:], row(4)["key"], keys[0]]
     store.compact()
     assert list(pd.read_parquet(tmp_path / "rows.parquet")["key"]) == [*keys, row(4)["key"]]
 
@@ -127,7 +127,7 @@ def test_a_row_says_which_study_made_it_and_every_parameter_of_its_cell(study):
         f"study={study}", "scenes=[pushing]", "backends=[numpy]", "estimators=[fobg]", "sweep.mass=[0.1,0.3]"
     )
     for cell, mass in zip(cells, (0.1, 0.3), strict=True):
-        stored = blank(made, cell)
+        stored = tasks.blank_row(made, cell)
         assert stored["study"] == study
         told = json.loads(stored["parameters"])
         assert told["study"]["name"] == study
@@ -300,7 +300,7 @@ def test_rows_that_a_listing_has_missed_in_both_places_are_read_again(tmp_path, 
     store, real = Store(tmp_path, COLUMNS), os.listdir
     store.append(row(1))
     old = [path.name for path in (tmp_path / "pending").iterdir()]
-    store._add("parquet", pd.DataFrame(store.load()).to_parquet(index=False))
+    store._write_pending("parquet", pd.DataFrame(store.load()).to_parquet(index=False))
     (tmp_path / "pending" / old[0]).unlink()
     first = [[]]
     monkeypatch.setattr(os, "listdir", lambda path: first.pop() if first else real(path))
@@ -344,11 +344,11 @@ def test_without_hard_links_nothing_of_another_run_is_overwritten(tmp_path, no_h
     mine.write_text("mine")
     other.write_text("other")
     with pytest.raises(FileExistsError, match="File exists"):
-        files.place(mine, other)
+        files.link_exclusively(mine, other)
     assert (mine.read_text(), other.read_text()) == ("mine", "other")
     with pytest.raises(FileNotFoundError):
-        files.place(tmp_path / "gone", tmp_path / "new")
-    files.place(mine, tmp_path / "new")
+        files.link_exclusively(tmp_path / "gone", tmp_path / "new")
+    files.link_exclusively(mine, tmp_path / "new")
     assert (tmp_path / "new").read_text() == "mine"
 
 
@@ -383,7 +383,7 @@ def test_unreadable_file_is_named_and_left_alone(tmp_path, capsys, place, conten
 @pytest.mark.parametrize("after", [0, 1, 2])
 def test_disk_that_fills(tmp_path, capsys, monkeypatch, after):
     """The disk is full after so many files of rows: exit status 2, what was stored stays, and the run goes on later."""
-    monkeypatch.setattr(tasks, "TOGETHER_S", 0.0)  # a file per row
+    monkeypatch.setattr(launcher, "BATCH_S", 0.0)  # a file per row
     words = [*TINY, "name=tiny", "sweep.sigma=[0.1,0.2,0.3,0.4]", f"results_dir={tmp_path}", "workers=0"]
     real, left = files.replace_file, [after]
 

@@ -14,7 +14,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.grid import cells
 from bench.model import MechanicalScene, State, compose, registry
 from bench.model.parameters import build
-from bench.run import runner
+from bench.run import runner, tasks
 from bench.run.plan import plan
 from bench.run.session import Session
 from bench.run.store import Store
@@ -142,7 +142,7 @@ def test_backends_without_step_jacobians_are_classified_alike(tmp_path, backend)
     ]
     given = experiment(tmp_path, *words, *sweep, *scenes)
     session = Session(given)
-    rows = [runner.outcome(found, session, Stability()) for found in cells(given)]
+    rows = [tasks.measure_cell(found, session, Stability()) for found in cells(given)]
     assert [row["verdict"] for row in rows] == ["inaccurate", "wrong_sign", "diverged", "diverged"]
     assert all(row["reason"] for row in rows[2:])
     assert rows[0]["growth_factor"] == pytest.approx(rows[0]["spectral_radius"], abs=1e-9)
@@ -224,7 +224,7 @@ def test_truth_is_refined_where_there_is_no_physical_gradient(tmp_path):
 
 def test_scenes_without_time_steps_are_unsupported(tmp_path):
     given = experiment(tmp_path, "scenes=[quadratic]", "backends=[jax]")
-    row = runner.outcome(cells(given)[0], Session(given), Stability())
+    row = tasks.measure_cell(cells(given)[0], Session(given), Stability())
     assert row["status"] == "unsupported"
     assert "no time steps" in row["reason"]
 

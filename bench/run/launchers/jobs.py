@@ -1,9 +1,10 @@
-"""Jobs: parts of a sweep that go to another machine, run there by workers of its own, and come back answer by answer."""
+"""Jobs: chunks of a sweep that run on another machine and stream their results back."""
 
 from __future__ import annotations
 
 import os
 import pickle
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,87 +12,109 @@ from typing import Any
 
 from bench.errors import UserError
 from bench.experiment.experiment import Experiment
-from bench.experiment.machine import kind_of_machine
 from bench.model import registry
+from bench.run.launchers.launcher import local_launcher, without_grid
 from bench.run.pool import Answer
+from bench.run.record import kind_of_machine
 from bench.run.store import Store
-from bench.run.tasks import Task, explained, row_of
+from bench.run.tasks import Task, result_of, row_of
 
-ELSEWHERE = "elsewhere"
-"""Entry of an answer from a machine of another kind than the sweep's times are of."""
+WRONG_KIND = "wrong_kind"
+"""Entry of a message from a machine of another kind than the sweep's timed rows: the kind of that machine."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """Tasks with all that another machine needs to run them; pickled parts, as their classes may be in ``folders``."""
+    """Tasks with everything that another machine needs to run them.
+
+    Experiment and tasks are pickled separately, since their classes may come from ``folders``.
+    """
 
     folders: tuple[Path, ...]
     experiment: bytes
     tasks: bytes
     timed: bool
     kind: str
-    """The kind of machine that timed tasks are for; empty for any."""
+    """The kind of machine that timed tasks need; empty for any."""
     workers: int = 1
     stores: bool = False
-    """Whether the job stores its rows, so that they are kept when the run that sent it has gone."""
+    """Whether the job stores its rows, so that they are kept if the run that sent it ends."""
 
 
-def packed(experiment: Experiment) -> bytes:
-    """Return the experiment as jobs need it: without its grid, and with folders that mean the same everywhere."""
-    lean = replace(experiment, choices={}, values={}, sweep={}, marks={}, results_dir=experiment.results_dir.absolute())
-    return pickle.dumps(lean)
+def pack(experiment: Experiment) -> bytes:
+    """Return the experiment pickled for a job, without its grid and with an absolute results folder."""
+    return pickle.dumps(replace(without_grid(experiment), results_dir=experiment.results_dir.absolute()))
 
 
-def split(groups: Sequence[Sequence[Task]], most: int, slots: int) -> list[list[Task]]:
-    """Cut groups into parts of at most ``most`` tasks, and smaller where the slots would not all get one."""
-    total = sum(map(len, groups))
-    size = max(1, min(most, -(-total // max(1, slots))))
+def split(groups: Sequence[Sequence[Task]], max_tasks: int, n_slots: int) -> list[list[Task]]:
+    """Split groups into chunks of at most ``max_tasks`` tasks, smaller if slots would stay idle."""
+    n_tasks = sum(map(len, groups))
+    size = max(1, min(max_tasks, -(-n_tasks // max(1, n_slots))))
     return [list(group[i : i + size]) for group in groups for i in range(0, len(group), size)]
 
 
-def answers(job: Job) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Run a job on this machine; yields the place of each task in it and its answer, as they come."""
-    from bench.run.launchers import local
-
+def run_job(job: Job) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Run a job on this machine; yields the index of each task and a message for :func:`read_message`."""
     for folder in job.folders:
         registry.add_folder(folder)
     experiment: Experiment = pickle.loads(job.experiment)
     tasks: list[Task] = pickle.loads(job.tasks)
     kind = kind_of_machine()
     if job.timed and job.kind not in ("", kind):
-        yield -1, {ELSEWHERE: kind}
+        yield -1, {WRONG_KIND: kind}
         return
-    place = {id(task): index for index, task in enumerate(tasks)}
+    index = {id(task): i for i, task in enumerate(tasks)}
     store = Store(experiment.directory, experiment.columns, experiment.study.name) if job.stores else None
-    with local(experiment, job.timed, job.workers) as pool:
-        for some in pool.run([tasks]):
-            rows = [row_of(experiment, a.item.cell, explained(a)) for a in some if not a.item.reference]
+    with local_launcher(experiment, job.timed, job.workers) as launcher:
+        for answers in launcher.run([tasks]):
+            rows = [row_of(experiment, a.item.cell, result_of(a)) for a in answers if not a.item.reference]
             if rows and store is not None:
                 store.append(*rows)
-            for a in some:
-                kept = {"result": a.result, "seconds": a.seconds, "output": a.output, "machine": kind}
-                yield place[id(a.item)], kept | {"stored": store is not None and not a.item.reference}
+            for a in answers:
+                message = {"result": a.result, "seconds": a.seconds, "output": a.output, "machine": kind}
+                yield index[id(a.item)], message | {"stored": store is not None and not a.item.reference}
 
 
-def answer(task: Task, said: dict[str, Any], kind: str) -> Answer:
-    """Return what a job said of a task; raises :class:`UserError` where it was on another kind of machine."""
-    if ELSEWHERE in said:
+def read_message(task: Task, message: dict[str, Any], kind: str) -> Answer:
+    """Return the answer in a job's message; raises :class:`UserError` if it ran on another kind of machine."""
+    if WRONG_KIND in message:
         raise UserError(
-            f"a job came to a machine of another kind ({said[ELSEWHERE]}) than the times of this sweep ({kind}), and times of "
-            "two kinds are not mixed: pin the jobs to one kind, or choose another folder with name=..."
+            f"a job ran on a machine of another kind ({message[WRONG_KIND]}) than the times of this sweep ({kind}), and times "
+            "of two kinds are not mixed: restrict the jobs to one kind, or choose another folder with name=..."
         )
-    return Answer(task, **said)
+    return Answer(task, **message)
+
+
+class Losses:
+    """Counts lost jobs, and blames the first task of a job that was lost ``limit`` times."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._counts: Counter[int] = Counter()
+
+    def requeue(self, tasks: list[Task], waiting: deque[list[Task]], reason: str) -> list[Answer]:
+        """Put the unanswered tasks of a lost job back in front of ``waiting``; returns the answer of a blamed task."""
+        answers: list[Answer] = []
+        if tasks:
+            self._counts[id(tasks[0])] += 1
+            if self._counts[id(tasks[0])] >= self._limit:
+                result = {"status": "crashed", "reason": f"lost {self._limit} times while it was running: {reason}"}
+                answers.append(Answer(tasks[0], result, 0.0))
+                tasks = tasks[1:]
+        if tasks:
+            waiting.appendleft(tasks)
+        return answers
 
 
 def import_path() -> str:
-    """Return where other machines find this package, as PYTHONPATH: they see the same folders."""
-    given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    own = Path(__file__).resolve().parents[3]
-    return os.pathsep.join(dict.fromkeys([str(own), *(str(Path(path).absolute()) for path in given if path)]))
+    """Return a PYTHONPATH with which other machines, which see the same folders, import this package."""
+    inherited = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    package = Path(__file__).resolve().parents[3]
+    return os.pathsep.join(dict.fromkeys([str(package), *(str(Path(path).absolute()) for path in inherited if path)]))
 
 
 def unavailable(library: str, error: ImportError) -> UserError:
-    """Make the error of a launcher whose library is not there."""
+    """Return the error for a launcher whose library is not installed."""
     return UserError(
         f"launcher={library} is unavailable: {error}; pip install 'diffsim-bench[{library}]' here and on the machines"
     )

@@ -1,4 +1,4 @@
-"""Runs tasks on a Ray cluster: many small jobs, and what a lost node had at work is run elsewhere."""
+"""Runs tasks as many small jobs on a Ray cluster; the tasks of a lost node run on another one."""
 
 from __future__ import annotations
 
@@ -14,44 +14,45 @@ from typing import Any
 
 from bench.errors import UserError, printable
 from bench.experiment.experiment import Experiment
-from bench.run.launchers import jobs
+from bench.run.launchers.jobs import Job, Losses, import_path, pack, read_message, run_job, split, unavailable
 from bench.run.pool import Answer
+from bench.run.record import kind_of_machine
 from bench.run.tasks import Task
 
 TICK = 0.1
-"""Seconds between looks at the jobs."""
-AHEAD = 2
-"""Jobs sent per core: one at work and one that need not be waited for."""
-LOST = 3
-"""Times that the same task may be at work on a node that is lost, before it is blamed."""
+"""Seconds between checks of the jobs."""
+JOBS_PER_CORE = 2
+"""Jobs sent per core: one runs, and the next is ready to start."""
+MAX_LOSSES = 3
+"""Times that a task may be running on a node that is lost, before it is blamed."""
 
 
 @dataclass(eq=False)
-class _Sent:
-    """A job at work: its answers to come, and the tasks that have none yet."""
+class _SentJob:
+    """A job on the cluster: the stream of its answers, and the tasks without an answer by their index in the job."""
 
     stream: Any
-    left: dict[int, Task]
+    unanswered: dict[int, Task]
     node: str = ""
 
 
 class RayLauncher:
-    """Jobs on the nodes of a Ray cluster; timed ones have a node to themselves, and all nodes are of one kind.
+    """Runs jobs on the nodes of a Ray cluster; timed jobs have a node to themselves, and all nodes are of one kind.
 
-    Raises :class:`UserError` where Ray or its cluster is not there, and where no node of the kind is.
+    Raises :class:`UserError` if Ray is not installed, no cluster runs, or no node is of the kind.
     """
 
     def __init__(self, experiment: Experiment, timed: bool, kind: str) -> None:
         try:
-            os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # a choice that it warns about otherwise
+            os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without a choice, Ray warns
             import ray
         except ImportError as error:
-            raise jobs.unavailable("ray", error) from None
+            raise unavailable("ray", error) from None
         self._ray, self._experiment, self._timed, self._kind = ray, experiment, timed, kind
         self._settings = experiment.execution.cluster
-        self._sent: list[_Sent] = []
-        self._losses: dict[int, int] = {}
-        self._ours = False
+        self._jobs: list[_SentJob] = []
+        self._losses = Losses(MAX_LOSSES)
+        self._has_started_ray = False
 
     def __enter__(self) -> RayLauncher:
         if not self._ray.is_initialized():
@@ -59,49 +60,48 @@ class RayLauncher:
             try:
                 self._ray.init(
                     address=address, log_to_driver=False, logging_level=logging.ERROR,
-                    runtime_env={"env_vars": {"PYTHONPATH": jobs.import_path()}},
+                    runtime_env={"env_vars": {"PYTHONPATH": import_path()}},
                 )  # fmt: skip
             except Exception as error:
-                said = printable(error)[:300]
                 raise UserError(
-                    f"no Ray cluster at {address or 'this machine'}: {said}; start one: ray start --head"
+                    f"no Ray cluster at {address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head"
                 ) from None
-            self._ours = True
-        self._packed = self._ray.put(jobs.packed(self._experiment))
+            self._has_started_ray = True
+        self._packed = self._ray.put(pack(self._experiment))
         return self
 
     def __exit__(self, *_: object) -> None:
-        for sent in self._sent:
+        for job in self._jobs:
             with suppress(Exception):
-                self._ray.cancel(sent.stream, force=True)
-        self._sent.clear()
-        if self._ours:
+                self._ray.cancel(job.stream, force=True)
+        self._jobs.clear()
+        if self._has_started_ray:
             self._ray.shutdown()
 
     @property
     def current(self) -> list[Task]:
-        """The first task without an answer of some of the jobs."""
-        return [next(iter(sent.left.values())) for sent in self._sent[:4] if sent.left]
+        """The first unanswered task of each of the first jobs."""
+        return [next(iter(job.unanswered.values())) for job in self._jobs[:4] if job.unanswered]
 
     def run(self, groups: Sequence[Sequence[Task]]) -> Iterator[list[Answer]]:
-        """Yield answers as they come, each task once, and an empty list now and then."""
-        nodes = self._nodes_of_a_kind() if self._timed else {}
-        slots = len(nodes) if self._timed else int(self._ray.cluster_resources().get("CPU", 1))
-        waiting = deque(jobs.split(groups, self._settings["cells"], AHEAD * slots))
-        while waiting or self._sent:
+        """Yield answers as they arrive, each task once, and an empty list every now and then."""
+        nodes = self._nodes_of_one_kind() if self._timed else {}
+        n_slots = len(nodes) if self._timed else int(self._ray.cluster_resources().get("CPU", 1))
+        waiting = deque(split(groups, self._settings["cells"], JOBS_PER_CORE * n_slots))
+        while waiting or self._jobs:
             if self._timed:
                 alive = {node["NodeID"] for node in self._ray.nodes() if node["Alive"]}
                 nodes = {node: cores for node, cores in nodes.items() if node in alive}
                 if waiting and not nodes:
                     raise UserError(
-                        f"no node of the kind '{self._kind}' is left; the same command goes on when there is one"
+                        f"no node of the kind '{self._kind}' is left; run the same command again when there is one"
                     )
-                free = [node for node in nodes if all(sent.node != node for sent in self._sent)]
+                free = [node for node in nodes if all(job.node != node for job in self._jobs)]
                 for node in free[: len(waiting)]:
                     self._send(waiting.popleft(), nodes[node], node)
             else:
-                cores = int(self._ray.cluster_resources().get("CPU", 1))
-                while waiting and len(self._sent) < AHEAD * cores:
+                n_cores = int(self._ray.cluster_resources().get("CPU", 1))
+                while waiting and len(self._jobs) < JOBS_PER_CORE * n_cores:
                     self._send(waiting.popleft(), self._settings["cpus"], "")
             yield self._collect(waiting)
 
@@ -112,78 +112,64 @@ class RayLauncher:
             from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
             options["scheduling_strategy"] = NodeAffinitySchedulingStrategy(node, soft=False)
-        send = self._ray.remote(_answers).options(**options)
-        rest = {"tasks": pickle.dumps(tasks), "timed": self._timed, "kind": self._kind}
-        stream = send.remote(self._experiment.plugins, self._packed, rest)
-        self._sent.append(_Sent(stream, dict(enumerate(tasks)), node))
+        send = self._ray.remote(_run_job).options(**options)
+        settings = {"tasks": pickle.dumps(tasks), "timed": self._timed, "kind": self._kind}
+        stream = send.remote(self._experiment.plugins, self._packed, settings)
+        self._jobs.append(_SentJob(stream, dict(enumerate(tasks)), node))
 
     def _collect(self, waiting: deque[list[Task]]) -> list[Answer]:
-        """Return the answers that have come; what a lost job had left is sent again."""
-        if not self._sent:
+        """Return the answers that have arrived; the unanswered tasks of a lost job are put back into ``waiting``."""
+        if not self._jobs:
             time.sleep(TICK)
             return []
-        found: list[Answer] = []
-        ready, _ = self._ray.wait([s.stream for s in self._sent], num_returns=len(self._sent), timeout=TICK)
-        for sent in [s for s in self._sent if any(s.stream is stream for stream in ready)]:
+        answers: list[Answer] = []
+        ready, _ = self._ray.wait([job.stream for job in self._jobs], num_returns=len(self._jobs), timeout=TICK)
+        for job in [job for job in self._jobs if any(job.stream is stream for stream in ready)]:
             try:
-                place, said = self._ray.get(next(sent.stream))
-            except StopIteration:
-                self._sent.remove(sent)
-                self._again(sent, waiting, found, "it ended early")
+                index, message = self._ray.get(next(job.stream))
             except self._ray.exceptions.RayTaskError as error:
                 raise UserError(f"a job on the cluster failed: {printable(error.cause)[:300]}") from None
-            except self._ray.exceptions.RayError as error:
-                self._sent.remove(sent)
-                self._again(sent, waiting, found, type(error).__name__)
+            except (StopIteration, self._ray.exceptions.RayError) as error:
+                self._jobs.remove(job)
+                reason = "its job ended early" if isinstance(error, StopIteration) else type(error).__name__
+                answers += self._losses.requeue(list(job.unanswered.values()), waiting, reason)
             else:
-                found.append(jobs.answer(sent.left.pop(place, next(iter(sent.left.values()))), said, self._kind))
-        return found
+                task = job.unanswered.pop(index, next(iter(job.unanswered.values())))
+                answers.append(read_message(task, message, self._kind))
+        return answers
 
-    def _again(self, sent: _Sent, waiting: deque[list[Task]], found: list[Answer], why: str) -> None:
-        left = list(sent.left.values())
-        if not left:
-            return
-        first = left[0]
-        self._losses[id(first)] = self._losses.get(id(first), 0) + 1
-        if self._losses[id(first)] >= LOST:
-            reason = f"its node or worker was lost {LOST} times while it was at work ({why})"
-            found.append(Answer(left.pop(0), {"status": "crashed", "reason": reason}, 0.0))
-        if left:
-            waiting.appendleft(left)
-
-    def _nodes_of_a_kind(self) -> dict[str, float]:
-        """Return the nodes on which times may be measured, with their cores; the first node chooses where none is stored."""
+    def _nodes_of_one_kind(self) -> dict[str, float]:
+        """Return the nodes for timed cells with their cores; without a kind, all of the first node's kind."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         alive = {n["NodeID"]: n["Resources"].get("CPU", 0) for n in self._ray.nodes() if n["Alive"]}
-        asked = {
-            node: self._ray.remote(_kind)
+        requests = {
+            node: self._ray.remote(_kind_of_node)
             .options(num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False))
             .remote()
             for node, cores in alive.items()
             if cores >= 1
         }
         kinds: dict[str, str] = {}
-        for node, one in asked.items():
+        for node, request in requests.items():
             with suppress(self._ray.exceptions.RayError):
-                kinds[node] = self._ray.get(one)
+                kinds[node] = self._ray.get(request)
         if not kinds:
             raise UserError("the Ray cluster has no node with a core")
         self._kind = self._kind or next(iter(kinds.values()))
         nodes = {node: alive[node] for node, kind in kinds.items() if kind == self._kind}
         if not nodes:
             raise UserError(
-                f"the stored times are of '{self._kind}', and the cluster has {', '.join(sorted(set(kinds.values())))}: times of "
-                "two kinds are not mixed; choose another folder with name=..."
+                f"the stored times are from '{self._kind}', and the cluster has {', '.join(sorted(set(kinds.values())))}: times "
+                "of two kinds are not mixed; choose another folder with name=..."
             )
         return nodes
 
 
-def _answers(folders: Any, experiment: bytes, rest: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
-    yield from jobs.answers(jobs.Job(folders, experiment, **rest))
+def _run_job(folders: Any, experiment: bytes, settings: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
+    yield from run_job(Job(folders, experiment, **settings))
 
 
-def _kind() -> str:
-    from bench.experiment.machine import kind_of_machine
-
+def _kind_of_node() -> str:
+    """Return the kind of machine of the node; a function of its own, since Ray does not accept a cached one."""
     return kind_of_machine()

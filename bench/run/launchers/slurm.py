@@ -18,40 +18,41 @@ from typing import Any
 
 from bench.errors import UserError, printable
 from bench.experiment.experiment import Experiment
-from bench.run.launchers import jobs
+from bench.run.launchers.jobs import Job, Losses, import_path, pack, read_message, run_job, split, unavailable
 from bench.run.pool import Answer
+from bench.run.store import Store
 from bench.run.tasks import Task
 
 TICK = 1.0
-"""Seconds between looks at the jobs, and seconds in which the local executor is asked."""
-LOST = 2
+"""Seconds between checks of the jobs."""
+MAX_LOSSES = 2
 """Times that a job may be lost before its first unanswered task is blamed."""
 
 
-def _imported() -> Any:
-    """Import submitit without its set-up of logging, which closes every handler there is, and some close their streams."""
-    name, given = "SUBMITIT_LOG_LEVEL", os.environ.get("SUBMITIT_LOG_LEVEL")
-    os.environ[name] = given or "NOCONFIG"
+def import_submitit() -> Any:
+    """Import submitit without its set-up of logging, which closes all existing handlers, some with their streams."""
+    name, level = "SUBMITIT_LOG_LEVEL", os.environ.get("SUBMITIT_LOG_LEVEL")
+    os.environ[name] = level or "NOCONFIG"
     try:
         return importlib.import_module("submitit")
     finally:
-        if given is None:
+        if level is None:
             del os.environ[name]
 
 
 class SlurmLauncher:
-    """Jobs by submitit; timed ones run one after the other, each with a node to itself, all on one kind of machine."""
+    """Runs jobs through submitit; timed jobs run one after another, each on a whole node, all on one kind of machine."""
 
     def __init__(self, experiment: Experiment, timed: bool, kind: str) -> None:
         try:
-            submitit = _imported()
+            submitit = import_submitit()
         except ImportError as error:
-            raise jobs.unavailable("slurm", error) from None
+            raise unavailable("slurm", error) from None
         self._submitit, self._experiment, self._timed, self._kind = submitit, experiment, timed, kind
         self._settings = experiment.execution.cluster
         self._folder = experiment.directory.absolute() / "jobs"
-        self._sent: list[tuple[Any, list[Task]]] = []
-        self._losses: dict[int, int] = {}
+        self._jobs: list[tuple[Any, list[Task]]] = []
+        self._losses = Losses(MAX_LOSSES)
 
     def __enter__(self) -> SlurmLauncher:
         cluster = self._settings["cluster"]
@@ -59,119 +60,110 @@ class SlurmLauncher:
             self._executor = self._submitit.AutoExecutor(folder=self._folder, cluster=cluster)
             self._executor.update_parameters(**parameters(self._experiment, self._timed, cluster))
         except (RuntimeError, ValueError, NameError) as error:
-            raise UserError(f"launcher=slurm cannot send jobs: {printable(error)}") from None
-        self._packed = jobs.packed(self._experiment)
+            raise UserError(f"launcher=slurm cannot submit jobs: {printable(error)}") from None
+        self._packed = pack(self._experiment)
         return self
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        for job, _ in self._sent:
+        for job, _ in self._jobs:
             with suppress(Exception):
                 job.cancel()
-        self._sent.clear()
-        if error is None:  # what is needed to look into a failure stays
+        self._jobs.clear()
+        if error is None:  # after a failure the output of the jobs is kept
             shutil.rmtree(self._folder, ignore_errors=True)
 
     @property
     def current(self) -> list[Task]:
-        """The first task of some of the jobs."""
-        return [tasks[0] for _, tasks in self._sent[:4]]
+        """The first task of each of the first jobs."""
+        return [tasks[0] for _, tasks in self._jobs[:4]]
 
     def run(self, groups: Sequence[Sequence[Task]]) -> Iterator[list[Answer]]:
-        """Yield answers when a job has ended, each task once, and an empty list now and then."""
-        most = 1 if self._timed else self._settings["parallel"]
-        waiting = deque(jobs.split(groups, self._settings["cells"], most))
-        while waiting or self._sent:
-            fresh = [waiting.popleft() for _ in range(min(len(waiting), most - len(self._sent)))]
-            self._send(fresh)
-            yield [answer for sent in list(self._sent) for answer in self._ended(sent, waiting)]
+        """Yield answers when a job has ended, each task once, and an empty list every now and then."""
+        n_jobs = 1 if self._timed else self._settings["parallel"]
+        waiting = deque(split(groups, self._settings["cells"], n_jobs))
+        while waiting or self._jobs:
+            self._submit([waiting.popleft() for _ in range(min(len(waiting), n_jobs - len(self._jobs)))])
+            yield [answer for job, tasks in list(self._jobs) for answer in self._collect(job, tasks, waiting)]
 
-    def _send(self, parts: list[list[Task]]) -> None:
-        if not parts:
+    def _submit(self, chunks: list[list[Task]]) -> None:
+        if not chunks:
             return
-        made = [
-            jobs.Job(
+        descriptions = [
+            Job(
                 self._experiment.plugins, self._packed, pickle.dumps(tasks), self._timed, self._kind,
                 self._settings["cpus"], stores=True,
-            ) for tasks in parts
+            ) for tasks in chunks
         ]  # fmt: skip
         try:
-            with self._executor.batch():  # one array of jobs, which a scheduler likes better than many jobs
-                sent = [self._executor.submit(_all, job) for job in made]
+            with self._executor.batch():  # one array of jobs, which a scheduler handles better than many jobs
+                jobs = [self._executor.submit(_run_job, description) for description in descriptions]
         except Exception as error:
-            raise UserError(f"the cluster takes no jobs: {printable(error)[:300]}") from None
-        self._sent += list(zip(sent, parts, strict=True))
+            raise UserError(f"the cluster accepts no jobs: {printable(error)[:300]}") from None
+        self._jobs += list(zip(jobs, chunks, strict=True))
 
-    def _ended(self, sent: tuple[Any, list[Task]], waiting: deque[list[Task]]) -> list[Answer]:
-        job, tasks = sent
+    def _collect(self, job: Any, tasks: list[Task], waiting: deque[list[Task]]) -> list[Answer]:
+        """Return the answers of a job that has ended, none of one that runs; a lost job's tasks are sent again."""
         if not job.done():
-            time.sleep(TICK / max(1, len(self._sent)))
+            # each pass over all jobs takes one tick
+            time.sleep(TICK / max(1, len(self._jobs)))
             return []
-        self._sent.remove(sent)
+        self._jobs.remove((job, tasks))
         try:
-            said = job.result()
+            messages = job.result()
         except self._submitit.core.utils.FailedJobError as error:
             raise UserError(f"a job failed, its output is in '{self._folder}': {printable(error)[-300:]}") from None
-        except Exception as error:  # the node is lost, or its time was over
-            return self._again(tasks, waiting, printable(error)[:200])
-        found = []
-        for place, one in said:
-            found.append(jobs.answer(tasks[place], one, self._kind))
-            self._kind = self._kind or one["machine"]
-        return found
+        except Exception as error:  # the node is lost, or the job has reached its time limit
+            return self._requeue(tasks, waiting, printable(error)[:200])
+        answers = []
+        for index, message in messages:
+            answers.append(read_message(tasks[index], message, self._kind))
+            self._kind = self._kind or message["machine"]
+        return answers
 
-    def _again(self, tasks: list[Task], waiting: deque[list[Task]], why: str) -> list[Answer]:
-        """Send what a lost job has not stored once more; after that its first task is blamed."""
-        from bench.run.store import Store
-
-        rows = Store(self._experiment.directory, self._experiment.columns, self._experiment.study.name).load()
-        held = {row["key"]: row for row in rows.to_dict("records")}
-        found, left = [], []
+    def _requeue(self, tasks: list[Task], waiting: deque[list[Task]], reason: str) -> list[Answer]:
+        """Return the rows that a lost job has stored as answers, and send its other tasks again."""
+        table = Store(self._experiment.directory, self._experiment.columns, self._experiment.study.name).load()
+        rows = {row["key"]: row for row in table.to_dict("records")}
+        answers, unanswered = [], []
         for task in tasks:
-            row = None if task.reference else held.get(task.cell.key)
+            row = None if task.reference else rows.get(task.cell.key)
             if row is None:
-                left.append(task)
+                unanswered.append(task)
             else:
-                found.append(Answer(task, {**row}, float(row["wall_s"]), "", row["machine"], stored=True))
-        if left:
-            self._losses[id(left[0])] = self._losses.get(id(left[0]), 0) + 1
-            if self._losses[id(left[0])] >= LOST:
-                reason = f"its job was lost {LOST} times while it was at work: {why}"
-                found.append(Answer(left.pop(0), {"status": "crashed", "reason": reason}, 0.0))
-        if left:
-            waiting.appendleft(left)
-        return found
+                answers.append(Answer(task, {**row}, float(row["wall_s"]), "", row["machine"], stored=True))
+        return answers + self._losses.requeue(unanswered, waiting, reason)
 
 
 def parameters(experiment: Experiment, timed: bool, cluster: str = "slurm") -> dict[str, Any]:
-    """Return what submitit is asked for: time for all cells of a job, cores, memory, and an own node for timed cells."""
-    given = experiment.execution.cluster
+    """Return the parameters of a job for submitit: minutes, cores, memory, and a whole node if cells are timed."""
+    settings = experiment.execution.cluster
     memory = experiment.execution.memory
-    asked: dict[str, Any] = {
-        "name": "bench-" + experiment.name, "timeout_min": given["minutes"], "cpus_per_task": given["cpus"],
+    request: dict[str, Any] = {
+        "name": "bench-" + experiment.name, "timeout_min": settings["minutes"], "cpus_per_task": settings["cpus"],
     }  # fmt: skip
     if cluster != "slurm":
-        return asked
+        return request
     if memory is not None:
-        asked["mem_gb"] = math.ceil(1.25 * given["cpus"] * memory / 2**30)
-    asked["slurm_array_parallelism"] = 1 if timed else given["parallel"]
-    asked["slurm_setup"] = [f"export PYTHONPATH={shlex.quote(jobs.import_path())}"]
-    more = {name: given[name] for name in ("partition", "constraint", "account", "qos") if given[name]}
-    return (
-        asked | {f"slurm_{name}": value for name, value in more.items()} | ({"slurm_exclusive": True} if timed else {})
-    )
+        request["mem_gb"] = math.ceil(1.25 * settings["cpus"] * memory / 2**30)
+    request["slurm_array_parallelism"] = 1 if timed else settings["parallel"]
+    request["slurm_setup"] = [f"export PYTHONPATH={shlex.quote(import_path())}"]
+    request |= {
+        f"slurm_{name}": settings[name] for name in ("partition", "constraint", "account", "qos") if settings[name]
+    }
+    return request | ({"slurm_exclusive": True} if timed else {})
 
 
 def script(experiment: Experiment) -> str:
-    """Return the job script that would be sent; raises :class:`UserError` where submitit is not there."""
+    """Return the script of a job; raises :class:`UserError` if submitit is not installed."""
     try:
-        _imported()
+        import_submitit()
         from submitit.slurm.slurm import SlurmExecutor, _make_sbatch_string
     except ImportError as error:
-        raise jobs.unavailable("slurm", error) from None
+        raise unavailable("slurm", error) from None
     folder = experiment.directory.absolute() / "jobs"
-    asked = parameters(experiment, experiment.timing)
+    request = parameters(experiment, experiment.timing)
     names = {"name": "job_name", "timeout_min": "time", "mem_gb": "mem"}
-    given = {names.get(name, name.removeprefix("slurm_")): value for name, value in asked.items()}
+    given = {names.get(name, name.removeprefix("slurm_")): value for name, value in request.items()}
     if "mem" in given:
         given["mem"] = f"{given['mem']}GB"
     command = f"{shlex.quote(sys.executable)} -u -m submitit.core._submit {shlex.quote(str(folder))}"
@@ -183,5 +175,5 @@ def script(experiment: Experiment) -> str:
     return str(_make_sbatch_string(command=command, folder=Path(folder), **given))
 
 
-def _all(job: jobs.Job) -> list[tuple[int, dict[str, Any]]]:
-    return list(jobs.answers(job))
+def _run_job(job: Job) -> list[tuple[int, dict[str, Any]]]:
+    return list(run_job(job))

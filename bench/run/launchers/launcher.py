@@ -1,0 +1,93 @@
+"""The contract of a launcher, which runs tasks somewhere, and the launchers of this machine."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from types import TracebackType
+from typing import Any, Protocol
+
+from bench.experiment.experiment import Experiment
+from bench.run.pool import Answer, Pool, ResourceLimits
+from bench.run.tasks import FAILED, Task, TaskHandler
+
+BATCH_S = 0.05
+"""Seconds of work in this process whose answers are stored together: syncing a file takes longer than a small cell."""
+
+
+class Launcher(Protocol):
+    """Runs groups of tasks: a context manager that leaves nothing running."""
+
+    def __enter__(self) -> Launcher: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> Any: ...
+
+    def run(self, groups: Sequence[Sequence[Task]]) -> Iterator[list[Answer]]:
+        """Yield answers as they arrive, each task once, and an empty list every now and then.
+
+        The tasks of a group share what is compiled, and go to one worker unless another one is idle.
+        """
+
+    @property
+    def current(self) -> list[Task]:
+        """The tasks being worked on."""
+
+
+class InProcessLauncher:
+    """Runs tasks in this process, without limits on time and memory, for debugging."""
+
+    def __init__(self, handle: TaskHandler) -> None:
+        self._handle = handle
+        self.current: list[Task] = []
+
+    def __enter__(self) -> InProcessLauncher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+    def run(self, groups: Iterable[Iterable[Task]]) -> Iterator[list[Answer]]:
+        """Yield answers, those of quick tasks together."""
+        answers: list[Answer] = []
+        since = time.perf_counter()
+        for task in itertools.chain.from_iterable(groups):
+            self.current = [task]
+            yield []
+            started = time.perf_counter()
+            try:
+                answers.append(Answer(task, self._handle(task), time.perf_counter() - started))
+            except BaseException:
+                yield answers  # the caller stores them before the error arrives
+                raise
+            if time.perf_counter() - since > BATCH_S or answers[-1].result["status"] in FAILED:
+                yield answers
+                answers, since = [], time.perf_counter()
+        if answers:
+            yield answers
+
+
+def local_launcher(experiment: Experiment, timed: bool = False, n_workers: int | None = None) -> Launcher:
+    """Return a launcher that uses processes of this machine, or only this process if there are 0 workers.
+
+    ``n_workers`` replaces the experiment's own setting. Timed tasks run one at a time and may use all cores.
+    """
+    rules = experiment.execution
+    workers = rules.workers if n_workers is None else n_workers
+    workers = (os.cpu_count() or 1) if workers is None else workers
+    if not workers:
+        return InProcessLauncher(TaskHandler(experiment))
+    limits = ResourceLimits(rules.timeout, rules.memory)
+    return Pool(
+        1 if timed else workers, TaskHandler, without_grid(experiment), limits,
+        single_thread=not timed, folders=experiment.plugins,
+    )  # fmt: skip
+
+
+def without_grid(experiment: Experiment) -> Experiment:
+    """Return the experiment without its grid, which workers do not need since tasks contain their plugins."""
+    return replace(experiment, choices={}, values={}, sweep={}, marks={})
