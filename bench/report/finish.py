@@ -9,6 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from bench.errors import UserError, printable
+from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.model import guard
@@ -24,7 +25,7 @@ def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, list
     """Write the files of a run (the record first); returns its rows in the order of its cells, and the files."""
     keys = finished.keys
     rows = finished.store.load()
-    rows = ordered(rows[rows["key"].isin(keys)], keys)
+    rows = completed_rows(ordered(rows[rows["key"].isin(keys)], keys))
     simulated = any(item.runs for item in finished.planned)
     path = record(finished.experiment, rows, list(words), finished.seconds, simulated)
     return rows, [*write(finished.experiment, rows), path]
