@@ -54,14 +54,14 @@ def values_of(axis: Axis, rows: pd.DataFrame) -> np.ndarray:
     import pandas as pd
 
     if axis.column in COUNTS:
-        return rows[axis.column].to_numpy(float)
+        return np.asarray(rows[axis.column], dtype=float)
     table = flatten(rows)
     values = pd.Series(np.nan, index=range(len(rows)))
     for name in axis.names:
         for column, mask in swept_columns(name, table).items():
             numbers = table[column].map(as_number) if table[column].dtype == object else table[column]
             values = values.fillna(numbers.where(mask).reset_index(drop=True))
-    return values.to_numpy(float)
+    return np.asarray(values, dtype=float)
 
 
 def shown_by(view: str, axis: Axis, rows: pd.DataFrame) -> np.ndarray:
@@ -103,7 +103,7 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
         groups.setdefault(short(name), []).append(name)
     result = []
     for own_name, members in groups.items():
-        clash = len(members) > 1 and bool((sum(_has_value(name, table) for name in members) > 1).any())
+        clash = bool((np.sum([_has_value(name, table) for name in members], axis=0) > 1).any())
         for part in [[name] for name in members] if clash else [members]:
             column = part[0] if clash else own_name
             axis = Axis(column, tuple(part), *_meaning(part, table))
@@ -121,7 +121,7 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
 
 
 def _has_value(name: str, table: pd.DataFrame) -> np.ndarray:
-    """Return, per row of flattened parameters, 1 where a name in the sweep has a value, else 0."""
+    """Return, per row of flattened parameters, 1 where a name in the sweep has a value and 0 elsewhere."""
     import numpy as np
 
     values = [mask & table[column].notna() for column, mask in swept_columns(name, table).items()]

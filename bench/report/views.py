@@ -182,7 +182,7 @@ class _Run:
 
     @cached_property
     def numbers(self) -> np.ndarray:
-        return self.rows[["rmse", "variance", "bias_high", "bias"]].to_numpy(dtype=float)
+        return np.asarray(self.rows[["rmse", "variance", "bias_high", "bias"]], dtype=float)
 
 
 def _agree(a: _Run, b: _Run, tolerance: float) -> bool:
@@ -200,7 +200,7 @@ def pareto(time: pd.Series, error: pd.Series) -> np.ndarray:
     """Return a mask of the points for which no other is smaller in both."""
     points = pd.DataFrame({"time": time.to_numpy(), "error": error.to_numpy()})
     best = points.groupby("time")["error"].min().cummin().shift(fill_value=math.inf)
-    return (points["error"] <= points["time"].map(best)).to_numpy()
+    return np.asarray(points["error"] <= points["time"].map(best))
 
 
 def unsteady(rows: Any) -> Any:

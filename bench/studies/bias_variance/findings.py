@@ -44,7 +44,7 @@ def lowest(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, floa
     """Return the lowest error at each ``x`` where there is one, in increasing order."""
     rows = pd.concat([line.rows for line in curves])
     good = rows[(rows["status"] == "ok") & np.isfinite(rows[error])]
-    return good.groupby(level=0)[error].min().to_dict()
+    return {float(x): float(low) for x, low in good.groupby(level=0)[error].min().items()}
 
 
 def winners(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, list[str]]:
