@@ -14,7 +14,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.model import guard
 from bench.report import averages, web
-from bench.report.cores import spread
+from bench.report.cores import run_tasks
 from bench.report.views import latest
 from bench.run.execute import Finished, store_of
 from bench.run.record import record
@@ -43,7 +43,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
     with guard.quiet("a plugin"), guard.guarded():  # the commands that repeat a cell are made from its plugins
         works = (study_of(experiment).write, _page, averages.write)
-        return [path for paths in spread([partial(work, experiment, rows) for work in works]) for path in paths]
+        return [path for paths in run_tasks([partial(work, experiment, rows) for work in works]) for path in paths]
 
 
 def _page(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from bench.experiment.axes import Axis
 from bench.experiment.experiment import Experiment
 from bench.model import SURROGATE, registry
-from bench.report.cores import spread
+from bench.report.cores import run_tasks
 from bench.report.figures import save, styled
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.style import Look, plain, symbol
@@ -47,7 +47,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
             return save(made, experiment.directory / name, experiment.formats)
 
     works = [partial(drawn, name, figure) for name, figure in drawings(experiment, rows).items()]
-    return [path for paths in spread(works) for path in paths]
+    return [path for paths in run_tasks(works) for path in paths]
 
 
 def file_name(axis: Axis, kind: str = "bias_variance") -> str:
