@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from bench.errors import UserError
 from bench.experiment.cell import labels
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, THETA, applies, expand, is_theta_axis, parameter_name, swept
+from bench.experiment.parameters import NOT_PLUGINS, as_number, flatten, swept_columns
+from bench.experiment.parameters import parsed as parsed
 from bench.model import Plugin, registry
 from bench.model.parameters import Parameter, build, parameters
 
@@ -19,13 +21,10 @@ if TYPE_CHECKING:
     import numpy as np
     import pandas as pd
 
-NOT_PARTS = ("study", "theta", "reference")
-"""Entries of a row's parameters that are not a plugin on an axis."""
-
 
 @dataclass(frozen=True)
 class Axis:
-    """One swept quantity: the column that holds it, what it means, and which names in the sweep it gathers.
+    """One swept quantity: the column that holds it, its meaning, and the names in the sweep that it gathers.
 
     Names that mean the same parameter of different plugins (``mass_spring.damping``, ``penalty.damping``) are one axis.
     """
@@ -49,79 +48,43 @@ class Axis:
         return f"{self.column}{unit}" + (f", with {', '.join(self.moves)}" if self.moves else "")
 
 
-def parsed(rows: pd.DataFrame) -> list[Mapping[str, Any]]:
-    """Return the parameters of each row; empty where a row has none."""
-    return [_parsed(text) for text in rows["parameters"]] if "parameters" in rows else [{} for _ in range(len(rows))]
-
-
-@lru_cache(maxsize=20_000)
-def _parsed(text: str) -> Mapping[str, Any]:
-    given: Mapping[str, Any] = json.loads(text) if text else {}
-    return given
-
-
-def value_of(name: str, given: Mapping[str, Any]) -> Any:
-    """Return the value that a row's parameters give to a name in a sweep; None if it applies to none of its plugins."""
-    if is_theta_axis(name):
-        return _coordinate(name, (given.get("theta") or {}).get("at") or ())
-    for group, part in given.items():
-        if _is_part(group, part):
-            parameter = applies(name, registry.kind_of(group), part["name"], part)
-            if parameter is not None and parameter != "name":
-                return part[parameter]
-    return None
-
-
-def _coordinate(name: str, at: Sequence[float]) -> float | None:
-    """Return a coordinate of theta0; of ``theta0`` itself the only one, None where it has several."""
-    _, dot, coordinate = name.partition(".")
-    if not dot:
-        return at[0] if len(at) == 1 else None
-    return at[int(coordinate)] if int(coordinate) < len(at) else None
-
-
 def values_of(axis: Axis, rows: pd.DataFrame) -> np.ndarray:
-    """Return the numbers of an axis, NaN where it does not apply or is not a number."""
+    """Return the numbers of an axis, one per row; NaN where it does not apply or is not a number."""
     import numpy as np
+    import pandas as pd
 
     if axis.column in COUNTS:
-        return rows[axis.column].to_numpy(float)
-    cache: dict[int, float] = {}
-
-    def number(given: Mapping[str, Any]) -> float:
-        if id(given) not in cache:
-            values = (value_of(name, given) for name in axis.names)
-            cache[id(given)] = next((_number(value) for value in values if value is not None), np.nan)
-        return cache[id(given)]
-
-    return np.array([number(given) for given in parsed(rows)], dtype=float)
+        return np.asarray(rows[axis.column], dtype=float)
+    table = flatten(rows)
+    values = pd.Series(np.nan, index=range(len(rows)))
+    for name in axis.names:
+        for column, mask in swept_columns(name, table).items():
+            numbers = table[column].map(as_number) if table[column].dtype == object else table[column]
+            values = values.fillna(numbers.where(mask).reset_index(drop=True))
+    return np.asarray(values, dtype=float)
 
 
 def shown_by(view: str, axis: Axis, rows: pd.DataFrame) -> np.ndarray:
-    """Return, per row, whether ``stiffness`` or ``smoothing`` is this very axis: a parameter of its contact law."""
+    """Return, per row, whether the column ``stiffness`` or ``smoothing`` shows an axis: a parameter of its contact law."""
     import numpy as np
 
-    cache: dict[int, bool] = {}
-
-    def shown(given: Mapping[str, Any]) -> bool:
-        part = given.get("contact")
-        if part is None:
-            return False
-        entry = registry.entries()["contacts"].get(part["name"])
-        parameter = view if view != "smoothing" else getattr(entry and entry.plugin, "smoothing", "")
-        return bool(parameter) and any(
-            applies(name, "contacts", part["name"], part) == parameter for name in axis.names
-        )
-
-    return np.array(
-        [cache[id(g)] if id(g) in cache else cache.setdefault(id(g), shown(g)) for g in parsed(rows)], dtype=bool
-    )
+    table = flatten(rows)
+    shown = np.zeros(len(rows), dtype=bool)
+    for name in axis.names:
+        for column, mask in swept_columns(name, table).items():
+            group, _, parameter = column.partition(".")
+            if group == "contact":
+                of_law = {
+                    law: smoothing_of(law) if view == "smoothing" else view for law in table["contact.name"].dropna()
+                }
+                shown |= (mask & (table["contact.name"].map(of_law) == parameter)).to_numpy(bool)
+    return shown
 
 
-def _number(value: Any) -> float:
-    if isinstance(value, str):
-        return float(value) if value in ("inf", "-inf") else float("nan")
-    return float("nan") if isinstance(value, bool) else float(value)
+def smoothing_of(law: str) -> str:
+    """Return the parameter that the column ``smoothing`` shows for a contact law; empty if there is none."""
+    entry = registry.entries()["contacts"].get(law)
+    return str(getattr(entry and entry.plugin, "smoothing", ""))
 
 
 def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
@@ -132,38 +95,45 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
     """
     import numpy as np
 
-    given = list({id(one): one for one in parsed(rows)}.values())
-    coordinates = _moved(given) if THETA in swept(sweep) else ()
+    table = flatten(rows).drop_duplicates()
+    coordinates = _moved(table) if THETA in swept(sweep) else ()
     names = [part for name in swept(sweep) for part in (coordinates if name == THETA else (name,))]
     groups: dict[str, list[str]] = {}
     for name in names:
         groups.setdefault(parameter_name(name), []).append(name)
     result = []
     for own_name, members in groups.items():
-        clash = any(sum(value_of(name, one) is not None for name in members) > 1 for one in given)
+        clash = bool((np.sum([_has_value(name, table) for name in members], axis=0) > 1).any())
         for part in [[name] for name in members] if clash else [members]:
             column = part[0] if clash else own_name
-            axis = Axis(column, tuple(part), *_meaning(part, given))
+            axis = Axis(column, tuple(part), *_meaning(part, table))
             values = values_of(axis, rows)
-            own = np.isfinite(values)
-            if not own.any():
+            is_known = np.isfinite(values)
+            if not is_known.any():
                 continue
             if not clash and column in rows and column not in COUNTS:
                 shown = np.asarray(rows[column], dtype=float)
-                if not np.array_equal(shown[own], values[own]):
+                if not np.array_equal(shown[is_known], values[is_known]):
                     axis = Axis(part[0] if "." in part[0] else f"swept.{own_name}", axis.names, axis.unit, axis.doc)
             result.append(axis)
     together = [*_together(sweep), *([frozenset(coordinates)] if len(coordinates) > 1 else [])]
     return [Axis(axis.column, axis.names, axis.unit, axis.doc, _moving(axis, result, together)) for axis in result]
 
 
-def _moved(given: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+def _has_value(name: str, table: pd.DataFrame) -> np.ndarray:
+    """Return, per row of flattened parameters, 1 where a name in the sweep has a value and 0 elsewhere."""
+    import numpy as np
+
+    values = [mask & table[column].notna() for column, mask in swept_columns(name, table).items()]
+    return np.any(values, axis=0).astype(int) if values else np.zeros(len(table), dtype=int)
+
+
+def _moved(table: pd.DataFrame) -> tuple[str, ...]:
     """Return the names of theta0's coordinates that differ between rows; ``theta0`` where it has but one."""
-    thetas = [tuple(at) for one in given if (at := (one.get("theta") or {}).get("at"))]
-    longest = max(map(len, thetas), default=1)
-    if longest == 1:
+    coordinates = [column for column in table if is_theta_axis(column)]
+    if len(coordinates) < 2:
         return (THETA,)
-    return tuple(f"{THETA}.{i}" for i in range(longest) if len({at[i] for at in thetas if i < len(at)}) > 1)
+    return tuple(column for column in coordinates if table[column].nunique() > 1)
 
 
 def _moving(axis: Axis, found: Sequence[Axis], together: Sequence[frozenset[str]]) -> tuple[str, ...]:
@@ -184,22 +154,17 @@ def _together(sweep: Mapping[str, Any]) -> list[frozenset[str]]:
     return groups
 
 
-def _meaning(names: Iterable[str], given: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
-    """Return unit and meaning of a parameter, as its plugin declares them."""
-    plugins = {(group, part["name"]): None for one in given for group, part in one.items() if _is_part(group, part)}
+def _meaning(names: Iterable[str], table: pd.DataFrame) -> tuple[str, str]:
+    """Return unit and meaning of a parameter, as its plugins declare them; empty where their units differ."""
     meanings = {}
     for name in names:
-        for group, plugin in plugins:
-            kind = registry.kind_of(group)
-            declared = declared_parameters(kind, plugin)
-            if (parameter := applies(name, kind, plugin, declared)) is not None:
-                meanings[declared[parameter].unit] = declared[parameter].doc
-    # a unit that differs between scenes cannot stand on a common axis
+        for column, mask in swept_columns(name, table).items():
+            axis, _, parameter = column.partition(".")
+            for plugin in table.loc[mask, f"{axis}.name"].unique() if f"{axis}.name" in table else ():
+                declared = declared_parameters(registry.kind_of(axis), plugin).get(parameter)
+                if declared is not None:
+                    meanings[declared.unit] = declared.doc
     return next(iter(meanings.items())) if len(meanings) == 1 else ("", "")
-
-
-def _is_part(group: str, part: Any) -> bool:
-    return group not in NOT_PARTS and part is not None
 
 
 def declared_parameters(kind: str, name: str) -> Mapping[str, Parameter]:
@@ -218,7 +183,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     extra = [axis.column for axis in axes(experiment.sweep, rows) if axis.column not in rows]
     wide = with_axes(experiment, rows)
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
-    texts = [name for name in experiment.columns.of_kind("text") if name in wide]
+    texts = [name for name in experiment.columns.named("text") if name in wide]
     return wide.assign(**{name: wide[name].map(_harmless) for name in texts})
 
 
@@ -231,7 +196,7 @@ def revived(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
     """Build the plugins described by a row's parameters, by axis; raises :class:`UserError` if one is not installed."""
     parts: dict[str, Plugin | None] = {}
     for axis, part in given.items():
-        if axis in NOT_PARTS:
+        if axis in NOT_PLUGINS:
             continue
         values = {} if part is None else {name: value for name, value in part.items() if name != "name"}
         parts[axis] = None if part is None else build(registry.usable(registry.kind_of(axis), part["name"]), values)
@@ -239,21 +204,17 @@ def revived(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
 
 
 def relabelled(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
-    """Drop from rows' identity strings the parameters shown as columns of swept axes; unknown plugins keep theirs."""
+    """Return rows whose identity strings omit the parameters of swept axes, which have columns of their own.
+
+    Rows whose plugins are not installed keep their identity strings.
+    """
     names = [name for axis in axes for name in axis.names]
-    known: dict[str, dict[str, str]] = {}
-
-    def read(some: Mapping[str, Any]) -> dict[str, str]:
-        text = repr(some)
-        if text not in known:
-            known[text] = _labels(some, names)
-        return known[text]
-
+    read = cache(lambda text: _labels(json.loads(text), names))
     lines = []
     for given in parsed(rows):
-        estimator = {group: part for group, part in given.items() if group == "estimator"}
-        problem = {group: part for group, part in given.items() if group != "estimator"}
-        lines.append(read(problem) | read(estimator))
+        estimator = {axis: part for axis, part in given.items() if axis == "estimator"}
+        problem = {axis: part for axis, part in given.items() if axis != "estimator"}
+        lines.append(read(json.dumps(problem)) | read(json.dumps(estimator)))
     changed = {name for line in lines for name in line}
     return rows.assign(
         **{name: [line.get(name, old) for line, old in zip(lines, rows[name], strict=True)] for name in changed}
@@ -261,11 +222,11 @@ def relabelled(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
 
 
 def _labels(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, str]:
-    hidden: dict[str, set[str]] = {}
-    for group, part in given.items():
-        if _is_part(group, part):
-            taken = {applies(name, registry.kind_of(group), part["name"], part) for name in names}
-            hidden[group] = {parameter for parameter in taken if parameter is not None}
+    hidden = {
+        axis: {parameter for name in names if (parameter := applies(name, registry.kind_of(axis), part["name"], part))}
+        for axis, part in given.items()
+        if axis not in NOT_PLUGINS and part is not None
+    }
     if not any(hidden.values()):
         return {}
     try:

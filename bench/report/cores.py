@@ -1,110 +1,92 @@
-"""Does several pieces of work on several cores, in forked copies of this process that share what it has read."""
+"""Runs tasks on several cores, in forked processes that share what this process has read."""
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import gc
+import multiprocessing
 import os
 import pickle
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from functools import partial
 from typing import Any, TypeVar
 
 from bench.model import blocks
 
 UNSAFE = ("jaxlib", "torch._C")
-"""Modules whose threads do not survive in a copy."""
+"""Modules whose threads do not survive a fork."""
 T = TypeVar("T")
+_tasks: Sequence[Callable[[], Any]] = ()
+"""The tasks of the pool that is being started: workers inherit them, since functions of functions cannot be pickled."""
 
 
-def spread(works: Sequence[Callable[[], T]]) -> list[T]:
-    """Return the results of all works, in their order; this process and its copies take turns.
+def run_tasks(tasks: Sequence[Callable[[], T]]) -> list[T]:
+    """Run tasks in forked processes and return their results in order.
 
-    Raises the error of the first work, in their order, that failed. What a copy leaves undone, since it was killed, is
-    done here. One core does it all where copies are not safe: elsewhere than on Linux, beside other threads of Python or
-    those of ``UNSAFE``.
+    Re-raises the first task error, in task order. Tasks of a killed process are rerun in this one, and so are tasks whose
+    result cannot be pickled. All tasks run in this process where a fork is not safe: elsewhere than on Linux, beside other
+    Python threads, and after modules of :data:`UNSAFE` were imported.
     """
-    helpers = min(blocks.cores(), len(works)) - 1
-    if helpers < 1 or not _safe():
-        return [work() for work in works]
-    turns = [range(first, len(works), helpers + 1) for first in range(helpers + 1)]
-    copies: list[tuple[int, int]] = []
-    gc.freeze()  # or the first collection in a copy would copy every page
-    try:
-        for places in turns[1:]:
-            copies.append(_copy(works, places, copies))
-        done = _take(works, turns[0])
-        for _, answers in copies:
-            done |= _read(answers)
-    finally:
-        gc.unfreeze()
-        for process, answers in copies:
-            os.close(answers)
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process, signal.SIGKILL)
-            with contextlib.suppress(ChildProcessError):
-                os.waitpid(process, 0)
-    results = [done[place] if place in done else (work(), None) for place, work in enumerate(works)]
-    for _, error in results:
+    n_workers = min(blocks.cores(), len(tasks))
+    is_safe = threading.active_count() == 1 and not any(name in sys.modules for name in UNSAFE)
+    if n_workers < 2 or not is_safe or sys.platform != "linux":
+        return [task() for task in tasks]
+    results = []
+    for task, future in zip(tasks, _finished(tasks, n_workers), strict=True):
+        try:
+            result, error = pickle.loads(future.result())
+        except (Exception, SystemExit):  # the worker ended, or result or error cannot be pickled
+            result, error = task(), None
         if error is not None:
             raise error
-    return [result for result, _ in results]
+        results.append(result)
+    return results
 
 
-def _safe() -> bool:
-    alone = threading.active_count() == 1 and not any(name in sys.modules for name in UNSAFE)
-    return alone and sys.platform == "linux"
-
-
-def _take(works: Sequence[Callable[[], Any]], places: Iterable[int]) -> dict[int, tuple[Any, Exception | None]]:
-    """Do the works at some places; returns result and error of each by its place."""
-    done: dict[int, tuple[Any, Exception | None]] = {}
-    for place in places:
-        try:
-            done[place] = (works[place](), None)
-        except Exception as error:
-            done[place] = (None, error)
-    return done
-
-
-def _copy(
-    works: Sequence[Callable[[], Any]], places: Iterable[int], others: Sequence[tuple[int, int]]
-) -> tuple[int, int]:
-    """Fork a copy that does the works at some places; returns its number and the pipe that its results come through."""
-    answers, results = os.pipe()
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
-    parent = os.getpid()
-    with warnings.catch_warnings():
-        # newer Pythons warn of threads of any library; those that do not survive are in UNSAFE
-        warnings.simplefilter("ignore", DeprecationWarning)
-        process = os.fork()
-    if process:
-        os.close(results)
-        return process, answers
+def _finished(tasks: Sequence[Callable[[], Any]], n_workers: int) -> list[Future[bytes]]:
+    """Return the futures of all tasks once they are done; kills the workers if it is interrupted."""
+    global _tasks
+    others = set(multiprocessing.active_children())
+    start = partial(_start_worker, os.getpid())
+    outer, _tasks = _tasks, tasks
+    gc.freeze()  # or the first collection in a worker would copy every page
     try:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # this process's parent ends it
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        for inherited in (answers, *(pipe for _, pipe in others)):
-            os.close(inherited)
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: it ends with its parent
-        if os.getppid() == parent:
-            content = pickle.dumps(_take(works, places))
-            with os.fdopen(results, "wb") as out:
-                out.write(content)
+        pool = ProcessPoolExecutor(n_workers, multiprocessing.get_context("fork"), start)
+        with pool, warnings.catch_warnings():
+            # newer Pythons warn of threads of any library; those that do not survive a fork are in UNSAFE
+            warnings.simplefilter("ignore", DeprecationWarning)
+            try:
+                futures = [pool.submit(_run, place) for place in range(len(tasks))]
+                for future in futures:
+                    future.exception()
+            except BaseException:
+                for worker in set(multiprocessing.active_children()) - others:
+                    worker.kill()
+                raise
     finally:
-        os._exit(0)  # what failed here is done again there
+        _tasks = outer
+        gc.unfreeze()
+    return futures
 
 
-def _read(answers: int) -> dict[int, tuple[Any, Exception | None]]:
-    with os.fdopen(os.dup(answers), "rb") as pipe:
-        content = pipe.read()
+def _start_worker(parent: int) -> None:
+    """Let the parent process alone handle interrupts, and end this process with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def _run(place: int) -> bytes:
+    """Run a task and return its result and its error, pickled."""
     try:
-        found: dict[int, tuple[Any, Exception | None]] = pickle.loads(content)
-    except Exception:  # it was cut off, or an error cannot be pickled
-        return {}
-    return found
+        outcome = (_tasks[place](), None)
+    except Exception as error:
+        outcome = (None, error)
+    return pickle.dumps(outcome)

@@ -9,11 +9,12 @@ from pathlib import Path
 import pandas as pd
 
 from bench.errors import UserError, printable
+from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.model import guard
 from bench.report import averages, web
-from bench.report.cores import spread
+from bench.report.cores import run_tasks
 from bench.report.views import latest
 from bench.run.execute import Finished, store_of
 from bench.run.record import record
@@ -24,7 +25,7 @@ def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, list
     """Write the files of a run (the record first); returns its rows in the order of its cells, and the files."""
     keys = finished.keys
     rows = finished.store.load()
-    rows = sort_rows(rows[rows["key"].isin(keys)], keys)
+    rows = completed_rows(sort_rows(rows[rows["key"].isin(keys)], keys))
     simulated = any(item.runs for item in finished.planned)
     path = record(finished.experiment, rows, list(words), finished.seconds, simulated)
     return rows, [*write(finished.experiment, rows), path]
@@ -43,7 +44,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     # the commands that repeat a cell are built from its plugins
     with guard.capture_output("a plugin"), guard.protect_process():
         works = (study_of(experiment).write, _page, averages.write)
-        return [path for paths in spread([partial(work, experiment, rows) for work in works]) for path in paths]
+        return [path for paths in run_tasks([partial(work, experiment, rows) for work in works]) for path in paths]
 
 
 def _page(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:

@@ -13,8 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from bench.report.problems import ProblemRows
 from bench.report.style import inches, plain, quantity, wrapped
-from bench.report.views import CATEGORIES, Family
+from bench.report.views import CATEGORIES
 
 WIDTH, NARROW = 7.16, 3.5
 """Inches of two columns of a paper and of one (for a single panel): fonts are printed at the size given."""
@@ -31,7 +32,7 @@ def columns(count: int, most: int) -> int:
 
 
 def page(
-    problems: Sequence[Family],
+    problems: Sequence[ProblemRows],
     across: int,
     height: float,
     labels: Sequence[str],
@@ -96,7 +97,7 @@ def _legends(figure: SubFigure, legends: Iterable[Sequence[Any]], counts: Iterab
             )  # fmt: skip
 
 
-def _panel_titles(problems: Sequence[Family], width: float) -> list[str]:
+def _panel_titles(problems: Sequence[ProblemRows], width: float) -> list[str]:
     """Return titles that distinguish problems, all broken before their numbers if one is too long for a line."""
     parts = [_title(problem) for problem in problems]
     if all(inches(", ".join(kinds + numbers)) <= width for kinds, numbers in parts):
@@ -104,7 +105,7 @@ def _panel_titles(problems: Sequence[Family], width: float) -> list[str]:
     return ["\n".join(wrapped(part, width) for part in both if part) for both in parts]
 
 
-def _title(problem: Family) -> tuple[list[str], list[str]]:
+def _title(problem: ProblemRows) -> tuple[list[str], list[str]]:
     """Return a problem's scene, contact law and the like, and its numbers."""
     kinds = [plain(str(value)) for name, value in problem.identity.items() if name in CATEGORIES]
     numbers = [quantity(name, value) for name, value in problem.identity.items() if name not in CATEGORIES]
@@ -113,7 +114,7 @@ def _title(problem: Family) -> tuple[list[str], list[str]]:
     return kinds, numbers
 
 
-def shared(problems: Sequence[Family], axis: str) -> list[str]:
+def shared(problems: Sequence[ProblemRows], axis: str) -> list[str]:
     """Return what panels have in common and therefore leave out of their titles."""
     rows = pd.concat([problem.rows for problem in problems])
     named = {axis, *(name for problem in problems for name in problem.identity)}

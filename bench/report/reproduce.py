@@ -12,10 +12,10 @@ from typing import Any
 import pandas as pd
 
 from bench.errors import UserError
-from bench.experiment.axes import NOT_PARTS, parsed
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget, Experiment
 from bench.experiment.grid import COUNTS
+from bench.experiment.parameters import NOT_PLUGINS, parsed
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, registry
 from bench.model.identity import changed, identity
@@ -55,7 +55,7 @@ class Reviver:
         assert study is not None
         theta, budget = given["theta"], given["reference"]
         cell = Cell(
-            {axis: self._plugin(axis, part) for axis, part in given.items() if axis not in NOT_PARTS},
+            {axis: self._plugin(axis, part) for axis, part in given.items() if axis not in NOT_PLUGINS},
             **{name: int(row[name]) for name in COUNTS},
             study=study,
             decision=Decision()

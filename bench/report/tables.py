@@ -17,7 +17,7 @@ WHOLE = ("horizon", "samples", "repeats", "dim", "seed")
 def csv(table: pd.DataFrame) -> str:
     """Write a table as CSV, with every digit of every number."""
     whole = [name for name in WHOLE if name in table and (table[name].dropna() % 1 == 0).all()]
-    return table.astype(dict.fromkeys(whole, "Int64")).to_csv(index=False, lineterminator="\n")
+    return str(table.astype(dict.fromkeys(whole, "Int64")).to_csv(index=False, lineterminator="\n"))
 
 
 def plain_markdown(table: pd.DataFrame, heads: Mapping[str, str] = MappingProxyType({})) -> str:

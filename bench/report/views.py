@@ -1,13 +1,13 @@
 """Rows arranged for reading: what tables, charts and pages share.
 
 :func:`arranged` puts the swept axes into columns; then rows along one axis (:func:`along`), one problem at a time
-(:func:`split_by_problem`), and in it one line per estimator with the backends that agree merged (:func:`lines`).
+(:mod:`bench.report.problems`), and in it one line per estimator with the backends that agree merged (:func:`lines`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -17,10 +17,10 @@ import pandas as pd
 
 from bench.experiment.axes import Axis, axes, relabelled, shown_by, values_of
 from bench.experiment.columns import IDENTITY
+from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
 from bench.measure.timing import NOISY
-from bench.model import ContactLaw, registry
-from bench.report.text import axis_value, number
+from bench.report.text import number
 
 CATEGORIES = ("scene", "contact", "integrator", "noise")
 NUMBERS = ("horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats")
@@ -45,6 +45,7 @@ def latest(rows: pd.DataFrame) -> pd.DataFrame:
 
     Rows of versions that did not store their parameters are distinguished by their other columns.
     """
+    rows = completed_rows(rows)
     bare = rows["parameters"] == ""
     old = np.where(bare, rows.duplicated(list(IDENTITY), keep="last"), rows.duplicated(list(CELL), keep="last"))
     return rows[~old.astype(bool)].reset_index(drop=True)
@@ -107,60 +108,6 @@ def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
     medians = rows[good].groupby(cell[good])[list(rows.select_dtypes("number").columns)].median()
     merged.loc[medians.index, medians.columns] = medians
     return merged.assign(lost=rows["lost"].groupby(cell).sum()).reset_index(drop=True)
-
-
-@dataclass(frozen=True, eq=False)
-class Family:
-    """The rows of one problem along an axis, and the names and values that distinguish it from its neighbours."""
-
-    identity: Mapping[str, Any]
-    rows: pd.DataFrame
-
-    def title(self) -> str:
-        """Return the problem in words: ``pushing, penalty, sigma=0.1``."""
-        return ", ".join(str(v) if k in CATEGORIES else f"{k}={axis_value(v)}" for k, v in self.identity.items())
-
-
-def split_by_problem(shown: Arranged, table: pd.DataFrame, always: Sequence[str] = ()) -> list[Family]:
-    """Split a table made by :func:`along` into problems, in order of appearance; ``always`` are columns to name anyway.
-
-    A numeric column splits problems when it varies at fixed ``x``; one that moves with ``x`` (a zipped axis) does not.
-    """
-    if table.empty:
-        return []
-    fixed = [*CATEGORIES, "backend", "dtype", "estimator", "estimator_params", "x"]
-    numbers = shown.numbers
-    varied = table.groupby(fixed, dropna=False)[numbers].nunique(dropna=False).max()
-    keys = [*CATEGORIES, *(c for c in numbers if varied[c] > 1)]
-    groups = [(dict(zip(keys, key, strict=True)), part) for key, part in table.groupby(keys, dropna=False, sort=False)]
-
-    def distinct(names: Sequence[str]) -> int:
-        return len({tuple(str(identity[name]) for name in names) for identity, _ in groups})
-
-    telling: list[str] = []
-    for key in keys:
-        if key in always or distinct([*telling, key]) > distinct(telling):
-            telling.append(key)
-    result = []
-    for identity, part in groups:
-        own = {"smoothing": smoothing_of(identity["contact"])}
-        named = {own.get(k, k): identity[k] for k in telling or ("scene", "contact") if _says(k, identity[k])}
-        result.append(Family(named, part.reset_index(drop=True)))
-    return result
-
-
-def _says(column: str, value: Any) -> bool:
-    """Return whether a value is worth naming to a reader."""
-    if column in CATEGORIES:
-        return bool(value != "none")
-    return math.isfinite(value) and not (column == "horizon" and value == 0)
-
-
-def smoothing_of(contact: str) -> str:
-    """Return the parameter behind the column ``smoothing`` for a contact law, by its identity string."""
-    entry = registry.entries()["contacts"].get(contact.partition("[")[0])
-    law = entry.plugin if entry is not None else None
-    return (law.smoothing if law is not None and issubclass(law, ContactLaw) else "") or "smoothing"
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +182,7 @@ class _Run:
 
     @cached_property
     def numbers(self) -> np.ndarray:
-        return self.rows[["rmse", "variance", "bias_high", "bias"]].to_numpy(dtype=float)
+        return np.asarray(self.rows[["rmse", "variance", "bias_high", "bias"]], dtype=float)
 
 
 def _agree(a: _Run, b: _Run, tolerance: float) -> bool:
@@ -253,7 +200,7 @@ def pareto(time: pd.Series, error: pd.Series) -> np.ndarray:
     """Return a mask of the points for which no other is smaller in both."""
     points = pd.DataFrame({"time": time.to_numpy(), "error": error.to_numpy()})
     best = points.groupby("time")["error"].min().cummin().shift(fill_value=math.inf)
-    return (points["error"] <= points["time"].map(best)).to_numpy()
+    return np.asarray(points["error"] <= points["time"].map(best))
 
 
 def unsteady(rows: Any) -> Any:

@@ -60,7 +60,10 @@ class _Run:
         if refused:
             self._finish([(cell, result | {"machine": kind_of_machine()}) for cell, result in refused])
         cells = [item.cell for item in due if item.refusal is None]
-        with guard.capture_output("a plugin"), guard.protect_process():  # backends are asked whether they can compute references
+        with (
+            guard.capture_output("a plugin"),
+            guard.protect_process(),
+        ):  # backends are asked whether they can compute references
             references = self._missing_references(cells)
         if not self._experiment.timing:
             with launcher_of(self._experiment) as launcher:

@@ -35,6 +35,7 @@ from bench.experiment.experiment import TableLayout
 from bench.report import views
 from bench.report.figures import save, styled
 from bench.report.plotted import plotted
+from bench.report.problems import split_by_problem
 from bench.report.style import PALETTE, Look, axis_name, colour
 from bench.report.text import number
 from bench.run.store import Store
@@ -162,7 +163,7 @@ def test_terminal_output_fits_and_says_what_matters(rows, capsys, monkeypatch):
 def families(rows, column, **given):
     """The problems of rows along the axis of that column."""
     shown = views.arranged(experiment(**given), rows)
-    return views.split_by_problem(shown, views.along(shown, named(shown, column)))
+    return split_by_problem(shown, named(shown, column))
 
 
 def named(shown, column):
@@ -522,7 +523,9 @@ def test_no_cell_is_lost_where_a_swept_value_is_the_default_of_one_scene(capsys,
     shown = views.arranged(swept, rows)
     along = views.along(shown, named(shown, "damping"))
     assert sorted(along["x"]) == [0.0, 0.0, 1.0, 1.0, 10.0, 10.0]
-    assert [sorted(family.rows["x"]) for family in views.split_by_problem(shown, along)] == [[0.0, 1.0, 10.0]] * 2
+    assert [sorted(family.rows["x"]) for family in split_by_problem(shown, named(shown, "damping"))] == [
+        [0.0, 1.0, 10.0]
+    ] * 2
     found = findings.problems(shown)
     assert [(axis.column, len(family.rows)) for axis, family in found] == [("damping", 3)] * 2
     terminal.show(swept, rows)
@@ -539,7 +542,7 @@ def test_a_law_parameter_that_happens_to_equal_another_keeps_its_problem():
     rows = rows_of(swept, cells)
     shown = views.arranged(swept, rows)
     for column in ("stiffness", "damping"):
-        found = views.split_by_problem(shown, views.along(shown, named(shown, column)))
+        found = split_by_problem(shown, named(shown, column))
         assert [len(family.rows) for family in found] == [2, 2]
     table = tables.readable(swept, rows)
     assert table.headers[:2] == ["stiffness", "damping"]
@@ -590,7 +593,7 @@ def test_a_swept_scene_parameter_is_a_number_in_every_table_and_title_at_its_def
     assert sorted(line[place] for line in found.body) == ["0.1", "0.1", "0.2", "0.2"]
     assert "| stiffness | mass | " in (swept.directory / "bias_variance.md").read_text()
     shown = views.arranged(swept, rows)
-    titles = [family.title() for family in views.split_by_problem(shown, views.along(shown, named(shown, "stiffness")))]
+    titles = [family.title() for family in split_by_problem(shown, named(shown, "stiffness"))]
     assert titles == ["mass=0.1", "mass=0.2"]
     with styled():
         panels = charts.figures(swept, rows)["bias_variance_stiffness"].axes
@@ -679,7 +682,7 @@ def test_titles_say_where_the_best_estimator_fails_and_what_never_does():
         given = experiment(sweep={"stiffness": [10.0, 1e3, 1e5]}, marks={"stiffness": marks})
         shown = views.arranged(given, table(made))
         axis = named(shown, "stiffness")
-        parts = [(part, views.lines(part.rows)) for part in views.split_by_problem(shown, views.along(shown, axis))]
+        parts = [(part, views.lines(part.rows)) for part in split_by_problem(shown, axis)]
         return findings.headline(parts, axis, marks)
 
     stiff = lambda contact, k: 9.0 if contact == "penalty" and k > 1e4 else 0.1  # noqa: E731

@@ -20,7 +20,8 @@ from bench.measure.gradcheck import EPS
 from bench.model import registry
 from bench.report import reproduce, web
 from bench.report.plotted import plotted
-from bench.report.views import along, arranged, split_by_problem
+from bench.report.problems import split_by_problem
+from bench.report.views import along, arranged
 from bench.report.web.content import Content, grouped, looks, problems
 from bench.report.web.document import data
 from bench.run.files import make_directory
@@ -314,7 +315,7 @@ def test_a_parameter_that_two_scenes_lend_to_their_law_keeps_every_row():
     (axis,) = shown.axes
     found = along(shown, axis)
     assert len(found) == 6
-    assert [len(family.rows) for family in split_by_problem(shown, found)] == [3, 3]
+    assert [len(family.rows) for family in split_by_problem(shown, axis)] == [3, 3]
     assert list(shown.rows["damping"]) == [0.0, 0.0, 1.0, 1.0, 10.0, 10.0]
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,12 +12,20 @@ import pandas as pd
 
 from bench.experiment import axes as sweep
 from bench.experiment.columns import IDENTITY
-from bench.experiment.grid import applies
-from bench.model import registry
+from bench.report.problems import (
+    axes_of,
+    distinguishing_columns,
+    part_columns,
+    problem_names,
+    problem_numbers,
+    value_text,
+)
 from bench.report.style import MARKERS, VARIANTS, colour, marker
-from bench.report.text import axis_value
-from bench.report.views import NUMBERS, Arranged, attempted
+from bench.report.views import attempted
 
+__all__ = ["distinguishing_columns"]
+columns_of, grouped, problems, shown_as, together = part_columns, problem_numbers, problem_names, value_text, axes_of
+"""The names under which the studies use these functions."""
 SYMBOLS = dict(
     zip(
         MARKERS,
@@ -158,113 +165,3 @@ def nothing_ran(rows: pd.DataFrame) -> str:
 def finite(value: float) -> bool:
     """Return whether a value is a finite number."""
     return isinstance(value, int | float) and math.isfinite(value)
-
-
-# ----------------------------------------------------------------------------------------------------- problems
-
-
-def grouped(rows: pd.DataFrame, parts: Sequence[str], without: Sequence[sweep.Axis] = ()) -> pd.Series:
-    """Number rows so that rows whose ``parts`` have equal parameters, ignoring the axes ``without``, share a number.
-
-    ``parts`` are axes of the grid: ``scene``, ``contact``. Rows of studies with other parameters, or with another
-    theta, are never equal. Rows without parameters, as older versions wrote them, are kept apart by their identity
-    columns.
-    """
-    names = [name for axis in without for name in axis.names]
-    labels = [name for name in (*parts, *NUMBERS, "noise") if name in rows and name not in {a.column for a in without}]
-    texts: dict[int, str] = {}
-    groups: dict[Any, int] = {}
-    numbers = []
-    for given, shown in zip(sweep.parsed(rows), rows[labels].astype(str).to_numpy().tolist(), strict=True):
-        if id(given) not in texts:
-            kept = {part: _without(part, given.get(part), names) for part in parts}
-            texts[id(given)] = json.dumps([kept, given.get("study"), given.get("theta")])
-        key = texts[id(given)] if given else tuple(shown)
-        numbers.append(groups.setdefault(key, len(groups)))
-    return pd.Series(numbers, index=rows.index, dtype=int)
-
-
-def _without(axis: str, part: Mapping[str, Any] | None, names: Sequence[str]) -> Mapping[str, Any] | None:
-    if part is None:
-        return None
-    hidden = {applies(name, registry.kind_of(axis), part["name"], part) for name in names}
-    return {name: value for name, value in part.items() if name == "name" or name not in hidden}
-
-
-def together(shown: Arranged, *columns: str) -> list[sweep.Axis]:
-    """Return the axes that hold the values of some columns, also under other names, and axes that step with them."""
-    own = [
-        axis for axis in shown.axes if axis.column in columns or (axis.short in columns and _holds(shown.rows, axis))
-    ]
-    moving = {name for axis in own for name in axis.moves}
-    return [axis for axis in shown.axes if axis in own or axis.column in moving]
-
-
-def _holds(rows: pd.DataFrame, axis: sweep.Axis) -> bool:
-    """Return whether the values of an axis are those of the column of its parameter's name."""
-    own = rows[axis.column].notna()
-    return bool((rows.loc[own, axis.short] == rows.loc[own, axis.column]).all())
-
-
-def constants(rows: pd.DataFrame, groups: pd.Series, names: Sequence[str]) -> pd.DataFrame:
-    """Return a line per group, in order of appearance: the values of columns, nothing where its rows differ."""
-    one = rows[list(names)].groupby(groups, sort=False)
-    values = one.first().reindex(groups.unique()).astype(object)
-    return values.mask(one.nunique(dropna=False).reindex(values.index) > 1, "")
-
-
-def distinguishing_columns(
-    rows: pd.DataFrame, groups: pd.Series, names: Sequence[str], always: Sequence[str] = ("scene",)
-) -> list[str]:
-    """Choose, of some columns, those that distinguish the groups, each only where the ones before it do not suffice."""
-    names = [name for name in names if name in rows]
-    values = constants(rows, groups, names)
-
-    def count(columns: Sequence[str]) -> int:
-        return len({tuple(map(str, line)) for line in values[list(columns)].to_numpy()})
-
-    choice: list[str] = []
-    for name in names:
-        if name in always or count([*choice, name]) > count(choice):
-            choice.append(name)
-    return choice
-
-
-def problems(
-    shown: Arranged,
-    parts: Sequence[str],
-    without: Sequence[sweep.Axis] = (),
-    always: Sequence[str] = ("scene",),
-    rows: pd.DataFrame | None = None,
-) -> pd.Series:
-    """Name the problem of each row, ``mass_spring, damping=0``: no two that differ in ``parts`` have the same name.
-
-    ``always`` are columns to name even where they distinguish nothing. ``rows`` are those of ``shown``, or some of
-    them.
-    """
-    rows = shown.rows if rows is None else rows
-    groups = grouped(rows, parts, without)
-    columns = distinguishing_columns(rows, groups, columns_of(shown, parts, without), always)
-    names: dict[Any, str] = {}
-    for group, line in constants(rows, groups, columns).iterrows():
-        name = ", ".join(filter(None, (_named(column, value) for column, value in line.items())))
-        names[group] = name if name not in names.values() else f"{name} ({group})"
-    return groups.map(names).astype(object)
-
-
-def columns_of(shown: Arranged, parts: Sequence[str], without: Sequence[sweep.Axis] = ()) -> list[str]:
-    """Return the columns that show some parts of the grid: identity strings, then numbers, less those of some axes."""
-    more = {"backend": ["dtype"], "estimator": ["estimator_params"], "scene": ["noise"]}
-    labels = [*parts, *(name for part in parts for name in more.get(part, []))]
-    return [name for name in (*labels, *shown.numbers) if name not in {axis.column for axis in without}]
-
-
-def shown_as(value: Any) -> str:
-    """Write a value of such a column as text."""
-    return value if isinstance(value, str) else axis_value(value)
-
-
-def _named(column: Any, value: Any) -> str:
-    if isinstance(value, str):
-        return "" if value == "none" else value
-    return f"{column}={axis_value(value)}" if math.isfinite(value) else ""

@@ -20,10 +20,11 @@ from matplotlib.figure import Figure
 from bench.experiment.axes import Axis
 from bench.experiment.experiment import Experiment
 from bench.model import SURROGATE, registry
-from bench.report.cores import spread
+from bench.report.cores import run_tasks
 from bench.report.figures import save, styled
+from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.style import Look, plain, symbol
-from bench.report.views import CATEGORIES, Family, along, arranged, attempted, split_by_problem
+from bench.report.views import CATEGORIES, arranged, attempted
 from bench.studies.bias_variance import time_to_accuracy
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost, charged
 from bench.studies.bias_variance.error_against_time import FEWEST, course
@@ -46,7 +47,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
             return save(made, experiment.directory / name, experiment.formats)
 
     works = [partial(drawn, name, figure) for name, figure in drawings(experiment, rows).items()]
-    return [path for paths in spread(works) for path in paths]
+    return [path for paths in run_tasks(works) for path in paths]
 
 
 def file_name(axis: Axis, kind: str = "bias_variance") -> str:
@@ -77,8 +78,8 @@ def drawings(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[
         merged.append(f"{plain(law)}: {SURROGATE}")
     made: dict[str, Callable[[], Figure]] = {}
 
-    def problems(axis: Axis | None, drawable: Callable[[pd.DataFrame], bool]) -> list[Family]:
-        return [p for p in split_by_problem(shown, along(shown, axis)) if drawable(p.rows)]
+    def problems(axis: Axis | None, drawable: Callable[[pd.DataFrame], bool]) -> list[ProblemRows]:
+        return [p for p in split_by_problem(shown, axis) if drawable(p.rows)]
 
     swept = shown.swept()
     for axis in swept:
@@ -116,11 +117,11 @@ def drawings(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[
     return made
 
 
-def _costs(problems: Sequence[Family], notes: Sequence[str], look: Look, cost: Cost) -> Figure:
+def _costs(problems: Sequence[ProblemRows], notes: Sequence[str], look: Look, cost: Cost) -> Figure:
     return speed_accuracy(problems, notes, look, cost, *_said(problems, cost))
 
 
-def _said(problems: Sequence[Family], cost: Cost) -> tuple[dict[int, str], str]:
+def _said(problems: Sequence[ProblemRows], cost: Cost) -> tuple[dict[int, str], str]:
     """Return, for each problem by place, who reaches an error of 10% and of 1% first, and who leads over all.
 
     Where samples are not swept nobody reaches anything: it is told who is most accurate and who fastest.
@@ -140,7 +141,7 @@ def _costed(cost: Cost, rows: pd.DataFrame) -> bool:
     return len(cost.known(rows)) > 1
 
 
-def choose(problems: Sequence[Family], room: int = ROOM) -> tuple[list[Family], list[str]]:
+def choose(problems: Sequence[ProblemRows], room: int = ROOM) -> tuple[list[ProblemRows], list[str]]:
     """Choose the problems to draw if there are more than fit, and report how many values of each number are shown.
 
     Every scene and contact law is drawn. The number with most values gets the remaining room, at evenly spaced ranks
@@ -148,7 +149,7 @@ def choose(problems: Sequence[Family], room: int = ROOM) -> tuple[list[Family], 
     """
     if len(problems) <= room:
         return list(problems), []
-    kinds: dict[tuple[Any, ...], list[Family]] = {}
+    kinds: dict[tuple[Any, ...], list[ProblemRows]] = {}
     for problem in problems:
         kinds.setdefault(tuple(problem.identity.get(k) for k in CATEGORIES), []).append(problem)
     kept = {p for members in kinds.values() for p in _thinned(members, problems, max(1, room // len(kinds)))}
@@ -160,14 +161,14 @@ def choose(problems: Sequence[Family], room: int = ROOM) -> tuple[list[Family], 
     return [problem for problem in problems if problem in kept], notes
 
 
-def _numbers(problems: Iterable[Family]) -> list[str]:
+def _numbers(problems: Iterable[ProblemRows]) -> list[str]:
     return list(dict.fromkeys(k for p in problems for k in p.identity if k not in CATEGORIES))
 
 
-def _thinned(members: Sequence[Family], problems: Sequence[Family], room: int) -> list[Family]:
+def _thinned(members: Sequence[ProblemRows], problems: Sequence[ProblemRows], room: int) -> list[ProblemRows]:
     """Return the problems of one scene and contact law that :func:`choose` keeps."""
 
-    def values(some: Iterable[Family], name: str) -> list[float]:
+    def values(some: Iterable[ProblemRows], name: str) -> list[float]:
         return [float(problem.identity.get(name, -math.inf)) for problem in some]
 
     kept = list(members)

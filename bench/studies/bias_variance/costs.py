@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.experiment.parameters import number_problems
 from bench.report.text import axis_value, duration
-from bench.studies.bias_variance.tables import problem
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def at_equal_cost(rows: pd.DataFrame) -> pd.DataFrame:
     """
     rows = charged(rows)
     good = rows["status"] == "ok"
-    setting = [problem(rows), rows["samples"], rows["seed"]]
+    setting = [number_problems(rows), rows["samples"], rows["seed"]]
     label = rows["estimator"] + "[" + rows["estimator_params"] + "]"
     time = rows["time_s"].where(good & (rows["time_s"] > 0))
     fastest = time.groupby([*setting, label]).transform("min")

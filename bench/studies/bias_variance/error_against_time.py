@@ -17,10 +17,11 @@ from matplotlib.patches import Patch
 
 from bench.experiment.axes import Axis
 from bench.report.page import columns, page, shared
+from bench.report.problems import ProblemRows
 from bench.report.scales import log_axis
 from bench.report.style import SHADE, Look, axis_name, plain
 from bench.report.text import axis_value, number
-from bench.report.views import CATEGORIES, Curve, Family, lines
+from bench.report.views import CATEGORIES, Curve, lines
 from bench.studies.bias_variance.costs import TIME
 from bench.studies.bias_variance.findings import winners
 
@@ -34,7 +35,7 @@ FACTOR = 2.0
 """Factors below this are not worth telling in a title."""
 
 
-def course(problems: Sequence[Family], notes: Sequence[str], look: Look, axis: Axis) -> Figure:
+def course(problems: Sequence[ProblemRows], notes: Sequence[str], look: Look, axis: Axis) -> Figure:
     """Draw relative RMSE against the time of one estimate, a panel per problem, a curve per estimator.
 
     Each curve joins the values of the axis in order, on the backend that is fastest in the median; numbers beside it are
@@ -81,7 +82,7 @@ def _median(line: Curve) -> float:
     return float(TIME.known(line.rows)["time_s"].median())
 
 
-def headline(parts: Sequence[tuple[Family, Sequence[Curve]]], axis: Axis) -> str:
+def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -> str:
     """Write what going along the axis does to error and time of the estimator that is most accurate at its start.
 
     Told are the problem where the error grows most and the one where it grows least.

@@ -12,8 +12,9 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import Axis
+from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.text import axis_value, number
-from bench.report.views import Arranged, Curve, Family, along, attempted, split_by_problem
+from bench.report.views import Arranged, Curve, attempted
 
 TIE = 1.1
 """Relative RMSEs within this factor of the lowest share the first place: R repeats do not resolve less."""
@@ -25,13 +26,13 @@ NAMED = 2
 """Most problems that a title names one by one."""
 
 
-def problems(shown: Arranged) -> list[tuple[Axis | None, Family]]:
+def problems(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
     """Return the problems to report, each along the longest axis it was swept along; every cell that ran is in one."""
     swept = shown.swept()
-    parts: list[tuple[Axis | None, Family]] = []
+    parts: list[tuple[Axis | None, ProblemRows]] = []
     seen: set[str] = set()
     for axis in (*sorted(swept, key=lambda a: -swept[a]), None):
-        for group in split_by_problem(shown, along(shown, axis), ("scene", "contact")):
+        for group in split_by_problem(shown, axis, ("scene", "contact")):
             cells = attempted(group.rows)
             if set(cells["key"]) - seen and (axis is None or cells["x"].nunique() > 1):
                 seen |= set(cells["key"])
@@ -43,7 +44,7 @@ def lowest(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, floa
     """Return the lowest error at each ``x`` where there is one, in increasing order."""
     rows = pd.concat([line.rows for line in curves])
     good = rows[(rows["status"] == "ok") & np.isfinite(rows[error])]
-    return good.groupby(level=0)[error].min().to_dict()
+    return {float(x): float(low) for x, low in good.groupby(level=0)[error].min().items()}
 
 
 def winners(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, list[str]]:
@@ -74,7 +75,7 @@ def span(where: Mapping[float, bool]) -> str:
 
 
 def headline(
-    parts: Sequence[tuple[Family, Sequence[Curve]]], axis: Axis, marks: Mapping[str, float] = MappingProxyType({})
+    parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis, marks: Mapping[str, float] = MappingProxyType({})
 ) -> str:
     """Write where estimators fail, the one that is lowest most often first, and which never does.
 
@@ -99,7 +100,7 @@ def headline(
     return "; ".join(clauses) or f"No estimator is better than zero anywhere along {axis.column}"
 
 
-def tally(parts: Sequence[tuple[Family, Sequence[Curve]]]) -> str:
+def tally(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> str:
     """Write on how many problems the estimator that is lowest most often fails, and how many fail on none.
 
     Failing is what it is in :func:`headline`.
@@ -117,7 +118,7 @@ def tally(parts: Sequence[tuple[Family, Sequence[Curve]]]) -> str:
     return f"{first} fails on {among}; {sound or 'none'} of {len(names)} estimators fail{'s' * (sound == 1)} on none"
 
 
-def _by_wins(parts: Sequence[tuple[Family, Sequence[Curve]]]) -> list[str]:
+def _by_wins(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> list[str]:
     """Return the estimators, the one that is lowest most often first."""
     wins = Counter(label for _, curves in parts for labels in winners(curves).values() for label in labels)
     return sorted(dict.fromkeys(line.label for _, curves in parts for line in curves), key=lambda name: -wins[name])
@@ -147,7 +148,7 @@ def _spoken(where: str, axis: Axis) -> str:
 
 
 def _where(
-    bad: Sequence[Mapping[float, bool]], families: Sequence[Family], axis: Axis, marks: Mapping[str, float]
+    bad: Sequence[Mapping[float, bool]], families: Sequence[ProblemRows], axis: Axis, marks: Mapping[str, float]
 ) -> str:
     """Write where along an axis something fails, and in which of several problems."""
     failing = [i for i, where in enumerate(bad) if any(where.values())]

@@ -1,4 +1,4 @@
-"""Estimates of one cell against the certified gradient, timed."""
+"""Measures the estimates of one cell against the certified gradient, and times them."""
 
 from __future__ import annotations
 
@@ -18,35 +18,36 @@ from bench.studies.bias_variance.estimates import Estimates
 
 
 def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> dict[str, Any]:
-    """Measure one cell's estimates.
+    """Return one cell's status, reason and statistics of its estimates, by column.
 
-    Timed cells take ``timed_calls`` of them one by one, all on backends that compile; cells without times take all at
-    once. ``settle_s`` is how long calls may be repeated until their times are steady.
+    In timed cells ``timed_calls`` estimates are computed one by one, or all of them on backends that compile. Other cells
+    compute all estimates together. ``settle_s`` is the time in seconds for which calls may be repeated until their times
+    are steady.
     """
     session.compilations.restart()
     program = cell.program()
     theta = program.theta0
     truth = session.references.of(cell)
     problem = session.problem(cell)
-    made = Estimates(cell, problem, theta)
+    estimates = Estimates(cell, problem, theta)
 
     timing.reset_peak_memory()
     calls = (cell.repeats if cell.backend.compiles else min(timed_calls, cell.repeats)) if cell.timing else 0
-    # usage covers the timed calls only: the reference may have used the same problem
+    # usage covers the timed calls alone: the reference may have used the same problem
     problem.reset_usage()
     started = time.perf_counter()
     parts: list[np.ndarray] = []
     clock: timing.Timing | None = None
     if calls:
-        parts, clock = timing.timed(lambda r: made.of(r, r + 1), calls, settle_s=settle_s, pause=made.pause)
-    # a copy, since the remaining estimates count on
-    usage, counted = replace(problem.usage), clock.calls if clock else cell.repeats
+        parts, clock = timing.timed(lambda r: estimates.of(r, r + 1), calls, settle_s=settle_s, pause=estimates.pause)
+    # a copy, since the remaining estimates are counted too
+    usage, n_counted = replace(problem.usage), clock.calls if clock else cell.repeats
     if calls < cell.repeats:
-        parts.append(made.of(calls, cell.repeats))
+        parts.append(estimates.of(calls, cell.repeats))
     if clock is None:
         usage = replace(problem.usage)
-    spent = time.perf_counter() - started
-    estimates = np.concatenate(parts)
+    elapsed = time.perf_counter() - started
+    values = np.concatenate(parts)
 
     result: dict[str, Any] = {
         "status": "ok",
@@ -56,38 +57,38 @@ def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> 
         "time_iqr_s": clock.iqr_s if clock else math.nan,
         "time_samples": list(clock.samples_s) if clock else [],
         "noise_s": noise.seconds(cell.seed, cell.scene.name, cell.samples, program.n_noise) if clock else math.nan,
-        "estimates_s": spent,
+        "estimates_s": elapsed,
         "compile_s": usage.compile_s,
-        "rollouts": usage.rollouts / counted,
-        "gradients": usage.gradients / counted,
+        "rollouts": usage.rollouts / n_counted,
+        "gradients": usage.gradients / n_counted,
         "peak_memory_mb": timing.peak_memory_mb(),
         "device": problem.device,
         "compilations": session.compilations.made,
         "shapes": " ".join(sorted(session.compilations.shapes)),
-        **made.singles,
+        **estimates.singles,
         "point": theta.tolist(),
-        "mean_estimate": estimates.mean(axis=0).tolist(),
+        "mean_estimate": values.mean(axis=0).tolist(),
         "reference_gradient": truth.gradient.tolist(),
-        "auxiliaries": summarised([made.decided[start] for start in sorted(made.decided)]),
+        "auxiliaries": summarise_diagnostics([estimates.diagnostics[start] for start in sorted(estimates.diagnostics)]),
     }
     if not np.isfinite(truth.batches).all():
         return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}
     unbiased = cell.estimator.declares_unbiased(program)
-    summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples, made.sums, unbiased=unbiased))
+    summary = asdict(statistics.summarise(values, truth.known(), cell.samples, estimates.sums, unbiased=unbiased))
     surrogate = SURROGATE if program.surrogate and "grad" in cell.estimator.needs else ""
     result |= {"reason": "; ".join(part for part in (surrogate, summary.pop("note"), truth.note) if part), **summary}
-    bad = ~np.isfinite(estimates).all(axis=1)
+    bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
         result["status"] = "nonfinite"
-        result["reason"] += f"; {first_bad(cell, problem, made, int(np.argmax(bad)))}"
+        result["reason"] += f"; {locate_first_bad(cell, problem, estimates, int(np.argmax(bad)))}"
     return result
 
 
-def summarised(decided: list[Auxiliaries]) -> str:
-    """Return as JSON, for each auxiliary, its mean, its 5, 50 and 95% quantiles and the share of exact zeros."""
+def summarise_diagnostics(diagnostics: list[Auxiliaries]) -> str:
+    """Return, as JSON, each diagnostic's mean, its 5, 50 and 95% quantiles and its share of exact zeros."""
     table = {}
-    for name in decided[0] if decided else ():
-        values = np.concatenate([np.ravel(one[name]) for one in decided]).astype(np.float64)
+    for name in diagnostics[0] if diagnostics else ():
+        values = np.concatenate([np.ravel(batch[name]) for batch in diagnostics]).astype(np.float64)
         if np.isfinite(values).all():
             low, median, high = np.quantile(values, (0.05, 0.5, 0.95)).tolist()
             table[name] = {
@@ -97,20 +98,20 @@ def summarised(decided: list[Auxiliaries]) -> str:
     return json.dumps(table) if table else ""
 
 
-def first_bad(cell: Cell, problem: Problem, made: Estimates, repeat: int) -> str:
-    """Return where an estimate that is not finite comes from, so that it can be repeated: theta, seed and sample.
+def locate_first_bad(cell: Cell, problem: Problem, estimates: Estimates, repeat: int) -> str:
+    """Return theta, seed and sample of an estimate that is not finite, as text, so that it can be repeated.
 
-    The sample is the first of the repeat whose own cost or gradient is not finite; an estimator may also spoil finite
-    ones, or displace theta.
+    The sample is the first of the repeat whose own cost or gradient is not finite. There may be none, since an estimator
+    can turn finite ones into an infinite estimate, or move theta.
     """
     theta, before = problem.program.theta0, 0
     sample = "no single sample, costs and gradients are finite"
-    for part in made.parts(repeat):
-        spoilt = ~np.isfinite(problem.value(theta, part))
+    for part in estimates.parts(repeat):
+        is_bad = ~np.isfinite(problem.value(theta, part))
         if "grad" in cell.backend.provides:
-            spoilt |= ~np.isfinite(problem.grad(theta, part)).all(axis=0)
-        if spoilt.any():
-            sample = f"sample {before + int(np.argmax(spoilt))}"
+            is_bad |= ~np.isfinite(problem.grad(theta, part)).all(axis=0)
+        if is_bad.any():
+            sample = f"sample {before + int(np.argmax(is_bad))}"
             break
         before += part.shape[1]
     text = np.array2string(theta, precision=17, threshold=8, separator=", ").replace("\n", "")

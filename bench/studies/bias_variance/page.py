@@ -11,21 +11,20 @@ import pandas as pd
 
 from bench.experiment import axes
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import number_problems
 from bench.model import registry
+from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.style import Look
 from bench.report.text import axis_value, counted, duration, number
 from bench.report.views import (
     CATEGORIES,
     Arranged,
     Curve,
-    Family,
-    along,
     arranged,
     attempted,
     lines,
     resolved,
     rmse_interval,
-    split_by_problem,
     unsteady,
 )
 from bench.report.web.content import (
@@ -44,7 +43,6 @@ from bench.report.web.content import (
 from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, at_equal_cost
 from bench.studies.bias_variance.findings import lowest, problems, span, winners
 from bench.studies.bias_variance.panels import FLOOR
-from bench.studies.bias_variance.tables import problem
 
 BIAS = PlotAxis(
     "bias_shown", "relative bias |bias| / |∇J|", True, "bias_from", "bias_to", "bias_limit", "larger than the gradient"
@@ -146,7 +144,7 @@ def derived(rows: pd.DataFrame) -> pd.DataFrame:
         # a panel never pools what makes costs differ
         "problem": titled(rows.assign(**_named(rows)), ["scene", "contact", *POOLED]),
         "line": rows["backend"] + " " + rows["dtype"] + " " + _label(rows),
-        "setting": problem(rows).astype(str),
+        "setting": number_problems(rows).astype(str),
     }
     return rows.assign(**{name: column.where(good) for name, column in values.items()}, **texts)
 
@@ -172,7 +170,7 @@ def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
     drawn = [BIAS.column, BIAS.low, BIAS.high, BIAS.limit, VARIANCE.column, VARIANCE.low, VARIANCE.high, RMSE.column]
     merged = rows["seed"].nunique() > 1
     parts = []
-    for family in split_by_problem(shown, along(shown, axis), ("scene", "contact")):
+    for family in split_by_problem(shown, axis, ("scene", "contact")):
         part = family.rows[family.rows["status"] == "ok"]
         if part["x"].nunique() > 1:
             part = part.sort_values(["line", "x"], kind="stable").assign(
@@ -199,7 +197,7 @@ def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
 class ProblemSummary:
     """One problem along an axis: which estimators have the lowest error at equal rollouts, and where."""
 
-    def __init__(self, axis: axes.Axis | None, family: Family) -> None:
+    def __init__(self, axis: axes.Axis | None, family: ProblemRows) -> None:
         self.axis, self.title = axis, family.title()
         self.kind = ", ".join(str(value) for name, value in family.identity.items() if name in CATEGORIES)
         self.lines = lines(family.rows)
@@ -296,7 +294,7 @@ def fastest(rows: pd.DataFrame) -> str:
     good = rows[(rows["status"] == "ok") & (rows["rmse_rel"] <= GOAL) & np.isfinite(rows["time_s"])]
     if rows["backend"].nunique() < 2 or good.empty:
         return ""
-    settings = good["time_s"].groupby(problem(good))
+    settings = good["time_s"].groupby(number_problems(good))
     first = good.loc[settings.idxmin()]
     ways = _label(first) + " on " + first["backend"]
     way = ways.value_counts().index[0]

@@ -19,6 +19,7 @@ from matplotlib.transforms import Transform
 
 from bench.experiment.axes import Axis
 from bench.report.page import columns, page, shared
+from bench.report.problems import ProblemRows
 from bench.report.scales import above, extent, log_axis, mark_values, scale_x, scale_y, shifts
 from bench.report.style import (
     CROSS,
@@ -35,7 +36,7 @@ from bench.report.style import (
     quantity,
     twin,
 )
-from bench.report.views import Curve, Family, lines, pareto, resolved, rmse_interval
+from bench.report.views import Curve, lines, pareto, resolved, rmse_interval
 from bench.studies.bias_variance.costs import Cost
 from bench.studies.bias_variance.findings import headline, tally
 
@@ -54,7 +55,7 @@ DOWN, LEFT = (
 
 
 def bias_variance(
-    problems: Sequence[Family], notes: Sequence[str], look: Look, axis: Axis, marks: Mapping[str, float]
+    problems: Sequence[ProblemRows], notes: Sequence[str], look: Look, axis: Axis, marks: Mapping[str, float]
 ) -> Figure:
     """Draw relative RMSE, and its parts below it: bias and variance; against one axis, a column of panels per problem.
 
@@ -204,7 +205,7 @@ BACKENDS = ("solid", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)), (0, (8, 2)
 
 
 def speed_accuracy(
-    problems: Sequence[Family], notes: Sequence[str], look: Look, cost: Cost, said: Mapping[int, str], first: str
+    problems: Sequence[ProblemRows], notes: Sequence[str], look: Look, cost: Cost, said: Mapping[int, str], first: str
 ) -> Figure:
     """Draw relative RMSE of one estimate against its cost, a panel per problem, a curve per estimator and backend.
 
@@ -326,7 +327,7 @@ def _draw_scales(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
         panel.axhspan(1.0, high * tall, zorder=0, **SHADE)
 
 
-def overview(problems: Sequence[Family], notes: Sequence[str], look: Look) -> Figure:
+def overview(problems: Sequence[ProblemRows], notes: Sequence[str], look: Look) -> Figure:
     """Draw relative bias and RMSE of every estimator, a panel per problem; the title says who fails on how many."""
     every = [lines(problem.rows, ALIKE) for problem in problems]
     drawn = [{_row_label(line, curves): line for line in curves} for curves in every]

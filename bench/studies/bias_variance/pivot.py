@@ -15,9 +15,10 @@ from typing import Any
 from bench.errors import unknown
 from bench.experiment.axes import Axis
 from bench.experiment.experiment import Experiment
+from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.tables import escape_latex, escape_markdown
 from bench.report.text import axis_value, number
-from bench.report.views import Arranged, Family, along, lines, rmse_interval, split_by_problem
+from bench.report.views import Arranged, lines, rmse_interval
 from bench.studies.bias_variance.findings import problems
 
 WIDTH = 504.0
@@ -77,10 +78,10 @@ class Pivot:
 
 def pivot(experiment: Experiment, shown: Arranged) -> Pivot:
     """Return the table of an experiment, along the axis that ``table.columns`` names or else the longest one."""
-    parts: Sequence[tuple[Axis | None, Family]] = problems(shown)
+    parts: Sequence[tuple[Axis | None, ProblemRows]] = problems(shown)
     if experiment.table.columns:
         axis = _axis(experiment.table.columns, shown)
-        parts = [(axis, family) for family in split_by_problem(shown, along(shown, axis))]
+        parts = [(axis, family) for family in split_by_problem(shown, axis)]
     apart = "backend" in experiment.table.rows
     blocks = tuple(_block(axis, family, apart) for axis, family in parts)
     return Pivot(f"{experiment.name}: relative RMSE of one estimate", blocks)
@@ -94,7 +95,7 @@ def _axis(name: str, shown: Arranged) -> Axis:
     return found[0]
 
 
-def _block(axis: Axis | None, family: Family, apart: bool) -> Block:
+def _block(axis: Axis | None, family: ProblemRows, apart: bool) -> Block:
     curves = lines(family.rows, close=None) if apart else lines(family.rows)
     values = sorted({x for line in curves for x in line.at})
     labels = [line.label for line in curves]

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 
+from bench.report.problems import ProblemRows
 from bench.report.style import plain
 from bench.report.text import counted, number
-from bench.report.views import Family
 from bench.studies.bias_variance.costs import ROLLOUTS, Cost
 from bench.studies.bias_variance.time_to_accuracy import TARGETS, Reached, lead, methods
 
@@ -36,7 +36,7 @@ LEGEND = (
 LEAD = "lead over the next"
 
 
-def glance(problems: Sequence[Family], costs: Sequence[Cost]) -> Figure:
+def glance(problems: Sequence[ProblemRows], costs: Sequence[Cost]) -> Figure:
     """Draw, per cost and error, estimators down and problems across: the cost on the best backend, coloured by factor.
 
     The last row is the factor between the first and the second estimator, with its 95% interval.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import pandas as pd
 from bench.experiment import axes
 from bench.experiment.columns import IDENTITY
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import number_problems
 from bench.measure.statistics import UNEXPLAINED, unexplained
 from bench.report.tables import csv, escape_markdown
 from bench.report.text import axis_value, number
@@ -46,21 +46,12 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     )
 
 
-def problem(rows: pd.DataFrame) -> pd.Series:
-    """Number the problem of each row: scene, contact law and integrator with all their parameters, and theta."""
-    numbers: dict[str, int] = {}
-    texts = [
-        json.dumps([given.get(a) for a in ("scene", "contact", "integrator", "theta")]) for given in axes.parsed(rows)
-    ]
-    return pd.Series([numbers.setdefault(text, len(numbers)) for text in texts], index=rows.index, dtype=int)
-
-
 def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:
     """Return error against time, with ``pareto`` where no other good row of the problem is faster and more accurate."""
     results = ["rmse_rel", "bias_rel", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients"]
     table = rows[["experiment", *IDENTITY, "status", *results]].assign(pareto=False)
     good = table[(table["status"] == "ok") & np.isfinite(table["rmse_rel"]) & np.isfinite(table["time_s"])]
-    for _, part in good.groupby(problem(good.assign(parameters=rows["parameters"]))):
+    for _, part in good.groupby(number_problems(rows).loc[good.index]):
         table.loc[part.index[pareto(part["time_s"], part["rmse_rel"])], "pareto"] = True
     return table
 

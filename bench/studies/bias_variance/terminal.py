@@ -16,11 +16,11 @@ from rich.text import Text
 from bench.experiment.axes import Axis
 from bench.experiment.experiment import Experiment
 from bench.measure.statistics import UNEXPLAINED, unexplained
+from bench.report.problems import ProblemRows
 from bench.report.text import axis_value, duration, number, one_line
 from bench.report.views import (
     UNSTEADY,
     Curve,
-    Family,
     arranged,
     bias_text,
     lines,
@@ -63,7 +63,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
         _show_verdict(console, group, axis)
 
 
-def _show_rows(console: Console, group: Family, axis: Axis | None, merge: bool) -> None:
+def _show_rows(console: Console, group: ProblemRows, axis: Axis | None, merge: bool) -> None:
     """Print a line per cell or, with ``merge``, per estimator and the backends that agree."""
     table = _table(group.title())
     if axis is not None:
@@ -90,7 +90,7 @@ def _show_rows(console: Console, group: Family, axis: Axis | None, merge: bool) 
     console.print(table)
 
 
-def _show_pivot(console: Console, group: Family, axis: Axis) -> None:
+def _show_pivot(console: Console, group: ProblemRows, axis: Axis) -> None:
     """Print two lines per estimator and agreeing backends, a column per value of the axis."""
     curves = lines(group.rows)
     best = lowest(curves)
@@ -188,7 +188,7 @@ def _print_wrapped(console: Console, text: str, indent: int) -> None:
     console.print(textwrap.fill(text, console.width, initial_indent=lead, subsequent_indent=lead + "  "))
 
 
-def _show_verdict(console: Console, group: Family, axis: Axis | None) -> None:
+def _show_verdict(console: Console, group: ProblemRows, axis: Axis | None) -> None:
     """Print, for one problem, the estimators of lowest error, those whose error is bias, useless ones, and where."""
     console.print(f"  {group.title()}" + (f", by {axis.title}" if axis else ""), style="bold")
     curves = lines(group.rows)

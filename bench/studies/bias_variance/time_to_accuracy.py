@@ -19,9 +19,10 @@ import pandas as pd
 from bench.experiment.axes import Axis
 from bench.experiment.experiment import Experiment
 from bench.measure.statistics import unexplained
+from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import axis_value, counted, number
-from bench.report.views import Curve, Family, along, arranged, lines, split_by_problem
+from bench.report.views import Curve, arranged, lines
 from bench.run.files import write_all
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost, charged
 
@@ -134,7 +135,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     timed = bool(np.isfinite(shown.rows["time_s"]).any())
     entries = [
         line(problem, target, kind, cost)
-        for problem in split_by_problem(shown, along(shown, SAMPLES), ("scene",))
+        for problem in split_by_problem(shown, SAMPLES, ("scene",))
         if problem.rows["x"].nunique() > 1
         for kind, cost in costs[0 if timed else 1 :]
         for target in TARGETS
@@ -142,7 +143,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(entries)
 
 
-def methods(problem: Family, target: float, cost: Cost) -> dict[str, Reached]:
+def methods(problem: ProblemRows, target: float, cost: Cost) -> dict[str, Reached]:
     """Return what each method needs for an error: per estimator and backend in time, per estimator in rollouts."""
     reached: dict[str, Reached] = {}
     for curve in lines(problem.rows, close=None):
@@ -158,7 +159,7 @@ def estimator_of(method: str) -> str:
     return method.partition(" on ")[0]
 
 
-def line(problem: Family, target: float, kind: str, cost: Cost) -> dict[str, Any]:
+def line(problem: ProblemRows, target: float, kind: str, cost: Cost) -> dict[str, Any]:
     """Return the fastest method, the next one of another estimator if there is one, and those that are out."""
     reached = methods(problem, target, cost)
     ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
@@ -255,7 +256,7 @@ def leaders(entries: Sequence[Any]) -> str:
     return ", ".join(said)
 
 
-def front(problems: Sequence[Family], cost: Cost) -> str:
+def front(problems: Sequence[ProblemRows], cost: Cost) -> str:
     """Write who is most accurate on most problems, who costs least, and on how many of those it is useless."""
     accurate: Counter[str] = Counter()
     cheap: Counter[str] = Counter()

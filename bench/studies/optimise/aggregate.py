@@ -11,8 +11,9 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from bench.experiment.axes import Axis, parsed, value_of
+from bench.experiment.axes import Axis
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import flatten, swept_columns
 from bench.measure import performance
 from bench.model.parameters import remember
 from bench.report.text import axis_value
@@ -114,11 +115,11 @@ def _races(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
 
 
 def _tunes(axis: Axis, rows: pd.DataFrame) -> bool:
+    table = flatten(rows)
     return any(
-        value_of(name, {"optimizer": given.get("optimizer")}) is not None
-        for given in parsed(rows)
+        column.startswith("optimizer.") and bool((mask & table[column].notna()).any())
         for name in axis.names
-        if given.get("optimizer") is not None
+        for column, mask in swept_columns(name, table).items()
     )
 
 

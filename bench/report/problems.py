@@ -1,0 +1,143 @@
+"""Splits rows by problem, and names each problem by the columns that distinguish it from the others.
+
+What a problem is stands in :mod:`bench.experiment.parameters`. Here its rows are chosen and its parameters become text.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from bench.experiment.axes import Axis, smoothing_of
+from bench.experiment.parameters import PROBLEM, number_problems
+from bench.report.text import axis_value
+from bench.report.views import CATEGORIES, RUN, Arranged, along
+
+
+@dataclass(frozen=True, eq=False)
+class ProblemRows:
+    """The rows of one problem along an axis, and the names and values that distinguish it from the other problems."""
+
+    identity: Mapping[str, Any]
+    rows: pd.DataFrame
+
+    def title(self) -> str:
+        """Return the problem as text: ``pushing, penalty, sigma=0.1``."""
+        return ", ".join(str(v) if k in CATEGORIES else f"{k}={axis_value(v)}" for k, v in self.identity.items())
+
+
+def split_by_problem(shown: Arranged, axis: Axis | None, always: Sequence[str] = ()) -> list[ProblemRows]:
+    """Split the rows along an axis into problems, in order of appearance; ``always`` are columns to name in any case.
+
+    A swept quantity distinguishes problems if it varies at a fixed value ``x`` of the axis. One that moves with the axis,
+    as in a ``zip``, does not. Sample counts, repeats and parameters of estimators count as swept quantities here.
+    """
+    table = along(shown, axis)
+    if table.empty:
+        return []
+    quantities = shown.numbers
+    n_values = table.groupby([*CATEGORIES, *RUN, "x"], dropna=False)[quantities].nunique(dropna=False).max()
+    columns = [*CATEGORIES, *(name for name in quantities if n_values[name] > 1)]
+    moving = [other for other in shown.axes if other.column not in columns]
+    numbers = problem_numbers(table, PROBLEM, [*moving, *([axis] if axis is not None else [])])
+    varying = [table[name] for name in columns if name in quantities]
+    groups = table.groupby([numbers, *varying], dropna=False, sort=False).ngroup()
+    named = distinguishing_columns(table, groups, columns, always) or ["scene", "contact"]
+    result = []
+    for _, part in table.groupby(groups, sort=False):
+        first = part.iloc[0]
+        labels = {"smoothing": smoothing_of(first["contact"].partition("[")[0]) or "smoothing"}
+        identity = {labels.get(name, name): first[name] for name in named if _is_worth_naming(name, first[name])}
+        result.append(ProblemRows(identity, part.reset_index(drop=True)))
+    return result
+
+
+def problem_numbers(rows: pd.DataFrame, parts: Sequence[str], without: Sequence[Axis] = ()) -> pd.Series:
+    """Return the number of each row's problem, which ignores swept axes; see :func:`~.parameters.number_problems`."""
+    return number_problems(rows, parts, [name for axis in without for name in axis.names])
+
+
+def _is_worth_naming(column: str, value: Any) -> bool:
+    if column in CATEGORIES:
+        return bool(value != "none")
+    return math.isfinite(value) and not (column == "horizon" and value == 0)
+
+
+def constants(rows: pd.DataFrame, groups: pd.Series, names: Sequence[str]) -> pd.DataFrame:
+    """Return a line per group, in order of appearance: the values of columns, empty where the group's rows differ."""
+    parts = rows[list(names)].groupby(groups, sort=False)
+    values = parts.first().reindex(groups.unique()).astype(object)
+    return values.mask(parts.nunique(dropna=False).reindex(values.index) > 1, "")
+
+
+def distinguishing_columns(
+    rows: pd.DataFrame, groups: pd.Series, names: Sequence[str], always: Sequence[str] = ("scene",)
+) -> list[str]:
+    """Choose, of some columns, those that distinguish the groups, each only where the ones before it do not suffice."""
+    names = [name for name in names if name in rows]
+    values = constants(rows, groups, names).astype(str)
+
+    def n_distinct(columns: Sequence[str]) -> int:
+        return len(values[list(columns)].drop_duplicates()) if columns else min(1, len(values))
+
+    choice: list[str] = []
+    for name in names:
+        if name in always or n_distinct([*choice, name]) > n_distinct(choice):
+            choice.append(name)
+    return choice
+
+
+def problem_names(
+    shown: Arranged,
+    parts: Sequence[str],
+    without: Sequence[Axis] = (),
+    always: Sequence[str] = ("scene",),
+    rows: pd.DataFrame | None = None,
+) -> pd.Series:
+    """Name the problem of each row, ``mass_spring, damping=0``: no two that differ in ``parts`` have the same name.
+
+    ``always`` are columns to name even where they distinguish nothing. ``rows`` are those of ``shown``, or some of
+    them.
+    """
+    rows = shown.rows if rows is None else rows
+    groups = problem_numbers(rows, parts, without)
+    columns = distinguishing_columns(rows, groups, part_columns(shown, parts, without), always)
+    names: dict[Any, str] = {}
+    for group, line in constants(rows, groups, columns).iterrows():
+        name = ", ".join(filter(None, (_with_name(column, value) for column, value in line.items())))
+        names[group] = name if name not in names.values() else f"{name} ({group})"
+    return groups.map(names).astype(object)
+
+
+def part_columns(shown: Arranged, parts: Sequence[str], without: Sequence[Axis] = ()) -> list[str]:
+    """Return the columns that show some parts of the grid: identity strings, then numbers, except those of some axes."""
+    more = {"backend": ["dtype"], "estimator": ["estimator_params"], "scene": ["noise"]}
+    labels = [*parts, *(name for part in parts for name in more.get(part, []))]
+    return [name for name in (*labels, *shown.numbers) if name not in {axis.column for axis in without}]
+
+
+def value_text(value: Any) -> str:
+    """Write a value of such a column as text."""
+    return value if isinstance(value, str) else axis_value(value)
+
+
+def _with_name(column: Any, value: Any) -> str:
+    if isinstance(value, str):
+        return "" if value == "none" else value
+    return f"{column}={axis_value(value)}" if math.isfinite(value) else ""
+
+
+def axes_of(shown: Arranged, *columns: str) -> list[Axis]:
+    """Return the axes that hold the values of some columns, under whatever name, and the axes that step with them."""
+
+    def has_values_of(axis: Axis) -> bool:
+        known = shown.rows[axis.column].notna()
+        return bool((shown.rows.loc[known, axis.short] == shown.rows.loc[known, axis.column]).all())
+
+    own = [a for a in shown.axes if a.column in columns or (a.short in columns and has_values_of(a))]
+    moving = {name for axis in own for name in axis.moves}
+    return [axis for axis in shown.axes if axis in own or axis.column in moving]
