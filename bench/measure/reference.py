@@ -206,7 +206,7 @@ def _doubt(
     through = through - along * (along * through).sum(axis=0)
     starts = np.concatenate([pilot[:, count : 2 * count], through - FAR * along], axis=1)
     ends = np.concatenate([pilot[:, 2 * count : 3 * count], through + FAR * along], axis=1)
-    jump = largest_jump(lambda w: in_columns(lambda part: problem.value(theta, part), w, columns), starts, ends)
+    jump = largest_jump(lambda w: in_columns(lambda part: problem.value(theta, part), w, columns), starts, ends).height
     if jump:
         return f"the cost jumps by {jump:.2g}, which its scene and contact law do not say, so zeroth order is used"
     return ""

@@ -278,7 +278,7 @@ def test_closed_form_is_used_where_there_is_one():
 def test_largest_jump(cost, jump):
     draw = np.random.default_rng(0)
     starts, ends = draw.standard_normal((2, 2, 8))
-    assert largest_jump(cost, starts, ends) == pytest.approx(jump, rel=1e-6)
+    assert largest_jump(cost, starts, ends).height == pytest.approx(jump, rel=1e-6)
 
 
 # ----------------------------------------------------------------------------------------------- which method it takes
@@ -305,5 +305,5 @@ def test_samples_without_any_spread_do_not_outdo_a_rule(monkeypatch, spread, cho
 def test_a_ramp_that_is_steep_and_resolved_is_no_jump():
     """Six parts in 1e11 of the line wide: its last change is a sixteenth of the one before."""
     start, end = np.zeros((1, 1)), np.ones((1, 1))
-    assert largest_jump(lambda x: np.clip((x[0] - 0.37) / 6e-11, 0.0, 1.0), start, end) == 0.0
-    assert largest_jump(lambda x: 1.0 * (x[0] > 0.37), start, end) == 1.0
+    assert largest_jump(lambda x: np.clip((x[0] - 0.37) / 6e-11, 0.0, 1.0), start, end).height == 0.0
+    assert largest_jump(lambda x: 1.0 * (x[0] > 0.37), start, end).height == 1.0
