@@ -19,8 +19,8 @@ from bench.conformance.subjects import (
     SAME,
     able_backend,
     available,
+    describe,
     distance,
-    with_changed_column,
     largest_jump,
     law_for,
     plain_backend,
@@ -29,7 +29,7 @@ from bench.conformance.subjects import (
     samples,
     sound_laws,
     stepping,
-    describe,
+    with_changed_column,
 )
 from bench.model import (
     ContactLaw,

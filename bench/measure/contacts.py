@@ -7,7 +7,9 @@ import numpy as np
 from bench.model import Array, ContactScene, ForceLaw, MechanicalScene, Rollout, State, Unsupported
 
 
-def acting(program: Rollout, states: np.ndarray, controls: np.ndarray, forces: np.ndarray | None = None) -> np.ndarray:
+def active_contacts(
+    program: Rollout, states: np.ndarray, controls: np.ndarray, forces: np.ndarray | None = None
+) -> np.ndarray:
     """Return which contacts act in each step, boolean ``(horizon, n_contacts, B)``.
 
     ``states (horizon + 1, n, B)`` and ``controls (horizon, n_u, B)`` are those of a rollout. Under a force law a
@@ -31,17 +33,19 @@ def acting(program: Rollout, states: np.ndarray, controls: np.ndarray, forces: n
     if isinstance(program.contact, ForceLaw):
         return np.stack([scene.gap(np, state.q) < 0 for state in before])
     if forces is None:
-        return np.stack([_predicted(program, scene, state, u) for state, u in zip(before, controls, strict=True)])
+        return np.stack(
+            [_predicted_contacts(program, scene, state, u) for state, u in zip(before, controls, strict=True)]
+        )
     steps = zip(before, states[1:], forces, strict=True)
-    return np.stack([_measured(scene, state, split(scene, x), force) for state, x, force in steps])
+    return np.stack([_measured_contacts(scene, state, split(scene, x), force) for state, x, force in steps])
 
 
-def _measured(scene: ContactScene, before: State, after: State, force: np.ndarray) -> np.ndarray:
+def _measured_contacts(scene: ContactScene, before: State, after: State, force: np.ndarray) -> np.ndarray:
     opened = scene.dt**2 * scene.contact(np).response(np, before.q) * force
     return np.asarray((scene.gap(np, before.q) < 0) | ((force > 0) & (opened > scene.gap(np, after.q))))
 
 
-def _predicted(program: Rollout, scene: ContactScene, before: State, u: Array) -> np.ndarray:
+def _predicted_contacts(program: Rollout, scene: ContactScene, before: State, u: Array) -> np.ndarray:
     q, v = before
     if program.needs_root:
         free = scene.carried(v) + scene.dt * scene.acceleration(np, q, v, u)

@@ -99,14 +99,14 @@ def certify(
     if closed is not None:
         found = Reference(np.asarray(closed, dtype=np.float64).reshape(1, -1), "closed_form")
     else:
-        found = _computed(problem, theta, provides, samples, tolerance)
+        found = _compute(problem, theta, provides, samples, tolerance)
     if physical is None or "grad" not in provides:
         return found
     plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
     return replace(found, plain=plain, physical=np.asarray(physical, dtype=np.float64))
 
 
-def _computed(
+def _compute(
     problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float
 ) -> Reference:
     program = problem.program
@@ -118,7 +118,7 @@ def _computed(
             quadrature = Reference(integral.gradient[None, :], method, integral.error)
             if integral.error <= QUADRATURE_TOLERANCE * np.linalg.norm(integral.gradient):
                 return quadrature
-    sampled = _sampled(problem, theta, provides, samples, tolerance)
+    sampled = _sample(problem, theta, provides, samples, tolerance)
     if quadrature is None:
         return sampled
     # a gradient near zero has no relative accuracy; what counts there is which method leaves less
@@ -141,9 +141,7 @@ Terms = Callable[[np.ndarray], np.ndarray]
 """Maps noise ``(n_w, B)`` to per-sample terms ``(d, B)`` whose expectation is the gradient."""
 
 
-def _sampled(
-    problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float
-) -> Reference:
+def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float) -> Reference:
     """Sample with the valid estimator of lowest variance, in independent batches, held against zeroth order.
 
     First order is valid where the cost is continuous. It gives way to zeroth order, with a note, where lines through the
@@ -157,7 +155,7 @@ def _sampled(
         orders["zeroth_order"] = lambda w: _antithetic(problem, theta, w, centre)
     if problem.program.continuous and "grad" in provides:
         orders["first_order"] = lambda w: problem.grad(theta, w)
-    pilot = _draw(problem, "pilot", columns, 0)
+    pilot = draw_columns(problem, "pilot", columns, 0)
     pilots = {name: terms(pilot) for name, terms in orders.items()}
     pilots = {name: terms for name, terms in pilots.items() if np.isfinite(terms).all()}
     if not pilots:
@@ -168,7 +166,7 @@ def _sampled(
     spread = {name: float(terms.var(axis=1, ddof=1).sum()) for name, terms in pilots.items()}
     chosen, doubt = min(spread, key=lambda name: spread[name]), ""
     if chosen == "first_order":
-        doubt = _doubt(problem, theta, pilots, pilot, directions, columns)
+        doubt = _reason_against_first_order(problem, theta, pilots, pilot, directions, columns)
     if doubt and "zeroth_order" in pilots:
         chosen = "zeroth_order"
 
@@ -177,17 +175,17 @@ def _sampled(
 
     found = sample(chosen)
     if chosen == "zeroth_order" or "zeroth_order" not in pilots:
-        return _noted(found, doubt)
+        return _with_note(found, doubt)
     # a pilot of heavy tails looks better than it is
     error = found.known().standard_error
     if 2.0 * spread["zeroth_order"] < _count(found) * error**2:
         other = sample("zeroth_order")
         if other.known().standard_error < error:
-            return _noted(other, "")
-    return _checked(problem, found, orders["zeroth_order"], columns, lambda: sample("zeroth_order"))
+            return _with_note(other, "")
+    return _cross_checked(problem, found, orders["zeroth_order"], columns, lambda: sample("zeroth_order"))
 
 
-def _doubt(
+def _reason_against_first_order(
     problem: Problem,
     theta: np.ndarray,
     pilots: dict[str, np.ndarray],
@@ -227,7 +225,7 @@ def _batches(
     batches = np.zeros((BATCHES, problem.dim))
     count = 0
     while True:
-        w = _draw(problem, "reference", BATCHES * size, count)
+        w = draw_columns(problem, "reference", BATCHES * size, count)
         means = in_columns(terms, w, columns).reshape(problem.dim, BATCHES, size).mean(axis=2).T
         batches = (batches * count + means * size) / (count + size)
         count += size
@@ -238,7 +236,7 @@ def _batches(
         se = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)
         enough = se <= tolerance * np.linalg.norm(batches.mean(axis=0)) and count * BATCHES >= LEAST_SAMPLES
         if spent or enough:
-            unseen = _unseen(problem, terms, batches.mean(axis=0), directions, count * BATCHES, columns)
+            unseen = _tail_error(problem, terms, batches.mean(axis=0), directions, count * BATCHES, columns)
             if spent or math.hypot(se, np.nan_to_num(unseen)) <= tolerance * np.linalg.norm(batches.mean(axis=0)):
                 break
         size = count
@@ -258,12 +256,12 @@ def _batches(
     return Reference(batches, f"sampling[{order},n={count * BATCHES}]", unseen, note=note)
 
 
-def _checked(
+def _cross_checked(
     problem: Problem, found: Reference, zeroth: Terms, columns: int, instead: Callable[[], Reference]
 ) -> Reference:
     """Hold a first-order reference against zeroth order of a quarter of its samples, and say what that could resolve."""
     count = max(columns, _count(found) // 4 // columns * columns)
-    check = in_columns(zeroth, _draw(problem, "check", count, 0), columns)
+    check = in_columns(zeroth, draw_columns(problem, "check", count, 0), columns)
     check = check.reshape(problem.dim, BATCHES, -1).mean(axis=2).T
     apart = found.gradient - check.mean(axis=0)
     errors = Sampling.of(found.batches), Sampling.of(check)
@@ -275,12 +273,12 @@ def _checked(
     at = {level: bias_interval(apart, *errors, level=level)[1] > size for level in (WARNED, REFUSED)}
     said = f"first and zeroth order disagree by {np.linalg.norm(apart):.2g} (check_z={z:.1f})"
     if at[REFUSED]:
-        return _noted(instead(), f"{said}, so zeroth order is used")
+        return _with_note(instead(), f"{said}, so zeroth order is used")
     method = found.method.removesuffix("]") + f",check_z={z:.1f},check_resolves={2.0 * math.sqrt(trace):.2g}]"
-    return _noted(replace(found, method=method), said if at[WARNED] else "")
+    return _with_note(replace(found, method=method), said if at[WARNED] else "")
 
 
-def _unseen(
+def _tail_error(
     problem: Problem, terms: Terms, mean: np.ndarray, directions: np.ndarray, count: int, columns: int
 ) -> float:
     """Return what the far tails add to the mean, as the largest over some directions: they hold few samples or none.
@@ -293,7 +291,7 @@ def _unseen(
     share = min(1.0, TAIL_EVENTS / count)
     each = max(1, columns // directions.shape[1])
     along = np.repeat(directions, each, axis=1)
-    w = _draw(problem, "tails", along.shape[1], 0)
+    w = draw_columns(problem, "tails", along.shape[1], 0)
     # the same noise with its component along the direction replaced by one beyond the quantile, of either sign
     middle = (np.arange(each) + 0.5) / each
     depth = -ndtri(0.5 * share * middle) * np.where(np.arange(each) % 2, 1.0, -1.0)
@@ -318,11 +316,11 @@ def _count(found: Reference) -> int:
     return int(found.method.split("n=")[1].split(",")[0].rstrip("]"))
 
 
-def _noted(found: Reference, note: str) -> Reference:
+def _with_note(found: Reference, note: str) -> Reference:
     return replace(found, note="; ".join(part for part in (note, found.note) if part))
 
 
-def _draw(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
+def draw_columns(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
     """Draw noise ``(n_w, count)`` from the reference's own streams, which no cell uses."""
     program = problem.program
     drawn = noise.draw(block, program.scene.name, 1, count, program.n_noise, stream)

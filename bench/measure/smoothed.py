@@ -51,12 +51,12 @@ def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples
     if program.continuous and "grad" in provides and not program.surrogate:
         orders["first_order"] = first
     columns = min(COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
-    pilot = _draw(problem, "ball pilot", columns, 0)
+    pilot = draw_columns(problem, "ball pilot", columns, 0)
     spread = {order: float(terms(pilot).var(axis=1).sum()) for order, terms in orders.items()}
     chosen = min(spread, key=lambda order: spread[order] if math.isfinite(spread[order]) else math.inf)
     size, count, batches = columns // BATCHES, 0, np.zeros((BATCHES, d))
     while True:
-        w = _draw(problem, "ball", BATCHES * size, count)
+        w = draw_columns(problem, "ball", BATCHES * size, count)
         means = in_columns(orders[chosen], w, columns).reshape(d, BATCHES, size).mean(axis=2).T
         batches = (batches * count + means * size) / (count + size)
         count += size
@@ -77,7 +77,7 @@ def _polar(problem: Problem, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return normal / size, gammainc(problem.dim / 2, size**2 / 2) ** (1 / problem.dim)
 
 
-def _draw(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
+def draw_columns(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
     """Draw noise ``(n_w, count)`` from streams that no cell uses."""
     program = problem.program
     drawn = noise.draw(block, program.scene.name, 1, count, program.n_noise, stream)

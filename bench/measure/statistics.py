@@ -28,8 +28,8 @@ __all__ = [
     "Truth",
     "bias_interval",
     "heavy_tails",
+    "is_unexplained",
     "summarise",
-    "unexplained",
     "variance_interval",
     "variance_per_sample",
 ]
@@ -51,7 +51,7 @@ UNEXPLAINED = "tails unseen or gradient wrong"
 """What a row says whose estimator declares to be unbiased while the interval of its bias excludes 0."""
 
 
-def unexplained(reason: str) -> bool:
+def is_unexplained(reason: str) -> bool:
     """Whether a row's remark says that its bias contradicts what the estimator declares: no bias to report as found."""
     return UNEXPLAINED in reason
 
@@ -242,11 +242,11 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
 
     limit = _student_quantile(0.5 + level / 2.0, 1.0 / doubt if doubt else math.inf)
     end = math.sqrt(total)
-    low = 0.0 if score(total, 0.0) <= limit else _falls_to(limit, lambda beta: score(total, beta), 0.0, end)
+    low = 0.0 if score(total, 0.0) <= limit else _bisect(limit, lambda beta: score(total, beta), 0.0, end)
     seen, end = max(total, 1.0), max(end, 1.0) + limit
     while score(seen, end) > -limit:
         end *= 2.0
-    high = _falls_to(-limit, lambda beta: score(seen, beta), 0.0, end)
+    high = _bisect(-limit, lambda beta: score(seen, beta), 0.0, end)
     return math.sqrt(max(0.0, total - 1.0)) * unit, low * unit, high * unit
 
 
@@ -260,7 +260,7 @@ def _noncentral_score(value: float, nu: float, noncentrality: float) -> float:
     return ((value / first) ** h - centre) / (h * math.sqrt(2.0 * p) * (1.0 + 0.5 * m * p))
 
 
-def _falls_to(target: float, function: Callable[[float], float], low: float, high: float) -> float:
+def _bisect(target: float, function: Callable[[float], float], low: float, high: float) -> float:
     """Return where in ``[low, high]`` a decreasing function reaches ``target``, to the last digit that matters."""
     for _ in range(50):
         middle = 0.5 * (low + high)
@@ -431,7 +431,7 @@ def summarise(
     repeats = len(estimates)
     finite = int(np.isfinite(estimates).all(axis=1).sum())
     if finite < repeats:
-        return _unknown(truth, finite / repeats, f"{repeats - finite} of {repeats} estimates are not finite")
+        return _not_finite(truth, finite / repeats, f"{repeats - finite} of {repeats} estimates are not finite")
 
     # In units of the largest entry, so that the squares of very large or small gradients are numbers too.
     unit = max(float(np.abs(part).max(initial=0.0)) for part in (estimates, truth.mean, truth.sampling.rows))
@@ -463,8 +463,8 @@ def summarise(
     rmse = math.sqrt(max(0.0, squared_error))
     relative = math.nan if norm <= ROUNDING or reference.vanishes() else norm
     cosine, signs = _directions(estimates, reference.mean)
-    notes = _remarks(deviations, difference, samples, identical)
-    notes += _about(reference, relative)
+    notes = _interval_remarks(deviations, difference, samples, identical)
+    notes += _reference_remarks(reference, relative)
     if unbiased and bias_low > 0.0:
         notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or 1 in 40 by chance")
     scaled = tuple(value * unit * unit for value in per_sample)
@@ -493,7 +493,7 @@ def summarise(
     )
 
 
-def _unknown(truth: Truth, finite_fraction: float, note: str) -> Summary:
+def _not_finite(truth: Truth, finite_fraction: float, note: str) -> Summary:
     values = dict.fromkeys((name for name in Summary.__dataclass_fields__ if name != "note"), math.nan)
     known = dict(reference_norm=truth.norm, reference_se=truth.standard_error, finite_fraction=finite_fraction)
     return Summary(**{**values, **known}, note=note)
@@ -501,17 +501,17 @@ def _unknown(truth: Truth, finite_fraction: float, note: str) -> Summary:
 
 def _directions(estimates: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
     """Return the mean cosine between estimates ``(R, d)`` and reference ``(d,)``, and the share of equal signs."""
-    told = reference != 0.0
-    if not told.any():
+    nonzero = reference != 0.0
+    if not nonzero.any():
         return math.nan, math.nan
     lengths = np.linalg.norm(estimates, axis=1)
     unit = reference / np.abs(reference).max()
     projections = estimates @ (unit / np.linalg.norm(unit)) / np.where(lengths > 0.0, lengths, 1.0)
-    agree = np.sign(estimates[:, told]) == np.sign(reference[told])
+    agree = np.sign(estimates[:, nonzero]) == np.sign(reference[nonzero])
     return float(np.clip(projections, -1.0, 1.0).mean()), float(agree.mean())
 
 
-def _about(reference: Truth, relative: float) -> list[str]:
+def _reference_remarks(reference: Truth, relative: float) -> list[str]:
     """Return what the reference does to relative columns; ``relative`` is its norm, or NaN where it vanishes."""
     norm, error = reference.norm, reference.standard_error
     if math.isnan(relative):
@@ -535,7 +535,7 @@ def heavy_tails(deviations: np.ndarray) -> float:
     return 0.0
 
 
-def _remarks(deviations: np.ndarray, difference: np.ndarray, samples: int, identical: bool) -> list[str]:
+def _interval_remarks(deviations: np.ndarray, difference: np.ndarray, samples: int, identical: bool) -> list[str]:
     """Return the reasons to doubt intervals from deviations ``(R, d)`` and a difference of means ``(d,)``."""
     repeats = len(deviations)
     if repeats == 1:

@@ -79,7 +79,7 @@ def timed(
     call(0)
     results: list[np.ndarray] = []
     seconds: list[float] = []
-    while len(seconds) < count or (len(seconds) < most * count and _goes_on(seconds, least_s, settle_s)):
+    while len(seconds) < count or (len(seconds) < most * count and _must_repeat(seconds, least_s, settle_s)):
         paused, start = pause.seconds, time.perf_counter()
         result = call(len(seconds) % count)
         seconds.append(time.perf_counter() - start - (pause.seconds - paused))
@@ -89,7 +89,7 @@ def timed(
     return results, Timing(float(median), float(high - low), tuple(seconds))
 
 
-def _goes_on(seconds: list[float], least_s: float, settle_s: float) -> bool:
+def _must_repeat(seconds: list[float], least_s: float, settle_s: float) -> bool:
     """Return whether calls have to be repeated: too short in all, or not yet steady and within the time for that."""
     total = sum(seconds)
     if total < least_s:

@@ -26,7 +26,7 @@ class Ratio:
     error: float
 
 
-def of_ratios(
+def causes_of_ratios(
     components: dict[int, list[Ratio]], directions: list[Ratio], some_right: bool, right_elsewhere: bool = False
 ) -> dict[int | None, str]:
     """Return the cause of each wrong component, and under None that of wrong directions.
@@ -44,7 +44,7 @@ def of_ratios(
     causes: dict[int | None, str] = {}
     some_right = some_right or right_elsewhere
     for component, ratios in components.items():
-        causes[component] = _of(ratios, some_right)
+        causes[component] = _cause(ratios, some_right)
     every = [ratio for ratios in components.values() for ratio in ratios]
     if len(components) > 1 and _constant(every):
         causes = dict.fromkeys(causes, "wrong_factor")
@@ -54,11 +54,11 @@ def of_ratios(
         kinds = [causes[c] for c in components]
         causes[None] = max(kinds, key=kinds.count)
     else:
-        causes[None] = _of(directions, some_right)
+        causes[None] = _cause(directions, some_right)
     return causes
 
 
-def _of(ratios: list[Ratio], some_right: bool) -> str:
+def _cause(ratios: list[Ratio], some_right: bool) -> str:
     if _constant(ratios):
         return "wrong_factor"
     values = [ratio.value for ratio in ratios]

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from . import roughness
-from .causes import Ratio, of_ratios
+from .causes import Ratio, causes_of_ratios
 from .direction import EPS, GUARD, Finding, Sample, judge
 from .sampling import order, points, samples
-from .verdicts import FAULTS, MEANING, TRUSTED, worst
+from .verdicts import FAULTS, MEANING, TRUSTED, most_severe
 
 Cost = Callable[[np.ndarray], np.ndarray]
 """Costs of columns: ``(d, B)`` to ``(B,)``."""
@@ -130,7 +130,7 @@ class Check:
         return tuple(part for part in self.parts if part.component is not None)
 
     @property
-    def guilty(self) -> tuple[Part, ...]:
+    def worst_parts(self) -> tuple[Part, ...]:
         """The parts that have the worst verdict, those at theta if there are any."""
         here = tuple(part for part in self.parts if part.verdict == self.cause)
         return here or tuple(part for part in self.draws if part.verdict == self.cause)
@@ -138,9 +138,9 @@ class Check:
     def sentence(self) -> str:
         """Say in one sentence what was found, with the numbers of the worst part."""
         text = f"{self.cause}: {MEANING[self.cause]}"
-        if not self.guilty:
+        if not self.worst_parts:
             return text
-        part = max(self.guilty, key=lambda p: (p.component is not None, np.nan_to_num(p.error, nan=np.inf)))
+        part = max(self.worst_parts, key=lambda p: (p.component is not None, np.nan_to_num(p.error, nan=np.inf)))
         if self.cause == "kink":
             return f"{text}; {part.name}: slopes {part.left:.6g} and {part.right:.6g}, the program's {part.program:.6g}"
         if self.trusted:
@@ -214,7 +214,7 @@ class _Checker:
     def run(self) -> Check:
         theta, options = self.theta, self.options
         first = self.gradient(theta)
-        chosen = self._chosen(first)
+        chosen = self._components(first)
         around = theta[:, None] + options.reach * self.scale[:, None] * self.random.standard_normal(
             (theta.size, options.draws)
         )
@@ -227,7 +227,7 @@ class _Checker:
         names = [f"component {i}" for i in chosen] + [f"direction {i}" for i in range(count)]
         vectors, lengths = self._directions(chosen)
         every = np.repeat(theta[:, None], len(names), axis=1), np.repeat(first[:, None], len(names), axis=1)
-        parts = self._parts(*every, vectors, lengths, names, [*chosen, *[None] * count], doubt)
+        parts = self._check_parts(*every, vectors, lengths, names, [*chosen, *[None] * count], doubt)
         names = [f"draw {k} direction {i}" for k in range(options.draws) for i in range(count)]
         draws: list[Part] = []
         if names:
@@ -235,8 +235,8 @@ class _Checker:
             found = np.repeat(np.stack(at_draws, axis=1), count, axis=1)
             none: list[int | None] = [None] * len(names)
             starts = np.repeat(around, count, axis=1)
-            draws = self._parts(starts, found, vectors, np.ones(len(names)), names, none, doubt, twice=False)
-        parts, draws = self._explained(parts, draws, around, at_draws)
+            draws = self._check_parts(starts, found, vectors, np.ones(len(names)), names, none, doubt, twice=False)
+        parts, draws = self._with_causes(parts, draws, around, at_draws)
         causes = [part.verdict for part in parts]
         # elsewhere, only what is certain counts: theta itself is on no kink of another theta
         causes += [part.verdict for part in draws if part.verdict in FAULTS]
@@ -249,7 +249,7 @@ class _Checker:
         size = max((abs(sample.centre) for sample in centres), default=0.0)
         orders = [part.order for part in parts if part.component is None and np.isfinite(part.order)]
         return Check(
-            cause=worst(causes),
+            cause=most_severe(causes),
             theta=theta,
             gradient=first,
             scale=self.scale,
@@ -262,7 +262,7 @@ class _Checker:
             gradients=self.gradients,
         )
 
-    def _chosen(self, gradient: np.ndarray) -> list[int]:
+    def _components(self, gradient: np.ndarray) -> list[int]:
         """Return the components that are checked one by one."""
         dim, most = gradient.size, self.options.components
         if dim <= most:
@@ -281,7 +281,7 @@ class _Checker:
         vectors = np.concatenate([np.diag(self.scale)[:, chosen], random], axis=1)
         return vectors, np.concatenate([self.scale[chosen], np.ones(count)])
 
-    def _parts(
+    def _check_parts(
         self,
         thetas: np.ndarray,
         gradients: np.ndarray,
@@ -317,7 +317,7 @@ class _Checker:
             found = [replace(s, derivative=judge(s).difference) for s in found]
         judged = [judge(sample) for sample in found]
         if twice:
-            judged = self._scanned(thetas, vectors, found, judged)
+            judged = self._with_staircases(thetas, vectors, found, judged)
         modes = [(tuple(a), tuple(b)) for a, b in zip(minus, plus, strict=True)]
         return [
             _part(names[m], components[m], sample, finding, modes[m])
@@ -333,7 +333,7 @@ class _Checker:
         names = np.array(self._modes(columns), dtype=object).reshape(count, 2 * eps)
         return names[:, :eps], names[:, eps:]
 
-    def _scanned(
+    def _with_staircases(
         self, thetas: np.ndarray, vectors: np.ndarray, found: list[Sample], judged: list[Finding]
     ) -> list[Finding]:
         """Look for staircases in the cost along the directions that are not plainly right.
@@ -347,17 +347,17 @@ class _Checker:
             if finding.verdict not in plain
             or (finding.verdict == "nonlinear" and sample.derivative == 0.0 and sample.differences.any())
         ][: self.options.scanned]
-        along = roughness.scans(1.0, self.unit)
+        along = roughness.staircase_offsets(1.0, self.unit)
         for m in asked:
             at = thetas[:, m : m + 1] + vectors[:, m : m + 1] * along.reshape(1, -1)
             values = self.cost(at).reshape(along.shape)
             for spacing, row in zip(along, values, strict=True):
-                if roughness.treads(row, 8.0 * self.unit * float(np.abs(row).max())):
-                    judged[m] = self._stepped(found[m], judged[m], row, float(spacing[1]))
+                if roughness.is_staircase(row, 8.0 * self.unit * float(np.abs(row).max())):
+                    judged[m] = self._judge_staircase(found[m], judged[m], row, float(spacing[1]))
                     break
         return judged
 
-    def _stepped(self, sample: Sample, finding: Finding, row: np.ndarray, spacing: float) -> Finding:
+    def _judge_staircase(self, sample: Sample, finding: Finding, row: np.ndarray, spacing: float) -> Finding:
         """Return the finding on a staircase: ``precision`` where the gradient is right beyond its treads.
 
         A cast to a shorter float leaves the gradient as it is, one to an integer cuts it off.
@@ -368,7 +368,7 @@ class _Checker:
         coarse = judge(replace(sample, noise=max(sample.noise or 0.0, tread)))
         return replace(coarse, verdict="precision" if coarse.verdict in TRUSTED else "staircase")
 
-    def _explained(
+    def _with_causes(
         self, parts: list[Part], draws: list[Part], around: np.ndarray, at_draws: list[np.ndarray]
     ) -> tuple[list[Part], list[Part]]:
         """Give wrong parts a finer cause: what their ratios to the differences are, here and at other thetas."""
@@ -378,11 +378,11 @@ class _Checker:
         still = bool(at_draws) and all(np.array_equal(g, at_draws[0]) for g in at_draws)
         here = [part for part in parts if part.verdict in FAULTS]
         if still and at_draws[0].any() and not here:
-            return parts, [_named(part, "stale_gradient", ("wrong_adjoint",)) for part in draws]
+            return parts, [_with_verdict(part, "stale_gradient", ("wrong_adjoint",)) for part in draws]
         guilty = [part.component for part in parts if any(part is one for one in wrong) and part.component is not None]
         ratios = {i: [_ratio(part) for part in parts if part.component == i] for i in guilty}
         count, few = len(guilty), min(len(at_draws), ELSEWHERE)
-        again = self._parts(
+        again = self._check_parts(
             np.repeat(around[:, :few], count, axis=1),
             np.repeat(np.stack(at_draws[:few], axis=1), count, axis=1) if few else np.zeros((around.shape[0], 0)),
             np.tile(np.diag(self.scale)[:, guilty], few),
@@ -398,13 +398,13 @@ class _Checker:
         whole = [part for part in (*parts, *draws) if part.component is None and part.verdict == "wrong_adjoint"]
         right = any(part.verdict in TRUSTED and part.verdict != "zero" for part in parts if part.component is not None)
         along = [_ratio(part) for part in whole]
-        cause = of_ratios(ratios, along, right)
-        if "wrong_adjoint" in cause.values() and self._right_far_away():
-            cause = of_ratios(ratios, along, right, right_elsewhere=True)
-        renamed = [_named(part, cause.get(part.component, cause[None]), ("wrong_adjoint",)) for part in parts]
-        return renamed, [_named(part, cause[None], ("wrong_adjoint",)) for part in draws]
+        cause = causes_of_ratios(ratios, along, right)
+        if "wrong_adjoint" in cause.values() and self._is_right_far_away():
+            cause = causes_of_ratios(ratios, along, right, right_elsewhere=True)
+        renamed = [_with_verdict(part, cause.get(part.component, cause[None]), ("wrong_adjoint",)) for part in parts]
+        return renamed, [_with_verdict(part, cause[None], ("wrong_adjoint",)) for part in draws]
 
-    def _right_far_away(self) -> bool:
+    def _is_right_far_away(self) -> bool:
         """Return whether the gradient is right at some theta farther away, so that what it misses acts only near this one.
 
         Two random directions have to agree there, since one may by chance. A slope of exactly 0 says nothing.
@@ -417,7 +417,7 @@ class _Checker:
             vectors = self.scale[:, None] * self.random.standard_normal(thetas.shape)
             names, none = [""] * thetas.shape[1], [None] * thetas.shape[1]
             doubt = np.zeros(self.theta.size)
-            parts = self._parts(thetas, gradients, vectors, np.ones(len(names)), names, none, doubt, twice=False)
+            parts = self._check_parts(thetas, gradients, vectors, np.ones(len(names)), names, none, doubt, twice=False)
             right = [k for k, part in enumerate(parts) if part.verdict in PLAINLY and part.program != 0.0]
             thetas, gradients = thetas[:, right], gradients[:, right]
         return thetas.shape[1] > 0
@@ -448,5 +448,5 @@ def _part(
     )
 
 
-def _named(part: Part, verdict: str, instead: Sequence[str]) -> Part:
+def _with_verdict(part: Part, verdict: str, instead: Sequence[str]) -> Part:
     return replace(part, verdict=verdict) if part.verdict in instead else part

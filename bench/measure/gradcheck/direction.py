@@ -22,11 +22,11 @@ RISE = 0.01
 """Relative error from which an end of the curve counts as risen."""
 WINDOW = 7
 """Neighbouring steps (three decades of them) along which a kink has to stay the same."""
-BRIEFLY = 4
+SHORT_WINDOW = 4
 """Neighbouring steps along which a slope has to stay the same in an exploding rollout, and a jump at the smallest."""
 ALIKE = 0.1
 """Relative spread within which values count as the same."""
-FEWEST = 7
+MIN_STEPS = 7
 """Steps with finite costs on both sides without which nothing is judged."""
 
 
@@ -148,7 +148,7 @@ def judge(sample: Sample) -> Finding:
     if not sample.repeatable:
         return Finding("nondeterministic")
     finite = sample.finite
-    if not np.isfinite(sample.centre) or finite.sum() < FEWEST:
+    if not np.isfinite(sample.centre) or finite.sum() < MIN_STEPS:
         return Finding("nonfinite")
     if not np.isfinite(sample.derivative):
         return Finding("nan_gradient")
@@ -164,12 +164,14 @@ def _judge(sample: Sample) -> Finding:
     if sample.derivative == 0.0 and still.all():
         return Finding("zero", 0, 0.0, float(sample.uncertainty[0]), 0.0, 0.0)
     noise = sample.uncertainty
-    if _jumps(sample, noise):
-        return _at(sample, "jump", sample.step.size - 1, float("nan"))
+    if _has_jump(sample, noise):
+        return _finding(sample, "jump", sample.step.size - 1, float("nan"))
     bend = sample.right - sample.left
-    kink = _settled(bend, 2.0 * noise)
+    kink = _last_stable_index(bend, 2.0 * noise)
     if kink is not None:
-        return _at(sample, "kink" if _between(sample, noise) else _wrong(sample), kink, float(noise[kink]))
+        return _finding(
+            sample, "kink" if _is_between_slopes(sample, noise) else _classify_wrong(sample), kink, float(noise[kink])
+        )
     index, spread = plateau(sample, noise)
     uncertainty = spread + float(noise[index])
     # ten times the spread, since the best of many spreads is a lucky one
@@ -179,14 +181,14 @@ def _judge(sample: Sample) -> Finding:
     resolved = uncertainty <= max(alike, rounding)
     # a tolerance as wide as the derivative would pass half of it
     if apart <= min(tolerance, alike + rounding + sample.doubt) and resolved:
-        return _at(sample, _ends(sample, index, still), index, uncertainty)
+        return _finding(sample, _classify_right(sample, index, still), index, uncertainty)
     if sample.crossing[index]:
-        return _at(sample, _sided(sample, noise), index, uncertainty)
-    settled = apart > tolerance and _believed(sample, index, uncertainty, tolerance)
-    return _at(sample, _wrong(sample) if settled else "unsettled", index, uncertainty)
+        return _finding(sample, _judge_one_sided(sample, noise), index, uncertainty)
+    settled = apart > tolerance and _is_credible(sample, index, uncertainty, tolerance)
+    return _finding(sample, _classify_wrong(sample) if settled else "unsettled", index, uncertainty)
 
 
-def _at(sample: Sample, verdict: str, index: int, uncertainty: float) -> Finding:
+def _finding(sample: Sample, verdict: str, index: int, uncertainty: float) -> Finding:
     sides = float(sample.left[index]), float(sample.right[index])
     return Finding(verdict, index, float(sample.differences[index]), uncertainty, *sides)
 
@@ -218,31 +220,31 @@ def _spread(differences: np.ndarray) -> np.ndarray:
     return np.fmax(np.r_[apart[0], apart], np.r_[apart, apart[-1]])
 
 
-def _believed(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:
+def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:
     """Return whether differences that contradict the derivative may be believed.
 
     Where the noise exceeds rounding's, as in an amplifying rollout, they are known to within ALIKE of their own size,
-    over BRIEFLY neighbouring steps. Elsewhere it is enough that they are apart by twice what is tolerated.
+    over SHORT_WINDOW neighbouring steps. Elsewhere it is enough that they are apart by twice what is tolerated.
     """
     differences = sample.differences
     near = np.asarray(np.abs(differences - differences[index]) <= ALIKE * abs(differences[index]))
-    lasting = np.asarray(_windows(near, BRIEFLY).all(axis=1))
-    settled = bool(lasting[max(0, index - BRIEFLY + 1) : index + 1].any())
+    lasting = np.asarray(_windows(near, SHORT_WINDOW).all(axis=1))
+    settled = bool(lasting[max(0, index - SHORT_WINDOW + 1) : index + 1].any())
     if settled and uncertainty <= ALIKE * abs(differences[index]):
         return True
     plain = (sample.noise or 0.0) / sample.step[index] <= sample.rounding(sample.unit)[index]
     return bool(plain and abs(differences[index] - sample.derivative) > 2.0 * tolerance)
 
 
-def _sided(sample: Sample, noise: np.ndarray) -> str:
+def _judge_one_sided(sample: Sample, noise: np.ndarray) -> str:
     """Return the verdict by one-sided slopes, where the two sides of every difference meet different contacts.
 
-    A slope settles where it is the same over BRIEFLY neighbouring steps. In an exploding rollout that happens
+    A slope settles where it is the same over SHORT_WINDOW neighbouring steps. In an exploding rollout that happens
     only at the smallest steps, where rounding is amplified like the state, and over fewer steps than a kink needs.
     """
     settled = False
     for slopes in (sample.left, sample.right):
-        for window, noises in zip(_windows(slopes, BRIEFLY), _windows(noise, BRIEFLY)[:, -1], strict=True):
+        for window, noises in zip(_windows(slopes, SHORT_WINDOW), _windows(noise, SHORT_WINDOW)[:, -1], strict=True):
             middle, spread = float(np.median(window)), float(np.ptp(window))
             if spread + noises > ALIKE * abs(middle):
                 continue
@@ -250,7 +252,7 @@ def _sided(sample: Sample, noise: np.ndarray) -> str:
             tolerance = 2.0 * spread + noises + float(np.cbrt(sample.unit)) * abs(middle)
             if abs(middle - sample.derivative) <= tolerance:
                 return "kink"
-    return _wrong(sample) if settled else "unsettled"
+    return _classify_wrong(sample) if settled else "unsettled"
 
 
 def _resolution(sample: Sample, index: int) -> float:
@@ -258,11 +260,11 @@ def _resolution(sample: Sample, index: int) -> float:
     return float(np.cbrt(sample.unit)) * sample.size(index)
 
 
-def _wrong(sample: Sample) -> str:
+def _classify_wrong(sample: Sample) -> str:
     return "disconnected" if sample.derivative == 0.0 else "wrong_adjoint"
 
 
-def _between(sample: Sample, noise: np.ndarray) -> bool:
+def _is_between_slopes(sample: Sample, noise: np.ndarray) -> bool:
     """Return whether the derivative lies between the one-sided slopes over the smallest step that rounding resolves.
 
     A slope is trusted to within its change since the step before, which exceeds its error of order h.
@@ -276,24 +278,24 @@ def _between(sample: Sample, noise: np.ndarray) -> bool:
     return bool(low <= sample.derivative <= high)
 
 
-def _jumps(sample: Sample, noise: np.ndarray) -> bool:
+def _has_jump(sample: Sample, noise: np.ndarray) -> bool:
     """Return whether the cost jumps at theta: it differs between two points by what no smaller step reduces.
 
     Two neighbouring steps give the limit of the difference at step 0, as what is linear in the step cancels. The limit
-    must be the same over BRIEFLY + 1 of the smallest steps, and exceed the noise.
+    must be the same over SHORT_WINDOW + 1 of the smallest steps, and exceed the noise.
     """
     height = noise * sample.step
     ratio = sample.step[:-1] / sample.step[1:]
     for rise in (sample.plus - sample.minus, sample.plus - sample.centre, sample.centre - sample.minus):
-        limits = ((ratio * rise[1:] - rise[:-1]) / (ratio - 1.0))[-BRIEFLY:]
-        error = 2.0 * ((ratio * height[1:] + height[:-1]) / (ratio - 1.0))[-BRIEFLY:]
+        limits = ((ratio * rise[1:] - rise[:-1]) / (ratio - 1.0))[-SHORT_WINDOW:]
+        error = 2.0 * ((ratio * height[1:] + height[:-1]) / (ratio - 1.0))[-SHORT_WINDOW:]
         middle = abs(float(np.median(limits)))
         if np.ptp(limits) <= ALIKE * middle + error.max() and middle > 2.0 * error.max():
             return True
     return False
 
 
-def _settled(values: np.ndarray, noise: np.ndarray) -> int | None:
+def _last_stable_index(values: np.ndarray, noise: np.ndarray) -> int | None:
     """Return the end of the last window of values that is constant to within ``ALIKE``, exceeds the noise, and stands.
 
     It does not stand where values at smaller steps contradict it by more than their own noise.
@@ -315,9 +317,9 @@ def _windows(values: np.ndarray, size: int) -> np.ndarray:
     return np.lib.stride_tricks.sliding_window_view(values, size)
 
 
-def _ends(sample: Sample, index: int, still: np.ndarray) -> str:
+def _classify_right(sample: Sample, index: int, still: np.ndarray) -> str:
     """Return the verdict on a derivative that is right, by how its differences err at small and at large steps."""
-    if sample.derivative == 0.0 and still[-FEWEST:].all():
+    if sample.derivative == 0.0 and still[-MIN_STEPS:].all():
         return "saturated"
     errors = np.abs(sample.differences - sample.derivative)
     small = np.arange(errors.size) > index

@@ -61,13 +61,13 @@ def scatter(step: np.ndarray, differences: np.ndarray) -> float:
     return middle if turns >= POINTS // 2 and size.max() <= 10.0 * middle else 0.0
 
 
-def scans(scale: float, unit: float) -> np.ndarray:
-    """Return displacements for :func:`treads` at seven spacings, a decade apart, ``(7, SCAN)``."""
+def staircase_offsets(scale: float, unit: float) -> np.ndarray:
+    """Return displacements for :func:`is_staircase` at seven spacings, a decade apart, ``(7, SCAN)``."""
     spacings = np.sqrt(unit) * 10.0 ** np.arange(-2.0, 5.0) * scale
     return spacings[:, None] * np.arange(SCAN)
 
 
-def treads(values: np.ndarray, rounding: float) -> bool:
+def is_staircase(values: np.ndarray, rounding: float) -> bool:
     """Return whether equally spaced ``values (n,)`` lie on a staircase, perhaps one that is added to a straight line.
 
     Most increments are then the same to within ``rounding``, and the others stand out of it one by one, by

@@ -1,4 +1,4 @@
-"""The names that a gradient check can give, worst first, and which of them nobody may build on."""
+"""The names that a gradient check can give, most_severe first, and which of them nobody may build on."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TRUSTED = ("saturated", "rounding", "mode_crossing", "nonlinear", "smooth", "zer
 UNTRUSTED = (*FAULTS, *UNDECIDED, *BROKEN)
 """Verdicts that end a check with exit status 1."""
 VERDICTS = (*UNTRUSTED, *TRUSTED)
-"""All verdicts, worst first."""
+"""All verdicts, most_severe first."""
 MEANING = {
     "nan_gradient": "the gradient is NaN or infinite where the cost is a number",
     "nondeterministic": "the same call gives different numbers",
@@ -43,6 +43,6 @@ MEANING = {
 """What each verdict says."""
 
 
-def worst(verdicts: Iterable[str]) -> str:
+def most_severe(verdicts: Iterable[str]) -> str:
     """Return the worst of some verdicts."""
     return min(verdicts, key=VERDICTS.index)
