@@ -64,7 +64,7 @@ FAULTS = [
     Fault(Q, "panels *= 2", "panels *= 1", OF_REFERENCE),
     Fault(Q, "REACH = 9.0", "REACH = 2.5", OF_REFERENCE),
     # sampling
-    Fault(R, "w = draw_columns(problem, \"reference\", BATCHES * size, count)", "w = draw_columns(problem, \"reference\", BATCHES * size, 0)", OF_REFERENCE),
+    Fault(R, "w = draw_columns(problem, stream, BATCHES * size, count)", "w = draw_columns(problem, stream, BATCHES * size, 0)", OF_REFERENCE),
     Fault(R, "draw_columns(problem, \"check\", count, 0)", "draw_columns(problem, \"reference\", count, 0)", OF_REFERENCE),
     Fault(R, "se = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)", "se = math.sqrt(batches.var(axis=0, ddof=1).sum()) / BATCHES / 2", OF_REFERENCE),
     Fault(R, "count * BATCHES >= LEAST_SAMPLES", "True", OF_REFERENCE),
