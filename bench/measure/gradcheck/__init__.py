@@ -1,4 +1,4 @@
-"""Gradient checks: pure functions of a cost and a gradient, which know nothing of problems."""
+"""Gradient checks: pure functions of a cost and a gradient, independent of problems."""
 
 from .check import Check, Options, Part, check
 from .direction import EPS, SHORT_WINDOW, WINDOW, Finding, Sample, best, diagnose, judge
