@@ -15,8 +15,8 @@ BENCH = ROOT / "bench"
 LAYERS = [
     ["errors", "interrupts", "deprecated"],
     ["model"],
-    ["measure", "conformance", "plugins"],
-    ["experiment"],
+    ["measure", "plugins"],
+    ["experiment", "conformance"],
     ["run"],
     ["report"],
     ["studies", "trace"],

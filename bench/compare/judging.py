@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.experiment.columns import Column, Columns, ComparisonRule
-from bench.measure.statistics import UNEXPLAINED, unexplained
+from bench.measure.statistics import UNEXPLAINED, is_unexplained
 from bench.report.text import number
 
 EFFECT = 1.25
@@ -71,7 +71,7 @@ def judge(column: Column, columns: Columns, old: Row, new: Row) -> Change | None
         change = change._replace(outcome="changed")
     remarks = [str(row["reason"]) for row in (old, new) if isinstance(row.get("reason"), str) and row["reason"]]
     if remarks and column.comparison.by in ("interval", "spread"):
-        doubt = UNEXPLAINED if any(map(unexplained, remarks)) else "intervals doubtful"
+        doubt = UNEXPLAINED if any(map(is_unexplained, remarks)) else "intervals doubtful"
         return Change("changed", f"{change.text}, {doubt}")
     return change
 

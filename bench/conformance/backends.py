@@ -20,16 +20,16 @@ from bench.conformance.subjects import (
     NewtonOps,
     all_programs,
     available,
-    covering,
+    describe,
     distance,
     distinguishing_programs,
-    disturbed,
     law_for,
     plain_backend,
+    representative_programs,
     rng,
     samples,
     stepping,
-    title,
+    with_changed_column,
 )
 from bench.model import (
     Array,
@@ -93,10 +93,10 @@ def value_agrees(backend: Backend) -> str:
     for program in programs:
         theta, w = samples(program)
         value = backend.compile(program).value(theta, w)
-        require(value.shape == (COLUMNS,), f"{title(program)}: shape {value.shape}, not {(COLUMNS,)}")
+        require(value.shape == (COLUMNS,), f"{describe(program)}: shape {value.shape}, not {(COLUMNS,)}")
         off = distance(value, plain.compile(program).value(theta, w))
         allowed = _allowed(backend, program, SAME)
-        require(off < allowed, f"{title(program)}: costs differ by {off:.1e}, more than {allowed:g}")
+        require(off < allowed, f"{describe(program)}: costs differ by {off:.1e}, more than {allowed:g}")
         worst = max(worst, off)
     return f"to {worst:.0e} on {len(programs)} programs"
 
@@ -114,26 +114,28 @@ def gradient_is_that_of_value(backend: Backend) -> str:
     """Verify gradients against central differences of the costs along random directions, except at kinks and jumps."""
     if "grad" not in backend.provides:
         raise Skipped("gives no gradients")
-    worst, judged, programs = 0.0, 0, programs_for(backend, covering)
+    worst, judged, programs = 0.0, 0, programs_for(backend, representative_programs)
     for program in programs:
         theta, w = samples(program)
         problem = backend.compile(program)
         gradient = problem.grad(theta, w)
-        require(gradient.shape == theta.shape, f"{title(program)}: shape {gradient.shape}, not {theta.shape}")
-        require(np.isfinite(gradient).all(), f"{title(program)}: not finite")
+        require(gradient.shape == theta.shape, f"{describe(program)}: shape {gradient.shape}, not {theta.shape}")
+        require(np.isfinite(gradient).all(), f"{describe(program)}: not finite")
         off, smooth = _against_differences(problem, gradient, theta, w)
-        require(smooth.any(), f"{title(program)}: no column on which differences settle")
+        require(smooth.any(), f"{describe(program)}: no column on which differences settle")
         if program.surrogate and "surrogate" in backend.provides:
-            require(off.max() > GRADIENT, f"{title(program)}: declares a surrogate gradient, but gives the derivative")
+            require(
+                off.max() > GRADIENT, f"{describe(program)}: declares a surrogate gradient, but gives the derivative"
+            )
             continue
         off = np.where(smooth, off, 0.0)
-        require(off.max() < GRADIENT, f"{title(program)}: differs from central differences by {off.max():.1e}")
+        require(off.max() < GRADIENT, f"{describe(program)}: differs from central differences by {off.max():.1e}")
         # theta that is not the scene's own, where an adjoint may use what it kept of that
         theta = program.theta0[:, None] + ELSEWHERE * (theta - program.theta0[:, None])
         with np.errstate(all="ignore"):
             beside, agree = _against_differences(problem, problem.grad(theta, w), theta, w)
         worse = np.where(agree, beside, 0.0).max()
-        require(worse < GRADIENT, f"{title(program)}: differs from central differences by {worse:.1e} beside theta0")
+        require(worse < GRADIENT, f"{describe(program)}: differs from central differences by {worse:.1e} beside theta0")
         worst, judged = max(worst, off.max()), judged + smooth.sum()
     return f"to {worst:.0e} on {judged} of {len(programs) * COLUMNS} columns of {len(programs)} programs"
 
@@ -163,17 +165,17 @@ def score_is_that_of_actions(backend: Backend) -> str:
         score = problem.score(theta, w)
         if program.noise_on_theta:
             off = distance(score, w / program.scene.sigma)
-            require(off < ROUNDED, f"{title(program)}: differs from w / sigma by {off:.1e}")
+            require(off < ROUNDED, f"{describe(program)}: differs from w / sigma by {off:.1e}")
             continue
         e, h, ops = rng("direction").standard_normal(theta.shape), 1e-3, NewtonOps()
         ahead, behind = (program.log_probability(ops, theta, theta + s * h * e, w) for s in (1, -1))
         off = distance((score * e).sum(axis=0), (ahead - behind) / (2 * h))
         allowed = _allowed(backend, program, SCORE)
-        require(off < allowed, f"{title(program)}: differs from differences of log p by {off:.1e}")
+        require(off < allowed, f"{describe(program)}: differs from differences of log p by {off:.1e}")
         many = problem.score(program.theta0, rng("scores").standard_normal((program.n_noise, 4096)))
         z = np.abs(many.mean(axis=1)) / (many.std(axis=1) / 64)
-        require(z.max() < LIMIT, f"{title(program)}: the mean is {z.max():.1f} standard errors from zero")
-        details.append(f"{title(program)} to {off:.0e}, mean within {z.max():.1f} standard errors of 0")
+        require(z.max() < LIMIT, f"{describe(program)}: the mean is {z.max():.1f} standard errors from zero")
+        details.append(f"{describe(program)} to {off:.0e}, mean within {z.max():.1f} standard errors of 0")
     return "; ".join(details) or "w / sigma"
 
 
@@ -185,12 +187,14 @@ def columns_are_independent(backend: Backend) -> str:
         problem, (theta, w) = backend.compile(program), samples(program)
         for capability in sorted(backend.provides & {"value", "grad", "score"}):
             function = getattr(problem, capability)
-            whole, other = function(theta, w), function(*disturbed(theta, w))
+            whole, other = function(theta, w), function(*with_changed_column(theta, w))
             kept = np.arange(COLUMNS) != 2
             off = distance(other[..., kept], whole[..., kept])
-            require(off < DIFFERENCED, f"{capability} of {title(program)}: a column changes others by {off:.1e}")
+            require(off < DIFFERENCED, f"{capability} of {describe(program)}: a column changes others by {off:.1e}")
             off = max(off, distance(function(theta[:, ::-1], w[:, ::-1])[..., ::-1], whole))
-            require(off < DIFFERENCED, f"{capability} of {title(program)}: the order of columns matters by {off:.1e}")
+            require(
+                off < DIFFERENCED, f"{capability} of {describe(program)}: the order of columns matters by {off:.1e}"
+            )
             worst = max(worst, off)
     return f"to {worst:.0e}"
 
@@ -206,9 +210,11 @@ def shared_theta_is_spread(backend: Backend) -> str:
             function = getattr(problem, capability)
             spread = function(np.repeat(theta[:, None], COLUMNS, axis=1), w)
             off = distance(function(theta, w), spread)
-            require(off < DIFFERENCED, f"{capability} of {title(program)}: theta (d,) and (d, B) differ by {off:.1e}")
+            require(
+                off < DIFFERENCED, f"{capability} of {describe(program)}: theta (d,) and (d, B) differ by {off:.1e}"
+            )
             off = max(off, distance(function(theta, w[:, :1]), spread[..., :1]))
-            require(off < DIFFERENCED, f"{capability} of {title(program)}: a single column differs by {off:.1e}")
+            require(off < DIFFERENCED, f"{capability} of {describe(program)}: a single column differs by {off:.1e}")
             worst = max(worst, off)
     return f"to {worst:.0e}"
 
@@ -231,8 +237,10 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
             gone = ~np.isfinite(problem.grad(far, w)).all(axis=0)
             if plain.incompatibility(program) is None:
                 beyond = ~np.isfinite(plain.compile(program).value(far, w))
-                require(failed[beyond].all(), f"{title(program)}: a rollout that leaves all numbers has a finite cost")
-        require(gone[failed].all(), f"{title(program)}: a cost that is not finite has a finite gradient")
+                require(
+                    failed[beyond].all(), f"{describe(program)}: a rollout that leaves all numbers has a finite cost"
+                )
+        require(gone[failed].all(), f"{describe(program)}: a cost that is not finite has a finite gradient")
         lost.append(failed.any())
     if not any(lost):
         raise Skipped(f"no rollout fails {FAR:g} away")
@@ -247,9 +255,9 @@ def single_precision_is_finite(backend: Backend) -> str:
     smooth = [p for p in programs_for(single, distinguishing_programs) if p.contact is None and p.continuous]
     for program, capability in itertools.product(smooth, worst):
         actual, expected = (getattr(b.compile(program), capability)(*samples(program)) for b in (single, backend))
-        require(np.isfinite(actual).all(), f"{capability} of {title(program)}: not finite in float32")
+        require(np.isfinite(actual).all(), f"{capability} of {describe(program)}: not finite in float32")
         off = distance(actual, expected)
-        require(off < SINGLE, f"{capability} of {title(program)}: float32 differs by {off:.1e}")
+        require(off < SINGLE, f"{capability} of {describe(program)}: float32 differs by {off:.1e}")
         worst[capability] = max(worst[capability], off)
     require(any(worst.values()), "float32 gives the numbers of float64")
     return ", ".join(f"{capability} to {off:.0e}" for capability, off in worst.items())
@@ -269,7 +277,7 @@ def provides_is_truthful(backend: Backend) -> str:
             require(
                 result.shape == shape and result.dtype == np.float64, f"{capability} is {result.dtype}{result.shape}"
             )
-            require(np.isfinite(result).all(), f"{capability} of {title(program)} is not finite")
+            require(np.isfinite(result).all(), f"{capability} of {describe(program)} is not finite")
     if "root" not in backend.provides:
         try:
             _implicit_problem(backend, 1).value(np.zeros(1), np.zeros((1, 1)))

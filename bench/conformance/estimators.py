@@ -28,7 +28,7 @@ SIGMAS = (0.1, 0.5)
 """Noise levels of the oracles: never 1, where sigma and its square are the same."""
 
 
-class Watched(Problem):
+class RecordingProblem(Problem):
     """A problem that notes which capabilities are used, and refuses those that are not allowed."""
 
     def __init__(self, inner: Problem, allowed: frozenset[str]) -> None:
@@ -109,7 +109,7 @@ def feedback_oracle() -> Oracle:
     raise Skipped("no scene with a policy under action noise is registered")
 
 
-def lively_oracle(estimator: Estimator) -> Oracle:
+def varying_oracle(estimator: Estimator) -> Oracle:
     """Return the first oracle on which no two samples have the same gradient, and sigma matters."""
     for oracle in usable(estimator, [o for o in oracles() if o.continuous]):
         w = rng("lively").standard_normal((oracle.problem.program.n_noise, 64))
@@ -166,7 +166,7 @@ def shape_and_repeatability(estimator: Estimator) -> str:
 @verifies(Estimator)
 def diagnostics_are_as_declared(estimator: Estimator) -> str:
     """Verify that ``explained`` gives the estimates, and finite ``(R,)`` or ``(R, d)`` arrays of the declared names."""
-    oracle = lively_oracle(estimator)
+    oracle = varying_oracle(estimator)
     noise = draw_noise(oracle, 6, 8)
     values, decided = estimator.estimate_with_diagnostics(oracle.problem, oracle.problem.program.theta0, noise)
     same = np.array_equal(values, estimates(estimator, oracle, noise))
@@ -185,7 +185,7 @@ def diagnostics_are_as_declared(estimator: Estimator) -> str:
 @verifies(Estimator)
 def repeats_are_independent(estimator: Estimator) -> str:
     """Verify that estimate r depends on ``noise[r]`` and on no other."""
-    oracle = lively_oracle(estimator)
+    oracle = varying_oracle(estimator)
     noise = np.array(draw_noise(oracle, 6, 8))
     whole = estimates(estimator, oracle, noise)
     order = np.array([3, 0, 5, 1, 4, 2])
@@ -206,7 +206,7 @@ def repeats_are_independent(estimator: Estimator) -> str:
 @verifies(Estimator)
 def uses_every_sample(estimator: Estimator) -> str:
     """Verify that other noise in any one of 8 samples (or any eighth of 4096, if needed) changes the estimate."""
-    oracle = lively_oracle(estimator)
+    oracle = varying_oracle(estimator)
     unused = set(range(8))
     for size in (1, 512):
         noise = draw_noise(oracle, 8, 8 * size)
@@ -224,7 +224,7 @@ def uses_every_sample(estimator: Estimator) -> str:
 @verifies(Estimator)
 def variance_falls_as_one_over_n(estimator: Estimator) -> str:
     """Verify the slope of log variance against log N: -1 for sample means and unbiased ones, else at most -1."""
-    oracle = lively_oracle(estimator)
+    oracle = varying_oracle(estimator)
     counts, groups = np.array([32, 128, 512]), 16
     logs = np.empty((len(counts), groups))
     for i, n in enumerate(counts):
@@ -319,9 +319,9 @@ def _standard_errors(estimator: Estimator, oracle: Oracle, count: int, repeats: 
 @verifies(Estimator)
 def needs_are_truthful(estimator: Estimator) -> str:
     """Verify that the estimator runs with only what it needs, and uses all of that."""
-    oracle = lively_oracle(estimator)
-    watched = Watched(oracle.problem, estimator.needs)
-    estimates(estimator, oracle, draw_noise(oracle, 4, 8), watched)
-    unused = sorted(estimator.needs - watched.used)
+    oracle = varying_oracle(estimator)
+    recording = RecordingProblem(oracle.problem, estimator.needs)
+    estimates(estimator, oracle, draw_noise(oracle, 4, 8), recording)
+    unused = sorted(estimator.needs - recording.used)
     require(not unused, f"never uses {', '.join(unused)}, which it needs")
-    return ", ".join(sorted(watched.used))
+    return ", ".join(sorted(recording.used))

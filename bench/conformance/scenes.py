@@ -19,8 +19,8 @@ from bench.conformance.subjects import (
     SAME,
     able_backend,
     available,
+    describe,
     distance,
-    disturbed,
     largest_jump,
     law_for,
     plain_backend,
@@ -29,7 +29,7 @@ from bench.conformance.subjects import (
     samples,
     sound_laws,
     stepping,
-    title,
+    with_changed_column,
 )
 from bench.model import (
     ContactLaw,
@@ -79,12 +79,12 @@ def costs_are_finite(scene: Scene) -> str:
     for program in subjects:
         (theta, w), problem = samples(program), able_backend(program).compile(program)
         cost = problem.value(theta, w)
-        require(cost.shape == (COLUMNS,), f"{title(program)}: shape {cost.shape}, not {(COLUMNS,)}")
-        require(np.isfinite(cost).all(), f"{title(program)}: {(~np.isfinite(cost)).sum()} costs are not finite")
-        other = problem.value(*disturbed(theta, w))
+        require(cost.shape == (COLUMNS,), f"{describe(program)}: shape {cost.shape}, not {(COLUMNS,)}")
+        require(np.isfinite(cost).all(), f"{describe(program)}: {(~np.isfinite(cost)).sum()} costs are not finite")
+        other = problem.value(*with_changed_column(theta, w))
         kept = np.arange(COLUMNS) != 2
         off = distance(other[kept], cost[kept])
-        require(off < ROUNDED, f"{title(program)}: a column changes the cost of others")
+        require(off < ROUNDED, f"{describe(program)}: a column changes the cost of others")
     return f"{cost.mean():.4g} on average, {len(subjects)} programs"
 
 
@@ -118,7 +118,7 @@ def backends_agree(scene: Scene) -> str:
         for backend in (plugin() for plugin in available("backends")):
             if "physics" not in backend.provides and backend.incompatibility(program) is None:
                 off = distance(backend.compile(program).value(theta, w), expected)
-                require(off < SAME, f"{title(program)}: {backend.name} differs by {off:.1e}")
+                require(off < SAME, f"{describe(program)}: {backend.name} differs by {off:.1e}")
                 worst = max(worst, off)
                 names.add(backend.name)
     return f"{', '.join(sorted(names))} to {worst:.0e}"
@@ -136,8 +136,8 @@ def continuity_is_as_declared(scene: Scene) -> str:
         raise Skipped("no continuous contact law is available")
     jump = largest_jump(runs[0], lines=2)
     if scene.continuous:
-        require(not jump, f"declares to be continuous, but jumps by {jump:.1e} of its range under {title(runs[0])}")
-        beside = max(largest_jump(runs[0], beside=side * ELSEWHERE) for side in (1, -1))
+        require(not jump, f"declares to be continuous, but jumps by {jump:.1e} of its range under {describe(runs[0])}")
+        beside = max(largest_jump(runs[0], offset=side * ELSEWHERE) for side in (1, -1))
         require(not beside, f"declares to be continuous, but jumps by {beside:.1e} of its range beside theta0")
         return f"no jump within {ELSEWHERE + 4:g} sigma of theta0"
     require(jump, "declares to jump, but no jump was found within 4 sigma of theta0")
@@ -154,11 +154,11 @@ def closed_form_is_right(scene: Scene) -> str:
             if closed is None:
                 continue
             shape = np.shape(closed)
-            require(shape == (program.dim,), f"{title(program)}: shape {shape}, not {(program.dim,)}")
+            require(shape == (program.dim,), f"{describe(program)}: shape {shape}, not {(program.dim,)}")
             mean, error = _sampled_gradient(program)
             beyond = np.maximum(np.abs(mean - closed) - DIFFERENCED * (1 + np.abs(closed)), 0.0)
             z = float(np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0).max())
-            detail = f"{title(program)}, sigma = {sigma:g}: {z:.1f} standard errors from the sampled gradient"
+            detail = f"{describe(program)}, sigma = {sigma:g}: {z:.1f} standard errors from the sampled gradient"
             require(z < LIMIT, detail)
             worst, count = max(worst, z), count + 1
     if not count:
@@ -216,7 +216,9 @@ def score_gives_the_gradient(scene: Scene) -> str:
     size = DIFFERENCED * (1 + np.abs(problem.grad(theta, w[:, :1])).max())
     beyond = np.maximum(np.abs(mean) - size, 0.0)
     z = float(np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0).max())
-    require(z < LIMIT, f"{title(program)}: E[cost score] is {z:.1f} standard errors from the mean difference of costs")
+    require(
+        z < LIMIT, f"{describe(program)}: E[cost score] is {z:.1f} standard errors from the mean difference of costs"
+    )
     return f"{z:.1f} standard errors from differences, {'with' if program.explicit else 'no'} explicit dependence"
 
 
@@ -251,10 +253,10 @@ def physical_gradient_is_the_limit(scene: Scene) -> str:
             ratios.append(_ratios(program, physical))
         off = float(np.abs(ratios[1] - 1.0).max())
         if off <= LIMITING:
-            return f"{title(program)} is {off:.1g} from it at a step finer by {FINER[1]}"
+            return f"{describe(program)} is {off:.1g} from it at a step finer by {FINER[1]}"
         # a coordinate may count one step, and so change with it: what settles is its ratio to the physics' own
         if np.isfinite(ratios).all() and np.abs(ratios[1] - ratios[0]).max() <= LIMITING:
-            apart[title(program)] = off
+            apart[describe(program)] = off
     if not apart:
         raise Skipped("no program's differences settle at finer steps")
     nearest = min(apart, key=lambda name: apart[name])

@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from bench.conformance.kit import Skipped, require
+from bench.measure import jumps
 from bench.model import (
     Array,
     Backend,
@@ -40,8 +41,8 @@ SAME = 1e-9
 rounding by 1e-16, through springs that multiply it by up to 1e4."""
 DIFFERENCED = 1e-7
 """Relative error allowed where gradients may be central differences of step 1e-6: rounding leaves 1e-10 of the cost."""
-NO_JUMP = 1e-6
-"""Change of a cost, relative to its range, below which rounding may keep it from falling further."""
+PARTS = 512
+"""Intervals that a line is divided into at first in a search for jumps."""
 COLUMNS = 6
 """Samples on which backends are compared; one number for all, since some compile for each."""
 
@@ -140,7 +141,7 @@ def sound_scenes() -> list[Scene]:
     return list(dict.fromkeys(program.scene for program in all_programs()))
 
 
-def covering(programs: Iterable[Program]) -> list[Program]:
+def representative_programs(programs: Iterable[Program]) -> list[Program]:
     """Choose fewer programs in which every scene and every contact law still occurs."""
     few = []
     for index, (_, group) in enumerate(itertools.groupby(programs, key=lambda p: type(p.scene))):
@@ -175,13 +176,13 @@ def samples(program: Program, count: int = COLUMNS) -> tuple[np.ndarray, np.ndar
     return theta, draw.standard_normal((program.n_noise, count))
 
 
-def disturbed(theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def with_changed_column(theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the same samples with another column 2."""
     column = np.arange(COLUMNS) == 2
     return theta + 1e-3 * column, w * (1 - 0.5 * column)
 
 
-def title(program: Program) -> str:
+def describe(program: Program) -> str:
     """Return the names of scene and contact law."""
     return f"{program.scene.name} + {program.contact.name}" if program.contact else program.scene.name
 
@@ -215,31 +216,26 @@ class NewtonOps(LoopOps):
         return z
 
 
-def largest_jump(program: Program, lines: int = 1, beside: float = 0.0) -> float:
-    """Return the largest jump of the cost along lines through theta0, relative to its range on them; 0 without one.
+def largest_jump(program: Program, lines: int = 1, offset: float = 0.0) -> float:
+    """Return the largest jump of the cost along lines through theta0, relative to its range on each; 0 without one.
 
-    ``beside`` moves the lines, by so many sigma in every coordinate; rollouts that fail there show no jump. The eight
-    intervals of largest change are cut into 64, again and again: across a slope the change falls with their
-    length, across a jump it stays.
+    ``offset`` moves the lines by that many sigma in every coordinate. A line on which a rollout fails has no jump there,
+    whereas rollouts on lines through theta0 itself must not fail.
     """
     problem = able_backend(program).compile(program)
-    theta, largest = program.theta0 + beside * program.scene.sigma, 0.0
+    theta = program.theta0 + offset * program.scene.sigma
+
+    def cost(points: np.ndarray) -> np.ndarray:
+        costs = problem.value(points, np.zeros((program.n_noise, points.shape[1])))
+        if np.isfinite(costs).all():
+            return costs
+        require(offset, f"{describe(program)}: costs within 4 sigma of theta0 are not finite")
+        return np.full_like(costs, np.nan)
+
+    largest = 0.0
     for line in range(lines):
         e = 4 * program.scene.sigma * (np.ones(theta.size) if line == 0 else rng("line").uniform(-1, 1, theta.size))
-        left, width = np.linspace(-1.0, 1.0, 8, endpoint=False), 0.25
-        span, changes = 0.0, [0.0]
-        while width > 1e-11:
-            nodes = left[:, None] + width * np.linspace(0.0, 1.0, 65)
-            shifts = nodes.reshape(1, -1)
-            cost = problem.value(theta[:, None] + e[:, None] * shifts, np.zeros((program.n_noise, shifts.size)))
-            if beside and not np.isfinite(cost).all():
-                return largest
-            require(np.isfinite(cost).all(), f"{title(program)}: costs within 4 sigma of theta0 are not finite")
-            span = max(span, float(np.ptp(cost)))
-            change = np.abs(np.diff(cost.reshape(nodes.shape), axis=1))
-            changes.append(float(change.max()))
-            steepest = np.argsort(change, axis=None)[-8:]
-            left, width = nodes[:, :-1].ravel()[steepest], width / 64
-        if changes[-1] > 0.1 * changes[-2] and changes[-1] > NO_JUMP * span:
-            largest = max(largest, changes[-1] / span)
+        jump = jumps.largest_jump(cost, (theta - e)[:, None], (theta + e)[:, None], PARTS)
+        if jump.height:
+            largest = max(largest, jump.height / jump.span)
     return largest

@@ -40,11 +40,11 @@ def run(words: Sequence[str]) -> Report:
         _theta(settings.get("theta", "theta"), module, "theta" in settings),
         grad=_gradient(settings.get("grad"), module),
         sigma=_numbers(settings["sigma"], "sigma") if "sigma" in settings else (),
-        noise=_whole(settings, "noise"),
+        noise=_count(settings, "noise"),
         budget=settings.get("budget", "60s"),
         batch=settings.get("batch"),
         scale=_theta(settings["scale"], module, True) if "scale" in settings else None,
-        seed=_whole(settings, "seed"),
+        seed=_count(settings, "seed"),
         name=places[0],
         progress=QUIET not in words,
     )
@@ -70,7 +70,7 @@ def _numbers(text: str, what: str) -> list[float]:
         raise UserError(f"{what}={text} has to be numbers with commas between, {what}=1,0.5") from None
 
 
-def _whole(settings: dict[str, str], key: str) -> int:
+def _count(settings: dict[str, str], key: str) -> int:
     text = settings.get(key, "0")
     if not re.fullmatch(r"\d+", text):
         raise UserError(f"{key}={text} has to be a whole number")

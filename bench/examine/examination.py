@@ -19,7 +19,7 @@ from bench.model.simulator.clock import Clock, OutOfTime, parse_duration
 from bench.model.simulator.simulator import Simulator
 from bench.model.simulator.tree import ParameterTree
 
-MADE = re.compile(r"_[0-9a-f]{8}$")
+GENERATED_SUFFIX = re.compile(r"_[0-9a-f]{8}$")
 """What a module's name gets when it is loaded from a file."""
 RELATIVE = 0.01
 """Sigma of the lines, and of a cost with noise of its own, in units of each input's scale, where none is given."""
@@ -41,7 +41,7 @@ PANELS = (7, 12)
 """Panels of 4 Gauss-Legendre points of the two integrals of the gradient along a line."""
 LEAST_MISSED = 0.002
 """Share of a cost's change that the integral of its gradient may miss by itself."""
-LOOKS = ((PLACES, HALVINGS), (3, 10), (1, 10))
+LINE_EFFORTS = ((PLACES, HALVINGS), (3, 10), (1, 10))
 """Places looked at on a line and halvings of each, from the whole to the least."""
 FEWEST_POINTS = 17
 """Points without which a line is not scanned."""
@@ -93,7 +93,9 @@ def examine(
         took = f"budget={clock.budget:g} seconds ended in the first call of the cost: give more"
         raise UserError(f"{took}, or a shorter rollout") from None
     try:
-        return _Examination(simulator, layout, scales, levels, clock, seed, name or _called(cost)).run(_called(grad))
+        return _Examination(simulator, layout, scales, levels, clock, seed, name or _function_name(cost)).run(
+            _function_name(grad)
+        )
     finally:
         clock.clear_progress()
 
@@ -117,7 +119,7 @@ def _scales(layout: ParameterTree, scale: Any) -> np.ndarray:
     return given
 
 
-def _called(function: Any) -> str:
+def _function_name(function: Any) -> str:
     """Return a name for a function, ``mysim.cost``, or the library that differentiates."""
     if function is None or isinstance(function, str):
         return function or ""
@@ -127,7 +129,7 @@ def _called(function: Any) -> str:
         .replace("<locals>.", "")
         .replace("<lambda>", "lambda")
     )
-    module = MADE.sub("", module)
+    module = GENERATED_SUFFIX.sub("", module)
     return own if module in ("__main__", "builtins", "") else f"{module}.{own}"
 
 
@@ -151,14 +153,14 @@ class _Examination:
 
     def run(self, gradient: str) -> Report:
         """Ask everything that the time allows, the gradient first."""
-        value, spread = self._repeated()
+        value, spread = self._repeat_cost()
         simulator, clock = self.simulator, self.clock
         checked, more = None, []
-        if spread == 0 and self._gradient_comes():
-            checked = self._checked()
-            more = self._under_other_noise(checked)
-        lines = self._lines(checked) if not simulator.gradient_error else []
-        found = self._smoothed(checked, spread == 0) if not simulator.gradient_error else []
+        if spread == 0 and self._request_gradient():
+            checked = self._check_gradient()
+            more = self._check_under_other_noise(checked)
+        lines = self._scan_lines(checked) if not simulator.gradient_error else []
+        found = self._measure_noise(checked, spread == 0) if not simulator.gradient_error else []
         notes = list(simulator.notes)
         notes += [f"the cost raised {count} times: {text}" for text, count in list(simulator.raised.items())[:3]]
         relative = not self.levels
@@ -196,7 +198,7 @@ class _Examination:
         w = self.w if w is None else w
         return self.simulator.costs(thetas, None if w is None else np.repeat(w, thetas.shape[1], axis=1))
 
-    def _repeated(self) -> tuple[float, float]:
+    def _repeat_cost(self) -> tuple[float, float]:
         """Return the cost at theta, and by how much equal calls differ; another theta stands between them."""
         self.clock.start_stage("repeating a call")
         other = self.theta + 1e-3 * self.scale
@@ -212,7 +214,7 @@ class _Examination:
         pairs = [same, np.array(values[1::2] or [0.0])]
         return values[0], max(0.0 if np.isnan(one).all() else float(np.ptp(one)) for one in pairs)
 
-    def _gradient_comes(self) -> bool:
+    def _request_gradient(self) -> bool:
         """Ask for the gradient twice, the second time to see how long it takes; return whether it came."""
         if self.simulator.has_gradient:
             self.clock.start_stage("first gradient")
@@ -259,13 +261,13 @@ class _Examination:
             self.left_out.append(f"the whole check: it looks at {what} at most")
         return replace(effort, scale=self.scale, unit=self.simulator.unit, seed=self.seed)
 
-    def _checked(self) -> Check | None:
+    def _check_gradient(self) -> Check | None:
         self.clock.start_stage("checking the gradient")
         options = self._options()
         for attempt in (options, replace(options, components=0, draws=0, directions=1, eps=EPS[::2], scanned=0)):
             self.clock.limit(SHARES["check"] if attempt is options else 1.0)
             try:
-                return self._one_check(attempt)
+                return self._check_once(attempt)
             except OutOfTime:
                 continue
             finally:
@@ -273,7 +275,7 @@ class _Examination:
         self.left_out.append("the gradient check")
         return None
 
-    def _one_check(self, options: Options, w: np.ndarray | None = None) -> Check:
+    def _check_once(self, options: Options, w: np.ndarray | None = None) -> Check:
         def gradient(theta: np.ndarray) -> np.ndarray:
             drawn = self.w if w is None else w
             return np.asarray(self.simulator.gradients(theta[:, None], drawn)[:, 0])
@@ -281,7 +283,7 @@ class _Examination:
         slope = gradient if self.simulator.has_gradient else None
         return check(lambda thetas: self._costs(thetas, w), slope, self.theta, options)
 
-    def _under_other_noise(self, checked: Check | None) -> list[Check]:
+    def _check_under_other_noise(self, checked: Check | None) -> list[Check]:
         """Check along random directions under other draws of the simulator's own noise."""
         if self.w is None or checked is None or not checked.trusted:
             return []
@@ -290,20 +292,20 @@ class _Examination:
         self.clock.limit(SHARES["again"])
         try:
             for _ in range(OTHER_NOISE):
-                found.append(self._one_check(options, self.random.standard_normal((self.simulator.noise, 1))))
+                found.append(self._check_once(options, self.random.standard_normal((self.simulator.noise, 1))))
         except OutOfTime:
             self.left_out.append("checks under other noise")
         self.clock.limit(1.0)
         return found
 
-    def _lines(self, checked: Check | None) -> list[LineScan]:
+    def _scan_lines(self, checked: Check | None) -> list[LineScan]:
         """Scan the cost for jumps and kinks along random directions."""
         self.clock.start_stage("scanning lines")
         spread = self.scale * RELATIVE if not self.levels else np.full(self.theta.size, max(self.levels))
         along = directions(2, spread, self.seed)
         each = self.clock.per_cost()
         room = SHARES["lines"] * self.clock.remaining / len(along) / each if each > 0 else math.inf
-        for most, halvings in LOOKS:
+        for most, halvings in LINE_EFFORTS:
             points = int(min(POINTS, room - 2 * most * halvings))
             if points >= FEWEST_POINTS:
                 break
@@ -320,13 +322,13 @@ class _Examination:
                 size = float(np.abs(self._costs(self.theta[:, None])).max())
                 rounding = max(measured, self.simulator.unit * (size if math.isfinite(size) else 0.0))
                 line = scan(self._costs, self.theta, direction, rounding, 3.0, points, halvings, most)
-                found.append(replace(line, missed=self._missed(line, checked)))
+                found.append(replace(line, missed=self._missed_share(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
         self.clock.limit(1.0)
         return found
 
-    def _missed(self, line: LineScan, checked: Check | None) -> float:
+    def _missed_share(self, line: LineScan, checked: Check | None) -> float:
         """Return the share of the cost's change along a line that its gradient does not explain.
 
         The integral of a right gradient along a line is the difference of the costs at its ends, except for jumps. It needs
@@ -350,7 +352,7 @@ class _Examination:
         doubt = abs(integrals[-1] - integrals[0]) / changes
         return float(missed) if doubt < max(0.1 * missed, LEAST_MISSED) else math.nan
 
-    def _smoothed(self, checked: Check | None, repeats: bool) -> list[Smoothed]:
+    def _measure_noise(self, checked: Check | None, repeats: bool) -> list[Smoothed]:
         """Measure the gradient under noise on theta, an equal share of the time for each sigma."""
         levels, scale = list(self.levels), np.ones(self.theta.size)
         if not levels and self.simulator.noise:

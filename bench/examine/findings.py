@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.examine.lines import ALIKE, LineScan
-from bench.examine.smoothing import WANTED, Smoothed
+from bench.examine.smoothing import TARGET_ERROR, Smoothed
 from bench.measure.gradcheck import FAULTS, MEANING, Check, Part
 from bench.report.text import counted, duration, number
 
 if TYPE_CHECKING:
     import pandas as pd
 
-WORDS = {
+EXPLANATIONS = {
     "nan_gradient": "the gradient is not a number where the cost is: a division, log, sqrt or norm at its edge, or a branch that "
     "'where' takes back only in the value",
     "nondeterministic": "the same call gives different numbers: noise that is drawn anew, or a state that outlasts a call; "
@@ -39,7 +39,7 @@ WORDS = {
 """What a cause means to the owner of the simulator."""
 SEEN = 0.01
 """Share of a cost's change that a gradient may miss on a line without a word."""
-WARNED = ("zero", "saturated")
+NOTEWORTHY = ("zero", "saturated")
 """Right, and yet worth a look."""
 
 
@@ -107,7 +107,7 @@ class Findings:
         bad = [one.cause for one in (self.check, *self.more) if not one.trusted]
         if not bad and (any(line.steps for line in self.lines) or self.tread):
             return "staircase"
-        if not bad and self.missed > WANTED:
+        if not bad and self.missed > TARGET_ERROR:
             return "jumps"
         if not bad and not all(one.defined for one in self.smoothed):
             return "nonfinite"
@@ -119,12 +119,14 @@ class Findings:
 
     @property
     def problems(self) -> list[str]:
-        """Everything that cannot be trusted, in words, worst first; empty when all is right."""
+        """Everything that cannot be trusted, in words, most_severe first; empty when all is right."""
         found = []
         if self.error:
             found.append(f"raised: the gradient could not be computed: {self.error}")
         elif not self.repeats:
-            found.append(f"nondeterministic: {WORDS['nondeterministic']} (costs differ by {number(self.spread)})")
+            found.append(
+                f"nondeterministic: {EXPLANATIONS['nondeterministic']} (costs differ by {number(self.spread)})"
+            )
         elif self.check is None:
             found.append("undecided: the budget ended before the gradient was checked")
         else:
@@ -142,7 +144,7 @@ class Findings:
             )
         if not found:
             missed = self.missed
-            if missed > WANTED:
+            if missed > TARGET_ERROR:
                 found.append(
                     f"jumps: along a line the integral of the gradient misses {number(100 * missed)}% of the cost's change: "
                     "jumps, which no gradient sees, make the rest"
@@ -180,11 +182,11 @@ class Findings:
         """What is right, and yet worth a look."""
         found = []
         if self.check is not None and self.check.trusted:
-            for verdict in WARNED:
-                parts = [self.called(part) for part in self.check.components if part.verdict == verdict]
+            for verdict in NOTEWORTHY:
+                parts = [self.label(part) for part in self.check.components if part.verdict == verdict]
                 if parts:
                     found.append(
-                        f"{verdict}: {', '.join(parts[:6])}{' ...' if len(parts) > 6 else ''}: {WORDS[verdict]}"
+                        f"{verdict}: {', '.join(parts[:6])}{' ...' if len(parts) > 6 else ''}: {EXPLANATIONS[verdict]}"
                     )
         if self.precision != "float64":
             found.append(f"{self.precision}: a check in {self.precision} sees errors above about {self.resolution}")
@@ -218,23 +220,23 @@ class Findings:
         """The exit status: 0, or 1 where something cannot be trusted."""
         return 1 if self.problems else 0
 
-    def called(self, part: Part) -> str:
+    def label(self, part: Part) -> str:
         """Return a part's name: that of its number in theta, or ``direction 0``."""
         return self.names[part.component] if part.component is not None else part.name
 
     def sentence(self, check: Check) -> str:
         """Say what a check found wrong, with the numbers of the worst part."""
-        text = f"{check.cause}: {WORDS.get(check.cause, check.cause)}"
-        guilty = [part for part in check.guilty if part.component is not None] or list(check.guilty)
+        text = f"{check.cause}: {EXPLANATIONS.get(check.cause, check.cause)}"
+        guilty = [part for part in check.worst_parts if part.component is not None] or list(check.worst_parts)
         if not guilty:
             return text
         part = max(guilty, key=lambda p: np.nan_to_num(p.error, nan=math.inf))
         if check.cause == "kink":
-            return f"{text} ({self.called(part)}: {number(part.left, 4)} and {number(part.right, 4)})"
+            return f"{text} ({self.label(part)}: {number(part.left, 4)} and {number(part.right, 4)})"
         if check.cause not in FAULTS:
-            return f"{text} ({self.called(part)})"
+            return f"{text} ({self.label(part)})"
         program = "" if not self.gradient else f"program {number(part.program, 6)}, "
-        return f"{text} ({self.called(part)}: {program}differences {number(part.difference, 6)})"
+        return f"{text} ({self.label(part)}: {program}differences {number(part.difference, 6)})"
 
     # ---------------------------------------------------------------------------------------------- tables
 
@@ -243,7 +245,7 @@ class Findings:
         """One row per derivative checked: its number, what the differences give, and the verdict."""
         import pandas as pd
 
-        parts = [(self.called(part), part) for part in (*self.check.parts, *self.check.draws)] if self.check else []
+        parts = [(self.label(part), part) for part in (*self.check.parts, *self.check.draws)] if self.check else []
         shown = bool(self.gradient)
         return pd.DataFrame(
             {
@@ -333,7 +335,7 @@ class Findings:
         for part in (*check.components, *whole):
             rows.append(
                 [
-                    self.called(part),
+                    self.label(part),
                     number(part.program, 6) if self.gradient else "-",
                     f"{number(part.difference, 6)} +- {number(part.uncertainty, 1)}",
                     number(part.step, 1),
@@ -388,7 +390,7 @@ class Findings:
 
     def _sigmas(self) -> list[str]:
         if not self.smoothed:
-            return self._plain()
+            return self._without_noise()
         unit = ", relative to each input's scale" if self.relative else ""
         rows = [["sigma", "|grad J|", "bias of the gradient", "smoothing moves it by", "use", "10% error costs"]]
         remarks = []
@@ -429,7 +431,7 @@ class Findings:
         kind = "gradient" if best.name == "gradient" else "cost"
         return f"{best.name}, N = {int(best.samples):,}", f"{counted(int(best.calls), kind)}, {duration(best.seconds)}"
 
-    def _plain(self) -> list[str]:
+    def _without_noise(self) -> list[str]:
         """Say what to use without noise."""
         if self.check is None or self.status:
             return []

@@ -105,13 +105,13 @@ def scan(
     for index in order:
         if len(places) < most and turns[index] > GUARD * noise and all(abs(index - p) > 1 for p in places):
             places.append(int(index))
-    found = _narrowed(along, t, f, places, halvings, noise) if places else []
+    found = _locate_breaks(along, t, f, places, halvings, noise) if places else []
     level = np.diff(f)
     steps = bool(level.any() and (np.abs(level) <= noise).mean() > 0.5 and any(b.kind == "jump" for b in found))
     return LineScan(direction, t, f, tuple(sorted(found, key=lambda b: b.at)), steps)
 
 
-def _narrowed(
+def _locate_breaks(
     along: Callable[[np.ndarray], np.ndarray],
     t: np.ndarray,
     f: np.ndarray,
@@ -125,7 +125,7 @@ def _narrowed(
     width = float(t[1] - t[0])
     # three points: left, middle, right
     values = np.stack([[f[i], f[i + 1], f[i + 2]] for i in places])
-    turns, widths = [_turn(values)], [width]
+    turns, widths = [_second_difference(values)], [width]
     bends = [turns[0] / width]  # changes of slope: over all five points, as a kink may lie off the middle of three
     for _ in range(halvings):
         between = along(np.stack([centre - width / 2, centre + width / 2], axis=1))
@@ -136,7 +136,7 @@ def _narrowed(
         bends.append(np.abs((five[:, 4] - five[:, 3]) - (five[:, 1] - five[:, 0])) / width)
         centre = centre + (best - 1) * width
         values = np.stack([five[np.arange(count), best + k] for k in range(3)], axis=1)
-        turns.append(_turn(values))
+        turns.append(_second_difference(values))
         widths.append(width)
     change = np.array(
         turns
@@ -154,14 +154,14 @@ def _narrowed(
             found.append(Break("jump", at, float(change[end, k])))
         elif order < 1.5:
             found.append(Break("kink", at, float(bends[end][k])))
-    return _apart(found, 4 * (t[1] - t[0]) / 2**halvings)
+    return _without_duplicates(found, 4 * (t[1] - t[0]) / 2**halvings)
 
 
-def _turn(values: np.ndarray) -> np.ndarray:
+def _second_difference(values: np.ndarray) -> np.ndarray:
     return np.abs(values[:, 0] - 2 * values[:, 1] + values[:, 2])
 
 
-def _apart(found: list[Break], near: float) -> list[Break]:
+def _without_duplicates(found: list[Break], near: float) -> list[Break]:
     """Return breaks without those found twice, jumps before kinks."""
     kept: list[Break] = []
     for one in sorted(found, key=lambda b: b.kind):

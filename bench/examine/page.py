@@ -110,7 +110,7 @@ def _steps(report: Findings) -> Figure:
         error = np.abs(sample.differences - part.program) / size
         left.loglog(
             sample.step, np.where(error > 0, error, np.nan), color=PALETTE[index % 8], marker=MARKERS[index % 8],
-            markersize=3, label=report.called(part),
+            markersize=3, label=report.label(part),
         )  # fmt: skip
     left.set_xlabel("step, in units of the input")
     left.set_ylabel("relative error of the gradient")

@@ -27,7 +27,7 @@ GROUPS = 32
 """Independent means that intervals are computed from."""
 ENOUGH = 0.03
 """Standard error of grad J, relative to it, from which no more pairs are drawn once the bias is decided."""
-WANTED = 0.1
+TARGET_ERROR = 0.1
 """Relative error that the costs are stated for."""
 
 
@@ -82,13 +82,13 @@ class Smoothed:
     @property
     def decided(self) -> bool:
         """Whether the bias is surely above or surely below 10% of |grad J|."""
-        edge = WANTED * self.norm
+        edge = TARGET_ERROR * self.norm
         return not self.bias_low <= edge <= self.bias_high
 
     @property
     def biased(self) -> bool:
         """Whether the program's gradient is off by more than 10% at this sigma, beyond doubt."""
-        return self.known and bool(self.bias_low > WANTED * self.norm)
+        return self.known and bool(self.bias_low > TARGET_ERROR * self.norm)
 
     @property
     def unshown(self) -> bool:
@@ -208,7 +208,7 @@ def _methods(norm: float, bias: float, terms: np.ndarray, slopes: np.ndarray, cl
 
 def _method(name: str, bias: float, terms: np.ndarray, norm: float, calls: int, seconds: float) -> Method:
     variance = float(terms.var(axis=1, ddof=1).sum())
-    room = WANTED**2 - bias**2
+    room = TARGET_ERROR**2 - bias**2
     samples = max(1.0, math.ceil(variance / norm**2 / room)) if room > 0 else math.inf
     return Method(name, bias, samples, calls * samples, calls * samples * seconds)
 

@@ -1,1 +1,1 @@
-"""Numbers from problems: references, statistics, noise, timing and gradient checks, pure where they can be."""
+"""Measurements of problems: references, statistics, noise, timing and gradient checks."""

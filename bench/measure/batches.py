@@ -1,4 +1,4 @@
-"""Long batches in parts of one length, so that a compiling backend compiles once."""
+"""Splits long batches into parts of equal length, so that a compiling backend compiles once."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 
 
 def in_columns(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray, columns: int) -> np.ndarray:
-    """Return ``function(w)``, ``(..., B)``, for noise ``w (n_w, B)`` taken ``columns`` at a time.
+    """Return ``function(w)``, ``(..., B)``, for noise ``w (n_w, B)``, evaluated ``columns`` at a time.
 
-    The last part is filled up with copies of its last column, whose results are dropped.
+    The last part is padded with copies of its last column, and their results are dropped.
     """
     count = w.shape[1]
-    short = -count % columns
-    whole = np.concatenate([w, np.repeat(w[:, -1:], short, axis=1)], axis=1) if short else w
-    parts = [function(whole[:, i : i + columns]) for i in range(0, whole.shape[1], columns)]
+    n_missing = -count % columns
+    padded = np.concatenate([w, np.repeat(w[:, -1:], n_missing, axis=1)], axis=1) if n_missing else w
+    parts = [function(padded[:, i : i + columns]) for i in range(0, padded.shape[1], columns)]
     return np.concatenate(parts, axis=-1)[..., :count]

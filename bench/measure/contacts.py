@@ -1,4 +1,4 @@
-"""Which contacts act in each step of a rollout: the one definition of a contact mode."""
+"""Which contacts are active in each step of a rollout: the single definition of a contact mode."""
 
 from __future__ import annotations
 
@@ -7,41 +7,45 @@ import numpy as np
 from bench.model import Array, ContactScene, ForceLaw, MechanicalScene, Rollout, State, Unsupported
 
 
-def acting(program: Rollout, states: np.ndarray, controls: np.ndarray, forces: np.ndarray | None = None) -> np.ndarray:
-    """Return which contacts act in each step, boolean ``(horizon, n_contacts, B)``.
+def active_contacts(
+    program: Rollout, states: np.ndarray, controls: np.ndarray, forces: np.ndarray | None = None
+) -> np.ndarray:
+    """Return which contacts are active in each step, boolean ``(horizon, n_contacts, B)``.
 
     ``states (horizon + 1, n, B)`` and ``controls (horizon, n_u, B)`` are those of a rollout. Under a force law a
-    contact acts where its bodies overlap before the step. Under an impulse law there are two answers:
+    contact is active where its bodies overlap before the step. Under an impulse law there are two answers:
 
     - predicted, without ``forces``: the criterion of the law itself. The bodies approach and would overlap after the
       step, or, where the law solves for the end of the step, they would overlap there without contact. This needs only
-      the state before the step, so that many rollouts can be labelled quickly.
+      the state before the step, so many rollouts can be labelled quickly.
     - measured, with ``forces (horizon, n_contacts, B)`` [N], the impulses of the steps over dt: the bodies overlap
       before the step, or the impulse opened the gap by more than the gap left after the step, dt^2 (J M^-1 J^T)_ii
       lambda_i > gap_i. On the central path, where forces act at every distance, a step without contact would have
       overlapped there.
 
-    The two differ for bodies that overlap and already part, which only the measured answer counts as a contact. Raises
-    :class:`Unsupported` for scenes whose contacts are known only to an engine.
+    The two differ for bodies that overlap and already separate: only the measured answer counts them as a contact.
+    Raises :class:`Unsupported` for scenes whose contacts only an engine knows.
     """
     scene = program.scene
     if not isinstance(scene, ContactScene):
-        raise Unsupported(f"the contacts of scene {scene.name} are known to its engine only")
+        raise Unsupported(f"only the engine knows the contacts of scene {scene.name}")
     before = [split(scene, x) for x in states[:-1]]
     if isinstance(program.contact, ForceLaw):
         return np.stack([scene.gap(np, state.q) < 0 for state in before])
     if forces is None:
-        return np.stack([_predicted(program, scene, state, u) for state, u in zip(before, controls, strict=True)])
+        return np.stack(
+            [_predicted_contacts(program, scene, state, u) for state, u in zip(before, controls, strict=True)]
+        )
     steps = zip(before, states[1:], forces, strict=True)
-    return np.stack([_measured(scene, state, split(scene, x), force) for state, x, force in steps])
+    return np.stack([_measured_contacts(scene, state, split(scene, x), force) for state, x, force in steps])
 
 
-def _measured(scene: ContactScene, before: State, after: State, force: np.ndarray) -> np.ndarray:
+def _measured_contacts(scene: ContactScene, before: State, after: State, force: np.ndarray) -> np.ndarray:
     opened = scene.dt**2 * scene.contact(np).response(np, before.q) * force
     return np.asarray((scene.gap(np, before.q) < 0) | ((force > 0) & (opened > scene.gap(np, after.q))))
 
 
-def _predicted(program: Rollout, scene: ContactScene, before: State, u: Array) -> np.ndarray:
+def _predicted_contacts(program: Rollout, scene: ContactScene, before: State, u: Array) -> np.ndarray:
     q, v = before
     if program.needs_root:
         free = scene.carried(v) + scene.dt * scene.acceleration(np, q, v, u)

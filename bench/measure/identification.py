@@ -1,7 +1,8 @@
-"""What a record can say about parameters: Fisher information, gauge directions in words, the Cramer-Rao bound.
+"""Which parameters a record identifies: Fisher information, unidentifiable directions, the Cramer-Rao bound.
 
-Everything is in logarithms of the parameters, so that a direction is a product of powers: a null vector (1, 1, 1) of mass,
-stiffness and damping says that all three can be scaled together unseen, and that only their ratios are in the data.
+All quantities are for logarithms of the parameters, so a direction is a product of powers. A null vector (1, 1, 1) of
+mass, stiffness and damping means that scaling all three together does not change the data, which identify only their
+ratios.
 """
 
 from __future__ import annotations
@@ -12,13 +13,13 @@ from functools import cached_property
 
 import numpy as np
 
-UNSEEN = 1e-6
-"""Singular values below this share of the largest are 0: differences give Jacobians to about 1e-9."""
+RANK_TOLERANCE = 1e-6
+"""Singular values below this share of the largest count as 0: Jacobians from differences are accurate to about 1e-9."""
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """A Jacobian of standardised residuals by the logarithms of named parameters, ``(m, p)``, and what follows from it."""
+    """The Jacobian ``(m, p)`` of standardised residuals by the logarithms of named parameters, and the information in it."""
 
     names: tuple[str, ...]
     jacobian: np.ndarray
@@ -35,34 +36,34 @@ class Information:
 
     @property
     def rank(self) -> int:
-        """How many directions the data see."""
+        """Number of identifiable directions."""
         values, _ = self._svd
-        return int((values > UNSEEN * values[0]).sum()) if values[0] > 0 else 0
+        return int((values > RANK_TOLERANCE * values[0]).sum()) if values[0] > 0 else 0
 
     @property
     def condition(self) -> float:
-        """The largest singular value over the smallest that is seen."""
+        """The largest singular value over the smallest that counts as nonzero."""
         values, _ = self._svd
         return float(values[0] / values[self.rank - 1]) if self.rank else np.inf
 
     @property
     def gauge(self) -> np.ndarray:
-        """The directions that the data do not see, as rows, ``(p - rank, p)``."""
+        """The unidentifiable directions as rows, ``(p - rank, p)``."""
         return self._svd[1][self.rank :]
 
     @cached_property
     def invariants(self) -> np.ndarray:
-        """Exponents of the products of powers that the data see, as rows ``(rank, p)``: p unit vectors without a gauge.
+        """Exponents of the identifiable products of powers, as rows ``(rank, p)``: unit vectors where all are identifiable.
 
-        Each gauge direction is led by one parameter; every other parameter is divided by the powers of the leaders that
-        scale with it.
+        One parameter leads each unidentifiable direction. Every other parameter is divided by the powers of the leaders
+        that scale with it.
         """
         rows = self.gauge.copy()
         leaders: list[int] = []
         for i in range(len(rows)):
             free = [j for j in range(rows.shape[1]) if j not in leaders]
             size = np.abs(rows[i][free])
-            # of nearly equal ones the first, so that the words do not depend on rounding
+            # the first of nearly equal ones, so that the text does not depend on rounding
             lead = free[int(np.flatnonzero(size > 0.9 * size.max())[0])]
             rows[i] /= rows[i, lead]
             for k in range(len(rows)):
@@ -81,18 +82,18 @@ class Information:
 
     @property
     def labels(self) -> list[str]:
-        """The invariants in words: ``stiffness/mass``."""
+        """The invariants as products: ``stiffness/mass``."""
         return [product(self.names, row) for row in self.invariants]
 
     @property
     def words(self) -> str:
-        """What can be known and what cannot, in a sentence."""
+        """One sentence: which parameters or products are identifiable, and which changes leave the data as they are."""
         if self.rank == len(self.names):
-            return f"{_listed(self.names)} can be told" + (" apart" if len(self.names) > 1 else "")
+            return f"{_listed(self.names)} {'are' if len(self.names) > 1 else 'is'} identifiable"
         hidden = [_direction(self.names, row) for row in self.gauge]
         if not self.rank:
-            return f"nothing can be told: the data do not depend on {_listed(self.names)}"
-        return f"only {', '.join(self.labels)}: {'; '.join(hidden)} changes nothing"
+            return f"nothing is identifiable: the data do not depend on {_listed(self.names)}"
+        return f"only {', '.join(self.labels)}: {'; '.join(hidden)} does not change the data"
 
     def covariance(self) -> np.ndarray:
         """Return the Cramer-Rao bound of the logarithms of the invariants, ``(rank, rank)``."""
@@ -121,11 +122,11 @@ def _power(exponent: float) -> str:
 
 
 def _direction(names: tuple[str, ...], row: np.ndarray) -> str:
-    own = np.abs(row) > 1e-4 * np.abs(row).max()
-    moving = [name for name, there in zip(names, own, strict=True) if there]
+    is_moving = np.abs(row) > 1e-4 * np.abs(row).max()
+    moving = [name for name, moves in zip(names, is_moving, strict=True) if moves]
     if len(moving) == 1:
         return f"{moving[0]}"
-    powers = row[own] / row[own][np.argmax(np.abs(row[own]))]
+    powers = row[is_moving] / row[is_moving][np.argmax(np.abs(row[is_moving]))]
     if np.allclose(powers, 1.0, atol=1e-3):
         return f"scaling {_listed(moving)} together"
     return "scaling " + " with ".join(

@@ -10,12 +10,12 @@ from functools import lru_cache
 import numpy as np
 
 HELD = 1 << 22
-"""Most normal numbers that a cell holds at once (32 MiB); of more, it draws a part, uses it and draws the next."""
+"""Most normal numbers that a cell holds in memory (32 MiB). A cell that needs more draws them part by part."""
 
 
 @lru_cache(maxsize=2)
 def shared(seed: int, scene: str, repeats: int, samples: int, width: int) -> np.ndarray:
-    """Return :func:`draw` for cells, kept for the next cell that asks for the same."""
+    """Return :func:`draw` for cells, cached for the next cell with the same arguments."""
     return draw(seed, scene, repeats, samples, width, "cells")
 
 
@@ -34,9 +34,9 @@ def draw(seed: int, scene: str, repeats: int, samples: int, width: int, stream: 
 
 
 def parts(seed: int, scene: str, repeat: int, samples: int, width: int, stream: str) -> Iterator[np.ndarray]:
-    """Yield repeat's row of :func:`draw` in parts ``(width, b)`` of at most :data:`HELD` numbers: the same numbers.
+    """Yield one repeat of :func:`draw`, the same numbers, in parts ``(width, b)`` of at most :data:`HELD` numbers.
 
-    Where the parts end depends on nothing but the width, so sums over parts do not depend on the machine.
+    The sizes of the parts depend only on the width, so sums over parts do not depend on the machine.
     """
     generator = _generator(seed, scene, repeat, stream)
     columns = max(1, HELD // max(width, 1))
@@ -46,7 +46,7 @@ def parts(seed: int, scene: str, repeat: int, samples: int, width: int, stream: 
 
 @lru_cache(maxsize=64)
 def seconds(seed: int, scene: str, samples: int, width: int) -> float:
-    """Return the seconds of drawing the noise of one estimate, the first part of it where it comes in parts."""
+    """Return the seconds that drawing the noise of one estimate takes, extrapolated from its first part."""
     started = time.perf_counter()
     part = next(parts(seed, scene, 0, samples, width, "cells"))
     return (time.perf_counter() - started) * samples / part.shape[1]

@@ -1,4 +1,4 @@
-"""Smoothed gradients by quadrature, with an error from rules that disagree and not from one rule that settles."""
+"""Smoothed gradients by quadrature, with an error from the disagreement of several rules."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ NODES = 8
 REACH = 9.0
 """Standard deviations integrated over: beyond, the normal density is below 1e-17."""
 SHIFTS = {1: ((0.0, 0.5, 0.25, 0.75),), 2: ((0.0, 0.5, 0.25, 0.75), (0.0, 0.25, 0.75, 0.5))}
-"""Per noise dimension, by how much of a panel the panels of each rule are moved: every rule samples the cost elsewhere."""
+"""Shift of the panels of each rule, as a share of a panel, by noise dimension: every rule samples the cost elsewhere."""
 FIRST = {1: 512, 2: 12}
 """Panels of the coarsest rules."""
 LEAST = {1: 1 << 15, 2: 1 << 17}
-"""Fewest points: of one dimension, 1800 a standard deviation, so that an event of .001 is seen; of two, 21 each way."""
+"""Fewest points. One dimension: 1800 per standard deviation, enough for an event of width .001. Two: 21 each way."""
 SAFETY = 2.0
-"""Error stated, over the largest distance of a rule from the mean of all."""
+"""Stated error, relative to the largest distance of a rule from the mean of all rules."""
 SETTLED = 1e-10
 """Relative error at which refining stops."""
 SOLVED = 1e-11
 """Relative error of costs whose steps solve an equation to 1e-12."""
 PROBES, STEP = 32, 1e-7
-"""Points at which the cost's rounding noise is measured, and the distance of its stencils, in standard deviations."""
+"""Points at which the cost's rounding noise is measured, and the spacing of the stencils there, in standard deviations."""
 
 
 @dataclass(frozen=True)
 class Integral:
-    """A smoothed gradient ``(d,)``, the norm of its error, the points it took, and their average distance."""
+    """A smoothed gradient ``(d,)``, the norm of its error, the number of points used, and their average spacing."""
 
     gradient: np.ndarray
     error: float
@@ -45,12 +45,12 @@ class Integral:
 def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) -> Integral | None:
     """Integrate E[(f(w) - f(0)) w] / sigma over noise on theta of one or two dimensions, on at most ``points`` points.
 
-    Gauss-Legendre panels lie between the scene's breakpoints, and are halved until the error no longer matters or the
-    points are spent. At every level four rules, shifted against each other, are averaged. The error stated is twice the
-    largest distance of one of them from the mean, or the change of the mean under the last halving if that is larger,
-    plus rounding: the cost's measured noise, and 1e-11 of its size where steps solve equations. Returns None where two
-    levels of at least :data:`LEAST` points do not fit, or a cost is not finite. What is narrower than the spacing, and
-    not among the breakpoints, is not seen. The cost is evaluated ``columns`` points at a time.
+    Gauss-Legendre panels lie between the scene's breakpoints and are halved until the error is negligible or the points
+    are spent. Every level averages four rules, shifted against each other. The stated error is twice the largest distance
+    of a rule from the mean, or the change of the mean under the last halving if that is larger, plus rounding: the cost's
+    measured noise, and 1e-11 of its size where steps solve equations. Returns None where two levels of at least
+    :data:`LEAST` points do not fit, or a cost is not finite. A feature of the cost that is narrower than the spacing, and
+    not among the breakpoints, is missed. The cost is evaluated ``columns`` points at a time.
     """
     width, dim = problem.program.n_noise, problem.dim
     breaks = problem.program.breakpoints()
@@ -65,7 +65,7 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
         return in_columns(lambda w: problem.value(theta, w), nodes, columns)
 
     rounding = _noise(cost, width) * math.sqrt(width) / problem.sigma
-    panels, found, error, used, size = FIRST[width], None, math.inf, 0, 0.0
+    panels, previous, error, used, size = FIRST[width], None, math.inf, 0, 0.0
     while True:
         rules = [[_panels(e, panels, shift) for shift in SHIFTS[width][i]] for i, e in enumerate(edges)]
         count = sum(math.prod(rule[0].size for rule in axes) for axes in zip(*rules, strict=True))
@@ -84,15 +84,15 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
             size = max(size, float(np.linalg.norm(np.abs(nodes[:dim]) @ (weights * np.abs(f))) / problem.sigma))
         mean = np.mean(gradients, axis=0)
         spread = max(float(np.linalg.norm(g - mean)) for g in gradients)
-        change = math.inf if found is None else float(np.linalg.norm(mean - found))
-        found, error, used = mean, max(SAFETY * spread, change), count
+        change = math.inf if previous is None else float(np.linalg.norm(mean - previous))
+        previous, error, used = mean, max(SAFETY * spread, change), count
         if count >= LEAST[width] and error <= SETTLED * np.linalg.norm(mean) + rounding:
             break
         panels *= 2
-    if found is None or used < LEAST[width] or not math.isfinite(error + rounding):
+    if previous is None or used < LEAST[width] or not math.isfinite(error + rounding):
         return None
     error += rounding + (SOLVED if problem.program.needs_root else 4.0 * np.finfo(float).eps) * size
-    return Integral(found, error, used, 2.0 * REACH / used ** (1.0 / width))
+    return Integral(previous, error, used, 2.0 * REACH / used ** (1.0 / width))
 
 
 def _panels(edges: np.ndarray, count: int, shift: float) -> tuple[np.ndarray, np.ndarray]:
@@ -109,12 +109,12 @@ def _panels(edges: np.ndarray, count: int, shift: float) -> tuple[np.ndarray, np
 
 
 def _noise(cost: Callable[[np.ndarray], np.ndarray], width: int) -> float:
-    """Return a bound on the cost's rounding noise, from fourth differences over stencils too short for its shape.
+    """Return a bound on the cost's rounding noise, from fourth differences over stencils too short to show its shape.
 
-    Of independent errors of variance s^2 a fourth difference has 70 s^2. Stencils that hold a kink or a jump are rare,
-    and make the bound larger, never smaller.
+    The fourth difference of independent errors of variance s^2 has the variance 70 s^2. A stencil that contains a kink or
+    a jump is rare, and only makes the bound larger.
     """
-    # evenly spread over a disc of three standard deviations, and no round numbers
+    # evenly spread over a disc of three standard deviations, away from round numbers
     turn = np.arange(PROBES)
     radius = 3.0 * np.sqrt((turn + 0.5) / PROBES)
     at = np.stack([radius * np.cos(2.4 * turn), radius * np.sin(2.4 * turn)])[:width]

@@ -1,9 +1,9 @@
-"""Certified gradients: closed form, then quadrature, then long sampling, each with an error that is meant as a bound."""
+"""Certified gradients: closed form, quadrature or long sampling, each with an error meant as a bound."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,36 +19,35 @@ BATCHES = 64
 """Number of independent batch means that a sampled reference is stored as."""
 COLUMNS = 4096
 """Columns of every batch evaluated, so that a compiling backend compiles once; fewer where few samples are allowed.
-
-One batch is also the budget for choosing the estimator of a sampled reference.
-"""
+Choosing the estimator of a sampled reference takes one batch too."""
 LEAST_SAMPLES = 16384
 """Fewest samples of a sampled reference, where so many are allowed: a small spread of few samples proves nothing."""
 QUADRATURE_POINTS = 1 << 20
 QUADRATURE_TOLERANCE = 1e-3
 """Relative error above which quadrature is accepted only where sampling does no better."""
 TAIL_EVENTS = 10.0
-"""Samples that are expected in the tails whose contribution is estimated apart: too few to be shown by a spread."""
+"""Samples expected in the tails, whose contribution is estimated separately: so few may not show in a spread."""
 DIRECTIONS = 16
-"""Directions in noise space whose tails and jumps are looked at: coordinates, and that of the largest mean effect."""
+"""Directions in noise space searched for tails and jumps: coordinates, and the direction of the largest mean effect."""
 FAR = 4.5
-"""Standard deviations to which jumps are looked for along a direction."""
+"""Standard deviations searched for jumps along a direction, to either side."""
 ROUNDING = 1e-9
-"""Share of a gradient below which first and zeroth order differ by rounding alone."""
+"""Share of a gradient below which first and zeroth order differ only by rounding."""
 SHARED = 1e-10
-"""Error that the terms of all samples may have in common, relative to their size: rounding, and central differences."""
+"""Error that the terms of all samples may share, relative to their size: from rounding and central differences."""
 WARNED, REFUSED = 0.999, 1.0 - 1e-6
-"""Levels at which a difference between first and zeroth order is remarked on, and at which zeroth order is used."""
+"""Confidence levels at which a difference between first and zeroth order is noted, and at which zeroth order is used."""
 
 
 @dataclass(frozen=True)
 class Reference:
     """A certified grad J_sigma.
 
-    ``batches (K, d)`` are independent estimates whose mean is the gradient, or one row where it has no sampling
-    error. ``error`` is the norm of an error that their spread does not show: what a deterministic method may leave,
-    or what samples in the tails would change. ``plain (d,)`` is the program's gradient at w = 0 and ``physical (d,)``
-    that of the physics it approximates; each is empty when unknown. ``note`` says what could not be certified.
+    ``batches (K, d)`` are independent estimates whose mean is the gradient, or one row where the gradient has no
+    sampling error. ``error`` is the norm of an error that their spread does not show: the remaining error of a
+    deterministic method, or the change that samples in the tails would make. ``plain (d,)`` is the program's gradient at
+    w = 0 and ``physical (d,)`` that of the physics it approximates; each is empty when unknown. ``note`` states what
+    could not be certified.
     """
 
     batches: np.ndarray
@@ -64,7 +63,7 @@ class Reference:
         return self.batches.mean(axis=0)
 
     def known(self) -> Truth:
-        """Return the reference as the statistics take it: a mean, its sampling error, and what that does not show."""
+        """Return the reference for the statistics: a mean, its sampling error, and the error that sampling does not show."""
         if len(self.batches) > 1:
             return Truth.from_batches(self.batches, self.error)
         return Truth.exact(self.gradient, self.error)
@@ -85,28 +84,28 @@ def certify(
     """Compute the reference of a problem by the best method that applies.
 
     A closed form belongs to the scene's own program, so it is not used for a backend that ``provides`` physics of its
-    own. Quadrature takes noise of one or two dimensions on theta, unless the cost jumps in a plane at places that the
-    scene does not list; above a relative error of 0.1% it gives way to sampling, if that does better. Sampling stops at
-    an error of ``tolerance`` times the gradient's norm, or after ``samples`` samples. ``physical (d,)`` is the gradient
-    that the program approximates, if known.
+    own. Quadrature handles noise of one or two dimensions on theta, unless the cost jumps in a plane at places that the
+    scene does not list. Above a relative error of 0.1%, sampling replaces quadrature if its error is smaller. Sampling
+    stops at an error of ``tolerance`` times the gradient's norm, or after ``samples`` samples. ``physical (d,)`` is the
+    gradient that the program approximates, if known.
     """
     program = problem.program
     theta = program.theta0
     if program.surrogate:
-        # its gradient is not the derivative of the program, so that only costs can certify one
+        # its gradient is not the derivative of the program, so only costs can certify a reference
         provides = provides - {"grad"}
     closed = None if "physics" in provides else program.closed_form_gradient()
     if closed is not None:
-        found = Reference(np.asarray(closed, dtype=np.float64).reshape(1, -1), "closed_form")
+        reference = Reference(np.asarray(closed, dtype=np.float64).reshape(1, -1), "closed_form")
     else:
-        found = _computed(problem, theta, provides, samples, tolerance)
+        reference = _compute(problem, theta, provides, samples, tolerance)
     if physical is None or "grad" not in provides:
-        return found
+        return reference
     plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
-    return replace(found, plain=plain, physical=np.asarray(physical, dtype=np.float64))
+    return replace(reference, plain=plain, physical=np.asarray(physical, dtype=np.float64))
 
 
-def _computed(
+def _compute(
     problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float
 ) -> Reference:
     program = problem.program
@@ -118,17 +117,17 @@ def _computed(
             quadrature = Reference(integral.gradient[None, :], method, integral.error)
             if integral.error <= QUADRATURE_TOLERANCE * np.linalg.norm(integral.gradient):
                 return quadrature
-    sampled = _sampled(problem, theta, provides, samples, tolerance)
+    sampled = _sample(problem, theta, provides, samples, tolerance)
     if quadrature is None:
         return sampled
-    # a gradient near zero has no relative accuracy; what counts there is which method leaves less
+    # a gradient near zero has no relative accuracy: there the method with the smaller error is used
     if not np.isfinite(sampled.batches).all():
         return quadrature
     return sampled if 0.0 < sampled.known().standard_error < quadrature.error else quadrature
 
 
 def _unlisted_jumps(program: Program) -> bool:
-    """Whether the cost jumps at places that are not among the breakpoints: a contact law's, or those of no list."""
+    """Return whether the cost may jump at places that the breakpoints do not list, such as the jumps of a contact law."""
     if program.contact is not None and not program.contact.continuous:
         return True
     return not program.continuous and not any(program.breakpoints())
@@ -141,13 +140,11 @@ Terms = Callable[[np.ndarray], np.ndarray]
 """Maps noise ``(n_w, B)`` to per-sample terms ``(d, B)`` whose expectation is the gradient."""
 
 
-def _sampled(
-    problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float
-) -> Reference:
-    """Sample with the valid estimator of lowest variance, in independent batches, held against zeroth order.
+def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float) -> Reference:
+    """Sample with the valid estimator of lowest variance, in independent batches, and compare it with zeroth order.
 
-    First order is valid where the cost is continuous. It gives way to zeroth order, with a note, where lines through the
-    samples find a jump, or the two disagree; both are unbiased otherwise.
+    First order is valid where the cost is continuous. Zeroth order replaces it, with a note, where a line through the
+    samples has a jump or the two estimators disagree. Otherwise both are unbiased.
     """
     columns = min(COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
     still = np.zeros((problem.program.n_noise, 1))
@@ -157,7 +154,7 @@ def _sampled(
         orders["zeroth_order"] = lambda w: _antithetic(problem, theta, w, centre)
     if problem.program.continuous and "grad" in provides:
         orders["first_order"] = lambda w: problem.grad(theta, w)
-    pilot = _draw(problem, "pilot", columns, 0)
+    pilot = draw_columns(problem, "pilot", columns, 0)
     pilots = {name: terms(pilot) for name, terms in orders.items()}
     pilots = {name: terms for name, terms in pilots.items() if np.isfinite(terms).all()}
     if not pilots:
@@ -168,26 +165,26 @@ def _sampled(
     spread = {name: float(terms.var(axis=1, ddof=1).sum()) for name, terms in pilots.items()}
     chosen, doubt = min(spread, key=lambda name: spread[name]), ""
     if chosen == "first_order":
-        doubt = _doubt(problem, theta, pilots, pilot, directions, columns)
+        doubt = _reason_against_first_order(problem, theta, pilots, pilot, directions, columns)
     if doubt and "zeroth_order" in pilots:
         chosen = "zeroth_order"
 
     def sample(order: str) -> Reference:
         return _batches(problem, orders[order], order, pilots[order], directions, columns, samples, tolerance)
 
-    found = sample(chosen)
+    reference = sample(chosen)
     if chosen == "zeroth_order" or "zeroth_order" not in pilots:
-        return _noted(found, doubt)
-    # a pilot of heavy tails looks better than it is
-    error = found.known().standard_error
-    if 2.0 * spread["zeroth_order"] < _count(found) * error**2:
+        return _with_note(reference, doubt)
+    # a pilot of a heavy-tailed distribution underestimates its variance
+    error = reference.known().standard_error
+    if 2.0 * spread["zeroth_order"] < _count(reference) * error**2:
         other = sample("zeroth_order")
         if other.known().standard_error < error:
-            return _noted(other, "")
-    return _checked(problem, found, orders["zeroth_order"], columns, lambda: sample("zeroth_order"))
+            return other
+    return _cross_checked(problem, reference, orders["zeroth_order"], columns, lambda: sample("zeroth_order"))
 
 
-def _doubt(
+def _reason_against_first_order(
     problem: Problem,
     theta: np.ndarray,
     pilots: dict[str, np.ndarray],
@@ -195,9 +192,9 @@ def _doubt(
     directions: np.ndarray,
     columns: int,
 ) -> str:
-    """Return why first order cannot be trusted, or nothing: the pilot's zeroth order disagrees, or the cost jumps."""
+    """Return why first order cannot be trusted: the pilot's zeroth order disagrees, or the cost jumps. Empty if neither."""
     if "zeroth_order" in pilots:
-        # both from the same noise, so their difference is a sample of its own
+        # both come from the same noise, so their differences are independent samples too
         paired = (pilots["first_order"] - pilots["zeroth_order"]).T
         if bias_interval(paired.mean(axis=0), Sampling.of(paired), level=REFUSED)[1] > ROUNDING * np.abs(paired).max():
             return "first and zeroth order disagree in the pilot, so zeroth order is used"
@@ -206,9 +203,9 @@ def _doubt(
     through = through - along * (along * through).sum(axis=0)
     starts = np.concatenate([pilot[:, count : 2 * count], through - FAR * along], axis=1)
     ends = np.concatenate([pilot[:, 2 * count : 3 * count], through + FAR * along], axis=1)
-    jump = largest_jump(lambda w: in_columns(lambda part: problem.value(theta, part), w, columns), starts, ends)
+    jump = largest_jump(lambda w: in_columns(lambda part: problem.value(theta, part), w, columns), starts, ends).height
     if jump:
-        return f"the cost jumps by {jump:.2g}, which its scene and contact law do not say, so zeroth order is used"
+        return f"the cost jumps by {jump:.2g}, which its scene and contact law do not declare, so zeroth order is used"
     return ""
 
 
@@ -222,15 +219,8 @@ def _batches(
     samples: int,
     tolerance: float,
 ) -> Reference:
-    """Sample until the error, that of the tails included, is small enough, or the samples are spent."""
-    size = columns // BATCHES
-    batches = np.zeros((BATCHES, problem.dim))
-    count = 0
-    while True:
-        w = _draw(problem, "reference", BATCHES * size, count)
-        means = in_columns(terms, w, columns).reshape(problem.dim, BATCHES, size).mean(axis=2).T
-        batches = (batches * count + means * size) / (count + size)
-        count += size
+    """Sample until the error, tails included, is small enough or the samples are spent."""
+    for batches, count in doubling_batches(problem, terms, "reference", columns):
         if not np.isfinite(batches).all():
             break
         # each pass doubles the samples, so stop if the next one would exceed the budget
@@ -238,74 +228,71 @@ def _batches(
         se = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)
         enough = se <= tolerance * np.linalg.norm(batches.mean(axis=0)) and count * BATCHES >= LEAST_SAMPLES
         if spent or enough:
-            unseen = _unseen(problem, terms, batches.mean(axis=0), directions, count * BATCHES, columns)
+            unseen = _tail_error(problem, terms, batches.mean(axis=0), directions, count * BATCHES, columns)
             if spent or math.hypot(se, np.nan_to_num(unseen)) <= tolerance * np.linalg.norm(batches.mean(axis=0)):
                 break
-        size = count
     if not np.isfinite(batches).all():
         return Reference(batches[:1] * math.nan, "sampling[failed: rollouts are not finite]", math.nan)
     note = ""
     if math.isnan(unseen):
         note, unseen = "rollouts in the far tails of the noise are not finite, so the reference may not exist", 0.0
     elif heavy_tails(batches - batches.mean(axis=0)):
-        note = "the reference's batches have heavy tails, so that its standard error is uncertain"
+        note = "the reference's batches have heavy tails, so its standard error is uncertain"
     elif not np.ptp(pilot) and not pilot.any():
-        note = (
-            f"no sample of the reference had a gradient: events rarer than {3.0 / (count * BATCHES):.1g} are not seen"
-        )
-    # an error that all samples share, such as that of a backend's differences, shows in no spread
+        note = f"every sample of the reference has gradient 0: events rarer than {3.0 / (count * BATCHES):.1g} are not seen"
+    # the spread does not show an error that all samples share, such as that of a backend's differences
     unseen = math.hypot(unseen, SHARED * math.sqrt(float(np.square(pilot).sum(axis=0).mean())))
     return Reference(batches, f"sampling[{order},n={count * BATCHES}]", unseen, note=note)
 
 
-def _checked(
-    problem: Problem, found: Reference, zeroth: Terms, columns: int, instead: Callable[[], Reference]
+def _cross_checked(
+    problem: Problem, reference: Reference, zeroth: Terms, columns: int, instead: Callable[[], Reference]
 ) -> Reference:
-    """Hold a first-order reference against zeroth order of a quarter of its samples, and say what that could resolve."""
-    count = max(columns, _count(found) // 4 // columns * columns)
-    check = in_columns(zeroth, _draw(problem, "check", count, 0), columns)
+    """Compare a first-order reference with zeroth order on a quarter of its samples, and record the resolution."""
+    count = max(columns, _count(reference) // 4 // columns * columns)
+    check = in_columns(zeroth, draw_columns(problem, "check", count, 0), columns)
     check = check.reshape(problem.dim, BATCHES, -1).mean(axis=2).T
-    apart = found.gradient - check.mean(axis=0)
-    errors = Sampling.of(found.batches), Sampling.of(check)
+    apart = reference.gradient - check.mean(axis=0)
+    errors = Sampling.of(reference.batches), Sampling.of(check)
     trace = sum(error.trace for error in errors)
     rows = np.concatenate([error.rows for error in errors])
     spread = math.sqrt(2.0 * float(np.square(rows @ rows.T).sum()))
     z = float((apart @ apart - trace) / spread) if spread else 0.0 if not apart.any() else math.inf
-    size = ROUNDING * (np.linalg.norm(found.gradient) + np.linalg.norm(check.mean(axis=0)))
+    size = ROUNDING * (np.linalg.norm(reference.gradient) + np.linalg.norm(check.mean(axis=0)))
     at = {level: bias_interval(apart, *errors, level=level)[1] > size for level in (WARNED, REFUSED)}
-    said = f"first and zeroth order disagree by {np.linalg.norm(apart):.2g} (check_z={z:.1f})"
+    disagreement = f"first and zeroth order disagree by {np.linalg.norm(apart):.2g} (check_z={z:.1f})"
     if at[REFUSED]:
-        return _noted(instead(), f"{said}, so zeroth order is used")
-    method = found.method.removesuffix("]") + f",check_z={z:.1f},check_resolves={2.0 * math.sqrt(trace):.2g}]"
-    return _noted(replace(found, method=method), said if at[WARNED] else "")
+        return _with_note(instead(), f"{disagreement}, so zeroth order is used")
+    method = reference.method.removesuffix("]") + f",check_z={z:.1f},check_resolves={2.0 * math.sqrt(trace):.2g}]"
+    return _with_note(replace(reference, method=method), disagreement if at[WARNED] else "")
 
 
-def _unseen(
+def _tail_error(
     problem: Problem, terms: Terms, mean: np.ndarray, directions: np.ndarray, count: int, columns: int
 ) -> float:
-    """Return what the far tails add to the mean, as the largest over some directions: they hold few samples or none.
+    """Return the contribution of the far tails to the mean, the largest norm over the directions.
 
-    Along each direction the tails begin where :data:`TAIL_EVENTS` of ``count`` samples are expected beyond, and are
-    sampled there; a spread of the samples themselves would show nothing of an event that none of them had.
+    The tails hold few of the ``count`` samples or none, so the spread of the samples does not show their contribution.
+    Along each direction the tails begin where :data:`TAIL_EVENTS` samples are expected beyond, and are sampled there.
     """
     from scipy.special import ndtri
 
     share = min(1.0, TAIL_EVENTS / count)
     each = max(1, columns // directions.shape[1])
     along = np.repeat(directions, each, axis=1)
-    w = _draw(problem, "tails", along.shape[1], 0)
-    # the same noise with its component along the direction replaced by one beyond the quantile, of either sign
+    w = draw_columns(problem, "tails", along.shape[1], 0)
+    # replace the component of the noise along the direction by one beyond the quantile, of either sign
     middle = (np.arange(each) + 0.5) / each
     depth = -ndtri(0.5 * share * middle) * np.where(np.arange(each) % 2, 1.0, -1.0)
     w = w + along * (np.tile(depth, directions.shape[1]) - (along * w).sum(axis=0))
-    found = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
-    if not np.isfinite(found).all():
+    tails = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
+    if not np.isfinite(tails).all():
         return math.nan
-    return share * float(np.linalg.norm(found.mean(axis=2) - mean[:, None], axis=0).max())
+    return share * float(np.linalg.norm(tails.mean(axis=2) - mean[:, None], axis=0).max())
 
 
 def _directions(effect: np.ndarray) -> np.ndarray:
-    """Return unit vectors in noise space, ``(n_w, L)``: coordinates, evenly chosen, and that of the mean effect."""
+    """Return unit vectors in noise space, ``(n_w, L)``: evenly chosen coordinates and the direction of the mean effect."""
     width = effect.size
     chosen = np.unique(np.linspace(0, width - 1, min(width, DIRECTIONS)).astype(int))
     directions = np.eye(width)[:, chosen] if width <= DIRECTIONS else np.zeros((width, chosen.size))
@@ -314,16 +301,31 @@ def _directions(effect: np.ndarray) -> np.ndarray:
     return np.column_stack([directions, effect / length]) if length and math.isfinite(length) else directions
 
 
-def _count(found: Reference) -> int:
-    return int(found.method.split("n=")[1].split(",")[0].rstrip("]"))
+def _count(reference: Reference) -> int:
+    return int(reference.method.split("n=")[1].split(",")[0].rstrip("]"))
 
 
-def _noted(found: Reference, note: str) -> Reference:
-    return replace(found, note="; ".join(part for part in (note, found.note) if part))
+def _with_note(reference: Reference, note: str) -> Reference:
+    return replace(reference, note="; ".join(part for part in (note, reference.note) if part))
 
 
-def _draw(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
-    """Draw noise ``(n_w, count)`` from the reference's own streams, which no cell uses."""
+def doubling_batches(problem: Problem, terms: Terms, stream: str, columns: int) -> Iterator[tuple[np.ndarray, int]]:
+    """Yield batch means ``(BATCHES, d)`` and the samples of each, adding as many samples again after each yield.
+
+    ``terms`` are evaluated ``columns`` at a time, on noise of the named stream.
+    """
+    size, count, batches = columns // BATCHES, 0, np.zeros((BATCHES, problem.dim))
+    while True:
+        w = draw_columns(problem, stream, BATCHES * size, count)
+        means = in_columns(terms, w, columns).reshape(problem.dim, BATCHES, size).mean(axis=2).T
+        batches = (batches * count + means * size) / (count + size)
+        count += size
+        yield batches, count
+        size = count
+
+
+def draw_columns(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
+    """Draw noise ``(n_w, count)`` from a stream of references, which no cell uses."""
     program = problem.program
     drawn = noise.draw(block, program.scene.name, 1, count, program.n_noise, stream)
     return np.moveaxis(drawn, -1, 0).reshape(program.n_noise, count)

@@ -1,4 +1,4 @@
-"""References of other smoothings than J_sigma: a Gaussian of another width, or the average over a ball."""
+"""References of smoothings other than J_sigma: a Gaussian of another width, or the average over a ball."""
 
 from __future__ import annotations
 
@@ -8,17 +8,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bench.measure import noise
-from bench.measure.batches import in_columns
-from bench.measure.reference import BATCHES, COLUMNS, Reference
+from bench.measure.reference import BATCHES, COLUMNS, LEAST_SAMPLES, Reference, doubling_batches, draw_columns
 from bench.model import Problem, Program, compose
-
-LEAST_SAMPLES = 16384
-"""Fewest samples, where so many are allowed: a small spread of few samples proves nothing."""
 
 
 def widened(program: Program, radius: float) -> Program:
-    """Return the program with the Gaussian of another standard deviation: its J_sigma is that smoothing."""
+    """Return the program whose J_sigma is the smoothing by a Gaussian of standard deviation ``radius``."""
     scene = dataclasses.replace(program.scene, sigma=radius)
     return compose(scene, program.contact, program.integrator, program.decision)
 
@@ -26,9 +21,9 @@ def widened(program: Program, radius: float) -> Program:
 def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples: int, tolerance: float) -> Reference:
     """Compute the gradient at theta0 of the cost averaged over the ball of that radius around theta.
 
-    It equals d / r times the mean of f u over the sphere (the divergence theorem; Flaxman et al. 2005, lemma 2.1). With
-    one variable that is a difference of two costs. Else it is sampled: first order inside the ball where the cost is
-    continuous, or central differences across the sphere, whichever has the lower variance in a pilot.
+    The gradient equals d / r times the mean of f u over the sphere (the divergence theorem; Flaxman et al. 2005, lemma
+    2.1). With one variable it is a difference of two costs. Otherwise it is sampled: first order inside the ball where
+    the cost is continuous, or central differences across the sphere, whichever has the lower variance in a pilot.
     """
     program, theta, d = problem.program, problem.program.theta0, problem.dim
     name = f"ball[radius={radius:g}]"
@@ -51,20 +46,15 @@ def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples
     if program.continuous and "grad" in provides and not program.surrogate:
         orders["first_order"] = first
     columns = min(COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
-    pilot = _draw(problem, "ball pilot", columns, 0)
+    pilot = draw_columns(problem, "ball pilot", columns, 0)
     spread = {order: float(terms(pilot).var(axis=1).sum()) for order, terms in orders.items()}
     chosen = min(spread, key=lambda order: spread[order] if math.isfinite(spread[order]) else math.inf)
-    size, count, batches = columns // BATCHES, 0, np.zeros((BATCHES, d))
-    while True:
-        w = _draw(problem, "ball", BATCHES * size, count)
-        means = in_columns(orders[chosen], w, columns).reshape(d, BATCHES, size).mean(axis=2).T
-        batches = (batches * count + means * size) / (count + size)
-        count += size
+    for batches, count in doubling_batches(problem, orders[chosen], "ball", columns):
         error = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)
         enough = error <= tolerance * np.linalg.norm(batches.mean(axis=0)) and count * BATCHES >= LEAST_SAMPLES
         if enough or 2 * count * BATCHES > samples or not math.isfinite(error):
-            return Reference(batches, f"{name},sampling[{chosen},n={count * BATCHES}]")
-        size = count
+            break
+    return Reference(batches, f"{name},sampling[{chosen},n={count * BATCHES}]")
 
 
 def _polar(problem: Problem, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -73,12 +63,5 @@ def _polar(problem: Problem, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     normal = problem.directions(w)
     size = np.linalg.norm(normal, axis=0)
-    # the squared length is chi-squared, independent of the direction: its rank is uniform
+    # the squared length is chi-squared and independent of the direction: its quantile is uniform
     return normal / size, gammainc(problem.dim / 2, size**2 / 2) ** (1 / problem.dim)
-
-
-def _draw(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
-    """Draw noise ``(n_w, count)`` from streams that no cell uses."""
-    program = problem.program
-    drawn = noise.draw(block, program.scene.name, 1, count, program.n_noise, stream)
-    return np.moveaxis(drawn, -1, 0).reshape(program.n_noise, count)

@@ -1,4 +1,4 @@
-"""Newton's method on a problem without noise: the least cost that can be reached, with a certificate."""
+"""Newton's method on a problem without noise: a local minimum of the cost, with a certificate."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from scipy.optimize import minimize
 from bench.model import Problem
 
 STEP = 1e-5
-"""Step of the differences of gradients that make the Hessian, in units of theta: error about 1e-10 of it."""
-ENOUGH = 1e-8
-"""A gradient below this share of the first one is 0: differences of costs no longer show it."""
+"""Step of the differences of gradients for the Hessian, in units of theta: their relative error is about 1e-10."""
+CONVERGED = 1e-8
+"""A gradient below this share of the first gradient counts as 0: differences of costs no longer show it."""
 FAR = 1e6
-"""A theta this many times its start has run away: the cost has no lower bound that can be found."""
+"""Multiple of the start beyond which theta counts as diverged: the cost then counts as unbounded below."""
 ROUNDING = 1e-13
-"""Relative difference of two costs that is rounding."""
+"""Relative difference of two costs that rounding explains."""
 
 
 @dataclass(frozen=True)
 class Solved:
-    """A local optimum: its cost and theta, the norm of the gradient there, and the least curvature."""
+    """A local minimum: cost, theta, norm of the gradient there, and smallest curvature."""
 
     cost: float
     theta: np.ndarray
@@ -34,43 +34,45 @@ class Solved:
 def solve(problem: Problem, theta: np.ndarray | None = None, steps: int = 40) -> Solved:
     """Minimise the cost at w = 0 from ``theta (d,)``, by default the problem's own: L-BFGS, then damped Newton steps.
 
-    The Hessian comes from central differences of gradients, 2 d of them per step. The damping grows tenfold while a
-    step does not lower the cost and falls tenfold after one that does (Nocedal, Wright 2006, ch. 10 to 11). A cost
-    without lower bound is -inf.
+    The Hessian comes from central differences of gradients, 2 d per step. The damping grows tenfold while a step does not
+    lower the cost, and falls tenfold after a step that does (Nocedal, Wright 2006, ch. 10 to 11). The cost is -inf where
+    it has no lower bound.
     """
     theta = np.array(problem.program.theta0 if theta is None else theta, dtype=np.float64)
     still = np.zeros((problem.program.n_noise, 1))
     first = max(float(np.linalg.norm(problem.grad(theta, still)[:, 0])), 1e-300)
 
-    def both(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def value_and_gradient(x: np.ndarray) -> tuple[float, np.ndarray]:
         return float(problem.value(x, still)[0]), problem.grad(x, still)[:, 0]
 
-    near = minimize(both, theta, jac=True, method="L-BFGS-B", options={"maxiter": 50 * steps, "maxcor": 30})
+    near = minimize(
+        value_and_gradient, theta, jac=True, method="L-BFGS-B", options={"maxiter": 50 * steps, "maxcor": 30}
+    )
     theta = near.x if np.isfinite(near.fun) and np.isfinite(near.x).all() else theta
-    (cost, gradient), damping = both(theta), 1e-9
+    (cost, gradient), damping = value_and_gradient(theta), 1e-9
     values, vectors = _curvatures(problem, theta)
     for _ in range(steps):
-        if np.linalg.norm(gradient) <= 1e-3 * ENOUGH * first:
+        if np.linalg.norm(gradient) <= 1e-3 * CONVERGED * first:
             break
         while damping < 1e12:
             scale = np.maximum(np.abs(values), 1e-9 * np.abs(values).max()) + damping * np.abs(values).max()
             moved = theta - vectors @ ((vectors.T @ gradient) / scale)
-            found, slope = both(moved)
-            # below rounding costs no longer decide, gradients do
-            level = abs(found - cost) <= ROUNDING * abs(cost)
-            if found < cost or (level and np.linalg.norm(slope) < np.linalg.norm(gradient)):
+            new_cost, slope = value_and_gradient(moved)
+            # where costs differ only by rounding, gradients decide
+            is_level = abs(new_cost - cost) <= ROUNDING * abs(cost)
+            if new_cost < cost or (is_level and np.linalg.norm(slope) < np.linalg.norm(gradient)):
                 break
             damping *= 10
         else:
             break
-        theta, cost, damping = moved, found, max(damping / 10, 1e-15)
+        theta, cost, damping = moved, new_cost, max(damping / 10, 1e-15)
         gradient = slope
         values, vectors = _curvatures(problem, theta)
     norm = float(np.linalg.norm(gradient))
     lowest = float(values.min())
     if np.abs(theta).max() > FAR * (1.0 + np.abs(problem.program.theta0).max()):
         return Solved(-np.inf, theta, norm, lowest, False)
-    certified = norm <= ENOUGH * first and lowest >= -1e-8 * float(np.abs(values).max())
+    certified = norm <= CONVERGED * first and lowest >= -1e-8 * float(np.abs(values).max())
     return Solved(cost, theta, norm, lowest, certified)
 
 

@@ -5,7 +5,7 @@ S = cov(x) / R + cov(truth), the covariance of m, everything about the bias b = 
 
     E |m|^2 = |b|^2 + tr S,        Var |m|^2 = 2 tr S^2 + 4 b'Sb        (Gaussian m),
 
-so that |m| by itself overstates the bias, by its noise. The interval inverts this law, see :func:`bias_interval`.
+so |m| overstates the bias because of its noise. The interval inverts this law, see :func:`bias_interval`.
 
 Sources: Chen and Qin 2010 (|m|^2 - tr S in many dimensions), Himeno and Yamada 2014 (unbiased tr S^2 under any
 noise), Satterthwaite 1946 (moment matching), Sankaran 1959 (normal form of the noncentral chi-square), Welch 1947
@@ -28,8 +28,8 @@ __all__ = [
     "Truth",
     "bias_interval",
     "heavy_tails",
+    "is_unexplained",
     "summarise",
-    "unexplained",
     "variance_interval",
     "variance_per_sample",
 ]
@@ -37,36 +37,36 @@ __all__ = [
 ROUNDING = 1e-12
 """Differences below this share of a gradient's size are rounding: no bias, and no spread of the estimates."""
 FEW_REPEATS = 8
-"""With fewer repeats than this, a note says so, and tails are not judged."""
+"""With fewer repeats than this, a note says so, and tails are not tested."""
 CONCENTRATION = 0.75
 """Tails are heavy when (sum y)^2 / sum y^2 of the squared deviations y is below this times sqrt(R). That holds for 5%
 of cells with normal noise at R = 8, 1% at 16, none of thousands at 64, and half of cells with kurtosis 100."""
 SYMMETRIC = 1e-6
 """Skewness below which its correction is rounding."""
 VAGUE = 0.1
-"""Error of a reference, as a share of its norm, above which a note says that relative columns are no better."""
+"""Error of a reference, as a share of its norm, above which a note warns that relative columns are no more accurate."""
 THREE = 3.0
 """An event that did not happen in n trials has a probability below 3 / n, at 95% (the rule of three)."""
 UNEXPLAINED = "tails unseen or gradient wrong"
-"""What a row says whose estimator declares to be unbiased while the interval of its bias excludes 0."""
+"""Remark on a row whose estimator declares to be unbiased although the interval of its bias excludes 0."""
 
 
-def unexplained(reason: str) -> bool:
-    """Whether a row's remark says that its bias contradicts what the estimator declares: no bias to report as found."""
+def is_unexplained(reason: str) -> bool:
+    """Return whether a row's remark says that its bias contradicts the estimator's declaration, so is not an established bias."""
     return UNEXPLAINED in reason
 
 
-# ------------------------------------------------------------------------------------- what a mean is known to
+# ------------------------------------------------------------------------------------------- error of a mean
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """The covariance of a mean, as rows: ``rows' rows``, so that no d x d matrix is needed where d is large."""
+    """The covariance of a mean, stored as ``rows`` with covariance ``rows' rows``: a large d needs no d x d matrix."""
 
     rows: np.ndarray
     """``(K, d)``. Of a sample: deviations from its mean, divided by sqrt(K (K - 1))."""
     degrees: float
-    """Its degrees of freedom: K - 1 for a sample of K, infinite for a covariance that is known."""
+    """Degrees of freedom: K - 1 for a sample of K, infinite for a known covariance."""
 
     @classmethod
     def of(cls, sample: np.ndarray) -> Sampling:
@@ -76,7 +76,7 @@ class Sampling:
 
     @classmethod
     def without_direction(cls, error: float, dim: int) -> Sampling:
-        """Return the covariance of an error of norm ``error`` that may point anywhere, taken as known."""
+        """Return the known covariance of an error of norm ``error`` whose direction is unknown."""
         rows = np.eye(dim) * (error / math.sqrt(max(dim, 1))) if error else np.zeros((0, dim))
         return cls(rows, math.inf)
 
@@ -90,11 +90,11 @@ class Sampling:
         return replace(self, rows=self.rows / unit)
 
     def excess(self) -> float:
-        """Return by how much the squared covariance has too large a trace because it comes from a sample.
+        """Return the upward bias of the trace of the squared covariance, which comes from estimating it from a sample.
 
         For n + 1 = K rows r with C = sum r r', the unbiased estimate under any noise is (Himeno and Yamada 2014)
         ``n / (K (K-2) (K-3)) * (n (K-2) tr C^2 + (tr C)^2 - K n sum |r|^4)``; below four rows none exists,
-        and its upper bound (tr C)^2 is used.
+        and the upper bound (tr C)^2 is used.
         """
         if math.isinf(self.degrees):
             return 0.0
@@ -123,7 +123,7 @@ class Truth:
     sampling: Sampling
     """Its error, independent of that of the estimates compared with it."""
     unseen: float = 0.0
-    """Norm of an error, without direction, that ``sampling`` does not show."""
+    """Norm of an error of unknown direction that ``sampling`` does not show."""
 
     def __post_init__(self) -> None:
         if self.mean.ndim != 1 or self.mean.size == 0 or self.sampling.rows.shape[1:] != self.mean.shape:
@@ -133,11 +133,11 @@ class Truth:
             )
         finite = np.isfinite(self.mean).all() and np.isfinite(self.sampling.rows).all()
         if not (finite and math.isfinite(self.unseen)):
-            raise ValueError("the reference gradient or its error is not finite, so nothing can be held to it")
+            raise ValueError("the reference gradient or its error is not finite, so nothing can be compared with it")
 
     @classmethod
     def exact(cls, mean: np.ndarray, error: float = 0.0) -> Truth:
-        """Make the truth of a closed form or quadrature ``(d,)``, whose error of norm ``error`` has no direction."""
+        """Make the truth of a closed form or quadrature ``(d,)``, with an error of norm ``error`` in unknown direction."""
         mean = np.asarray(mean, dtype=np.float64)
         return cls(mean, Sampling.without_direction(error, mean.size))
 
@@ -168,17 +168,17 @@ class Truth:
 
     @property
     def errors(self) -> tuple[Sampling, ...]:
-        """Its independent errors: that of sampling, and that which sampling does not show, if any."""
+        """The independent errors: the sampling error, and the error that sampling does not show, if any."""
         hidden = (Sampling.without_direction(self.unseen, self.mean.size),) if self.unseen else ()
         return (self.sampling, *hidden)
 
     @property
     def standard_error(self) -> float:
-        """Square root of the trace of the covariance of the mean, with the error that sampling does not show."""
+        """Square root of the trace of the covariance of the mean, including the error that sampling does not show."""
         return math.hypot(float(np.linalg.norm(self.sampling.rows)), self.unseen)
 
     def vanishes(self) -> bool:
-        """Whether the gradient is not distinguishable from 0, so that nothing can be put in relation to it."""
+        """Return whether the gradient is not distinguishable from 0, so that relative quantities are undefined."""
         return self.norm == 0.0 or (self.standard_error > 0.0 and bias_interval(self.mean, *self.errors)[1] == 0.0)
 
     def over(self, unit: float) -> Truth:
@@ -199,20 +199,20 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
         g = (tr S^2 + 2 q) / (tr S + 2 beta^2),    nu = tr S / g,    q = b'Sb
 
     give it the mean and the variance above. The term q matters because a bias in a direction of little noise is known
-    better than one in a direction of much noise. Its unbiased estimate at the observed norm is q0 = m'Sm - tr S^2; from
+    more accurately than a bias in a direction of much noise. Its unbiased estimate at the observed norm is q0 = m'Sm - tr S^2; from
     there q follows the direction in which noise moves m,
 
         q(beta) = q0 + (m'S^2 m / m'Sm) (beta^2 - T + tr S),    kept between 0 and tr S beta^2.
 
-    The interval holds the beta at which T lies within Student's quantiles, the degrees of freedom being those of S,
-    on the normal scale of Sankaran's transform. Where T falls short of tr S the upper end is computed for T = tr S, so
-    that a lucky draw never claims more than the noise allows; the lower end is 0 where T is within its quantiles
-    for no bias at all. A bias of 0 can only be missed from above, and so is covered 97.5% of the time.
+    The interval holds the beta at which T lies within Student's quantiles, with the degrees of freedom of S, on the
+    normal scale of Sankaran's transform. Where T is below tr S, the upper end is computed for T = tr S, so that a lucky
+    draw never claims more than the noise allows. The lower end is 0 where T is within its quantiles for no bias at all.
+    An interval can miss a bias of 0 only from above, so it covers a bias of 0 97.5% of the time.
 
-    Simulated for d = 1 to 100, R = 16 to 256, equal and very unequal variances, biases of 0 to 10 errors along and
-    across the noise: 91 to 99% covered in 95% or more of the settings under normal, t5 and mildly skewed noise, 88% in
-    the worst. Under a skewness of 6 the worst is 82%, at R = 16; ``tests/measure/test_statistics.py -m slow`` prints
-    all.
+    Coverage was simulated for d = 1 to 100, R = 16 to 256, equal and very unequal variances, biases of 0 to 10 errors
+    along and across the noise. Under normal, t5 and mildly skewed noise it is 91 to 99% in at least 95% of the settings,
+    and 88% in the worst. Under a skewness of 6 the worst is 82%, at R = 16. ``tests/measure/test_statistics.py -m slow``
+    prints all.
     """
     observed, trace = float(difference @ difference), sum(error.trace for error in errors)
     if trace <= 1e-32 * observed or trace == 0.0:  # noise below the last digit of m
@@ -223,7 +223,7 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
     errors = tuple(error.over(unit) for error in errors)
     difference = difference / unit
     rows = np.concatenate([error.rows for error in errors])
-    doubt = sum(error.trace**2 / error.degrees for error in errors)  # Welch: one over the degrees of freedom
+    doubt = sum(error.trace**2 / error.degrees for error in errors)  # Welch: the reciprocal of the degrees of freedom
     square = _trace_square(rows) - sum(error.excess() for error in errors)
     square = min(max(square, 1.0 / difference.size), 1.0)
     total = float(difference @ difference)
@@ -242,11 +242,11 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
 
     limit = _student_quantile(0.5 + level / 2.0, 1.0 / doubt if doubt else math.inf)
     end = math.sqrt(total)
-    low = 0.0 if score(total, 0.0) <= limit else _falls_to(limit, lambda beta: score(total, beta), 0.0, end)
+    low = 0.0 if score(total, 0.0) <= limit else _bisect(limit, lambda beta: score(total, beta), 0.0, end)
     seen, end = max(total, 1.0), max(end, 1.0) + limit
     while score(seen, end) > -limit:
         end *= 2.0
-    high = _falls_to(-limit, lambda beta: score(seen, beta), 0.0, end)
+    high = _bisect(-limit, lambda beta: score(seen, beta), 0.0, end)
     return math.sqrt(max(0.0, total - 1.0)) * unit, low * unit, high * unit
 
 
@@ -260,8 +260,11 @@ def _noncentral_score(value: float, nu: float, noncentrality: float) -> float:
     return ((value / first) ** h - centre) / (h * math.sqrt(2.0 * p) * (1.0 + 0.5 * m * p))
 
 
-def _falls_to(target: float, function: Callable[[float], float], low: float, high: float) -> float:
-    """Return where in ``[low, high]`` a decreasing function reaches ``target``, to the last digit that matters."""
+def _bisect(target: float, function: Callable[[float], float], low: float, high: float) -> float:
+    """Return where in ``[low, high]`` a decreasing function reaches ``target``, by 50 bisections.
+
+    ``scipy.optimize.bisect`` needs a sign change at the ends, which rounding may remove, and returns other last digits.
+    """
     for _ in range(50):
         middle = 0.5 * (low + high)
         if function(middle) > target:
@@ -280,9 +283,9 @@ def _student_quantile(probability: float, degrees: float) -> float:
 def variance_interval(deviations: np.ndarray, level: float = 0.95) -> tuple[float, float]:
     """Return the interval of the trace of the covariance, from the deviations from the mean ``(R, d)``.
 
-    It is the jackknife of the logarithm, which allows for the kurtosis, with the upper end of :func:`_jackknife`, which
-    allows for the skewness: leaving out repeat i removes ``R / (R - 1) |x_i - mean|^2`` from the sum of squares. It is
-    ``(0, inf)`` where fewer than three repeats differ, and a single point where none do.
+    The interval is the jackknife of the logarithm, which accounts for kurtosis, with the upper end of :func:`_jackknife`,
+    which accounts for skewness. Omitting repeat i removes ``R / (R - 1) |x_i - mean|^2`` from the sum of squares. The
+    interval is ``(0, inf)`` where fewer than three repeats differ, and a single point where none do.
     """
     repeats = len(deviations)
     squares = np.einsum("rd,rd->r", deviations, deviations)
@@ -296,15 +299,15 @@ def variance_interval(deviations: np.ndarray, level: float = 0.95) -> tuple[floa
 
 
 def _jackknife(whole: float, without: np.ndarray, level: float) -> tuple[float, float]:
-    """Return the interval of a variance from its logarithm and those ``(R,)`` with one repeat left out.
+    """Return the interval of a variance from its logarithm and the logarithms ``(R,)`` with one repeat omitted.
 
-    The pseudo-values are as skewed as the squares they come from: where large ones are rare, most samples hold too
-    few of them, and a symmetric interval is too low. With their skewness g, Hall (1992) takes
+    The pseudo-values are as skewed as the squares they come from. Where large squares are rare, most samples contain too
+    few of them, and a symmetric interval is too low. With the skewness g of the pseudo-values, Hall (1992) uses
 
         T + g T^2 / 3 + g^2 T^3 / 27 + g / (6 R),    T = (centre - truth) / spread,
 
-    for normal, with deviation 1 / sqrt(R). The upper end is the larger of what this and Student's T give. The lower
-    end stays Student's: squares that are missing do not lower it.
+    for normal, with deviation 1 / sqrt(R). The upper end is the larger of this and Student's. The lower end stays
+    Student's, which missing squares do not lower.
     """
     repeats = len(without)
     pseudo = repeats * whole - (repeats - 1) * without
@@ -325,9 +328,9 @@ def variance_per_sample(
     """Return the trace of the covariance of one sample's term, with its interval, from all R x N terms.
 
     ``sums (R, d)`` are the sums of the ``samples`` terms of each repeat, ``squares (R,)`` the sums of their squared
-    norms; take a common vector off all terms first where their mean is large against their spread. The interval is
-    that of :func:`variance_interval`, a repeat left out at a time, so that it allows for tails. It is ``(0, inf)`` for
-    fewer than three repeats, NaN where there is one term in all.
+    norms. Where the mean of the terms is large compared with their spread, subtract a common vector from all terms first.
+    The interval is the jackknife over repeats of :func:`variance_interval`, which accounts for tails. It is ``(0, inf)``
+    for fewer than three repeats, and NaN where there is only one term in total.
     """
     sums, squares = np.asarray(sums, dtype=np.float64), np.asarray(squares, dtype=np.float64)
     repeats = len(sums)
@@ -360,11 +363,11 @@ def _exp(exponent: float) -> float:
 
 @dataclass(frozen=True)
 class Summary:
-    """How R estimates of N samples each compare with the reference. Norms are Euclidean, intervals 95%.
+    """Statistics of R estimates of N samples each, compared with the reference. Norms are Euclidean, intervals 95%.
 
-    A field is NaN where it cannot be computed: all fields of the estimates when some are not finite, those of their
-    spread when there is only one, the relative ones for a reference not distinguishable from 0, the directional ones
-    for a reference of 0.
+    A field that cannot be computed is NaN: every field of the estimates when some are not finite, every field of their
+    spread when there is only one estimate, relative fields for a reference not distinguishable from 0, and directional
+    fields for a reference of 0.
     """
 
     grad_norm: float
@@ -383,21 +386,21 @@ class Summary:
     variance_low: float
     variance_high: float
     variance_per_sample: float
-    """``samples * variance``, or from all samples where their sums are given."""
+    """``samples * variance``, or computed from all samples where their sums are given."""
     variance_per_sample_low: float
     variance_per_sample_high: float
     rmse: float
-    """Root mean squared distance of one estimate from the truth, less the reference's own error."""
+    """Root mean squared distance of one estimate from the truth, with the reference's own error subtracted."""
     rmse_rel: float
     """``rmse / reference_norm``."""
     cosine: float
     """Mean over repeats of the cosine between one estimate and the reference; an estimate of 0 counts as 0."""
     sign_agreement: float
-    """Share of coordinates of one estimate whose sign is the reference's, where that is not 0."""
+    """Share of coordinates of one estimate with the sign of the reference, over coordinates where the reference is not 0."""
     finite_fraction: float
-    """Share of repeats all of whose coordinates are finite."""
+    """Share of repeats whose coordinates are all finite."""
     note: str = ""
-    """What to bear in mind when reading the intervals; empty if nothing."""
+    """Caveats for reading the intervals; empty if there are none."""
 
     @property
     def indistinguishable(self) -> bool:
@@ -412,13 +415,14 @@ def summarise(
     terms: tuple[np.ndarray, np.ndarray] | None = None,
     unbiased: bool = False,
 ) -> Summary:
-    """Return the statistics of independent ``estimates (R, d)``, each made of ``samples``, against the reference.
+    """Return the statistics of independent ``estimates (R, d)``, each of ``samples`` samples, compared with the reference.
 
-    ``terms`` are the sums and squares that :func:`variance_per_sample` takes, for estimates that are means of one term
-    per sample; without them that column is ``samples`` times the variance of an estimate. ``unbiased`` says that the
-    estimator declares to be, so that a bias found is remarked on as :data:`UNEXPLAINED`. The relative and directional
-    fields are NaN, with a remark, where the reference is not distinguishable from 0. Identical estimates have the width
-    that the rule of three leaves for an event of the size of the gradient that none of them saw. Raises ValueError for shapes that do not fit. Estimates that are not finite raise nothing: see :class:`Summary`.
+    ``terms`` are the sums and squares for :func:`variance_per_sample`, for estimates that are means of one term per
+    sample; without them that column is ``samples`` times the variance of an estimate. ``unbiased`` is the estimator's
+    declaration: a bias of an estimator declared unbiased gets the remark :data:`UNEXPLAINED`. The relative and
+    directional fields are NaN, with a remark, where the reference is not distinguishable from 0. Intervals of identical
+    estimates have the width that the rule of three leaves for an event of the gradient's size that no estimate contains.
+    Raises ValueError for shapes that do not fit. Estimates that are not finite do not raise: see :class:`Summary`.
     """
     estimates = np.asarray(estimates, dtype=np.float64)
     if estimates.ndim != 2 or len(estimates) < 1 or estimates.shape[1:] != truth.mean.shape:
@@ -431,9 +435,9 @@ def summarise(
     repeats = len(estimates)
     finite = int(np.isfinite(estimates).all(axis=1).sum())
     if finite < repeats:
-        return _unknown(truth, finite / repeats, f"{repeats - finite} of {repeats} estimates are not finite")
+        return _not_finite(truth, finite / repeats, f"{repeats - finite} of {repeats} estimates are not finite")
 
-    # In units of the largest entry, so that the squares of very large or small gradients are numbers too.
+    # in units of the largest entry, so that squares of very large or small gradients do not overflow or underflow
     unit = max(float(np.abs(part).max(initial=0.0)) for part in (estimates, truth.mean, truth.sampling.rows))
     unit = unit or 1.0
     estimates, reference = estimates / unit, truth.over(unit)
@@ -463,8 +467,8 @@ def summarise(
     rmse = math.sqrt(max(0.0, squared_error))
     relative = math.nan if norm <= ROUNDING or reference.vanishes() else norm
     cosine, signs = _directions(estimates, reference.mean)
-    notes = _remarks(deviations, difference, samples, identical)
-    notes += _about(reference, relative)
+    notes = _interval_remarks(deviations, difference, samples, identical)
+    notes += _reference_remarks(reference, relative)
     if unbiased and bias_low > 0.0:
         notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or 1 in 40 by chance")
     scaled = tuple(value * unit * unit for value in per_sample)
@@ -493,7 +497,7 @@ def summarise(
     )
 
 
-def _unknown(truth: Truth, finite_fraction: float, note: str) -> Summary:
+def _not_finite(truth: Truth, finite_fraction: float, note: str) -> Summary:
     values = dict.fromkeys((name for name in Summary.__dataclass_fields__ if name != "note"), math.nan)
     known = dict(reference_norm=truth.norm, reference_se=truth.standard_error, finite_fraction=finite_fraction)
     return Summary(**{**values, **known}, note=note)
@@ -501,33 +505,35 @@ def _unknown(truth: Truth, finite_fraction: float, note: str) -> Summary:
 
 def _directions(estimates: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
     """Return the mean cosine between estimates ``(R, d)`` and reference ``(d,)``, and the share of equal signs."""
-    told = reference != 0.0
-    if not told.any():
+    nonzero = reference != 0.0
+    if not nonzero.any():
         return math.nan, math.nan
     lengths = np.linalg.norm(estimates, axis=1)
     unit = reference / np.abs(reference).max()
     projections = estimates @ (unit / np.linalg.norm(unit)) / np.where(lengths > 0.0, lengths, 1.0)
-    agree = np.sign(estimates[:, told]) == np.sign(reference[told])
+    agree = np.sign(estimates[:, nonzero]) == np.sign(reference[nonzero])
     return float(np.clip(projections, -1.0, 1.0).mean()), float(agree.mean())
 
 
-def _about(reference: Truth, relative: float) -> list[str]:
-    """Return what the reference does to relative columns; ``relative`` is its norm, or NaN where it vanishes."""
+def _reference_remarks(reference: Truth, relative: float) -> list[str]:
+    """Return the effects of the reference on relative columns; ``relative`` is its norm, or NaN where it vanishes."""
     norm, error = reference.norm, reference.standard_error
     if math.isnan(relative):
         if error == 0.0:
             return []  # exactly 0, as many references are
-        share = f"{error / norm:.2g} times its norm" if norm else "all there is"
+        share = f"{error / norm:.2g} times its norm" if norm else f"{error:.2g} and its norm is 0"
         return [
-            f"the reference is not distinguishable from 0, its error is {share}: relative columns, cosine and signs mean nothing"
+            f"the reference is not distinguishable from 0, its error is {share}: relative columns, cosine and signs are meaningless"
         ]
     if error > VAGUE * norm:
-        return [f"the reference is known to {100 * error / norm:.0f}% of its norm: relative columns are no better"]
+        return [
+            f"the reference is known to {100 * error / norm:.0f}% of its norm: relative columns are no more accurate"
+        ]
     return []
 
 
 def heavy_tails(deviations: np.ndarray) -> float:
-    """Return the largest share that one of the deviations ``(R, d)`` has of their squares, or 0 if tails are not heavy."""
+    """Return the largest share of one repeat in the squared deviations ``(R, d)``, or 0 if tails are not heavy."""
     squares = np.einsum("rd,rd->r", deviations, deviations)
     total, fourth = float(squares.sum()), float(squares @ squares)
     if fourth > 0.0 and total**2 / fourth < CONCENTRATION * math.sqrt(len(deviations)):
@@ -535,18 +541,18 @@ def heavy_tails(deviations: np.ndarray) -> float:
     return 0.0
 
 
-def _remarks(deviations: np.ndarray, difference: np.ndarray, samples: int, identical: bool) -> list[str]:
+def _interval_remarks(deviations: np.ndarray, difference: np.ndarray, samples: int, identical: bool) -> list[str]:
     """Return the reasons to doubt intervals from deviations ``(R, d)`` and a difference of means ``(d,)``."""
     repeats = len(deviations)
     if repeats == 1:
-        return ["only 1 repeat: no variance, and no bias apart from it"]
+        return ["only 1 repeat: no variance, and no interval of the bias"]
     if identical:
         return [
             "all estimates are identical: the intervals allow for an event of the gradient's size, rarer than about "
-            f"{THREE / (repeats * samples):.2g} a sample, which would not have been seen"
+            f"{THREE / (repeats * samples):.2g} per sample, which these samples would miss"
         ]
     if repeats < FEW_REPEATS:
-        return [f"only {repeats} repeats: wide intervals, and no say about tails"]
+        return [f"only {repeats} repeats: intervals are wide, and tails are not tested"]
     for part, where in ((deviations, ""), ((deviations @ difference)[:, None], " along the bias")):
         if share := heavy_tails(part):
             return [

@@ -1,4 +1,4 @@
-"""The measuring protocol: warm up, time whole estimates, keep their results."""
+"""The timing protocol: warm up, time whole estimates, keep their results."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ import numpy as np
 from bench.model import blocks
 
 LEAST_S = 0.005
-"""Seconds that the calls of one timing should fill; fast ones are repeated."""
+"""Least total seconds of the calls of one timing; fast calls are repeated until then."""
 MOST = 20
-"""Most calls made for each call asked for."""
+"""Most repetitions of each call."""
 STEADY = 0.1
 """Interquartile range over median below which a timing is steady; until then calls are repeated."""
 NOISY = 0.2
@@ -48,7 +48,7 @@ class Timing:
 
 
 class Pause:
-    """Time that belongs to no call: ``with pause:`` around drawing noise, say."""
+    """Time that timings exclude: ``with pause:`` around drawing noise, for example."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -69,17 +69,17 @@ def timed(
     settle_s: float = 0.0,
     pause: Pause | None = None,
 ) -> tuple[list[np.ndarray], Timing]:
-    """Return results and seconds of ``call(0) ... call(count - 1)``, after one warm-up call that is thrown away.
+    """Return results and seconds of ``call(0) ... call(count - 1)``, after one discarded warm-up call.
 
-    Where these take less than ``least_s`` in all, calls are repeated until they do, ``most`` times each at most; and
-    until their times are :data:`STEADY`, but not beyond ``settle_s`` seconds in all. What passes within ``pause`` is
-    taken off. Calls must return finished NumPy arrays, so that no work is left on a device when the clock stops.
+    Calls are repeated, each at most ``most`` times, until they take ``least_s`` seconds in total, and then until their
+    times are :data:`STEADY` or they take ``settle_s`` seconds in total. Time within ``pause`` is subtracted. Calls must
+    return finished NumPy arrays, so that no work remains on a device when the clock stops.
     """
     pause = pause or Pause()
     call(0)
     results: list[np.ndarray] = []
     seconds: list[float] = []
-    while len(seconds) < count or (len(seconds) < most * count and _goes_on(seconds, least_s, settle_s)):
+    while len(seconds) < count or (len(seconds) < most * count and _must_repeat(seconds, least_s, settle_s)):
         paused, start = pause.seconds, time.perf_counter()
         result = call(len(seconds) % count)
         seconds.append(time.perf_counter() - start - (pause.seconds - paused))
@@ -89,8 +89,8 @@ def timed(
     return results, Timing(float(median), float(high - low), tuple(seconds))
 
 
-def _goes_on(seconds: list[float], least_s: float, settle_s: float) -> bool:
-    """Return whether calls have to be repeated: too short in all, or not yet steady and within the time for that."""
+def _must_repeat(seconds: list[float], least_s: float, settle_s: float) -> bool:
+    """Return whether to repeat calls: they are too short in total, or unsteady with settling time left."""
     total = sum(seconds)
     if total < least_s:
         return True
@@ -101,7 +101,7 @@ def _goes_on(seconds: list[float], least_s: float, settle_s: float) -> bool:
 
 
 def conditions() -> dict[str, Any]:
-    """Return the conditions that times depend on: processor, cores and threads this process may use, other load."""
+    """Return the timing conditions: processor, available cores and threads, system load."""
     torch = sys.modules.get("torch")
     return {
         "processor": _processor(),
@@ -138,7 +138,7 @@ def _processor() -> str:
 
 
 def reset_peak_memory() -> None:
-    """Make :func:`peak_memory_mb` count from now (Linux; elsewhere nothing happens)."""
+    """Make :func:`peak_memory_mb` count from now (only on Linux)."""
     with suppress(OSError):
         # 5 resets the peak VmHWM, see proc_pid_clear_refs(5)
         Path("/proc/self/clear_refs").write_text("5")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.measure.contacts import acting, split
+from bench.measure.contacts import active_contacts, split
 from bench.model import ContactScene, ForceLaw, FrictionScene, Jacobians, Rollout, compose
 from bench.trace import equations
 from bench.trace.equations import Newton, solved_again, stepped
@@ -47,7 +47,7 @@ def _touching(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return which contacts act at each state, and their normal forces [N], both ``(n_contacts, T + 1)``.
 
-    A state has the contacts of the step from it, see :func:`bench.measure.contacts.acting`. Under a force law the force
+    A state has the contacts of the step from it, see :func:`bench.measure.contacts.active_contacts`. Under a force law the force
     is the law's at the state; under an impulse law it is the impulse of the step over dt, the contacts are the measured
     ones, and the last state keeps those of the step that led to it.
     """
@@ -55,11 +55,11 @@ def _touching(
     if isinstance(law, ForceLaw):
         state = split(scene, path.states.T)
         gap = scene.gap(np, state.q)
-        touching = acting(program, states, controls)[..., 0].T
+        touching = active_contacts(program, states, controls)[..., 0].T
         force = law.force(np, gap, scene.gap_rate(np, *state)) + 0.0
         return np.append(touching, gap[:, -1:] < 0, axis=1), force
     force = _impulse_forces(program, scene, path, after)
-    touching = acting(program, states, controls, force.T[..., None])[..., 0].T
+    touching = active_contacts(program, states, controls, force.T[..., None])[..., 0].T
     nothing = np.full((len(force), 1), np.nan)
     return np.append(touching, touching[:, -1:], axis=1), np.append(force, nothing, axis=1)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.measure.gradcheck import EPS, TRUSTED, UNTRUSTED, VERDICTS, Options, check, judge, roughness, worst
+from bench.measure.gradcheck import EPS, TRUSTED, UNTRUSTED, VERDICTS, Options, check, judge, most_severe, roughness
 from bench.measure.gradcheck.sampling import points, samples
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "trust.md").read_text().partition("## Planted faults")[2]
@@ -159,7 +159,7 @@ def test_fault_of_one_component_is_that_components():
 
 def test_kink_names_both_slopes():
     found = check(*FAULTS["kink"][1:], THETA, Options(directions=0))
-    (part,) = found.guilty
+    (part,) = found.worst_parts
     assert (part.left, part.right) == pytest.approx([gradient(THETA)[0] - 1.0, gradient(THETA)[0] + 1.0], rel=1e-4)
     assert f"slopes {part.left:.6g} and {part.right:.6g}" in found.sentence()
 
@@ -213,9 +213,9 @@ def test_amplified_rounding_on_a_slope_is_no_staircase(slope):
     steps = np.arange(roughness.SCAN)
     for seed in range(200):
         noise = 3e-9 * np.random.default_rng(seed).standard_normal(steps.size)
-        assert not roughness.treads(slope * steps + noise, 1e-15)
-    assert roughness.treads(slope * steps + 1e-7 * (steps // 7), 1e-15)
-    assert roughness.treads(slope * steps + 1e-7 * np.floor(steps / 4.3) + 1e-9 * np.sin(steps), 1e-15)
+        assert not roughness.is_staircase(slope * steps + noise, 1e-15)
+    assert roughness.is_staircase(slope * steps + 1e-7 * (steps // 7), 1e-15)
+    assert roughness.is_staircase(slope * steps + 1e-7 * np.floor(steps / 4.3) + 1e-9 * np.sin(steps), 1e-15)
 
 
 def test_noise_of_the_cost_is_measured():
@@ -250,8 +250,8 @@ def test_cost_is_judged_without_a_gradient():
 def test_every_verdict_is_trusted_or_not():
     assert set(TRUSTED) | set(UNTRUSTED) == set(VERDICTS)
     assert not set(TRUSTED) & set(UNTRUSTED)
-    assert worst(["zero", "smooth", "kink"]) == "kink"
-    assert worst(["zero", "smooth"]) == "smooth"
+    assert most_severe(["zero", "smooth", "kink"]) == "kink"
+    assert most_severe(["zero", "smooth"]) == "smooth"
 
 
 # -------------------------------------------------------------------------------------------- amplifying rollouts

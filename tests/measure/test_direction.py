@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.measure.gradcheck import EPS, TRUSTED, Sample, check, judge, roughness
-from bench.measure.gradcheck.causes import Ratio, of_ratios
+from bench.measure.gradcheck.causes import Ratio, causes_of_ratios
 
 SLOPE = 2.0
 WIDE = np.logspace(-2, -5, 7)
@@ -85,23 +85,23 @@ def test_a_jump_is_the_same_over_five_of_the_smallest_steps(steps, verdict):
 
 def test_a_part_of_the_derivative_is_a_missing_term():
     partly, beyond = ([Ratio(v, 1e-9) for v in values] for values in ([0.5, 0.7, 0.9, 1.2], [-3.0, 5.0, 2.5, -0.2]))
-    assert of_ratios({0: partly}, [], some_right=False)[0] == "missing_term"
-    assert of_ratios({0: beyond}, [], some_right=False)[0] == "wrong_adjoint"
-    assert of_ratios({0: beyond}, [], some_right=True)[0] == "missing_term"
+    assert causes_of_ratios({0: partly}, [], some_right=False)[0] == "missing_term"
+    assert causes_of_ratios({0: beyond}, [], some_right=False)[0] == "wrong_adjoint"
+    assert causes_of_ratios({0: beyond}, [], some_right=True)[0] == "missing_term"
 
 
 def test_a_factor_is_named_only_where_ratios_agree_within_their_errors():
     same, nearly, other = (
         [Ratio(v, 1e-9) for v in r] for r in ([0.5] * 4, [0.5, 0.5001, 0.5002, 0.4999], [0.1, 0.9, 0.5])
     )
-    assert of_ratios({0: same}, [], some_right=False)[0] == "wrong_factor"
-    assert of_ratios({0: nearly}, [], some_right=False)[0] == "missing_term"
-    assert of_ratios({0: [Ratio(r.value, 1e-4) for r in nearly]}, [], some_right=False)[0] == "wrong_factor"
-    assert of_ratios({0: same, 1: other}, [], False) == dict.fromkeys([0, 1, None], "missing_term")
+    assert causes_of_ratios({0: same}, [], some_right=False)[0] == "wrong_factor"
+    assert causes_of_ratios({0: nearly}, [], some_right=False)[0] == "missing_term"
+    assert causes_of_ratios({0: [Ratio(r.value, 1e-4) for r in nearly]}, [], some_right=False)[0] == "wrong_factor"
+    assert causes_of_ratios({0: same, 1: other}, [], False) == dict.fromkeys([0, 1, None], "missing_term")
 
 
 def cause(values, error, **given):
-    return of_ratios({0: [Ratio(value, error) for value in values]}, [], some_right=False, **given)[0]
+    return causes_of_ratios({0: [Ratio(value, error) for value in values]}, [], some_right=False, **given)[0]
 
 
 def test_ratios_may_differ_by_the_programs_rounding_by_ten_errors_and_no_more():
@@ -127,10 +127,10 @@ def test_one_ratio_of_five_may_be_spoilt_and_two_may_not():
 def test_one_factor_for_several_components_is_one_and_the_most_frequent_cause_is_that_of_directions():
     """Two ratios are too few to say alone, and enough together; what most components have, random directions have."""
     few = [Ratio(0.5, 1e-9)] * 2
-    assert of_ratios({0: few, 1: few}, [], False) == dict.fromkeys([0, 1, None], "wrong_factor")
+    assert causes_of_ratios({0: few, 1: few}, [], False) == dict.fromkeys([0, 1, None], "wrong_factor")
     beyond, partly = ([Ratio(v, 1e-9) for v in values] for values in ([-3.0, 5.0, 2.5], [0.1, 0.9, 0.5]))
-    assert of_ratios({0: beyond, 1: partly, 2: partly}, [], False)[None] == "missing_term"
-    assert of_ratios({0: partly, 1: beyond, 2: beyond}, [], False)[None] == "wrong_adjoint"
+    assert causes_of_ratios({0: beyond, 1: partly, 2: partly}, [], False)[None] == "missing_term"
+    assert causes_of_ratios({0: partly, 1: beyond, 2: beyond}, [], False)[None] == "wrong_adjoint"
 
 
 def test_noise_is_the_standard_deviation_of_independent_normal_numbers():

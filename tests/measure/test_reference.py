@@ -223,7 +223,7 @@ def test_jump_that_nobody_declares_makes_the_reference_zeroth_order(jump):
 
 def test_disagreement_of_the_check_is_acted_upon(monkeypatch):
     """First order wrong by 20% where neither a jump nor the pilot shows it."""
-    monkeypatch.setattr(reference, "_doubt", lambda *given: "")
+    monkeypatch.setattr(reference, "_reason_against_first_order", lambda *given: "")
     case = ridge(bank.power(1), bank.power(2, 0.1))
     problem = Numpy().compile(case.program)
     plain = problem.grad
@@ -278,7 +278,7 @@ def test_closed_form_is_used_where_there_is_one():
 def test_largest_jump(cost, jump):
     draw = np.random.default_rng(0)
     starts, ends = draw.standard_normal((2, 2, 8))
-    assert largest_jump(cost, starts, ends) == pytest.approx(jump, rel=1e-6)
+    assert largest_jump(cost, starts, ends).height == pytest.approx(jump, rel=1e-6)
 
 
 # ----------------------------------------------------------------------------------------------- which method it takes
@@ -297,7 +297,7 @@ def test_jumps_that_no_list_holds_are_not_for_a_rule_in_the_plane():
 def test_samples_without_any_spread_do_not_outdo_a_rule(monkeypatch, spread, chosen):
     """A coarse rule gives way to samples that leave less, and never to ones that all missed the event."""
     batches = 1.0 + spread * np.linspace(-1.0, 1.0, BATCHES)[:, None]
-    monkeypatch.setattr(reference, "_sampled", lambda *_: reference.Reference(batches, "sampling[n=64]", 0.0))
+    monkeypatch.setattr(reference, "_sample", lambda *_: reference.Reference(batches, "sampling[n=64]", 0.0))
     monkeypatch.setattr(reference, "integrate", lambda *_: Integral(np.array([1.0]), 0.5, 1, 1.0))
     assert bank.certified(ridge(bank.power(1), dim=1), SAMPLES).method.startswith(chosen)
 
@@ -305,5 +305,5 @@ def test_samples_without_any_spread_do_not_outdo_a_rule(monkeypatch, spread, cho
 def test_a_ramp_that_is_steep_and_resolved_is_no_jump():
     """Six parts in 1e11 of the line wide: its last change is a sixteenth of the one before."""
     start, end = np.zeros((1, 1)), np.ones((1, 1))
-    assert largest_jump(lambda x: np.clip((x[0] - 0.37) / 6e-11, 0.0, 1.0), start, end) == 0.0
-    assert largest_jump(lambda x: 1.0 * (x[0] > 0.37), start, end) == 1.0
+    assert largest_jump(lambda x: np.clip((x[0] - 0.37) / 6e-11, 0.0, 1.0), start, end).height == 0.0
+    assert largest_jump(lambda x: 1.0 * (x[0] > 0.37), start, end).height == 1.0

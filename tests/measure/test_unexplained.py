@@ -16,7 +16,7 @@ from bench.plugins.scenes.quadratic import Quadratic
 from helpers import experiment, small_rows
 
 from bench.compare import judging
-from bench.measure.statistics import UNEXPLAINED, Truth, summarise, unexplained, variance_per_sample
+from bench.measure.statistics import UNEXPLAINED, Truth, is_unexplained, summarise, variance_per_sample
 from bench.model import compose
 from bench.studies.bias_variance import tables, terminal
 from bench.studies.bias_variance.columns import COLUMNS
@@ -29,9 +29,9 @@ def rare_tails(repeats=64, samples=100):
 
 def test_bias_of_an_unbiased_estimator_is_said_to_be_unexplained():
     truth = Truth.exact(np.ones(1))
-    assert unexplained(summarise(rare_tails(), truth, 100, unbiased=True).note)
-    assert not unexplained(summarise(rare_tails(), truth, 100, unbiased=False).note)
-    assert not unexplained(summarise(rare_tails() + 1.0, truth, 100, unbiased=True).note)
+    assert is_unexplained(summarise(rare_tails(), truth, 100, unbiased=True).note)
+    assert not is_unexplained(summarise(rare_tails(), truth, 100, unbiased=False).note)
+    assert not is_unexplained(summarise(rare_tails() + 1.0, truth, 100, unbiased=True).note)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_measure_says_so(monkeypatch):
 
     monkeypatch.setattr("bench.api._made", lambda kind, text, given=None: Off())
     problem = Numpy().compile(compose(Quadratic()))
-    assert unexplained(bench.estimate(problem, "fobg", samples=16, repeats=16).summary.note)
+    assert is_unexplained(bench.estimate(problem, "fobg", samples=16, repeats=16).summary.note)
 
 
 def doubted(rows):

@@ -63,7 +63,8 @@ def test_only_ratios_without_a_force():
     model = model_of(cell_of(*SPRING))
     found = information(model, model.values, 0.01)
     assert (
-        found.words == "only stiffness/mass, damping/mass: scaling mass, stiffness and damping together changes nothing"
+        found.words
+        == "only stiffness/mass, damping/mass: scaling mass, stiffness and damping together does not change the data"
     )
     assert np.abs(found.jacobian @ np.ones(3)).max() < 1e-7 * np.abs(found.jacobian).max()
     bound = np.sqrt(np.diag(found.covariance()))
@@ -85,9 +86,9 @@ def test_words_of_products():
     assert product(names, np.array([1.0, -0.5, 0.0])) == "a/b^(1/2)"
     square = Information(names, np.array([[2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))  # a^2 b and c
     assert square.labels == ["a*b^(1/2)", "c"]
-    assert Information(names, np.zeros((2, 3))).words.startswith("nothing can be told")
+    assert Information(names, np.zeros((2, 3))).words.startswith("nothing is identifiable")
     alone = Information(names, np.diag([1.0, 1.0, 0.0])[:2])
-    assert alone.words == "only a, b: c changes nothing"
+    assert alone.words == "only a, b: c does not change the data"
 
 
 def test_friction_fitted_with_a_step_holds_for_that_step():

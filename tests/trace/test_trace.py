@@ -21,7 +21,7 @@ from bench.plugins.scenes.pushing import Pushing
 from bench.cli import main
 from bench.experiment import config
 from bench.measure import noise
-from bench.measure.contacts import acting, split
+from bench.measure.contacts import active_contacts, split
 from bench.model import Decision, FrictionScene, Jacobians, LoopOps, Unsupported, compose
 from bench.trace.adjoints import adjoints
 from bench.trace.chart import chart
@@ -122,10 +122,10 @@ def test_a_contact_mode_is_predicted_or_measured():
     before, after = [[0.05, 1.0, 0.15], [1.0, -1.0, -1.0]], [[0.15, 0.9, 0.15], [1.0, -1.0, 1.0]]
     states = np.array([before, after])
     forces = np.array([[[0.0, 0.0, 20.0]]])
-    assert acting(program, states, controls).tolist() == [[[False, False, True]]]
-    assert acting(program, states, controls, forces).tolist() == [[[True, False, True]]]
+    assert active_contacts(program, states, controls).tolist() == [[[False, False, True]]]
+    assert active_contacts(program, states, controls, forces).tolist() == [[[True, False, True]]]
     soft = compose(program.scene, Penalty(), program.integrator)
-    assert acting(soft, states, controls).tolist() == [[[True, False, False]]]
+    assert active_contacts(soft, states, controls).tolist() == [[[True, False, False]]]
 
 
 def test_contacts_under_a_penalty_by_hand():

@@ -1,11 +1,32 @@
-"""Gradient checks: pure functions of a cost and a gradient, which know nothing of problems."""
+"""Gradient checks: pure functions of a cost and a gradient, independent of problems."""
 
 from .check import Check, Options, Part, check
-from .direction import BRIEFLY, EPS, WINDOW, Finding, Sample, best, diagnose, judge
+from .direction import EPS, SHORT_WINDOW, WINDOW, Finding, Sample, best, diagnose, judge
 from .sampling import order, points, samples
-from .verdicts import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED, UNTRUSTED, VERDICTS, worst
+from .verdicts import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED, UNTRUSTED, VERDICTS, most_severe
 
 __all__ = [
-    "BRIEFLY", "BROKEN", "EPS", "FAULTS", "MEANING", "TRUSTED", "UNDECIDED", "UNTRUSTED", "VERDICTS", "WINDOW",
-    "Check", "Finding", "Options", "Part", "Sample", "best", "check", "diagnose", "judge", "order", "points", "samples", "worst",
+    "BROKEN",
+    "EPS",
+    "FAULTS",
+    "MEANING",
+    "SHORT_WINDOW",
+    "TRUSTED",
+    "UNDECIDED",
+    "UNTRUSTED",
+    "VERDICTS",
+    "WINDOW",
+    "Check",
+    "Finding",
+    "Options",
+    "Part",
+    "Sample",
+    "best",
+    "check",
+    "diagnose",
+    "judge",
+    "most_severe",
+    "order",
+    "points",
+    "samples",
 ]  # fmt: skip

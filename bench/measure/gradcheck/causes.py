@@ -1,4 +1,4 @@
-"""Why a gradient is wrong, by the ratios of its components to the differences, at several thetas."""
+"""Why a gradient is wrong, from the ratios of its components to the differences at several thetas."""
 
 from __future__ import annotations
 
@@ -7,44 +7,44 @@ from dataclasses import dataclass
 import numpy as np
 
 CONSTANT = 1e-3
-"""Most that a ratio may spread and still count as constant, relative to itself, however large its error."""
+"""Largest relative spread of a ratio that counts as constant, however large its error."""
 MOSTLY = 0.8
-"""Share of ratios that may decide for all."""
+"""Share of the ratios that has to agree."""
 FINEST = 1e-5
-"""Spread that the program's own rounding may leave a constant ratio, relative to the same."""
+"""Relative spread of a constant ratio that the program's own rounding explains."""
 KNOWN = 10.0
-"""Errors of a difference by which its ratio may be off."""
+"""Deviation allowed to a ratio, in errors of its difference."""
 ENOUGH = 3
-"""Ratios without which none counts as constant."""
+"""Fewest ratios that can count as constant."""
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """A derivative of the program over its difference, and the error that the difference leaves it."""
+    """The program's derivative over the difference, and its error from the error of the difference."""
 
     value: float
     error: float
 
 
-def of_ratios(
+def causes_of_ratios(
     components: dict[int, list[Ratio]], directions: list[Ratio], some_right: bool, right_elsewhere: bool = False
 ) -> dict[int | None, str]:
-    """Return the cause of each wrong component, and under None that of wrong directions.
+    """Return the cause of each wrong component, and the cause of wrong directions under None.
 
-    ``components`` are the ratios of each wrong component to its difference at several thetas, ``directions`` those of
-    the random directions that are wrong. ``some_right`` says whether other components are right, ``right_elsewhere``
-    whether the whole gradient is at other thetas.
+    ``components`` are the ratios of each wrong component to its difference at several thetas, ``directions`` the ratios of
+    the wrong random directions. ``some_right`` says whether other components are right, ``right_elsewhere`` whether the
+    whole gradient is right at other thetas.
 
-    - ``wrong_factor``: the ratio of each wrong component is the same at all thetas, within its error. One that is
-      constant beside others that are not says nothing: a term may act alike on one input.
-    - ``missing_term``: it changes, while other components are right, or the gradient is right where the term does not
-      act, or while the ratio lies between 0 and 2: the gradient has part of the derivative.
-    - ``wrong_adjoint``: neither, or too few ratios to say.
+    - ``wrong_factor``: the ratio of each wrong component is the same at all thetas, within its error. A constant ratio
+      next to ratios that vary does not count, since a missing term may act on one input as a factor.
+    - ``missing_term``: the ratio varies, and other components are right, or the gradient is right at thetas where the
+      term does not act, or the ratio lies between 0 and 2, so that the gradient has part of the derivative.
+    - ``wrong_adjoint``: neither, or too few ratios to decide.
     """
     causes: dict[int | None, str] = {}
     some_right = some_right or right_elsewhere
     for component, ratios in components.items():
-        causes[component] = _of(ratios, some_right)
+        causes[component] = _cause(ratios, some_right)
     every = [ratio for ratios in components.values() for ratio in ratios]
     if len(components) > 1 and _constant(every):
         causes = dict.fromkeys(causes, "wrong_factor")
@@ -54,11 +54,11 @@ def of_ratios(
         kinds = [causes[c] for c in components]
         causes[None] = max(kinds, key=kinds.count)
     else:
-        causes[None] = _of(directions, some_right)
+        causes[None] = _cause(directions, some_right)
     return causes
 
 
-def _of(ratios: list[Ratio], some_right: bool) -> str:
+def _cause(ratios: list[Ratio], some_right: bool) -> str:
     if _constant(ratios):
         return "wrong_factor"
     values = [ratio.value for ratio in ratios]
@@ -69,10 +69,10 @@ def _of(ratios: list[Ratio], some_right: bool) -> str:
 
 
 def _constant(ratios: list[Ratio]) -> bool:
-    """Return whether there are enough ratios and all are the same, up to one in five that a kink or noise may spoil.
+    """Return whether there are enough ratios and four in five agree; a kink or noise may spoil the others.
 
-    A gradient that misses a little has ratios near 1 everywhere, and one whose term hardly changes has ratios that are
-    nearly the same: they have to agree as well as the differences are known.
+    A gradient that misses little has ratios near 1 everywhere, and a missing term that hardly varies gives nearly equal
+    ratios. So the ratios have to agree to the accuracy of the differences.
     """
     values, errors = np.array([ratio.value for ratio in ratios]), np.array([ratio.error for ratio in ratios])
     if len(ratios) < ENOUGH or not np.isfinite(values).all():

@@ -1,6 +1,6 @@
-"""The whole check of a gradient: each component, random directions, other thetas, and the cause of what is wrong.
+"""Checks a gradient by components, random directions and other thetas, and finds the cause of errors.
 
-Nothing here knows problems: a cost and a gradient are callables of theta.
+The check is independent of problems: cost and gradient are callables of theta.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from . import roughness
-from .causes import Ratio, of_ratios
+from .causes import Ratio, causes_of_ratios
 from .direction import EPS, GUARD, Finding, Sample, judge
 from .sampling import order, points, samples
-from .verdicts import FAULTS, MEANING, TRUSTED, worst
+from .verdicts import FAULTS, MEANING, TRUSTED, most_severe
 
 Cost = Callable[[np.ndarray], np.ndarray]
 """Costs of columns: ``(d, B)`` to ``(B,)``."""
@@ -23,21 +23,21 @@ Gradient = Callable[[np.ndarray], np.ndarray]
 Modes = Callable[[np.ndarray], Sequence[str]]
 """Names of the contact modes of columns: ``(d, B)`` to ``B`` strings."""
 SUSPICIOUS = 4
-"""Directions at most that are scanned for a staircase."""
+"""Most directions scanned for a staircase."""
 ELSEWHERE = 4
 """Other thetas at which a wrong component's ratio is taken."""
 FAR = (1.0, 3.0)
-"""Standard deviations, in units of each input's scale, of thetas at which a term may not act, as a contact in flight."""
+"""Standard deviations, in units of each input's scale, of thetas where a term may not act, such as a contact in flight."""
 PLAINLY = ("smooth", "nonlinear", "mode_crossing")
 """Verdicts by which a gradient counts as right at such a theta."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """What a check looks at."""
+    """The scope of a check."""
 
     components: int = 16
-    """Components checked one by one: all of them, or the half with the largest and the half with the smallest share."""
+    """Most components checked one by one: those with the largest shares and as many with the smallest, if not all."""
     directions: int = 2
     """Random directions, in units of each input's own scale."""
     draws: int = 8
@@ -47,13 +47,13 @@ class Options:
     eps: np.ndarray = field(default_factory=lambda: EPS)
     """Steps, relative to each input's own scale, falling."""
     unit: float = float(np.finfo(np.float64).eps)
-    """Unit roundoff that the arithmetic is declared to have; the noise of the cost is measured beside it."""
+    """Declared unit roundoff of the arithmetic; the noise of the cost is measured in addition."""
     scale: np.ndarray | None = None
     """The scale of each input ``(d,)``; None for :func:`scales`."""
     scanned: int = SUSPICIOUS
-    """Directions at most that are scanned for a staircase, some 450 costs each."""
+    """Most directions scanned for a staircase, some 450 costs each."""
     seed: int = 0
-    """Of the random directions and thetas."""
+    """Seed of the random directions and thetas."""
 
 
 @dataclass(frozen=True)
@@ -64,19 +64,19 @@ class Part:
     """``component 3``, ``direction 0`` or ``draw 2 direction 0``."""
     component: int | None
     program: float
-    """The program's number."""
+    """The program's derivative."""
     difference: float
-    """What the differences settle on."""
+    """The value that the differences agree on."""
     uncertainty: float
-    """The error of that, by its neighbours and the noise of the cost."""
+    """The error of the difference, from its neighbours and the noise of the cost."""
     step: float
-    """The step it was taken at, in units of the input."""
+    """The step of the difference, in units of the input."""
     left: float
     """One-sided slope towards smaller values."""
     right: float
     """One-sided slope towards larger values."""
     order: float
-    """Order of the Taylor remainder: 2 for a right gradient, 1 for a wrong one, NaN where noise or nothing is left."""
+    """Order of the Taylor remainder: 2 for a right gradient, 1 for a wrong one, NaN where the remainder is only noise."""
     verdict: str
     sample: Sample
     modes: tuple[Sequence[str], Sequence[str]] = ((), ())
@@ -84,7 +84,7 @@ class Part:
 
     @property
     def ratio(self) -> float:
-        """Program's number over difference; NaN for 0 / 0."""
+        """The program's derivative over the difference; NaN for 0 / 0."""
         with np.errstate(all="ignore"):
             return float(np.float64(self.program) / np.float64(self.difference))
 
@@ -111,13 +111,13 @@ class Check:
     noise: float
     """Measured standard deviation of the cost's noise."""
     roundoff: float
-    """That noise relative to the cost: the unit roundoff that the arithmetic shows, at least that declared."""
+    """The noise relative to the cost: the effective unit roundoff of the arithmetic, at least the declared one."""
     order: float
-    """Median order of the Taylor remainder along the random directions, NaN where it cannot be seen."""
+    """Median order of the Taylor remainder along the random directions, NaN where noise hides it."""
     evaluations: int
-    """Costs asked for."""
+    """Number of costs computed."""
     gradients: int
-    """Gradients asked for."""
+    """Number of gradients computed."""
 
     @property
     def trusted(self) -> bool:
@@ -130,17 +130,17 @@ class Check:
         return tuple(part for part in self.parts if part.component is not None)
 
     @property
-    def guilty(self) -> tuple[Part, ...]:
-        """The parts that have the worst verdict, those at theta if there are any."""
+    def worst_parts(self) -> tuple[Part, ...]:
+        """The parts with the worst verdict, at theta if there are any, else at other thetas."""
         here = tuple(part for part in self.parts if part.verdict == self.cause)
         return here or tuple(part for part in self.draws if part.verdict == self.cause)
 
     def sentence(self) -> str:
-        """Say in one sentence what was found, with the numbers of the worst part."""
+        """Return the verdict in one sentence, with the numbers of the worst part."""
         text = f"{self.cause}: {MEANING[self.cause]}"
-        if not self.guilty:
+        if not self.worst_parts:
             return text
-        part = max(self.guilty, key=lambda p: (p.component is not None, np.nan_to_num(p.error, nan=np.inf)))
+        part = max(self.worst_parts, key=lambda p: (p.component is not None, np.nan_to_num(p.error, nan=np.inf)))
         if self.cause == "kink":
             return f"{text}; {part.name}: slopes {part.left:.6g} and {part.right:.6g}, the program's {part.program:.6g}"
         if self.trusted:
@@ -167,10 +167,10 @@ def check(
 ) -> Check:
     """Check a gradient against differences of its cost; ``theta (d,)``.
 
-    Each component is judged on its own at the steps of ``options.eps``, relative to its own scale; random directions
-    see all components at once, here and at other thetas. The gradient is asked for at theta first and last, so that one
-    that is kept from an earlier call, or that is drawn, shows. ``modes`` names contact modes, if there are any. Without
-    a gradient, the cost alone is judged.
+    Each component is checked at the steps of ``options.eps``, relative to its own scale. Random directions check all
+    components together, at theta and at other thetas. The gradient is computed at theta first and last, which exposes a
+    cached or random gradient. ``modes`` names contact modes, if there are any. Without a gradient, only the cost is
+    checked.
 
     Raises :class:`TypeError` for complex costs or gradients and :class:`ValueError` for wrong shapes.
     """
@@ -204,21 +204,21 @@ class _Checker:
         if self._gradient is None:
             return np.full(theta.size, np.nan)
         self.gradients += 1
-        found = np.asarray(self._gradient(theta.copy()))
-        if np.iscomplexobj(found):
+        result = np.asarray(self._gradient(theta.copy()))
+        if np.iscomplexobj(result):
             raise TypeError("the gradient is complex; a check needs a real one")
-        if found.shape != theta.shape:
-            raise ValueError(f"the gradient has shape {found.shape}, not that of theta, {theta.shape}")
-        return found.astype(np.float64)
+        if result.shape != theta.shape:
+            raise ValueError(f"the gradient has shape {result.shape}, not that of theta, {theta.shape}")
+        return result.astype(np.float64)
 
     def run(self) -> Check:
         theta, options = self.theta, self.options
         first = self.gradient(theta)
-        chosen = self._chosen(first)
+        chosen = self._components(first)
         around = theta[:, None] + options.reach * self.scale[:, None] * self.random.standard_normal(
             (theta.size, options.draws)
         )
-        # as far from theta as its last digits, so that what changes is rounding's
+        # moves only the last digits of theta, so every change of the gradient is rounding
         with np.errstate(invalid="ignore"):
             doubt = np.abs(self.gradient(theta + 4.0 * self.unit * self.scale) - first)
         at_draws = [self.gradient(other) for other in around.T]
@@ -227,18 +227,18 @@ class _Checker:
         names = [f"component {i}" for i in chosen] + [f"direction {i}" for i in range(count)]
         vectors, lengths = self._directions(chosen)
         every = np.repeat(theta[:, None], len(names), axis=1), np.repeat(first[:, None], len(names), axis=1)
-        parts = self._parts(*every, vectors, lengths, names, [*chosen, *[None] * count], doubt)
+        parts = self._check_parts(*every, vectors, lengths, names, [*chosen, *[None] * count], doubt)
         names = [f"draw {k} direction {i}" for k in range(options.draws) for i in range(count)]
         draws: list[Part] = []
         if names:
             vectors = np.concatenate([self._directions([])[0] for _ in range(options.draws)], axis=1)
-            found = np.repeat(np.stack(at_draws, axis=1), count, axis=1)
+            gradients = np.repeat(np.stack(at_draws, axis=1), count, axis=1)
             none: list[int | None] = [None] * len(names)
             starts = np.repeat(around, count, axis=1)
-            draws = self._parts(starts, found, vectors, np.ones(len(names)), names, none, doubt, twice=False)
-        parts, draws = self._explained(parts, draws, around, at_draws)
+            draws = self._check_parts(starts, gradients, vectors, np.ones(len(names)), names, none, doubt, twice=False)
+        parts, draws = self._with_causes(parts, draws, around, at_draws)
         causes = [part.verdict for part in parts]
-        # elsewhere, only what is certain counts: theta itself is on no kink of another theta
+        # at other thetas only faults count: a kink there is not a kink at theta
         causes += [part.verdict for part in draws if part.verdict in FAULTS]
         if not np.isfinite(first).all() and self._gradient is not None and np.isfinite(self.cost(theta[:, None])).all():
             causes.append("nan_gradient")
@@ -249,7 +249,7 @@ class _Checker:
         size = max((abs(sample.centre) for sample in centres), default=0.0)
         orders = [part.order for part in parts if part.component is None and np.isfinite(part.order)]
         return Check(
-            cause=worst(causes),
+            cause=most_severe(causes),
             theta=theta,
             gradient=first,
             scale=self.scale,
@@ -262,8 +262,8 @@ class _Checker:
             gradients=self.gradients,
         )
 
-    def _chosen(self, gradient: np.ndarray) -> list[int]:
-        """Return the components that are checked one by one."""
+    def _components(self, gradient: np.ndarray) -> list[int]:
+        """Return the indices of the components to check one by one."""
         dim, most = gradient.size, self.options.components
         if dim <= most:
             return list(range(dim))
@@ -271,9 +271,9 @@ class _Checker:
         return sorted(int(i) for i in np.r_[share[: most // 2], share[dim - (most - most // 2) :]])
 
     def _directions(self, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the chosen components' and random directions' vectors ``(d, M)``, and what a unit of each counts as.
+        """Return the direction vectors ``(d, M)`` of chosen components and random directions, and their lengths ``(M,)``.
 
-        A component's derivative is by its own unit, that along a random direction by the inputs' scales.
+        A component's derivative is in its own unit, a derivative along a random direction in units of the inputs' scales.
         """
         dim, count = self.theta.size, self.options.directions
         random = self.random.standard_normal((dim, count))
@@ -281,7 +281,7 @@ class _Checker:
         vectors = np.concatenate([np.diag(self.scale)[:, chosen], random], axis=1)
         return vectors, np.concatenate([self.scale[chosen], np.ones(count)])
 
-    def _parts(
+    def _check_parts(
         self,
         thetas: np.ndarray,
         gradients: np.ndarray,
@@ -300,7 +300,7 @@ class _Checker:
         values = self.cost(at).reshape(count, -1)
         repeatable = np.ones(count, bool)
         if twice:
-            # in another order, so that no column depends on its neighbours
+            # in reverse order, which exposes columns that depend on their neighbours
             again = self.cost(at[:, ::-1])[::-1].reshape(count, -1)
             repeatable = np.asarray(((values == again) | (np.isnan(values) & np.isnan(again))).all(axis=1))
         minus, plus = self._sides(at, count)
@@ -309,19 +309,19 @@ class _Checker:
         if self._gradient is None:
             program = np.zeros(count)
         doubts = np.abs(vectors).T @ np.nan_to_num(doubt, nan=0.0, posinf=0.0) / lengths
-        # what is this little beside the other components may come from their rounding; an exact 0 does not
+        # a component this small beside the others may be their rounding, unless it is exactly 0
         whole = np.abs(np.nan_to_num(gradients, posinf=0.0, neginf=0.0)) * self.scale[:, None]
         doubts += np.where(program != 0.0, np.sqrt(self.unit) * whole.max(axis=0) / lengths, 0.0)
-        found = samples(values, lengths, program, self.unit, eps, minus != plus, repeatable, doubts)
+        measured = samples(values, lengths, program, self.unit, eps, minus != plus, repeatable, doubts)
         if self._gradient is None:
-            found = [replace(s, derivative=judge(s).difference) for s in found]
-        judged = [judge(sample) for sample in found]
+            measured = [replace(s, derivative=judge(s).difference) for s in measured]
+        findings = [judge(sample) for sample in measured]
         if twice:
-            judged = self._scanned(thetas, vectors, found, judged)
+            findings = self._with_staircases(thetas, vectors, measured, findings)
         modes = [(tuple(a), tuple(b)) for a, b in zip(minus, plus, strict=True)]
         return [
             _part(names[m], components[m], sample, finding, modes[m])
-            for m, (sample, finding) in enumerate(zip(found, judged, strict=True))
+            for m, (sample, finding) in enumerate(zip(measured, findings, strict=True))
         ]
 
     def _sides(self, at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -333,34 +333,35 @@ class _Checker:
         names = np.array(self._modes(columns), dtype=object).reshape(count, 2 * eps)
         return names[:, :eps], names[:, eps:]
 
-    def _scanned(
-        self, thetas: np.ndarray, vectors: np.ndarray, found: list[Sample], judged: list[Finding]
+    def _with_staircases(
+        self, thetas: np.ndarray, vectors: np.ndarray, measured: list[Sample], findings: list[Finding]
     ) -> list[Finding]:
-        """Look for staircases in the cost along the directions that are not plainly right.
+        """Return the findings with the verdict on a staircase for directions along which the cost is one.
 
-        A derivative of exactly 0 is not where differences are not: it may be that of a tread.
+        Directions that are clearly right are not scanned. A derivative of exactly 0 where differences are not 0 is not
+        clearly right: it may be the slope of a tread.
         """
-        plain = ("smooth", "nonlinear", "mode_crossing", "zero", "nonfinite", "nondeterministic")
-        asked = [
+        clear = ("smooth", "nonlinear", "mode_crossing", "zero", "nonfinite", "nondeterministic")
+        to_scan = [
             m
-            for m, (sample, finding) in enumerate(zip(found, judged, strict=True))
-            if finding.verdict not in plain
+            for m, (sample, finding) in enumerate(zip(measured, findings, strict=True))
+            if finding.verdict not in clear
             or (finding.verdict == "nonlinear" and sample.derivative == 0.0 and sample.differences.any())
         ][: self.options.scanned]
-        along = roughness.scans(1.0, self.unit)
-        for m in asked:
+        along = roughness.staircase_offsets(1.0, self.unit)
+        for m in to_scan:
             at = thetas[:, m : m + 1] + vectors[:, m : m + 1] * along.reshape(1, -1)
             values = self.cost(at).reshape(along.shape)
-            for spacing, row in zip(along, values, strict=True):
-                if roughness.treads(row, 8.0 * self.unit * float(np.abs(row).max())):
-                    judged[m] = self._stepped(found[m], judged[m], row, float(spacing[1]))
+            for row in values:
+                if roughness.is_staircase(row, 8.0 * self.unit * float(np.abs(row).max())):
+                    findings[m] = self._judge_staircase(measured[m], findings[m], row)
                     break
-        return judged
+        return findings
 
-    def _stepped(self, sample: Sample, finding: Finding, row: np.ndarray, spacing: float) -> Finding:
-        """Return the finding on a staircase: ``precision`` where the gradient is right beyond its treads.
+    def _judge_staircase(self, sample: Sample, finding: Finding, row: np.ndarray) -> Finding:
+        """Return the finding on a staircase: ``precision`` where the gradient is right on scales above the treads.
 
-        A cast to a shorter float leaves the gradient as it is, one to an integer cuts it off.
+        A cast to a shorter float keeps the gradient, a cast to an integer removes it.
         """
         tread = float(np.ptp(np.diff(row)))
         if GUARD * float(self.unit) * abs(sample.centre) >= tread:
@@ -368,27 +369,27 @@ class _Checker:
         coarse = judge(replace(sample, noise=max(sample.noise or 0.0, tread)))
         return replace(coarse, verdict="precision" if coarse.verdict in TRUSTED else "staircase")
 
-    def _explained(
+    def _with_causes(
         self, parts: list[Part], draws: list[Part], around: np.ndarray, at_draws: list[np.ndarray]
     ) -> tuple[list[Part], list[Part]]:
-        """Give wrong parts a finer cause: what their ratios to the differences are, here and at other thetas."""
+        """Return the parts with the cause of wrong ones, from their ratios to the differences at theta and at other thetas."""
         wrong = [part for part in (*parts, *draws) if part.verdict in ("wrong_adjoint", "disconnected")]
         if not wrong:
             return parts, draws
         still = bool(at_draws) and all(np.array_equal(g, at_draws[0]) for g in at_draws)
         here = [part for part in parts if part.verdict in FAULTS]
         if still and at_draws[0].any() and not here:
-            return parts, [_named(part, "stale_gradient", ("wrong_adjoint",)) for part in draws]
-        guilty = [part.component for part in parts if any(part is one for one in wrong) and part.component is not None]
-        ratios = {i: [_ratio(part) for part in parts if part.component == i] for i in guilty}
-        count, few = len(guilty), min(len(at_draws), ELSEWHERE)
-        again = self._parts(
+            return parts, [_with_verdict(part, "stale_gradient", ("wrong_adjoint",)) for part in draws]
+        components = [p.component for p in parts if any(p is one for one in wrong) and p.component is not None]
+        ratios = {i: [_ratio(part) for part in parts if part.component == i] for i in components}
+        count, few = len(components), min(len(at_draws), ELSEWHERE)
+        again = self._check_parts(
             np.repeat(around[:, :few], count, axis=1),
             np.repeat(np.stack(at_draws[:few], axis=1), count, axis=1) if few else np.zeros((around.shape[0], 0)),
-            np.tile(np.diag(self.scale)[:, guilty], few),
-            np.tile(self.scale[guilty], few),
+            np.tile(np.diag(self.scale)[:, components], few),
+            np.tile(self.scale[components], few),
             [""] * (count * few),
-            guilty * few,
+            components * few,
             np.zeros(self.theta.size),
             twice=False,
         )
@@ -398,16 +399,16 @@ class _Checker:
         whole = [part for part in (*parts, *draws) if part.component is None and part.verdict == "wrong_adjoint"]
         right = any(part.verdict in TRUSTED and part.verdict != "zero" for part in parts if part.component is not None)
         along = [_ratio(part) for part in whole]
-        cause = of_ratios(ratios, along, right)
-        if "wrong_adjoint" in cause.values() and self._right_far_away():
-            cause = of_ratios(ratios, along, right, right_elsewhere=True)
-        renamed = [_named(part, cause.get(part.component, cause[None]), ("wrong_adjoint",)) for part in parts]
-        return renamed, [_named(part, cause[None], ("wrong_adjoint",)) for part in draws]
+        cause = causes_of_ratios(ratios, along, right)
+        if "wrong_adjoint" in cause.values() and self._is_right_far_away():
+            cause = causes_of_ratios(ratios, along, right, right_elsewhere=True)
+        renamed = [_with_verdict(part, cause.get(part.component, cause[None]), ("wrong_adjoint",)) for part in parts]
+        return renamed, [_with_verdict(part, cause[None], ("wrong_adjoint",)) for part in draws]
 
-    def _right_far_away(self) -> bool:
-        """Return whether the gradient is right at some theta farther away, so that what it misses acts only near this one.
+    def _is_right_far_away(self) -> bool:
+        """Return whether the gradient is right at some theta farther away, so the missing term acts only near theta.
 
-        Two random directions have to agree there, since one may by chance. A slope of exactly 0 says nothing.
+        Two random directions have to agree there, since one may agree by chance. A slope of exactly 0 does not count.
         """
         count = self.options.draws
         away = np.repeat(FAR, count) * self.scale[:, None]
@@ -417,14 +418,14 @@ class _Checker:
             vectors = self.scale[:, None] * self.random.standard_normal(thetas.shape)
             names, none = [""] * thetas.shape[1], [None] * thetas.shape[1]
             doubt = np.zeros(self.theta.size)
-            parts = self._parts(thetas, gradients, vectors, np.ones(len(names)), names, none, doubt, twice=False)
+            parts = self._check_parts(thetas, gradients, vectors, np.ones(len(names)), names, none, doubt, twice=False)
             right = [k for k, part in enumerate(parts) if part.verdict in PLAINLY and part.program != 0.0]
             thetas, gradients = thetas[:, right], gradients[:, right]
         return thetas.shape[1] > 0
 
 
 def _ratio(part: Part) -> Ratio:
-    """Return a part's ratio, and the error that the difference leaves it."""
+    """Return a part's ratio, and its error from the error of the difference."""
     size = abs(part.difference)
     return Ratio(part.ratio, abs(part.ratio) * part.uncertainty / size if size > 0.0 else 0.0)
 
@@ -448,5 +449,5 @@ def _part(
     )
 
 
-def _named(part: Part, verdict: str, instead: Sequence[str]) -> Part:
+def _with_verdict(part: Part, verdict: str, instead: Sequence[str]) -> Part:
     return replace(part, verdict=verdict) if part.verdict in instead else part

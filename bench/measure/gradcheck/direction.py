@@ -1,9 +1,9 @@
-"""Judges the derivative along one direction from differences of the cost over many step sizes: arrays in, name out.
+"""Checks the derivative along one direction against differences of the cost over many step sizes.
 
-A central difference of step h errs by h^2 f'''/6 from the bend of the cost and by about u |f| / h from rounding, so
-that its error always rises at both ends (Nocedal and Wright 2006, section 8.1). A difference is believed where its
-neighbours agree with it and where no smaller step contradicts it by more than the noise of the cost explains: on an
-amplifying rollout, differences over wide steps agree with each other on nothing.
+A central difference of step h errs by h^2 f'''/6 from the curvature of the cost and by about u |f| / h from rounding,
+so its error always rises at both ends (Nocedal and Wright 2006, section 8.1). A difference is trusted where its
+neighbours agree with it and where no smaller step contradicts it by more than the noise of the cost explains. On an
+amplifying rollout, differences over wide steps may agree with each other without approximating the derivative.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ import numpy as np
 EPS = np.logspace(-2, -10, 17)
 """Step sizes, two per decade, in units of the natural scale."""
 GUARD = 64.0
-"""Rounding errors granted to a rollout in its cost, and in moving theta."""
+"""Rounding errors allowed in the cost of a rollout, and in moving theta."""
 MEASURED = 8.0
-"""Standard deviations granted to a cost whose noise is measured, and rounding errors beside them."""
+"""Standard deviations allowed to a cost whose noise is measured, and rounding errors in addition."""
 RISE = 0.01
-"""Relative error from which an end of the curve counts as risen."""
+"""Relative error above which an end of the error curve counts as risen."""
 WINDOW = 7
-"""Neighbouring steps (three decades of them) along which a kink has to stay the same."""
-BRIEFLY = 4
-"""Neighbouring steps along which a slope has to stay the same in an exploding rollout, and a jump at the smallest."""
+"""Neighbouring steps (three decades) over which a kink has to be constant."""
+SHORT_WINDOW = 4
+"""Neighbouring steps over which a slope has to be constant in an exploding rollout, and a jump at the smallest steps."""
 ALIKE = 0.1
-"""Relative spread within which values count as the same."""
-FEWEST = 7
-"""Steps with finite costs on both sides without which nothing is judged."""
+"""Relative spread within which values count as equal."""
+MIN_STEPS = 7
+"""Fewest steps with finite costs on both sides; with fewer, the verdict is ``nonfinite``."""
 
 
 @dataclass(frozen=True)
 class Sample:
     """A cost along one direction at one point, and the derivative that the program gives there.
 
-    ``step (K,)`` are displacements, falling; ``minus`` and ``plus (K,)`` the costs there, ``centre`` that of the point
-    itself. ``crossing (K,)`` marks where the contact mode differs between the two sides. ``scale`` is the size of
+    ``step (K,)`` are displacements, falling; ``minus`` and ``plus (K,)`` are the costs there, and ``centre`` is the cost at
+    the point itself. ``crossing (K,)`` marks where the contact mode differs between the two sides. ``scale`` is the size of
     theta, ``slope`` the norm of the program's gradient and ``unit`` the unit roundoff of its arithmetic. ``noise`` is
     the measured standard deviation of the cost's noise (None: not measured) and ``doubt`` the error that the program's
     derivative has from rounding theta.
@@ -88,8 +88,8 @@ class Sample:
         costs = costs + float(np.finfo(np.float64).tiny) / unit
         if self.noise is None:
             return np.asarray(GUARD * unit * (costs + self.slope * self.scale) / self.step)
-        # what was measured has more in it than the guess above, and no word of the program's; a rounded theta moves the
-        # cost by its slope where it is asked for, which at a minimum is that of one side
+        # measured noise includes more than the guess above, and does not rely on the program's gradient; rounding theta
+        # moves the cost by its slope there, which at a minimum is the slope of one side
         slopes = np.maximum(np.abs(self.left), np.abs(self.right))
         return np.asarray(MEASURED * unit * (costs + slopes * self.scale) / self.step)
 
@@ -105,10 +105,10 @@ class Sample:
 
 @dataclass(frozen=True)
 class Finding:
-    """A verdict, and the numbers it rests on; NaN where there is none.
+    """A verdict, and the numbers that support it; NaN where there are none.
 
-    ``difference`` is the slope believed, with its own ``uncertainty``, at the step ``index``; ``left`` and ``right``
-    are the one-sided slopes there (of a kink, where they are best resolved).
+    ``difference`` is the trusted slope, with its ``uncertainty``, at the step ``index``; ``left`` and ``right`` are the
+    one-sided slopes there (for a kink, at the step that resolves it best).
     """
 
     verdict: str
@@ -120,8 +120,8 @@ class Finding:
 
 
 def best(sample: Sample) -> int:
-    """Return the index of the step with the smallest error; 0 when no error is a number."""
-    # argmin takes a NaN for the smallest number
+    """Return the index of the step with the smallest error; 0 when every error is NaN."""
+    # argmin treats NaN as the smallest number
     return int(np.argmin(np.nan_to_num(sample.errors, nan=np.inf)))
 
 
@@ -131,32 +131,32 @@ def diagnose(sample: Sample) -> str:
 
 
 def judge(sample: Sample) -> Finding:
-    """Return what the differences say about the derivative.
+    """Return the verdict of the differences on the derivative.
 
-    - ``nondeterministic``: the same call gives another cost. ``nonfinite``: the cost, or that at too many steps, is NaN
-      or infinite. ``nan_gradient``: only the derivative is.
+    - ``nondeterministic``: the same call returns another cost. ``nonfinite``: the cost at the point or at too many steps
+      is NaN or infinite. ``nan_gradient``: only the derivative is.
     - ``zero``: derivative and differences are exactly 0. ``disconnected``: only the derivative is.
     - ``jump``: at the smallest steps the costs differ by a constant. ``kink``: the one-sided slopes do, over three
       decades of steps. A kink's derivative must lie between the two slopes. Where the slopes are the same over
       fewer steps, as in an exploding rollout, and the sides meet different contacts, it must be one of the two.
-    - ``unsettled``: the differences agree at no step, or smaller steps contradict them, so that they prove nothing.
-    - ``wrong_adjoint``: they settle on a value other than the derivative, by their own size.
-    - the derivative is right, and exactly 0 at the smallest steps only (``saturated``), or its differences err at small
-      steps by more than ten times what float64 explains (``rounding``), at large ones with a change of contact mode
-      (``mode_crossing``) or without (``nonlinear``), or at neither (``smooth``).
+    - ``unsettled``: the differences agree at no step, or smaller steps contradict them, so they prove nothing.
+    - ``wrong_adjoint``: the differences agree on a value other than the derivative.
+    - the derivative is right, and exactly 0 at the smallest steps only (``saturated``), or its differences have errors at
+      small steps of more than ten times what float64 explains (``rounding``), errors at large steps with a change of
+      contact mode (``mode_crossing``) or without (``nonlinear``), or neither (``smooth``).
     """
     if not sample.repeatable:
         return Finding("nondeterministic")
     finite = sample.finite
-    if not np.isfinite(sample.centre) or finite.sum() < FEWEST:
+    if not np.isfinite(sample.centre) or finite.sum() < MIN_STEPS:
         return Finding("nonfinite")
     if not np.isfinite(sample.derivative):
         return Finding("nan_gradient")
     where = np.flatnonzero(finite)
     parts = {name: getattr(sample, name)[where] for name in ("step", "minus", "plus", "crossing")}
     with np.errstate(over="ignore", invalid="ignore"):
-        found = _judge(replace(sample, **parts))
-    return replace(found, index=int(where[found.index]))
+        finding = _judge(replace(sample, **parts))
+    return replace(finding, index=int(where[finding.index]))
 
 
 def _judge(sample: Sample) -> Finding:
@@ -164,38 +164,40 @@ def _judge(sample: Sample) -> Finding:
     if sample.derivative == 0.0 and still.all():
         return Finding("zero", 0, 0.0, float(sample.uncertainty[0]), 0.0, 0.0)
     noise = sample.uncertainty
-    if _jumps(sample, noise):
-        return _at(sample, "jump", sample.step.size - 1, float("nan"))
+    if _has_jump(sample, noise):
+        return _finding(sample, "jump", sample.step.size - 1, float("nan"))
     bend = sample.right - sample.left
-    kink = _settled(bend, 2.0 * noise)
+    kink = _last_stable_index(bend, 2.0 * noise)
     if kink is not None:
-        return _at(sample, "kink" if _between(sample, noise) else _wrong(sample), kink, float(noise[kink]))
+        return _finding(
+            sample, "kink" if _is_between_slopes(sample, noise) else _classify_wrong(sample), kink, float(noise[kink])
+        )
     index, spread = plateau(sample, noise)
     uncertainty = spread + float(noise[index])
-    # ten times the spread, since the best of many spreads is a lucky one
+    # ten times the spread, since the smallest of many spreads is small partly by chance
     tolerance = 10.0 * spread + float(noise[index]) + _resolution(sample, index) + sample.doubt
     apart = abs(float(sample.differences[index]) - sample.derivative)
     alike, rounding = ALIKE * sample.size(index), GUARD * float(sample.rounding(sample.unit)[index])
     resolved = uncertainty <= max(alike, rounding)
     # a tolerance as wide as the derivative would pass half of it
     if apart <= min(tolerance, alike + rounding + sample.doubt) and resolved:
-        return _at(sample, _ends(sample, index, still), index, uncertainty)
+        return _finding(sample, _classify_right(sample, index, still), index, uncertainty)
     if sample.crossing[index]:
-        return _at(sample, _sided(sample, noise), index, uncertainty)
-    settled = apart > tolerance and _believed(sample, index, uncertainty, tolerance)
-    return _at(sample, _wrong(sample) if settled else "unsettled", index, uncertainty)
+        return _finding(sample, _judge_one_sided(sample, noise), index, uncertainty)
+    settled = apart > tolerance and _is_credible(sample, index, uncertainty, tolerance)
+    return _finding(sample, _classify_wrong(sample) if settled else "unsettled", index, uncertainty)
 
 
-def _at(sample: Sample, verdict: str, index: int, uncertainty: float) -> Finding:
+def _finding(sample: Sample, verdict: str, index: int, uncertainty: float) -> Finding:
     sides = float(sample.left[index]), float(sample.right[index])
     return Finding(verdict, index, float(sample.differences[index]), uncertainty, *sides)
 
 
 def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
-    """Return the index of the step whose difference is best believed, and by how much its neighbours disagree.
+    """Return the index of the step with the most reliable difference, and the disagreement with its neighbours.
 
-    Noise counts as disagreement, because differences rounded to 0 agree without meaning anything. A step is left out
-    where a smaller one contradicts it, and where the contact mode changes across it when three others remain.
+    Noise counts as disagreement, because differences rounded to 0 agree by accident. A step is excluded where a smaller
+    step contradicts it, and where the contact mode changes across it if three other steps remain.
     """
     differences = sample.differences
     spread = _spread(differences)
@@ -213,36 +215,36 @@ def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
 
 
 def _spread(differences: np.ndarray) -> np.ndarray:
-    """Return by how much each difference and the ones next to it disagree, ``(K,)``."""
+    """Return the largest disagreement of each difference with its neighbours, ``(K,)``."""
     apart = np.abs(np.diff(differences))
     return np.fmax(np.r_[apart[0], apart], np.r_[apart, apart[-1]])
 
 
-def _believed(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:
-    """Return whether differences that contradict the derivative may be believed.
+def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:
+    """Return whether differences that contradict the derivative are reliable.
 
-    Where the noise exceeds rounding's, as in an amplifying rollout, they are known to within ALIKE of their own size,
-    over BRIEFLY neighbouring steps. Elsewhere it is enough that they are apart by twice what is tolerated.
+    Where the noise exceeds rounding, as in an amplifying rollout, they have to agree to within ALIKE of their own size
+    over SHORT_WINDOW neighbouring steps. Elsewhere a distance of twice the tolerance from the derivative is enough.
     """
     differences = sample.differences
     near = np.asarray(np.abs(differences - differences[index]) <= ALIKE * abs(differences[index]))
-    lasting = np.asarray(_windows(near, BRIEFLY).all(axis=1))
-    settled = bool(lasting[max(0, index - BRIEFLY + 1) : index + 1].any())
+    lasting = np.asarray(_windows(near, SHORT_WINDOW).all(axis=1))
+    settled = bool(lasting[max(0, index - SHORT_WINDOW + 1) : index + 1].any())
     if settled and uncertainty <= ALIKE * abs(differences[index]):
         return True
     plain = (sample.noise or 0.0) / sample.step[index] <= sample.rounding(sample.unit)[index]
     return bool(plain and abs(differences[index] - sample.derivative) > 2.0 * tolerance)
 
 
-def _sided(sample: Sample, noise: np.ndarray) -> str:
-    """Return the verdict by one-sided slopes, where the two sides of every difference meet different contacts.
+def _judge_one_sided(sample: Sample, noise: np.ndarray) -> str:
+    """Return the verdict of one-sided slopes, where the two sides of every difference have different contacts.
 
-    A slope settles where it is the same over BRIEFLY neighbouring steps. In an exploding rollout that happens
+    A slope is settled where it is constant over SHORT_WINDOW neighbouring steps. In an exploding rollout that happens
     only at the smallest steps, where rounding is amplified like the state, and over fewer steps than a kink needs.
     """
     settled = False
     for slopes in (sample.left, sample.right):
-        for window, noises in zip(_windows(slopes, BRIEFLY), _windows(noise, BRIEFLY)[:, -1], strict=True):
+        for window, noises in zip(_windows(slopes, SHORT_WINDOW), _windows(noise, SHORT_WINDOW)[:, -1], strict=True):
             middle, spread = float(np.median(window)), float(np.ptp(window))
             if spread + noises > ALIKE * abs(middle):
                 continue
@@ -250,7 +252,7 @@ def _sided(sample: Sample, noise: np.ndarray) -> str:
             tolerance = 2.0 * spread + noises + float(np.cbrt(sample.unit)) * abs(middle)
             if abs(middle - sample.derivative) <= tolerance:
                 return "kink"
-    return _wrong(sample) if settled else "unsettled"
+    return _classify_wrong(sample) if settled else "unsettled"
 
 
 def _resolution(sample: Sample, index: int) -> float:
@@ -258,14 +260,14 @@ def _resolution(sample: Sample, index: int) -> float:
     return float(np.cbrt(sample.unit)) * sample.size(index)
 
 
-def _wrong(sample: Sample) -> str:
+def _classify_wrong(sample: Sample) -> str:
     return "disconnected" if sample.derivative == 0.0 else "wrong_adjoint"
 
 
-def _between(sample: Sample, noise: np.ndarray) -> bool:
+def _is_between_slopes(sample: Sample, noise: np.ndarray) -> bool:
     """Return whether the derivative lies between the one-sided slopes over the smallest step that rounding resolves.
 
-    A slope is trusted to within its change since the step before, which exceeds its error of order h.
+    The tolerance of a slope is its change since the previous step, which exceeds its error of order h.
     """
     resolved = [i for i in range(1, noise.size) if noise[i] <= _resolution(sample, i)]
     finest = resolved[-1] if resolved else int(np.argmin(noise[1:])) + 1
@@ -276,27 +278,28 @@ def _between(sample: Sample, noise: np.ndarray) -> bool:
     return bool(low <= sample.derivative <= high)
 
 
-def _jumps(sample: Sample, noise: np.ndarray) -> bool:
-    """Return whether the cost jumps at theta: it differs between two points by what no smaller step reduces.
+def _has_jump(sample: Sample, noise: np.ndarray) -> bool:
+    """Return whether the cost jumps at theta: a difference of costs there stays however small the step.
 
-    Two neighbouring steps give the limit of the difference at step 0, as what is linear in the step cancels. The limit
-    must be the same over BRIEFLY + 1 of the smallest steps, and exceed the noise.
+    Two neighbouring steps give the limit of the difference at step 0, since the part linear in the step cancels. The
+    limit must be constant over the SHORT_WINDOW + 1 smallest steps, and exceed the noise. Unlike
+    :func:`bench.measure.jumps.largest_jump` this needs no further costs.
     """
     height = noise * sample.step
     ratio = sample.step[:-1] / sample.step[1:]
     for rise in (sample.plus - sample.minus, sample.plus - sample.centre, sample.centre - sample.minus):
-        limits = ((ratio * rise[1:] - rise[:-1]) / (ratio - 1.0))[-BRIEFLY:]
-        error = 2.0 * ((ratio * height[1:] + height[:-1]) / (ratio - 1.0))[-BRIEFLY:]
+        limits = ((ratio * rise[1:] - rise[:-1]) / (ratio - 1.0))[-SHORT_WINDOW:]
+        error = 2.0 * ((ratio * height[1:] + height[:-1]) / (ratio - 1.0))[-SHORT_WINDOW:]
         middle = abs(float(np.median(limits)))
         if np.ptp(limits) <= ALIKE * middle + error.max() and middle > 2.0 * error.max():
             return True
     return False
 
 
-def _settled(values: np.ndarray, noise: np.ndarray) -> int | None:
-    """Return the end of the last window of values that is constant to within ``ALIKE``, exceeds the noise, and stands.
+def _last_stable_index(values: np.ndarray, noise: np.ndarray) -> int | None:
+    """Return the end of the last window of values that is constant to within ``ALIKE`` and exceeds the noise, or None.
 
-    It does not stand where values at smaller steps contradict it by more than their own noise.
+    A window does not count where values at smaller steps contradict it by more than their own noise.
     """
     windows, noises = _windows(values, WINDOW), _windows(noise, WINDOW).max(axis=1)
     middles = np.median(windows, axis=1)
@@ -315,9 +318,9 @@ def _windows(values: np.ndarray, size: int) -> np.ndarray:
     return np.lib.stride_tricks.sliding_window_view(values, size)
 
 
-def _ends(sample: Sample, index: int, still: np.ndarray) -> str:
-    """Return the verdict on a derivative that is right, by how its differences err at small and at large steps."""
-    if sample.derivative == 0.0 and still[-FEWEST:].all():
+def _classify_right(sample: Sample, index: int, still: np.ndarray) -> str:
+    """Return the verdict on a right derivative, from the errors of its differences at small and at large steps."""
+    if sample.derivative == 0.0 and still[-MIN_STEPS:].all():
         return "saturated"
     errors = np.abs(sample.differences - sample.derivative)
     small = np.arange(errors.size) > index

@@ -1,4 +1,4 @@
-"""How rough a cost is at the smallest scale: the size of its computational noise, and whether it is a staircase."""
+"""Roughness of a cost at the smallest scale: the size of its computational noise, and whether it is a staircase."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ import numpy as np
 POINTS = 8
 """Points on either side of theta from which the noise is estimated."""
 SPACING = 64.0
-"""Least distance of those points, in units in the last place of the input."""
+"""Least spacing of those points, in units in the last place of the input."""
 FINE = 1.37e-11
-"""Their distance otherwise, relative to the input's scale: below the smallest step, and no round number."""
+"""Default spacing of those points, relative to the input's scale: below the smallest step, and not a round number."""
 SCAN = 65
-"""Points of a scan for the treads of a staircase."""
+"""Points of a scan for a staircase."""
 EDGES = 3
-"""Separate edges from which a run of treads counts as a staircase, and not as a jump or two."""
+"""Fewest separate edges of a staircase; a cost with fewer has a jump or two."""
 APART = 3.0
-"""Least ratio of an edge to what the increments on the treads differ by."""
+"""Least ratio of an edge to the differences between increments on the treads."""
 
 
 def offsets(unit: float) -> np.ndarray:
-    """Return the displacements, relative to an input's scale, at which :func:`noise` wants the cost, ``(2, POINTS)``.
+    """Return the displacements, relative to an input's scale, at which :func:`noise` needs the cost, ``(2, POINTS)``.
 
-    The centre belongs to neither side, so that a jump exactly at theta is in no estimate. The two sides are spaced
-    differently, so that no ripple looks smooth on both.
+    The centre belongs to neither side, so a jump exactly at theta does not affect the estimate. The two sides have
+    different spacings, so no ripple looks smooth on both.
     """
     side = max(SPACING * unit, FINE) * np.arange(1, POINTS + 1)
     return np.stack([-side, np.sqrt(3.0) * side])
 
 
 def noise(values: np.ndarray) -> float:
-    """Return the standard deviation of the noise in equally spaced ``values (..., n)``, the largest of all rows.
+    """Return the standard deviation of the noise in equally spaced ``values (..., n)``, the largest over the rows.
 
-    Differences of order k cancel what is smooth and multiply the variance of independent noise by (2k)! / (k!)^2
-    (More and Wild 2011, SIAM J. Sci. Comput. 33, equation 2.4). The least over orders 3 to 5 is taken, as a smooth part
-    that is left adds to it.
+    Differences of order k cancel the smooth part and multiply the variance of independent noise by (2k)! / (k!)^2
+    (More and Wild 2011, SIAM J. Sci. Comput. 33, equation 2.4). The result is the least over orders 3 to 5, since a
+    remaining smooth part only adds to it.
     """
     if not np.isfinite(values).all():
         return float("inf")
@@ -47,10 +47,10 @@ def noise(values: np.ndarray) -> float:
 
 
 def scatter(step: np.ndarray, differences: np.ndarray) -> float:
-    """Return the noise of the cost by its central differences over falling steps ``(K,)``; 0 where they show none.
+    """Return the noise of the cost from its central differences over falling steps ``(K,)``; 0 where they show none.
 
-    Noise moves the differences to and fro by its size over the step. What moves them one way only, or less with each
-    step, is no noise: a jump, a kink, a bend.
+    Noise moves the differences up and down by its size over the step. A jump, a kink or a bend moves them only one way,
+    or less with each step, and does not count.
     """
     moved = (np.diff(differences) * step[1:])[-POINTS:]
     size = np.abs(moved)
@@ -61,18 +61,18 @@ def scatter(step: np.ndarray, differences: np.ndarray) -> float:
     return middle if turns >= POINTS // 2 and size.max() <= 10.0 * middle else 0.0
 
 
-def scans(scale: float, unit: float) -> np.ndarray:
-    """Return displacements for :func:`treads` at seven spacings, a decade apart, ``(7, SCAN)``."""
+def staircase_offsets(scale: float, unit: float) -> np.ndarray:
+    """Return displacements for :func:`is_staircase` at seven spacings, a decade apart, ``(7, SCAN)``."""
     spacings = np.sqrt(unit) * 10.0 ** np.arange(-2.0, 5.0) * scale
     return spacings[:, None] * np.arange(SCAN)
 
 
-def treads(values: np.ndarray, rounding: float) -> bool:
+def is_staircase(values: np.ndarray, rounding: float) -> bool:
     """Return whether equally spaced ``values (n,)`` lie on a staircase, perhaps one that is added to a straight line.
 
-    Most increments are then the same to within ``rounding``, and the others stand out of it one by one, by
-    :data:`APART` times what is left. A single jump is no staircase, neither is a slope with a flat part, and neither is
-    rounding that a rollout amplifies: its increments have every size.
+    On a staircase most increments are equal to within ``rounding``, and the others are isolated and exceed the remaining
+    variation by a factor of :data:`APART`. A single jump is not a staircase, nor is a slope with a flat part, nor rounding
+    that a rollout amplifies: its increments have every size.
     """
     if not np.isfinite(values).all():
         return False

@@ -1,4 +1,4 @@
-"""Where a gradient check evaluates the cost, and the samples it makes of the values: one batch for all directions."""
+"""The points at which a gradient check evaluates the cost, in one batch, and the samples made from the values."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .roughness import POINTS, noise, offsets, scatter
 
 
 def shifts(unit: float, eps: np.ndarray = EPS) -> np.ndarray:
-    """Return displacements, relative to a direction's length: down, up, none, and those that measure the noise."""
+    """Return displacements, relative to a direction's length: down, up, none, and those for the noise estimate."""
     return np.concatenate([-eps, eps, [0.0], offsets(unit).ravel()])
 
 
@@ -40,7 +40,7 @@ def samples(
     A displacement of 1 along direction m has the length ``lengths[m]``, in the units of its ``derivatives[m]``.
     """
     count = eps.size
-    found = []
+    result = []
     for m, row in enumerate(values):
         with np.errstate(over="ignore", invalid="ignore"):
             minus, centre, plus = row[:count], float(row[2 * count]), row[count : 2 * count]
@@ -55,15 +55,15 @@ def samples(
                 noise=measured,
                 doubt=0.0 if doubts is None else float(doubts[m]),
             )  # fmt: skip
-            found.append(replace(sample, noise=max(measured, scatter(sample.step, sample.differences))))
-    return found
+            result.append(replace(sample, noise=max(measured, scatter(sample.step, sample.differences))))
+    return result
 
 
 def order(sample: Sample) -> float:
     """Return the order in h of the Taylor remainder |f(x + h d) - f(x) - h g d|: 2 for a right gradient, 1 for a wrong one.
 
-    It needs no best step: it is the median slope, in log scales, over the five smallest steps whose remainder exceeds
-    ten times the noise, on either side. NaN where fewer than four do, as for a cost that is linear.
+    The order is the median slope, in log scales, over the five smallest steps whose remainder exceeds ten times the noise,
+    on either side. It is NaN where fewer than four do, as for a linear cost. No best step is needed.
     """
     slopes: list[float] = []
     for side, sign in ((sample.plus, 1.0), (sample.minus, -1.0)):

@@ -14,7 +14,7 @@ from bench.experiment import axes
 from bench.experiment.columns import IDENTITY
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
-from bench.measure.statistics import UNEXPLAINED, unexplained
+from bench.measure.statistics import UNEXPLAINED, is_unexplained
 from bench.report.tables import csv, escape_markdown
 from bench.report.text import axis_value, number
 from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, arranged, bias_text, pareto, unsteady
@@ -131,7 +131,7 @@ def _results(row: Any) -> list[str]:
     if row["status"] != "ok":
         return ["-"] * 6
     return [
-        bias_text(row) + DOUBTED * unexplained(row["reason"]),
+        bias_text(row) + DOUBTED * is_unexplained(row["reason"]),
         bias_text(row, row["reference_norm"], interval=False),
         number(row["variance"], 3), number(row["rmse_rel"], 3), number(row["cosine"], 3),
         number(row["time_s"] * 1e3, 3) + UNSTEADY * bool(unsteady(row)),

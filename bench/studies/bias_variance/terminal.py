@@ -15,7 +15,7 @@ from rich.text import Text
 
 from bench.experiment.axes import Axis
 from bench.experiment.experiment import Experiment
-from bench.measure.statistics import UNEXPLAINED, unexplained
+from bench.measure.statistics import UNEXPLAINED, is_unexplained
 from bench.report.problems import ProblemRows
 from bench.report.text import axis_value, duration, number, one_line
 from bench.report.views import (
@@ -230,7 +230,7 @@ def _biased(row: Any) -> bool:
 
 
 def _unexplained(row: Any) -> bool:
-    return unexplained(row["reason"])
+    return is_unexplained(row["reason"])
 
 
 def _useless(row: Any) -> bool:

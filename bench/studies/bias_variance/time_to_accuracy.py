@@ -18,7 +18,7 @@ import pandas as pd
 
 from bench.experiment.axes import Axis
 from bench.experiment.experiment import Experiment
-from bench.measure.statistics import unexplained
+from bench.measure.statistics import is_unexplained
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import axis_value, counted, number
@@ -117,7 +117,7 @@ def _beyond(row: Any, samples: float, price: float, target: float) -> Reached:
     low, high, bias = (row[name] / row["reference_norm"] for name in ("bias_low", "bias_high", "bias"))
     if low >= target:
         # a bias that the method should not have may be tails that were not seen
-        return Reached("unknown" if unexplained(str(row.get("reason", ""))) else "never")
+        return Reached("unknown" if is_unexplained(str(row.get("reason", ""))) else "never")
     if not high < target:
         return Reached("unknown")
     certain_bias = bias if low > 0 else 0.0

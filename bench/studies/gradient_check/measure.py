@@ -13,7 +13,7 @@ import numpy as np
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import gradcheck, noise
-from bench.measure.contacts import acting
+from bench.measure.contacts import active_contacts
 from bench.model import SURROGATE, ContactScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
 from bench.report.reproduce import check_of
 from bench.studies.gradient_check.places import trusted
@@ -70,7 +70,7 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     return {
         "status": "nonfinite" if lost else "ok",
         "reason": "no cost is finite" if lost else "; ".join([*said, *beyond_stability(cell)]),
-        "verdict": gradcheck.worst(verdicts),
+        "verdict": gradcheck.most_severe(verdicts),
         "untrusted": sum(not trusted(point.point, point.verdict) for point in points),
         "best_error": errors[severest],
         "best_eps": float(gradcheck.EPS[best[severest]]),
@@ -154,7 +154,7 @@ def at_start(whole: gradcheck.Check) -> list[Point]:
     ]
     if whole.cause not in (*seen, *(part.verdict for part in parts)):
         # found at other thetas only, or by asking twice
-        parts += [replace(part, verdict=whole.cause) for part in (*whole.guilty, *whole.parts)[:1]]
+        parts += [replace(part, verdict=whole.cause) for part in (*whole.worst_parts, *whole.parts)[:1]]
     return [Point("start", 0, _number(part), part.verdict, part.sample, *part.modes) for part in parts]
 
 
@@ -300,7 +300,9 @@ def contact_modes(problem: Problem) -> Modes | None:
     # an engine and a solver step by themselves; anything else is quicker in NumPy
     rollout = _asked if program.needs_root or "physics" in problem.provides else _followed
     try:
-        acting(program, *rollout(problem, program.theta0[:, None], np.zeros((program.n_noise, COLUMNS_AT_ONCE))))
+        active_contacts(
+            program, *rollout(problem, program.theta0[:, None], np.zeros((program.n_noise, COLUMNS_AT_ONCE)))
+        )
     except Unsupported:
         return None
 
@@ -310,7 +312,7 @@ def contact_modes(problem: Problem) -> Modes | None:
         parts = []
         for part in index.reshape(-1, COLUMNS_AT_ONCE):
             with np.errstate(all="ignore"):
-                parts.append(acting(program, *rollout(problem, theta[:, part], w[:, part])))
+                parts.append(active_contacts(program, *rollout(problem, theta[:, part], w[:, part])))
         return [signature(column) for column in np.concatenate(parts, axis=-1)[..., :width].transpose(2, 1, 0)]
 
     return modes
