@@ -73,7 +73,7 @@ def long_table(rows: pd.DataFrame) -> pd.DataFrame:
             values = {name: row[name][i * count + k] for name in PER_STEP}
             lines.append(check | {"eps": row["eps"][k]} | values | end)
     unchecked = rows[[len(verdicts) == 0 for verdicts in rows["check_verdict"]]]
-    lines += unchecked[[*whole, "verdict", *last]].to_dict("records")  # type: ignore[arg-type]
+    lines += unchecked[[*whole, "verdict", *last]].to_dict("records")
     table = pd.DataFrame(lines, columns=[*whole, *PER_CHECK, "eps", *PER_STEP, "verdict", *last])
     counts = ["horizon", "samples", "repeats", "dim", "seed", "sample", "direction"]
     return table.astype(dict.fromkeys(counts, "Int64"))
