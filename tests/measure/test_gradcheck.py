@@ -14,7 +14,7 @@ from bench.measure import noise
 from bench.measure.gradcheck import EPS, FAULTS, VERDICTS, Sample, diagnose
 from bench.model import Problem, compose, registry
 from bench.studies.gradient_check import GradientCheck, measure, report
-from bench.studies.gradient_check.places import trusted
+from bench.studies.gradient_check.points import is_trusted
 
 FLOAT64, FLOAT32 = (float(np.finfo(dtype).eps) for dtype in (np.float64, np.float32))
 
@@ -344,8 +344,8 @@ def test_step_beyond_the_stability_limit_is_said(tmp_path, capsys):
 
 @pytest.mark.parametrize("verdict", ["unsettled", "jump", "kink", "nan_gradient", "wrong_factor", "staircase"])
 def test_what_cannot_be_trusted_counts_except_what_was_sought_on_a_switch(verdict):
-    assert not trusted("start", verdict)
-    assert trusted("at", verdict) == (verdict in ("jump", "kink"))
+    assert not is_trusted("start", verdict)
+    assert is_trusted("at", verdict) == (verdict in ("jump", "kink"))
 
 
 def test_gradient_that_is_right_for_the_first_column_alone_is_seen(pendulum):

@@ -85,12 +85,14 @@ def test_titles_of_searches_say_what_was_found():
         columns=["scene_class", "points", "rho", "rho_low", "rho_high", "chance"],
     )  # fmt: skip
     assert (
-        findings.sooner(rho)
-        == "The better gradient arrives sooner on stiff scenes; not known on smooth, chaotic scenes"
+        findings.effect_title(rho)
+        == "The better gradient reaches the target sooner on stiff scenes; not known on smooth, chaotic scenes"
     )
-    assert findings.sooner(rho[1:]).startswith("Whether the better gradient arrives sooner is not known on smooth")
-    assert findings.reaches({"cem": 0.5, "fobg, adam": 0.4, "reinforce, adam": 0.1}) == (
+    assert findings.effect_title(rho[1:]).startswith(
+        "Whether the better gradient reaches the target sooner is not known on smooth"
+    )
+    assert findings.targets_title({"cem": 0.5, "fobg, adam": 0.4, "reinforce, adam": 0.1}) == (
         "Most targets reached: cem (50%); with gradients fobg, adam (40%)"
     )
-    assert findings.reaches({"fobg, adam": 0.4, "cem": 0.3}) == "Most targets reached: fobg, adam (40%)"
-    assert findings.reaches({"a, adam": 0.4, "b, adam": 0.4}) == "Most targets reached: a, adam and b, adam (40%)"
+    assert findings.targets_title({"fobg, adam": 0.4, "cem": 0.3}) == "Most targets reached: fobg, adam (40%)"
+    assert findings.targets_title({"a, adam": 0.4, "b, adam": 0.4}) == "Most targets reached: a, adam and b, adam (40%)"

@@ -12,7 +12,7 @@ from bench.experiment.grid import cells
 from bench.measure.identification import Information, product
 from bench.run.execute import store_of
 from bench.run.plan import plan
-from bench.studies.identify.measure import Fitting, fitted, information, measure, model_of, windows_of
+from bench.studies.identify.measure import Fitting, count_windows, information, measure, model_of, run_fits
 
 SPRING = ("scenes=[mass_spring_damper]", "integrators=[rk4]")
 STEPPED = 1e-4
@@ -98,7 +98,7 @@ def test_friction_fitted_with_a_step_holds_for_that_step():
     assert -exact / 0.3 == pytest.approx(-5.096840, rel=1e-6)
     fitting = Fitting(model, "single", 1, 0.01, np.ones(2))
     start = np.log(np.array([[0.25]]))
-    found = np.exp(fitted(fitting, GaussNewton(), start, np.array([[exact]]), 40))[0, 0]
+    found = np.exp(run_fits(fitting, GaussNewton(), start, np.array([[exact]]), 40))[0, 0]
     # the stop within a step leaves a second-order rest
     assert found / 0.3 == pytest.approx(1 - 0.02 * 0.3 * 9.81 / 3.0, abs=2e-3)
     fine = model_of(cell_of("scenes=[sliding_block[dt=0.0005,horizon=2400]]"))
@@ -122,10 +122,10 @@ def test_single_shooting_is_lost_beyond_its_basin_and_windows_are_not():
     data = model.record(truth[:, None])
     for off, converges in ((0.3, True), (0.8, False)):
         start = np.full((1, 1), (2.0 + off) ** 2)
-        for way, count in (("single", 1), ("windows", 5)):
-            fitting = Fitting(model, way, count, 0.01, np.array([1.0, 2.0]))
-            found = np.exp(fitted(fitting, GaussNewton(), fitting.start(start, data), data, 20)[0, 0])
-            assert (abs(found - 4.0) < 1e-3) == (converges or way == "windows"), (off, way)
+        for shooting, count in (("single", 1), ("windows", 5)):
+            fitting = Fitting(model, shooting, count, 0.01, np.array([1.0, 2.0]))
+            found = np.exp(run_fits(fitting, GaussNewton(), fitting.start(start, data), data, 20)[0, 0])
+            assert (abs(found - 4.0) < 1e-3) == (converges or shooting == "windows"), (off, shooting)
 
 
 def test_a_row_in_all_ways():
@@ -192,7 +192,7 @@ def test_own_measurements_are_fitted(tmp_path):
 
 
 def test_number_of_windows():
-    assert windows_of(200, 8) == 8
-    assert windows_of(7, 8) == 1
-    assert windows_of(12, 8) == 6
-    assert windows_of(1, 8) == 1
+    assert count_windows(200, 8) == 8
+    assert count_windows(7, 8) == 1
+    assert count_windows(12, 8) == 6
+    assert count_windows(1, 8) == 1

@@ -29,8 +29,8 @@ from bench.run.execute import store_of
 from bench.run.plan import plan
 from bench.run.session import Session
 from bench.studies.optimise import aggregate, report
-from bench.studies.optimise.batched import side_by_side
-from bench.studies.optimise.measure import compared, scene_class
+from bench.studies.optimise.batched import run_batched
+from bench.studies.optimise.search import compare_with_reference, scene_class
 
 CHECKED = 1e-6
 """Relative agreement with the checked optima."""
@@ -346,7 +346,7 @@ def test_a_seed_that_fails_among_others_fails_alone():
 
         return run
 
-    found = side_by_side(problem, [search(seed) for seed in range(3)])
+    found = run_batched(problem, [search(seed) for seed in range(3)])
     assert isinstance(found[1], ZeroDivisionError)
     assert asked == [0, 2]
     assert found[0]["cost"] != found[2]["cost"]
@@ -358,7 +358,7 @@ def test_a_call_that_fails_for_one_seed_is_made_for_each_alone():
         return lambda lane: {"cost": lane.value(np.zeros(lane.dim), np.zeros((width, 1)))}
 
     problem = Numpy().compile(compose(Quadratic(), None, None))
-    good, bad = side_by_side(problem, [search(problem.program.n_noise), search(problem.program.n_noise + 1)])
+    good, bad = run_batched(problem, [search(problem.program.n_noise), search(problem.program.n_noise + 1)])
     assert isinstance(good, dict)
     assert isinstance(bad, BaseException)
 
@@ -380,9 +380,9 @@ def test_tables_charts_and_page(finished):
     text = (folder / "optimise.md").read_text()
     assert "Best score" in text
     assert "not known" in text  # two methods on one problem say nothing about gradients in general
-    found = aggregate.races(experiment, bench.load(folder))
+    found = aggregate.collect_runs(experiment, bench.load(folder))
     assert found.methods == ["fobg, gradient_descent", "cem[elites=5,population=20]", "reinforce, gradient_descent"]
-    assert found.chosen[found.problems[0], "fobg, gradient_descent"] == "rate=0.1"
+    assert found.best_tunings[found.problems[0], "fobg, gradient_descent"] == "rate=0.1"
 
 
 def one(*words):
@@ -399,7 +399,7 @@ def refusals(tmp_path, *words):
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["study=optimise[target=10]", "scenes=[lqr]"], "target=10 is below the least cost 10.98868364 of scene lqr"),
+        (["study=optimise[target=10]", "scenes=[lqr]"], "target=10 is below the optimum 10.98868364 of scene lqr"),
         (["study=optimise", "optimizers=[gauss_newton]"], "optimizer gauss_newton needs jacobian and residual, which scene quadratic"),
     ],
 )  # fmt: skip
@@ -412,7 +412,7 @@ def test_estimator_without_gradients_is_refused(tmp_path):
     (tmp_path / "plugins").mkdir()
     (tmp_path / "plugins" / "cost_only.py").write_text(COST_ONLY)
     (said,) = refusals(tmp_path, "study=optimise", f"plugins=[{tmp_path}/plugins]", "estimators=[cost_only]")
-    assert said == "optimizer gradient_descent needs gradient, which estimator cost_only does not give"
+    assert said == "optimizer gradient_descent needs gradient, which estimator cost_only does not provide"
 
 
 COST_ONLY = '''
@@ -436,7 +436,7 @@ class CostOnly(Estimator):
     ("words", "message"),
     [
         (["study=optimise", "optimizers=[gauss_newton]"], "gauss_newton needs jacobian and residual"),
-        (["study=optimise[target=10]", "scenes=[lqr]"], "target=10 is below the least cost 10.98868364 of scene lqr"),
+        (["study=optimise[target=10]", "scenes=[lqr]"], "target=10 is below the optimum 10.98868364 of scene lqr"),
         (["study=identify", "optimizers=[gauss_newton]"], "scene quadratic is a plain function"),
     ],
 )
@@ -481,7 +481,7 @@ def test_smaller_noise_is_that_of_a_smaller_sigma():
     from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
     from bench.plugins.estimators.reinforce import Reinforce
 
-    from bench.studies.optimise.measure import ScaledNoiseProblem
+    from bench.studies.optimise.search import ScaledNoiseProblem
 
     noise = np.random.default_rng(0).standard_normal((2, 16, 5))
     for scene, policy in (("cubic", False), ("cartpole[horizon=5,sigma=0.4]", True)):
@@ -496,16 +496,18 @@ def test_smaller_noise_is_that_of_a_smaller_sigma():
 def test_quality_subtracts_noise():
     rng = np.random.default_rng(0)
     terms = 3.0 + rng.standard_normal((4, 200_000))
-    unbiased = compared(3.0 + 0.5 * rng.standard_normal((4000, 4)), terms)
+    unbiased = compare_with_reference(3.0 + 0.5 * rng.standard_normal((4000, 4)), terms)
     assert unbiased["rmse_rel"] == pytest.approx(0.5 / 3.0, rel=0.02)
     assert unbiased["bias_share"] < 0.01
-    biased = compared(4.0 + 0.5 * rng.standard_normal((4000, 4)), terms)
+    biased = compare_with_reference(4.0 + 0.5 * rng.standard_normal((4000, 4)), terms)
     assert biased["bias_share"] == pytest.approx(1.0 / 1.25, rel=0.02)
 
 
 def test_quality_is_unknown_where_the_reference_is_noisier_than_the_estimates():
     rng = np.random.default_rng(0)
-    found = compared(3.0 + 0.01 * rng.standard_normal((50, 4)), 3.0 + 100.0 * rng.standard_normal((4, 1000)))
+    found = compare_with_reference(
+        3.0 + 0.01 * rng.standard_normal((50, 4)), 3.0 + 100.0 * rng.standard_normal((4, 1000))
+    )
     assert all(math.isnan(value) for value in found.values())
 
 
@@ -589,17 +591,17 @@ def test_seeds_that_choose_a_tuning_do_not_score_it():
     """A tuning that is lucky on the scored seeds is not taken, and one that is lucky on its own is scored without them."""
     found = searches({("tuned", "1"): [1, 1, 9, 9, 9], ("tuned", "2"): [2, 2, 0, 0, 0], ("plain", ""): [5, 5, 5, 5, 5]})
     assert found.tuning_seeds == (0, 1)
-    assert found.chosen == {("p", "tuned"): "1", ("p", "plain"): ""}
-    assert found.best.groupby("method")["final_cost"].mean().to_dict() == {"tuned": 9, "plain": 5}
-    assert sorted(found.best["seed"].unique()) == [2, 3, 4]  # the same for all methods, so that pairs remain
-    assert "seeds 0, 1, which score nothing" in " ".join(report.notes(found))
+    assert found.best_tunings == {("p", "tuned"): "1", ("p", "plain"): ""}
+    assert found.best_runs.groupby("method")["final_cost"].mean().to_dict() == {"tuned": 9, "plain": 5}
+    assert sorted(found.best_runs["seed"].unique()) == [2, 3, 4]  # the same for all methods, so that pairs remain
+    assert "seeds 0, 1, which do not score" in " ".join(report.notes(found))
 
 
 @pytest.mark.parametrize("finals", [{("one", ""): [1, 2, 3, 4, 5]}, {("few", "1"): [1, 2, 3], ("few", "2"): [2, 3, 4]}])
 def test_few_seeds_or_nothing_tuned_use_all_seeds(finals):
     found = searches(finals)
     assert found.tuning_seeds == ()
-    assert len(found.best) == len(next(iter(finals.values())))
+    assert len(found.best_runs) == len(next(iter(finals.values())))
 
 
 def test_quality_along_the_path_is_summed_up_over_seeds():

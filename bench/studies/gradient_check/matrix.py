@@ -1,14 +1,12 @@
-"""The chart of the gradient checks: a matrix of verdicts, problems by horizon and point of the rollout."""
+"""The chart of the gradient checks: a matrix of verdicts, problems by horizon and point."""
 
 from __future__ import annotations
 
-import textwrap
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
@@ -16,35 +14,36 @@ from bench.experiment.experiment import Experiment
 from bench.measure.gradcheck import BROKEN, FAULTS, TRUSTED, UNDECIDED, VERDICTS
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
+from bench.report.study_tables import titled_figure
 from bench.report.style import PALETTE, plain
 from bench.report.text import counted
 from bench.report.views import Arranged, arranged
 from bench.run.files import write_whole
-from bench.studies.gradient_check.places import trusted
-from bench.studies.gradient_check.report import POINTS, by_point, problem_of
+from bench.studies.gradient_check.points import POINTS, is_trusted
+from bench.studies.gradient_check.report import by_point, problem_of
 
 BLUE, BLACK, RED, GREEN, PINK, ORANGE, SKY, _ = PALETTE
 KINDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     "X": (FAULTS, RED, "not the derivative of its cost"),
-    "?": (UNDECIDED, "#bdbdbd", "cannot tell"),
+    "?": (UNDECIDED, "#bdbdbd", "undecided"),
     "J": (("jump",), PINK, "the cost jumps here"),
-    "K": (tuple(name for name in BROKEN if name != "jump"), ORANGE, "kink: one side's slope at most"),
+    "K": (tuple(name for name in BROKEN if name != "jump"), ORANGE, "kink: at most a one-sided slope"),
     "ok": (TRUSTED, "#cfe8df", "right"),
 }
-"""By the letters in a cell: verdicts, colour and meaning, the worst first."""
+"""By the letter of a cell: its verdicts, colour and meaning, the worst first."""
 ROW = 0.17
 """Inches of a row."""
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Draw the matrix as ``gradient_check``, where something was checked; its data are a line per cell of it."""
+    """Draw the matrix as ``gradient_check``, unless nothing was checked; the plotted data have a line per cell of it."""
     shown = arranged(experiment, rows)
     table = by_point(rows)
     if table.empty:
         return []
     with styled():
         paths = save(figure(shown), experiment.directory / "gradient_check", experiment.formats)
-    # coloured cells are no points: the plotted values are the verdicts
+    # the matrix has no points to read back: its plotted values are the verdicts
     write_whole(paths[-1], table.drop(columns=["row", "rank"]).to_csv(index=False, lineterminator="\n").encode())
     return paths
 
@@ -57,8 +56,7 @@ def figure(shown: Arranged) -> Figure:
     horizons = sorted(table["horizon"].unique())
     points = [point for point in POINTS if point in set(table["point"])]
     columns = [(horizon, point) for horizon in horizons for point in points]
-    drawn = Figure(figsize=(WIDTH, 1.5 + ROW * (len(names) + 1)), layout="constrained")
-    FigureCanvasAgg(drawn)
+    drawn = titled_figure(WIDTH, 1.5 + ROW * (len(names) + 1), headline(table))
     panel = drawn.subplots()
     for (name, horizon, point), part in table.groupby(["name", "horizon", "point"], sort=False):
         verdict = min(part["verdict"], key=VERDICTS.index)
@@ -87,7 +85,6 @@ def figure(shown: Arranged) -> Figure:
     ]
     legend += [Patch(facecolor="white", label="blank: no switch of contact was found")] * (len(points) > 1)
     drawn.legend(handles=legend, loc="outside lower center", ncols=3, columnspacing=1.2)
-    drawn.suptitle("\n".join(textwrap.wrap(headline(table), 90)), fontsize=9, fontweight="bold")
     return drawn
 
 
@@ -96,19 +93,18 @@ def _steps(horizon: int) -> str:
 
 
 def headline(table: pd.DataFrame) -> str:
-    """Write where gradients are not derivatives, or are not known to be, before how many are right."""
+    """Write the problems with wrong gradients first, then how many have untrusted checks around a contact switch."""
     faults = table[table["verdict"].isin(FAULTS)]
-    beside = [
-        not trusted(point, verdict) and verdict not in FAULTS
+    undecided = [
+        not is_trusted(point, verdict) and verdict not in FAULTS
         for point, verdict in zip(table["point"], table["verdict"], strict=True)
     ]
     parts = []
     if len(faults):
         parts.append(f"Wrong gradients: {', '.join(dict.fromkeys(faults['name']))}")
-    if any(beside):
-        where = list(dict.fromkeys(table.loc[beside, "name"]))
-        parts.append(f"kinks, jumps or no answer beside a switch in {len(where)} of {table['name'].nunique()} problems")
+    if any(undecided):
+        n_problems = table.loc[undecided, "name"].nunique()
+        parts.append(f"kinks, jumps or undecided checks in {n_problems} of {table['name'].nunique()} problems")
     if not parts:
-        return "Every gradient is the derivative of its own program, away from contact switches"
-    text = "; ".join(parts if len(faults) else ["No gradient is wrong for its own program", *parts])
-    return text
+        return "Away from contact switches, every gradient is the derivative of its program's cost"
+    return "; ".join(parts if len(faults) else ["No gradient is wrong for its program", *parts])

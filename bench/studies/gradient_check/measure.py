@@ -1,4 +1,4 @@
-"""The program's gradient against differences of its cost, at the start and on both sides of a contact switch."""
+"""Compares the program's gradient with differences of its cost, at theta0 and on both sides of a contact switch."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from bench.experiment.session import Session
 from bench.measure import gradcheck, noise
 from bench.measure.contacts import active_contacts
 from bench.model import SURROGATE, ContactScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
-from bench.report.reproduce import check_of
-from bench.studies.gradient_check.places import trusted
+from bench.studies.gradient_check.points import is_trusted
 
 COLUMNS_AT_ONCE = 128
-"""Rollouts per evaluation, always the same number so that a compiling backend compiles once."""
+"""Rollouts per evaluation. The number is always the same, so that a compiling backend compiles once."""
 NEUTRAL = 1e-9
-"""Growth per step that rounding explains."""
+"""Growth of the state per step up to which rounding may be the cause."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Place:
 
 @dataclass(frozen=True)
 class SwitchSearch:
-    """Where gradients are checked; see the parameters of the study."""
+    """Where gradients are checked: the parameters of the study."""
 
     directions: int
     drawn: int
@@ -50,34 +49,33 @@ class SwitchSearch:
 
 
 def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any]:
-    """Make all checks of one cell."""
+    """Return the columns of one cell, except ``command``, from checks at theta0 and around contact switches."""
     problem = session.problem(cell)
     theta = problem.program.theta0
     unit = float(np.finfo(cell.backend.dtype).eps)
     drawn = noise.draw(cell.seed, cell.scene.name, 1, 1, problem.program.n_noise, "gradient check")[0, 0]
     directions = noise.draw(cell.seed, cell.scene.name, 1, search.drawn, theta.size, "directions")[0]
     whole = start(problem, theta, unit, search, cell.seed)
-    places, found = examine(problem, theta, drawn, directions, unit, search)
-    points = [*at_start(whole), *(_checked(place, *both) for place, both in zip(places, found, strict=True))]
+    places, samples = examine(problem, theta, drawn, directions, unit, search)
+    points = [*at_start(whole), *(_checked(place, *both) for place, both in zip(places, samples, strict=True))]
     verdicts = [point.verdict for point in points]
     best = [gradcheck.best(point.sample) for point in points]
     errors = [float(point.sample.errors[i]) for point, i in zip(points, best, strict=True)]
     severest = min(range(len(points)), key=lambda i: (gradcheck.VERDICTS.index(verdicts[i]), -errors[i]))
     lost = all(verdict == "nonfinite" for verdict in verdicts)
     parts = whole.components
-    said = [SURROGATE] if problem.program.surrogate else []
-    said += [] if whole.cause in PLAIN else [whole.sentence()]
+    remarks = [SURROGATE] if problem.program.surrogate else []
+    remarks += [] if whole.cause in PLAIN else [whole.sentence()]
     return {
         "status": "nonfinite" if lost else "ok",
-        "reason": "no cost is finite" if lost else "; ".join([*said, *beyond_stability(cell)]),
+        "reason": "no cost is finite" if lost else "; ".join([*remarks, *beyond_stability(cell)]),
         "verdict": gradcheck.most_severe(verdicts),
-        "untrusted": sum(not trusted(point.point, point.verdict) for point in points),
+        "untrusted": sum(not is_trusted(point.point, point.verdict) for point in points),
         "best_error": errors[severest],
         "best_eps": float(gradcheck.EPS[best[severest]]),
         "scale": scale_of(theta),
         "taylor_order": whole.order,
         "cost_noise": whole.noise,
-        "command": check_of(cell),
         "device": problem.device,
         "component": [part.component for part in parts],
         "component_program": [part.program for part in parts],
@@ -104,17 +102,19 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
 
 
 PLAIN = ("smooth", "nonlinear", "zero", "mode_crossing")
-"""Verdicts on theta that need no sentence."""
+"""Verdicts on theta that need no remark."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """One derivative checked, wherever."""
+    """One checked directional derivative."""
 
     point: str
+    """One of :data:`bench.studies.gradient_check.points.POINTS`."""
     noise: int
+    """0 without noise, 1 with it."""
     number: int
-    """Number of the direction; -1 - i for component i."""
+    """Number of the direction, or -1 - i for component i."""
     verdict: str
     sample: gradcheck.Sample
     minus: Sequence[str]
@@ -123,10 +123,10 @@ class Point:
 
 
 def start(problem: Problem, theta: np.ndarray, unit: float, search: SwitchSearch, seed: int) -> gradcheck.Check:
-    """Check every component at theta without noise, random directions there and around it.
+    """Check every component and random directions at ``theta (d,)`` and at other thetas near it, without noise.
 
-    Costs come in batches of one width, so that a compiling backend compiles once. A gradient is the last column of a
-    batch that begins with another theta, as a backend may be right for one column alone.
+    Costs are evaluated in batches of one width, so that a compiling backend compiles once. A gradient is the last
+    column of a batch that begins with another theta, since a backend may be right for a single column only.
     """
     still = np.zeros((problem.program.n_noise, COLUMNS_AT_ONCE))
 
@@ -146,14 +146,14 @@ def start(problem: Problem, theta: np.ndarray, unit: float, search: SwitchSearch
 
 
 def at_start(whole: gradcheck.Check) -> list[Point]:
-    """Return the components, and of random directions and other thetas those that show more than they do."""
+    """Return all components, and the random directions and other thetas whose verdicts no component has."""
     parts = list(whole.components)
     seen = {part.verdict for part in parts}
     parts += [
         part for part in whole.parts if part.component is None and part.verdict not in (*gradcheck.TRUSTED, *seen)
     ]
     if whole.cause not in (*seen, *(part.verdict for part in parts)):
-        # found at other thetas only, or by asking twice
+        # the cause shows at other thetas only, or in a second evaluation
         parts += [replace(part, verdict=whole.cause) for part in (*whole.worst_parts, *whole.parts)[:1]]
     return [Point("start", 0, _number(part), part.verdict, part.sample, *part.modes) for part in parts]
 
@@ -168,7 +168,7 @@ def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, 
 
 
 def beyond_stability(cell: Cell) -> list[str]:
-    """Return a remark if a step in contact multiplies the state, by the integrator's own matrix on the law's spring."""
+    """Return a remark if the integrator is unstable on the contact law's spring: each step then multiplies the state."""
     scene, law, integrator = cell.scene, cell.contact, cell.integrator
     spring = law.spring() if isinstance(law, ForceLaw) else None
     if not isinstance(scene, ContactScene) or spring is None or integrator is None:
@@ -191,7 +191,7 @@ def _joined(parts: Iterator[np.ndarray]) -> list[float]:
 
 
 def scale_of(theta: np.ndarray) -> float:
-    """Return the natural scale of displacements of theta: its norm, or 1 where that is less."""
+    """Return the natural scale of displacements of theta: its norm, but at least 1."""
     return max(1.0, float(np.linalg.norm(theta)))
 
 
@@ -204,11 +204,12 @@ Modes = Callable[[np.ndarray, np.ndarray], list[str]]
 def examine(
     problem: Problem, theta: np.ndarray, drawn: np.ndarray, directions: np.ndarray, unit: float, search: SwitchSearch
 ) -> tuple[list[Place], list[tuple[gradcheck.Sample, list[tuple[str, str]]]]]:
-    """Make checks at ``theta (d,)``, without noise and with ``drawn (n_w,)``, along the first ``directions (D, d)``.
+    """Check directional derivatives at ``theta (d,)``, without noise and with ``drawn (n_w,)``, and at contact switches.
 
-    Checks at a switch of contact mode are made along the first directions that meet one, without noise. Returns the
-    places and, for each, its costs with the contact modes on both sides at every eps. ``unit`` is the unit roundoff of
-    the program's arithmetic. Two calls of one batch give all costs, twice.
+    Derivatives at theta are along the first of ``directions (D, d)``. Switches are searched along all directions,
+    without noise, and checked on the first that meet one. Returns the places and, for each, its costs with the contact
+    modes on both sides at every eps. ``unit`` is the unit roundoff of the program's arithmetic. All costs are one
+    batch, evaluated twice.
     """
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     modes = contact_modes(problem)
@@ -239,14 +240,13 @@ def examine(
         repeatable=((first == second) | (np.isnan(first) & np.isnan(second))).all(axis=1),
     )
     sides = [list(zip(*both, strict=True)) for both in zip(minus, plus, strict=True)]
-    found = list(zip(samples, sides, strict=True))
-    return places, found
+    return places, list(zip(samples, sides, strict=True))
 
 
 def boundary(
     modes: Modes, theta: np.ndarray, direction: np.ndarray, w: np.ndarray, number: int, search: SwitchSearch
 ) -> list[Place]:
-    """Return places just before, at and just after the switch of contact mode nearest to theta, if there is one."""
+    """Return places just before, at and just after the contact switch nearest to theta, or none without a switch."""
     scale = scale_of(theta)
 
     def names(at: np.ndarray) -> list[str]:
@@ -262,13 +262,14 @@ def boundary(
 
 
 def switch(names: Callable[[np.ndarray], list[str]], reach: float) -> tuple[float, float] | None:
-    """Return the nearest two arguments, from 0 outwards, between which the name changes; None if it never does.
+    """Return the two arguments nearest to 0 between which the name changes, or None if it never does.
 
-    Each pass looks at many arguments at once and keeps the first change, until they are neighbours in floating point.
+    Each pass evaluates a grid of arguments and refines the interval of the first change, down to floating-point
+    neighbours.
     """
     half = np.linspace(0.0, reach, COLUMNS_AT_ONCE // 2)
-    seen = names(np.concatenate([half, -half]))
-    sides = ((1.0, seen[: half.size]), (-1.0, seen[half.size :]))
+    values = names(np.concatenate([half, -half]))
+    sides = ((1.0, values[: half.size]), (-1.0, values[half.size :]))
     changes = [(_change(names_), sign) for sign, names_ in sides if _change(names_) is not None]
     if not changes:
         return None
@@ -285,7 +286,7 @@ def switch(names: Callable[[np.ndarray], list[str]], reach: float) -> tuple[floa
 
 
 def _change(names: Sequence[str]) -> int | None:
-    """Return the index of the first name that differs from the one before all others."""
+    """Return the index of the first name that differs from name 0, or None."""
     return next((i for i, name in enumerate(names) if name != names[0]), None)
 
 
@@ -293,12 +294,12 @@ def _change(names: Sequence[str]) -> int | None:
 
 
 def contact_modes(problem: Problem) -> Modes | None:
-    """Return the function that names contact modes; None for a scene without contact or a backend that hides states."""
+    """Return the function that names contact modes, or None without contacts or without access to the states."""
     program = problem.program
     if not isinstance(program, Rollout) or not program.scene.n_contacts:
         return None
-    # an engine and a solver step by themselves; anything else is quicker in NumPy
-    rollout = _asked if program.needs_root or "physics" in problem.provides else _followed
+    # engines and implicit steps need the backend, anything else is faster in NumPy
+    rollout = _backend_rollout if program.needs_root or "physics" in problem.provides else _numpy_rollout
     try:
         active_contacts(
             program, *rollout(problem, program.theta0[:, None], np.zeros((program.n_noise, COLUMNS_AT_ONCE)))
@@ -318,7 +319,7 @@ def contact_modes(problem: Problem) -> Modes | None:
     return modes
 
 
-def _followed(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _numpy_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return states ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)`` of rollouts, computed in NumPy."""
     theta = np.broadcast_to(theta, (theta.shape[0], w.shape[1]))
     program = problem.program
@@ -327,16 +328,16 @@ def _followed(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.nd
     return np.stack([np.concatenate(state) for state, _ in steps]), np.stack([u for _, u in steps[:-1]])
 
 
-def _asked(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same from the backend, for programs that solve equations."""
+def _backend_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return states and controls of rollouts as :func:`_numpy_rollout`, computed by the backend."""
     theta = np.ascontiguousarray(np.broadcast_to(theta, (theta.shape[0], w.shape[1])))
     return problem.trajectory(theta, w)
 
 
 def signature(contacts: np.ndarray) -> str:
-    """Return ``contacts (n_contacts, horizon)`` as a short name: steps in contact, ``12-18 30``, split by ``;``.
+    """Return a short name of ``contacts (n_contacts, horizon)``: the steps in contact, ``12-18 30``, split by ``;``.
 
-    A name that would be too long is cut and ends in a checksum of the whole.
+    A name of over 24 characters is cut and ends in a checksum of the whole.
     """
     text = ";".join(_runs(row) for row in contacts)
     return text if len(text) <= 24 else f"{text[:14]}..{zlib.crc32(text.encode()):08x}"

@@ -21,18 +21,22 @@ from bench.report.web.content import (
     titled,
     together,
 )
-from bench.studies.gradient_check.report import PROBLEM, by_point, doubtful, long_table
+from bench.studies.gradient_check.points import POINTS
+from bench.studies.gradient_check.report import PROBLEM, by_point, long_table, untrusted
 
-POINTS = {"start": 0, "before": 5, "at": 2, "after": 3}
-"""Colours, as places in the palette, of the points at which gradients are checked."""
+LOOKS = {
+    point: look(PALETTE[place], symbol)
+    for point, place, symbol in zip(POINTS, (0, 5, 2, 3), ("circle", "square", "diamond", "triangle-up"), strict=True)
+}
+"""Colour and symbol of each point at which gradients are checked."""
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the verdicts, and every error against eps."""
+    """Return the finding, a table of verdicts and a chart of errors against the step of the differences."""
     shown = arranged(experiment, rows)
     chart = Chart(
         "Error against the step of the differences",
-        "A right gradient falls with eps^2 until rounding takes over; one that is wrong stays on a level.",
+        "The error of a right gradient falls with eps^2 until rounding dominates; that of a wrong one stays constant.",
         [PlotAxis("eps", "eps, in units of the natural scale")],
         [PlotAxis("relative_error", "relative error", above_one="larger than the gradient")],
         table="checks",
@@ -53,17 +57,12 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         answers=answers(rows),
         answers_title="Verdicts",
         tables={"checks": checks(shown)},
-        looks={
-            point: look(PALETTE[place], symbol)
-            for (point, place), symbol in zip(
-                POINTS.items(), ("circle", "square", "diamond", "triangle-up"), strict=True
-            )
-        },
+        looks=LOOKS,
     )
 
 
 def checks(shown: Arranged) -> pd.DataFrame:
-    """Return a line per check and eps."""
+    """Return one line per check and eps: the data of the chart."""
     parts = [*PROBLEM, "backend"]
     rows = shown.rows.assign(
         row=range(len(shown.rows)),
@@ -85,22 +84,23 @@ def checks(shown: Arranged) -> pd.DataFrame:
 
 
 def finding(rows: pd.DataFrame) -> str:
-    """Write how many checks found a fault, and where."""
+    """Write how many checked points have an untrusted gradient, with their verdicts and problems."""
     points = by_point(rows)
-    faults = doubtful(points)
+    faults = untrusted(points)
     if points.empty:
         return "No gradient could be checked: the table has the reason of each cell."
     if faults.empty:
-        return (
-            f"None of {counted(len(points), 'checked point')} shows a gradient that cannot be trusted{_errors(points)}."
-        )
-    named = ", ".join(dict.fromkeys(titled(faults, ["scene", "contact", "backend"])))
-    kinds, show = ", ".join(faults["verdict"].unique()), "shows" if len(faults) == 1 else "show"
-    return f"{len(faults)} of {counted(len(points), 'checked point')} {show} a gradient that cannot be trusted: {kinds}; on {named}."
+        return f"No wrong gradient at {counted(len(points), 'checked point')}{_errors(points)}."
+    problem_names = ", ".join(dict.fromkeys(titled(faults, ["scene", "contact", "backend"])))
+    have, verdicts = "has" if len(faults) == 1 else "have", ", ".join(faults["verdict"].unique())
+    return (
+        f"{len(faults)} of {counted(len(points), 'checked point')} {have} a gradient that cannot be trusted "
+        f"({verdicts}): {problem_names}."
+    )
 
 
 def _errors(points: pd.DataFrame) -> str:
-    """Write the largest error where there is a derivative, and how many points have none."""
+    """Write the largest error of points with a derivative, and the number of points without one."""
     broken = points["verdict"].isin(UNTRUSTED)
     errors = points.loc[~broken, "error"].dropna()
     text = (
@@ -108,24 +108,20 @@ def _errors(points: pd.DataFrame) -> str:
     )
     if broken.any():
         scenes = ", ".join(dict.fromkeys(points.loc[broken, "scene"]))
-        lies = "lies" if broken.sum() == 1 else "lie"
-        text += (
-            f"; {broken.sum()} of them {lies} on a kink or a jump, where a gradient can be of one side only ({scenes})"
-        )
+        points_are = "point is" if broken.sum() == 1 else "points are"
+        text += f"; {broken.sum()} {points_are} on a kink or a jump, where only one-sided gradients exist ({scenes})"
     return text
 
 
 def answers(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return how many points have each verdict, and on which scenes."""
+    """Return one line per verdict: the number of points, the largest error and the scenes."""
     points = by_point(rows)
     lines = []
     for verdict in VERDICTS:
         part = points[points["verdict"] == verdict]
         if len(part):
-            fault = "yes" if doubtful(part).empty else "no"
-            scenes = ", ".join(dict.fromkeys(part["scene"]))
-            largest = number(part["error"].max())
-            lines.append(
-                {"verdict": verdict, "trusted": fault, "points": len(part), "largest error": largest, "scenes": scenes}
-            )
+            lines.append({
+                "verdict": verdict, "trusted": "yes" if untrusted(part).empty else "no", "points": len(part),
+                "largest error": number(part["error"].max()), "scenes": ", ".join(dict.fromkeys(part["scene"])),
+            })  # fmt: skip
     return pd.DataFrame(lines)

@@ -1,4 +1,4 @@
-"""How gradients grow with the horizon: their norm, the step Jacobians' product, and what both do to the variance."""
+"""How gradients grow with the horizon: their norm, the product of the step Jacobians, and the variance."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Growth(Study):
     lags: int = param(40, "most lags whose gain is stored", positive=True)
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Measure gradients, Jacobian products and variances of one problem over its noise."""
+        """Measure gradient norms, Jacobian products and variances of one cell."""
         from bench.studies.growth.measure import measure
 
         return measure(cell, session, self.rollouts, self.lags)

@@ -1,4 +1,4 @@
-"""How gradients grow with the horizon: their norm, the step Jacobians' product, and what both do to the variance."""
+"""How gradients grow with the horizon: their norm, the product of the step Jacobians, and the variance."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from bench.measure import noise
 from bench.model import Jacobians, Problem, Rollout, columns
 
 QUANTILES = {"low": 0.05, "quarter": 0.25, "median": 0.5, "three_quarters": 0.75, "high": 0.95}
-"""Quantiles over noise samples that are stored for heavy-tailed quantities."""
+"""Quantiles over noise samples, stored for heavy-tailed quantities."""
 ROUNDING = 1e-6
 """Relative rounding error of the logarithm of a product's spectral radius: sqrt(eps), as for a defective eigenvalue."""
 
 
 def measure(cell: Cell, session: Session, rollouts: int, most_lags: int) -> dict[str, Any]:
-    """Measure gradients, Jacobian products (of ``rollouts`` rollouts) and variances of one problem over its noise."""
+    """Return gradient norms, variances of both orders, and Jacobian products of the first ``rollouts`` rollouts."""
     problem = session.problem(cell)
     program = problem.program
     draws = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, problem.program.n_noise)
@@ -48,12 +48,12 @@ def measure(cell: Cell, session: Session, rollouts: int, most_lags: int) -> dict
 def variances(terms: np.ndarray, name: str) -> dict[str, float]:
     """Return the variance per sample of terms ``(d, R, N)``: median over repeats with its quantiles, and mean."""
     with np.errstate(over="ignore"):
-        found = np.nansum(np.nanvar(terms, axis=2, ddof=1), axis=0)
+        totals = np.nansum(np.nanvar(terms, axis=2, ddof=1), axis=0)
     return {
-        f"{name}_variance": float(np.median(found)),
-        f"{name}_variance_low": float(np.quantile(found, QUANTILES["low"])),
-        f"{name}_variance_high": float(np.quantile(found, QUANTILES["high"])),
-        f"{name}_variance_mean": float(found.mean()),
+        f"{name}_variance": float(np.median(totals)),
+        f"{name}_variance_low": float(np.quantile(totals, QUANTILES["low"])),
+        f"{name}_variance_high": float(np.quantile(totals, QUANTILES["high"])),
+        f"{name}_variance_mean": float(totals.mean()),
     }
 
 
@@ -62,7 +62,7 @@ def variances(terms: np.ndarray, name: str) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Products:
-    """Logarithms of the rollouts' Jacobian products, so that nothing overflows."""
+    """Logarithms of the Jacobian products of B rollouts, which would overflow themselves."""
 
     gain: np.ndarray
     """log of the largest singular value of dx_N/du_i (of dx_N/dx_i without controls) at lag N - i, ``(N, B)``."""
@@ -84,7 +84,7 @@ def products(jacobians: Jacobians) -> Products:
         effect = product @ b[i] if b.shape[-1] else after
         gain[horizon - 1 - i] = scale + _log(np.linalg.norm(effect, ord=2, axis=(1, 2)))
         norm = np.linalg.norm(after, axis=(1, 2))
-        # a product of 0 stays 0 and adds nothing to the scale
+        # a zero product stays zero and adds nothing to the scale
         norm = np.where(norm > 0, norm, 1.0)
         product, scale = after / norm[:, None, None], scale + np.log(norm)
     singular = scale[:, None] + _log(np.linalg.svd(product, compute_uv=False))
@@ -94,7 +94,7 @@ def products(jacobians: Jacobians) -> Products:
 
 def _log(values: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore"):
-        return np.log(values)
+        return np.asarray(np.log(values))
 
 
 def rate(logarithms: np.ndarray, steps: int) -> tuple[float, float, float]:
@@ -110,10 +110,10 @@ def rate(logarithms: np.ndarray, steps: int) -> tuple[float, float, float]:
 
 
 def classify(stretch_high: float, spectral_low: float, tolerance: float) -> str:
-    """Return ``exploding`` if the spectral radius surely grows, ``vanishing`` if the norm surely falls, or ``neutral``.
+    """Return ``exploding`` if the spectral radius certainly grows, ``vanishing`` if the norm certainly falls, or ``neutral``.
 
-    The spectral radius never exceeds the norm, and does not depend on the units of the state. By its norm a free mass
-    would be called exploding, although its product [[1, t], [0, 1]] only grows like t and has spectral radius 1.
+    The spectral radius never exceeds the norm and does not depend on the units of the state. By its norm a free mass
+    would be exploding, although its product [[1, t], [0, 1]] only grows like t and has spectral radius 1.
     """
     if spectral_low > tolerance:
         return "exploding"
@@ -122,9 +122,9 @@ def classify(stretch_high: float, spectral_low: float, tolerance: float) -> str:
 
 def _product_columns(problem: Problem, w: np.ndarray, most_lags: int) -> dict[str, Any]:
     """Return gains, singular values, rates and class of the Jacobian product."""
-    found = problem.jacobians(problem.program.theta0, w)
-    steps = found.a.shape[0]
-    product = products(found)
+    jacobians = problem.jacobians(problem.program.theta0, w)
+    steps = jacobians.a.shape[0]
+    product = products(jacobians)
     stretch, spectral = rate(product.singular[:, 0], steps), rate(product.spectral, steps)
     lags = np.unique(np.round(np.geomspace(1, steps, most_lags)).astype(int))
     low, middle, high = np.exp(np.quantile(product.gain[lags - 1], [0.05, 0.5, 0.95], axis=1))
@@ -132,7 +132,7 @@ def _product_columns(problem: Problem, w: np.ndarray, most_lags: int) -> dict[st
         **dict(zip(("stretch_rate", "stretch_low", "stretch_high"), stretch, strict=True)),
         **dict(zip(("spectral_rate", "spectral_low", "spectral_high"), spectral, strict=True)),
         "growth": classify(stretch[2], spectral[1], ROUNDING / steps),
-        "gain_of": "controls" if found.b.shape[2] else "states",
+        "gain_of": "controls" if jacobians.b.shape[2] else "states",
         "lags": lags.tolist(),
         "gain": middle.tolist(),
         "gain_low": low.tolist(),

@@ -20,7 +20,7 @@ from bench.report.web.content import (
     looks,
     nothing_ran,
 )
-from bench.studies.growth.report import grown, problem_of
+from bench.studies.growth.report import headline, problem_of
 
 HORIZON = [PlotAxis("time_horizon", "horizon [s]"), PlotAxis("horizon", "horizon [steps]")]
 RESULTS = [
@@ -32,10 +32,12 @@ RESULTS = [
     TableColumn("zeroth_order_variance", "variance, zeroth order"),
 ]
 ORDERS = {"first_order": "first order", "zeroth_order": "zeroth order"}
+CROSSING = "zeroth order has less variance"
+"""Column of the answers: the horizon from which on it has."""
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return what grows and what vanishes, and where the zeroth order has the lower variance."""
+    """Return the finding, charts of norms, variances and gains, and the table."""
     shown = arranged(experiment, rows)
     problem = problem_of(shown)
     table = shown.rows.assign(series=problem, problem=problem)
@@ -45,22 +47,18 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         HORIZON,
         [
             PlotAxis("gradient_median", "norm of one sample's gradient", True, "gradient_low", "gradient_high"),
-            PlotAxis(
-                "spectral_rate", "growth per step: log of the spectral radius", False, "spectral_low", "spectral_high"
-            ),
-            PlotAxis(
-                "stretch_rate",
-                "growth per step: log of the largest singular value",
-                False,
-                "stretch_low",
-                "stretch_high",
+            *(
+                PlotAxis(
+                    f"{name}_rate", f"growth per step: log of the {quantity}", False, f"{name}_low", f"{name}_high"
+                )
+                for name, quantity in (("spectral", "spectral radius"), ("stretch", "largest singular value"))
             ),
         ],
         line="problem",
     )
     variances = Chart(
         "Variance per sample of both orders",
-        "Where the lines cross the zeroth order becomes the better one.",
+        "Beyond the crossing of the lines the zeroth order has the lower variance.",
         HORIZON,
         [PlotAxis("variance", "variance per sample", True, "low", "high")],
         table="variances",
@@ -81,7 +79,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         columns=[*identity_columns(table, [axis.column for axis in shown.axes]), *RESULTS, *STATUS],
         charts=[norms, variances, gains],
         answers=answers(shown),
-        answers_title="What becomes of the gradient",
+        answers_title="Growth of the gradient",
         tables={"variances": variances_of(table), "gains": gains_of(table)},
         looks={
             **looks(list(problem)),
@@ -92,26 +90,20 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
 
 
 def variances_of(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per row and order."""
+    """Return one line per row and order: the data of the chart of variances."""
     rows = rows.assign(row=range(len(rows))).sort_values("horizon", kind="stable")
     parts = [
-        pd.DataFrame(
-            {
-                "row": rows["row"],
-                "problem": rows["problem"],
-                "series": name,
-                "variance": rows[f"{order}_variance"],
-                "low": rows[f"{order}_variance_low"],
-                "high": rows[f"{order}_variance_high"],
-            }
-        )
+        pd.DataFrame({
+            "row": rows["row"], "problem": rows["problem"], "series": name, "variance": rows[f"{order}_variance"],
+            "low": rows[f"{order}_variance_low"], "high": rows[f"{order}_variance_high"],
+        })
         for order, name in ORDERS.items()
-    ]
+    ]  # fmt: skip
     return pd.concat(parts, ignore_index=True)
 
 
 def gains_of(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per row and lag, of the longest horizon of each problem."""
+    """Return one line per row and lag, at the longest horizon of each problem: the data of the chart of gains."""
     longest = (
         rows.assign(row=range(len(rows))).sort_values("horizon", kind="stable").drop_duplicates("problem", keep="last")
     )
@@ -126,35 +118,25 @@ def gains_of(rows: pd.DataFrame) -> pd.DataFrame:
 
 def finding(table: pd.DataFrame) -> str:
     """Write which problems explode and vanish, and from which horizon on the zeroth order has the lower variance."""
-    better = table[table["zeroth order has less variance"] != "nowhere"]
-    text = grown(dict(zip(table["problem"], table["growth"], strict=True)))
-    crossing = ", ".join(
-        f"{problem} {where}"
-        for problem, where in zip(better["problem"], better["zeroth order has less variance"], strict=True)
+    better = table[table[CROSSING] != "nowhere"]
+    text = headline(dict(zip(table["problem"], table["growth"], strict=True)))
+    crossings = ", ".join(
+        f"{problem} {horizon}" for problem, horizon in zip(better["problem"], better[CROSSING], strict=True)
     )
-    return f"{text}; the zeroth order has the lower variance " + (f"on {crossing}." if crossing else "nowhere.")
+    return f"{text}. The zeroth order has the lower variance " + (f"on {crossings}." if crossings else "on no problem.")
 
 
 def answers(shown: Arranged) -> pd.DataFrame:
-    """Return, by problem, growth at the longest horizon, norms at both ends, and where the zeroth order wins."""
+    """Return, by problem, the growth at the longest horizon, norms at both ends, and the crossing of the variances."""
     lines = []
     good = shown.rows[np.isfinite(shown.rows["gradient_median"])]
     for problem, part in good.groupby(problem_of(shown, good), sort=False):
         part = part.sort_values("time_horizon")
         first, last = part.iloc[0], part.iloc[-1]
-        wins = (part["zeroth_order_variance"] < part["first_order_variance"]).to_numpy()
-        losing = np.flatnonzero(~wins)
-        first_win = int(losing[-1]) + 1 if len(losing) else 0
-        from_ = f"from {axis_value(part['horizon'].iloc[first_win])} steps" if first_win < len(part) else "nowhere"
-        lines.append(
-            {
-                "problem": str(problem),
-                "growth": last["growth"],
-                "per second": number(last["spectral_rate"] / last["dt"]),
-                "norm, shortest": f"{number(first['gradient_median'])} at {axis_value(first['horizon'])} steps",
-                "norm, longest": f"{number(last['gradient_median'])} at {axis_value(last['horizon'])} steps",
-                "zeroth order has less variance": from_,
-            }
-        )
-    names = ["problem", "growth", "per second", "norm, shortest", "norm, longest", "zeroth order has less variance"]
-    return pd.DataFrame(lines, columns=names)
+        is_lower = (part["zeroth_order_variance"] < part["first_order_variance"]).to_numpy()
+        higher = np.flatnonzero(~is_lower)
+        start = int(higher[-1]) + 1 if len(higher) else 0
+        crossing = f"from {axis_value(part['horizon'].iloc[start])} steps" if start < len(part) else "nowhere"
+        ends = [f"{number(row['gradient_median'])} at {axis_value(row['horizon'])} steps" for row in (first, last)]
+        lines.append([str(problem), last["growth"], number(last["spectral_rate"] / last["dt"]), *ends, crossing])
+    return pd.DataFrame(lines, columns=["problem", "growth", "per second", "norm, shortest", "norm, longest", CROSSING])

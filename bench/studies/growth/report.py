@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,24 +10,30 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
 
-from bench.experiment.axes import table
 from bench.experiment.experiment import Experiment
 from bench.report.colours import ink
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.scales import log_axis
+from bench.report.study_tables import (
+    interval,
+    label_columns,
+    open_console,
+    print_reasons,
+    print_table,
+    titled_figure,
+    write_tables,
+)
 from bench.report.style import PALETTE, plain
 from bench.report.tables import plain_markdown
-from bench.report.text import axis_value, counted, number
+from bench.report.text import axis_value, number
 from bench.report.views import Arranged, arranged, attempted
-from bench.report.web.content import columns_of, distinguishing_columns, grouped, problems, shown_as, together
-from bench.run.files import write_all
+from bench.report.web.content import problems, shown_as, together
 
 NORM: dict[str, Any] = {"color": "#000000", "marker": "o"}
 SINGULAR: tuple[dict[str, Any], ...] = (
@@ -36,17 +41,17 @@ SINGULAR: tuple[dict[str, Any], ...] = (
     {"color": PALETTE[0], "marker": "v", "markersize": 3.5},
     {"color": "#808080", "linewidth": 0.8},
 )
-"""The looks of the largest singular value, the smallest and those between."""
+"""Styles of the largest singular value, the smallest and those between."""
 CLASSES = {"exploding": PALETTE[2], "neutral": "#404040", "vanishing": PALETTE[0]}
 """Colours of the names of growth classes."""
 PROBLEM = ("scene", "contact", "integrator", "backend")
-"""What a problem is made of; it is drawn along the horizon and along axes that step with the horizon."""
+"""Parts of the grid that make a problem, which is drawn along the horizon and axes that step with it."""
 ROUNDING = float(np.finfo(np.float64).eps)
-"""Share of a matrix's largest singular value below which the others are rounding."""
+"""Share of the largest singular value below which the others are rounding errors."""
 NOTES = (
     "|grad|: norm of one sample's gradient, median and 5% to 95% of the noise samples. growth: log of the largest "
     "singular value (stretch) and of the spectral radius of the Jacobian product dx_N/dx_0, per second, mean and 95% "
-    "interval over noise samples. exploding: the spectral radius surely grows; vanishing: the stretch surely falls. "
+    "interval over noise samples. exploding: the spectral radius certainly grows. vanishing: the stretch certainly falls. "
     "singular values: largest and smallest of that product, median. gain: largest singular value of dx_N/du_0 (dx_N/dx_1 "
     "without controls), median. variance: per sample, median over "
     "repeats.",
@@ -54,7 +59,7 @@ NOTES = (
 
 
 def variances() -> dict[str, tuple[str, dict[str, Any]]]:
-    """Return, by column, the name and the look of the curves of variance."""
+    """Return, by column, the name and the style of each curve of variance."""
     return {
         "first_order": ("fobg", {"color": ink("fobg"), "marker": "D"}),
         "zeroth_order": ("zeroth order", {"color": ink("reinforce"), "marker": "P", "linestyle": (0, (4, 1.5))}),
@@ -65,11 +70,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``growth`` (.csv, .md) and the chart."""
     shown = arranged(experiment, rows)
     texts = [f"# {experiment.name}: growth of gradients with the horizon", plain_markdown(readable(shown)), *NOTES]
-    contents = {
-        "growth.csv": table(experiment, rows).to_csv(index=False, lineterminator="\n"),
-        "growth.md": "\n\n".join(texts) + "\n",
-    }
-    paths = write_all(experiment.directory, contents)
+    paths = write_tables(experiment, rows, "growth", texts)
     with styled():
         drawn = figure(shown)
     if drawn is not None:
@@ -85,25 +86,17 @@ def problem_of(shown: Arranged, rows: pd.DataFrame | None = None) -> pd.Series:
     return problems(shown, PROBLEM, together(shown, "horizon"), rows=rows)
 
 
-def named(shown: Arranged) -> list[str]:
-    """Return the columns that distinguish the lines of the table, besides the horizon."""
-    along = together(shown, "horizon")
-    return distinguishing_columns(
-        shown.rows, grouped(shown.rows, PROBLEM, along), columns_of(shown, PROBLEM, along), ("scene", "contact")
-    )
-
-
 def readable(shown: Arranged) -> pd.DataFrame:
     """Return a table of texts, a line per cell in order of scene and horizon."""
     lines = []
-    columns = [name for name in named(shown) if name != "horizon"]
+    columns = [name for name in label_columns(shown, PROBLEM, together(shown, "horizon")) if name != "horizon"]
     rows = shown.rows.assign(place=shown.rows["scene"].map({s: i for i, s in enumerate(shown.rows["scene"].unique())}))
     for row in rows.sort_values(["place", "time_horizon"], kind="stable").to_dict("records"):
         line = {name: shown_as(row[name]) for name in columns} | {"steps": axis_value(row["horizon"])}
         line["T [s]"] = axis_value(row["time_horizon"])
-        line["|grad| [5%, 95%]"] = _interval(row, "gradient_median", "gradient_low", "gradient_high")
+        line["|grad| [5%, 95%]"] = interval(row, "gradient_median", "gradient_low", "gradient_high")
         for kind in ("stretch", "spectral"):
-            line[f"{kind} [1/s]"] = _interval(row, f"{kind}_rate", f"{kind}_low", f"{kind}_high", 1.0 / row["dt"])
+            line[f"{kind} [1/s]"] = interval(row, f"{kind}_rate", f"{kind}_low", f"{kind}_high", 1.0 / row["dt"])
         line["growth"] = row["growth"]
         line["singular values"] = _ends(row["singular_values"])
         line["gain"] = number(row["gain"][-1]) if len(row["gain"]) else "-"
@@ -115,57 +108,37 @@ def readable(shown: Arranged) -> pd.DataFrame:
 
 
 def _ends(values: Sequence[float]) -> str:
-    """Return the largest and the smallest singular value, the latter at most as small as rounding can resolve."""
+    """Write the largest and the smallest singular value, or the rounding error as an upper bound of the smallest."""
     if not len(values):
         return "-"
     floor = ROUNDING * values[0]
     return f"{number(values[0])} to " + (number(values[-1]) if values[-1] > floor else f"< {number(floor)}")
 
 
-def _interval(row: Any, middle: str, low: str, high: str, factor: float = 1.0) -> str:
-    values = [row[name] * factor for name in (middle, low, high)]
-    if not math.isfinite(values[0]):
-        return "-"
-    return "{} [{}, {}]".format(*map(number, values))
-
-
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     """Print the table, and the reasons of cells without numbers."""
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal:
-        console.width = max(console.width, 180)
-    counts = ", ".join(f"{n} {status}" for status, n in rows["status"].value_counts().items())
-    console.print(f"\n{experiment.name}: {experiment.question}\n{counted(len(rows), 'cell')}: {counts}")
-    lines = readable(arranged(experiment, rows))
-    grid = Table(box=None, padding=(0, 2, 0, 0))
-    for name in lines:
-        grid.add_column(name, justify="left" if name in (*PROBLEM, "growth", "status") else "right")
-    for line in lines.to_numpy():
-        grid.add_row(*map(str, line))
-    console.print(grid)
-    for reason in rows.loc[rows["reason"] != "", "reason"].unique():
-        console.print(reason)
+    console = open_console(experiment, rows)
+    texts = readable(arranged(experiment, rows))
+    print_table(console, texts, right=set(texts) - {*PROBLEM, "growth", "status"})
+    print_reasons(console, rows)
     console.print(*NOTES)
 
 
 # ------------------------------------------------------------------------------------------------------- chart
 
 
-def grown(growths: Mapping[str, str]) -> str:
-    """Write on which problems gradients explode and vanish; ``growths`` has the growth of each at its longest horizon."""
+def headline(classes: Mapping[str, str]) -> str:
+    """Write on which problems gradients explode and vanish, from the growth class of each at its longest horizon."""
     parts = []
     for growth, verb in (("exploding", "explode"), ("vanishing", "vanish"), ("neutral", "do neither")):
-        names = [name for name, found in growths.items() if found == growth]
+        names = [name for name, value in classes.items() if value == growth]
         if names:
             parts.append(f"{verb} on {', '.join(names)}")
-    return "Gradients through time " + ", ".join(parts)
+    return "Gradients through time " + "; ".join(parts)
 
 
 def figure(shown: Arranged) -> Figure | None:
-    """Draw a column of panels per problem: norms of sampled gradients, the Jacobian product, variances per sample."""
+    """Draw a column of panels per problem: gradient norms, the Jacobian product, variances per sample."""
     rows = attempted(shown.rows)
     rows = rows[np.isfinite(rows["gradient_median"])]
     groups = [
@@ -174,13 +147,8 @@ def figure(shown: Arranged) -> Figure | None:
     ]
     if not groups:
         return None
-    drawing = Figure(figsize=(max(WIDTH, 1.45 * len(groups)), 7.6), layout="constrained")
-    FigureCanvasAgg(drawing)
-    drawing.suptitle(
-        textwrap.fill(grown({name: part["growth"].iloc[-1] for name, part in groups}), 92),
-        fontsize=9,
-        fontweight="bold",
-    )
+    title = headline({name: part["growth"].iloc[-1] for name, part in groups})
+    drawing = titled_figure(max(WIDTH, 1.45 * len(groups)), 7.6, title)
     grid = drawing.subplots(len(ROWS), len(groups), squeeze=False, sharey="row")
     for column, (name, part) in zip(grid.T, groups, strict=True):
         times = part["time_horizon"]
@@ -207,7 +175,7 @@ def _legend() -> list[Any]:
 
 
 def _draw_title(panel: Axes, name: str, rows: pd.DataFrame) -> None:
-    """Write the problem, and what becomes of its Jacobian product over the longest horizon."""
+    """Write the problem, and the growth of its Jacobian product over the longest horizon."""
     last = rows.iloc[-1]
     panel.set_title("\n".join(map(plain, name.split(", "))), pad=15)
     text = last["growth"]
@@ -227,7 +195,7 @@ def _draw_norms(panel: Axes, rows: pd.DataFrame) -> None:
 
 
 def _draw_singular(panel: Axes, rows: pd.DataFrame) -> None:
-    """Draw every singular value of dx_N/dx_0, at each horizon, and the value 1 between growing and fading."""
+    """Draw every singular value of dx_N/dx_0 at each horizon, and the line 1 between growth and decay."""
     values = np.array(rows["singular_values"].to_list(), dtype=float)
     values = np.where(values > ROUNDING * values[:, :1], values, np.nan)
     last = values.shape[1] - 1
@@ -237,7 +205,7 @@ def _draw_singular(panel: Axes, rows: pd.DataFrame) -> None:
 
 
 def _draw_gain(panel: Axes, rows: pd.DataFrame) -> None:
-    """Draw the gain of the longest horizon against the time by which a control, or a state, comes before the end."""
+    """Draw the gain at the longest horizon against the time between a control, or a state, and the end."""
     row = rows.iloc[-1]
     times, (gain, low, high) = np.array(row["lags"]) * row["dt"], (row[f"gain{end}"] for end in ("", "_low", "_high"))
     panel.fill_between(times, low, high, color="#000000", alpha=0.2, linewidth=0)
@@ -265,7 +233,7 @@ ROWS = (
     ("gain to the end state,\nby time before it", _draw_gain),
     ("variance per sample,\nby horizon", _draw_variances),
 )
-"""The rows of panels: their labels, and the functions that draw them."""
+"""The rows of panels: label and drawing function of each."""
 
 
 def _decades(panels: Any) -> None:

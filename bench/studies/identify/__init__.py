@@ -1,4 +1,4 @@
-"""Which parameters does a record of the motion tell, how well, and does a fit know it?"""
+"""Which parameters are identifiable from a record of the motion, how precisely, and do fits reach that precision?"""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ class Identify(Study):
     axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "optimizer")
     columns: ClassVar[Columns] = Columns.of(
         text("optimizer", "identity string of the optimizer"),
-        text("words", "what the record can and cannot tell"),
-        Column("rank", "directions of the parameters that the record sees"),
-        Column("condition", "largest singular value of the information over the smallest that is seen",
+        text("words", "which parameters are identifiable from the record"),
+        Column("rank", "number of identifiable directions of the parameters"),
+        Column("condition", "largest singular value of the information over the smallest identifiable one",
                comparison=ComparisonRule("exact", "condition number")),
         Column("fits", "records that were fitted"),
         Column("step_shift", "largest relative change of an estimate when the model's step is halved, without noise"),
         text("step_note", "whether the estimate holds for its time step only"),
         numbers("unknowns", "names of the parameters"),
-        numbers("truth", "their values"),
-        numbers("start", "their values where fits start"),
-        numbers("invariants", "products of powers that the record tells"),
-        numbers("bound", "Cramer-Rao bound of their relative standard deviations"),
+        numbers("truth", "true values of the parameters"),
+        numbers("start", "values of the parameters where fits start"),
+        numbers("invariants", "identifiable products of powers of the parameters"),
+        numbers("bound", "Cramer-Rao bound of the relative standard deviation of each invariant"),
         numbers("fisher", "Fisher information of the logarithms, row by row", table=False),
-        numbers("shooting", "the ways of fitting: single, multiple, windows"),
-        numbers("converged", "by way, share of fits whose residuals are the noise"),
+        numbers("shooting", "the shooting methods: single, multiple, windows"),
+        numbers("converged", "by shooting method, share of fits whose residuals are consistent with the noise"),
         numbers("converged_low", "lower end of its 95% interval"),
         numbers("converged_high", "upper end of its 95% interval"),
-        numbers("error", "by way, root mean square of the errors in units of the bound, of converged fits"),
-        numbers("coverage", "by way, share of 95% intervals that hold the truth, of converged fits"),
-        numbers("coverage_low", "lower end of its 95% interval, records being what is drawn"),
-        numbers("coverage_high", "upper end of its 95% interval"),
-        numbers("hidden", "by way, fits that report more directions than the record sees"),
-        numbers("estimate", "by way and invariant, the median estimate"),
-        numbers("estimate_low", "lower end of the 95% interval of the first fit, by way and invariant"),
-        numbers("estimate_high", "its upper end"),
+        numbers("error", "by shooting method, root mean square error of converged fits in units of the bound"),
+        numbers("coverage", "by shooting method, share of 95% intervals of converged fits that contain the truth"),
+        numbers("coverage_low", "lower end of its 95% interval over records"),
+        numbers("coverage_high", "upper end of its 95% interval over records"),
+        numbers("hidden", "by shooting method, fits with more identifiable directions than the record has"),
+        numbers("estimate", "by shooting method and invariant, the median estimate"),
+        numbers("estimate_low", "by shooting method and invariant, lower end of the 95% interval of the first fit"),
+        numbers("estimate_high", "by shooting method and invariant, its upper end"),
     )  # fmt: skip
 
     measurement: float = param(0.01, "standard deviation of the noise on each measurement", "m", positive=True)
@@ -60,13 +60,13 @@ class Identify(Study):
     data: str | None = param(None, "CSV file with measurements of your own, a line per step; null: made from the truth")
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Fit all records in all ways."""
+        """Fit all records by each shooting method."""
         from bench.studies.identify.measure import measure
 
         return measure(cell, self)
 
     def unsupported_reason(self, cell: Cell) -> str | None:
-        """Refuse scenes without unknowns or steps that NumPy can take, truths that are not positive, data of another length."""
+        """Return why a cell cannot be fitted: no unknowns, steps that NumPy cannot take, sampling, or unusable data."""
         from bench.studies.identify.measure import read
 
         scene, optimizer = cell.scene, cell.parts["optimizer"]
@@ -77,9 +77,12 @@ class Identify(Study):
             return f"scene {scene.name} names no unknowns: name parameters of it, theta=[..]"
         program = cell.program()
         if program.needs:
-            return f"{scene.name} with {cell.integrator.name if cell.integrator else 'none'} cannot be stepped in NumPy, where records are fitted"
+            integrator = cell.integrator.name if cell.integrator else "none"
+            return (
+                f"scene {scene.name} with integrator {integrator} cannot be stepped in NumPy, where records are fitted"
+            )
         if optimizer.draws(2):
-            return f"optimizer {optimizer.name} samples, and fits are compared along one path: use one that does not"
+            return f"optimizer {optimizer.name} samples, and fits are compared along one path: use a deterministic one"
         if self.data is not None:
             try:
                 read(self.data, scene)
@@ -94,7 +97,7 @@ class Identify(Study):
         return report.write(experiment, rows)
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print what each record tells, and how the fits did."""
+        """Print the identifiable parameters of each record, and convergence and coverage of the fits."""
         from bench.studies.identify import report
 
         report.show(experiment, rows)

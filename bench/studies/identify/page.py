@@ -1,4 +1,4 @@
-"""The page of fits: what each record tells, errors and coverage by way of fitting."""
+"""The page of fits: identifiable parameters, errors and coverage by shooting method."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ from bench.experiment.experiment import Experiment
 from bench.report.views import arranged
 from bench.report.web import generic
 from bench.report.web.content import Content, nothing_ran
-from bench.studies.identify.report import failing, findings, flat, readable
+from bench.studies.identify.report import failures, findings, flatten, readable
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return what fails, a chart of any two numbers, and the table of fits."""
-    made, shown = generic.content(experiment, rows), arranged(experiment, rows)
-    lines = flat(shown)
-    sentences = failing(lines) if len(lines) else findings(shown)
-    said = nothing_ran(rows) or "; ".join(sentence.rstrip(".").replace("; ", ", ") for sentence in sentences)
-    return replace(made, finding=said, answers=readable(lines), answers_title="What the records tell, and how fits did")
+    """Return the failures, a chart of any two numbers, and the table of fits."""
+    shown = arranged(experiment, rows)
+    lines = flatten(shown)
+    sentences = failures(lines) if len(lines) else findings(shown)
+    return replace(
+        generic.content(experiment, rows),
+        finding=nothing_ran(rows) or " ".join(sentences),
+        answers=readable(lines),
+        answers_title="Identifiable parameters, and precision of the fits",
+    )

@@ -1,4 +1,4 @@
-"""Does a better gradient get a better controller, sooner? A search per problem, estimator, optimizer and seed."""
+"""Does a better gradient lead to a better controller, sooner? A search per problem, estimator, optimizer and seed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, t
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
-from bench.model import KnownOptimum, Optimizer, Plugin, param
+from bench.model import Estimator, KnownOptimum, Optimizer, Plugin, param
 from bench.model.program import OWN
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Optimise(Study):
-    """Searches for the best theta with each estimator and optimizer, and keeps the whole path."""
+    """Searches for the best theta with each estimator and optimizer, and records the path."""
 
     name = "optimise"
     axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "estimator", "optimizer")
@@ -72,32 +72,32 @@ class Optimise(Study):
     quality_samples: int = param(4096, "gradients of the reference of the quality", low=64)
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Search once; without timing, together with the seeds that come after, so that their rollouts are one batch."""
-        from bench.studies.optimise.batched import measure_batched
+        """Search once. Untimed cells that differ by seed only are searched together, in shared batches of rollouts."""
         from bench.studies.optimise.measure import measure
 
-        return measure(cell, session, self) if cell.timing else measure_batched(cell, session, self)
+        return measure(cell, session, self)
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
-        """Leave out the estimator where the optimizer looks at costs only: all would give the same search."""
+        """Return the plugins without the estimator where the optimizer uses costs only: every estimator is the same then."""
         optimizer = given.get("optimizer")
         if isinstance(optimizer, Optimizer) and "gradient" not in optimizer.needs:
             return given | {"estimator": None}
         return given
 
     def unsupported_reason(self, cell: Cell) -> str | None:
-        """Refuse an optimizer whose needs nothing meets, and a target below the least cost."""
+        """Return why a cell cannot be searched: an optimizer lacks its gradient, or the target is below the optimum."""
         optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
         assert isinstance(optimizer, Optimizer)
-        gives = {"value", *(("gradient",) if estimator is not None and estimator.gives_gradient else ())}  # type: ignore[attr-defined]
-        lacking = sorted(optimizer.needs - gives)
-        if lacking:
+        assert estimator is None or isinstance(estimator, Estimator)
+        available = {"value", "gradient"} if estimator is not None and estimator.gives_gradient else {"value"}
+        missing = sorted(optimizer.needs - available)
+        if missing:
             source = f"estimator {estimator.name}" if estimator is not None else f"scene {cell.scene.name}"
-            return f"optimizer {optimizer.name} needs {' and '.join(lacking)}, which {source} does not give"
+            return f"optimizer {optimizer.name} needs {' and '.join(missing)}, which {source} does not provide"
         if self.target is not None and isinstance(cell.scene, KnownOptimum) and cell.decision == OWN:
-            least, how = cell.scene.optimum(cell.contact, cell.integrator) or (-math.inf, "")
-            if self.target < least:
-                return f"target={self.target:g} is below the least cost {least:.10g} of scene {cell.scene.name} ({how})"
+            optimum, how = cell.scene.optimum(cell.contact, cell.integrator) or (-math.inf, "")
+            if self.target < optimum:
+                return f"target={self.target:g} is below the optimum {optimum:.10g} of scene {cell.scene.name} ({how})"
         return None
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:

@@ -1,4 +1,4 @@
-"""What searches say about methods: regrets, times to targets, scores, and whether a better gradient was worth it."""
+"""Aggregates searches by method: regret, times to targets, scores, and whether a smaller gradient error pays."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,7 +18,7 @@ from bench.experiment.parameters import flatten, swept_columns
 from bench.measure import performance
 from bench.model.parameters import remember
 from bench.report.text import axis_value
-from bench.report.views import Arranged, arranged, attempted
+from bench.report.views import arranged, attempted
 from bench.report.web.content import problems
 
 PARTS = ("scene", "contact", "integrator", "backend")
@@ -25,8 +26,8 @@ TARGETS = (10.0, 100.0, 1000.0)
 """A target is the first regret divided by one of these."""
 RESTARTS = 100
 """Simulated runs with restarts per problem and target."""
-FEWEST_SEEDS = 4
-"""Seeds from which some only choose tunings and the others only score: fewer are too few to be parted."""
+MIN_SEEDS_TO_SPLIT = 4
+"""Fewest seeds that are split into those that choose tunings and those that score."""
 ROUNDING = 1e-12
 """Regret below this share of the first one is 0."""
 
@@ -35,12 +36,12 @@ ROUNDING = 1e-12
 class RunSet:
     """The searches of an experiment, by problem, method and tuning.
 
-    ``rows`` has the columns ``problem``, ``method``, ``tuning`` (text of the optimizer's swept parameters), ``least`` (J*,
-    or the lowest cost of any row where that is lower), ``least_status`` and ``score`` against it.
+    ``rows`` has the columns ``problem``, ``method``, ``tuning`` (the optimizer's swept parameters as text),
+    ``best_known`` (J*, or the lowest cost of any search where that is lower), ``best_known_status`` and ``score``.
     """
 
     rows: pd.DataFrame
-    tuned: tuple[Axis, ...]
+    tuned_axes: tuple[Axis, ...]
     """The swept parameters of optimizers."""
 
     @property
@@ -55,66 +56,75 @@ class RunSet:
 
     @cached_property
     def tuning_seeds(self) -> tuple[int, ...]:
-        """The first third of the seeds, which choose tunings and score nothing; none where nothing is tuned or seeds are few."""
+        """The first third of the seeds, which choose tunings and do not score. Empty without tuning or with few seeds."""
         seeds = sorted(int(seed) for seed in self.rows["seed"].unique())
         several = (self.rows.groupby(["problem", "method"])["tuning"].nunique() > 1).any()
-        return tuple(seeds[: math.ceil(len(seeds) / 3)]) if several and len(seeds) >= FEWEST_SEEDS else ()
+        return tuple(seeds[: math.ceil(len(seeds) / 3)]) if several and len(seeds) >= MIN_SEEDS_TO_SPLIT else ()
 
     @cached_property
-    def chosen(self) -> dict[tuple[str, str], str]:
-        """The tuning of each problem and method with the best median final cost over the tuning seeds, or all seeds where
-        there are none; a lost search counts as inf."""
+    def best_tunings(self) -> dict[tuple[str, str], str]:
+        """The tuning with the lowest median final cost, by problem and method.
+
+        The median is over the tuning seeds, or over all seeds if there are no tuning seeds. A failed search counts as inf.
+        """
         best: dict[tuple[str, str], tuple[float, str]] = {}
         rows = self.rows[self.rows["seed"].isin(self.tuning_seeds)] if self.tuning_seeds else self.rows
         final = rows["final_cost"].where(rows["status"] == "ok", math.inf).fillna(math.inf)
         for key, part in final.groupby([rows[n] for n in ("problem", "method", "tuning")], sort=False):
             problem, method, tuning = (str(k) for k in key)
-            # the lower of the two middle ones: a mean with a lost search would be infinite
+            # the lower of the two middle costs, since a mean with a failed search would be infinite
             middle = float(np.sort(part.to_numpy())[(len(part) - 1) // 2])
             if (problem, method) not in best or middle < best[problem, method][0]:
                 best[problem, method] = (middle, tuning)
         return {key: tuning for key, (_, tuning) in best.items()}
 
     @cached_property
-    def best(self) -> pd.DataFrame:
-        """The rows of each method's best tuning on each problem, of the seeds that did not choose it."""
+    def best_runs(self) -> pd.DataFrame:
+        """The rows of each method's best tuning on each problem, without the tuning seeds."""
         rows = self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
         keys = zip(rows["problem"], rows["method"], rows["tuning"], strict=True)
-        return rows[[self.chosen.get((problem, method)) == tuning for problem, method, tuning in keys]]
+        return rows[[self.best_tunings.get((problem, method)) == tuning for problem, method, tuning in keys]]
 
-    def each(self, rows: pd.DataFrame | None = None) -> Iterator[tuple[str, str, pd.DataFrame]]:
-        """Yield problem, method and rows of the best tuning, or of the rows given."""
-        for key, part in (self.best if rows is None else rows).groupby(["problem", "method"], sort=False):
+    def by_method(self) -> Iterator[tuple[str, str, pd.DataFrame]]:
+        """Yield each problem and method, with the rows of its best tuning."""
+        for key, part in self.best_runs.groupby(["problem", "method"], sort=False):
             yield str(key[0]), str(key[1]), part
 
+    def gradient_ratio(self, problem: str, default: float) -> float:
+        """Return the rollouts that take the time of one gradient: the median over searches, ``default`` without times."""
+        ratios = self.rows.loc[self.rows["problem"] == problem, "gradient_ratio"].dropna()
+        return float(ratios.median()) if len(ratios) else default
 
-_made: dict[tuple[int, int], tuple[Experiment, pd.DataFrame, RunSet]] = {}
-"""The races arranged last, by identity of experiment and rows, which are kept so that no other gets their place."""
+
+_latest: dict[tuple[int, int], tuple[Experiment, pd.DataFrame, RunSet]] = {}
+"""The last run set by the ids of experiment and rows, which are referenced here so that their ids stay theirs."""
 
 
-def races(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
-    """Arrange the rows of searches; refused ones are left out."""
+def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
+    """Collect the searches that ran, with names of problem, method and tuning, and their scores."""
     key = (id(experiment), id(rows))
-    if key not in _made:
-        _made.clear()
-        _made[key] = (experiment, rows, _races(experiment, rows))
-    return _made[key][2]
+    if key not in _latest:
+        _latest.clear()
+        _latest[key] = (experiment, rows, _collect(experiment, rows))
+    return _latest[key][2]
 
 
-def _races(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
+def _collect(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
     shown = arranged(experiment, rows)
-    kept = attempted(shown.rows)
-    kept = kept[np.isfinite(kept["start_cost"])]
-    tuned = tuple(axis for axis in shown.axes if _tunes(axis, kept))
-    kept = kept.assign(problem=_named(shown, kept, tuned), method=_methods(kept), tuning=_tunings(kept, tuned))
-    least, status = _least(kept)
-    start, final = kept["start_cost"], kept["final_cost"]
-    way = (start - least).where(start > least)
-    score = ((start - final) / way).clip(0.0, 1.0).mask(kept["status"] != "ok", 0.0)
-    return RunSet(kept.assign(least=least, least_status=status, score=score), tuned)
+    runs = attempted(shown.rows)
+    runs = runs[np.isfinite(runs["start_cost"])]
+    tuned_axes = tuple(axis for axis in shown.axes if _is_tuned(axis, runs))
+    names = problems(shown, PARTS, tuned_axes, rows=runs).astype(str)
+    runs = runs.assign(problem=names, method=_method_names(runs), tuning=_tuning_labels(runs, tuned_axes))
+    best_known, status = _best_known_cost(runs)
+    start, final = runs["start_cost"], runs["final_cost"]
+    achievable = (start - best_known).where(start > best_known)
+    score = ((start - final) / achievable).clip(0.0, 1.0).mask(runs["status"] != "ok", 0.0)
+    return RunSet(runs.assign(best_known=best_known, best_known_status=status, score=score), tuned_axes)
 
 
-def _tunes(axis: Axis, rows: pd.DataFrame) -> bool:
+def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
+    """Return whether an axis sweeps a parameter of an optimizer."""
     table = flatten(rows)
     return any(
         column.startswith("optimizer.") and bool((mask & table[column].notna()).any())
@@ -123,31 +133,27 @@ def _tunes(axis: Axis, rows: pd.DataFrame) -> bool:
     )
 
 
-def _named(shown: Arranged, rows: pd.DataFrame, tuned: Sequence[Axis]) -> pd.Series:
-    return problems(shown, PARTS, tuned, rows=rows).astype(str)
-
-
-def _methods(rows: pd.DataFrame) -> pd.Series:
-    """Name estimator and optimizer: ``fobg, adam``; the optimizer alone where there is no estimator."""
+def _method_names(rows: pd.DataFrame) -> pd.Series:
+    """Name estimator and optimizer, ``fobg, adam``, or only the optimizer where there is no estimator."""
     names = []
     for estimator, params, optimizer in rows[["estimator", "estimator_params", "optimizer"]].to_numpy():
-        named = f"{estimator}[{params}]" if params else estimator
-        names.append(", ".join(filter(None, (named, optimizer))))
+        label = f"{estimator}[{params}]" if params else estimator
+        names.append(", ".join(filter(None, (label, optimizer))))
     return pd.Series(names, index=rows.index, dtype=object)
 
 
-def _tunings(rows: pd.DataFrame, tuned: Sequence[Axis]) -> pd.Series:
-    lines = [
+def _tuning_labels(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.Series:
+    labels = [
         ", ".join(
-            f"{axis.short}={axis_value(value)}" for axis, value in zip(tuned, values, strict=True) if value == value
+            f"{axis.short}={axis_value(value)}" for axis, value in zip(axes, values, strict=True) if value == value
         )
-        for values in rows[[axis.column for axis in tuned]].to_numpy(float)
+        for values in rows[[axis.column for axis in axes]].to_numpy(float)
     ]
-    return pd.Series(lines, index=rows.index, dtype=object)
+    return pd.Series(labels, index=rows.index, dtype=object)
 
 
-def _least(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
-    """Return, per row, the least cost known for its problem, and how: a search may go below a J* of another limit."""
+def _best_known_cost(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
+    """Return, per row, the lowest cost known for its problem and its source: J*, or a search where that went below J*."""
     lowest = rows.groupby("problem")["best_cost"].transform("min")
     known = rows["optimum"]
     below = known.isna() | (lowest < known - 1e-9 * known.abs())
@@ -159,58 +165,64 @@ def _least(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
 # -------------------------------------------------------------------------------------------------- single paths
 
 
-def ratio_of(rows: pd.DataFrame, default: float) -> float:
-    """Return the rollouts that a gradient takes the time of, the median over rows; ``default`` without times."""
-    known = rows["gradient_ratio"].dropna()
-    return float(known.median()) if len(known) else default
-
-
-def spent(row: pd.Series, ratio: float) -> np.ndarray:
-    """Return the rollouts spent at each kept point of a path, a gradient counting as ``ratio``."""
+def rollouts_spent(row: pd.Series, ratio: float) -> np.ndarray:
+    """Return the rollouts spent up to each stored point of a path, where a gradient counts as ``ratio`` rollouts."""
     return np.asarray(row["path_rollouts"], dtype=float) + ratio * np.asarray(row["path_gradients"], dtype=float)
 
 
 def regret(row: pd.Series) -> np.ndarray:
-    """Return J(theta_t) - J* at each kept point of a path, at least rounding."""
+    """Return J(theta_t) - J* at each stored point of a path, at least :data:`ROUNDING` of the first."""
     cost = np.asarray(row["path_cost"], dtype=float)
-    return np.maximum(cost - row["least"], ROUNDING * max(abs(row["start_cost"] - row["least"]), 1e-300))
+    rounding = ROUNDING * max(abs(row["start_cost"] - row["best_known"]), 1e-300)
+    return np.asarray(np.maximum(cost - row["best_known"], rounding))
 
 
-def curve(rows: pd.DataFrame, at: Sequence[np.ndarray], grid: np.ndarray) -> np.ndarray:
-    """Return the 20%, 50% and 80% quantiles of regret over paths at each place of ``grid``: ``(3, len(grid))``.
+def regret_quantiles(rows: pd.DataFrame, spent: Sequence[np.ndarray], grid: np.ndarray) -> np.ndarray:
+    """Return the 20%, 50% and 80% quantiles of regret over paths at each budget of ``grid``: ``(3, len(grid))``.
 
-    A path stays at its last point; a diverged one is infinite from there on.
+    ``spent`` has the budget used up to each point of each path. A path keeps its last regret, and is infinite from
+    there on if it diverged.
     """
     lines = []
-    for place, (_, row) in zip(at, rows.iterrows(), strict=True):
+    for places, (_, row) in zip(spent, rows.iterrows(), strict=True):
         values = np.append(regret(row), math.inf if row["status"] == "diverged" else regret(row)[-1])
-        ends = np.append(place, place[-1] * (1 + 1e-9) + 1e-12)
+        ends = np.append(places, places[-1] * (1 + 1e-9) + 1e-12)
         lines.append(values[np.maximum(np.searchsorted(ends, grid, side="right") - 1, 0)])
     return np.quantile(np.where(np.isnan(lines), math.inf, lines), [0.2, 0.5, 0.8], axis=0, method="nearest")
 
 
-def arrival(row: pd.Series, factor: float, cost: np.ndarray) -> tuple[float, bool]:
-    """Return the cost at which a path first had at most the first regret over ``factor``, and whether it ever had."""
-    below = np.flatnonzero(regret(row) <= regret(row)[0] / factor)
-    return (float(cost[below[0]]), True) if below.size else (float(cost[-1]), False)
+def hitting_times(rows: pd.DataFrame, factor: float, ratio: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rollouts at which each path first has at most its first regret / ``factor``, and whether it ever does.
+
+    The number for a path that never does is all the rollouts it spent.
+    """
+    rollouts, reached = [], []
+    for _, row in rows.iterrows():
+        spent = rollouts_spent(row, ratio)
+        below = np.flatnonzero(regret(row) <= regret(row)[0] / factor)
+        rollouts.append(float(spent[below[0] if below.size else -1]))
+        reached.append(bool(below.size))
+    return np.array(rollouts), np.array(reached)
 
 
 # ------------------------------------------------------------------------------------------------------- tables
 
 
 @remember
-def targets(found: RunSet, default: float) -> pd.DataFrame:
-    """Return, per problem, method and target, successes with Wilson's interval and the average runtime in rollouts."""
+def times_to_targets(runs: RunSet, default: float) -> pd.DataFrame:
+    """Return, per problem, method and target, successes with Wilson's interval and the average runtime in rollouts.
+
+    ``default`` is the number of rollouts that a gradient counts as where no times were measured, here and below.
+    """
     lines = []
-    for problem, method, part in found.each():
-        ratio = ratio_of(found.rows[found.rows["problem"] == problem], default)
+    for problem, method, part in runs.by_method():
+        ratio = runs.gradient_ratio(problem, default)
         for factor in TARGETS:
-            pairs = np.array([arrival(row, factor, spent(row, ratio)) for _, row in part.iterrows()])
-            reached, costs = pairs[:, 1].astype(bool), pairs[:, 0]
+            costs, reached = hitting_times(part, factor, ratio)
             low, high = performance.wilson(int(reached.sum()), len(reached))
             art_low, art_high = performance.runtime_interval(costs, reached)
             lines.append({
-                "problem": problem, "method": method, "tuning": found.chosen[problem, method], "target": factor,
+                "problem": problem, "method": method, "tuning": runs.best_tunings[problem, method], "target": factor,
                 "successes": int(reached.sum()), "searches": len(reached), "rate": float(reached.mean()),
                 "rate_low": low, "rate_high": high, "art": performance.average_runtime(costs, reached),
                 "art_low": art_low, "art_high": art_high,
@@ -218,40 +230,39 @@ def targets(found: RunSet, default: float) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def runtimes(found: RunSet, default: float) -> dict[str, np.ndarray]:
-    """Return, per method, runtimes with simulated restarts over all problems and targets."""
-    times: dict[str, list[np.ndarray]] = {method: [] for method in found.methods}
-    for problem, method, part in found.each():
-        ratio = ratio_of(found.rows[found.rows["problem"] == problem], default)
+def restart_runtimes(runs: RunSet, default: float) -> dict[str, np.ndarray]:
+    """Return, per method, runtimes in rollouts with simulated restarts, over all problems and targets."""
+    times: dict[str, list[np.ndarray]] = {method: [] for method in runs.methods}
+    for problem, method, part in runs.by_method():
+        ratio = runs.gradient_ratio(problem, default)
         for seed, factor in enumerate(TARGETS):
-            pairs = np.array([arrival(row, factor, spent(row, ratio)) for _, row in part.iterrows()])
-            times[method].append(performance.runtimes(pairs[:, 0], pairs[:, 1].astype(bool), RESTARTS, seed))
+            times[method].append(performance.runtimes(*hitting_times(part, factor, ratio), RESTARTS, seed))
     return {method: np.concatenate(parts) for method, parts in times.items() if parts}
 
 
 @remember
-def summary(found: RunSet, default: float, baseline: str = "fobg") -> pd.DataFrame:
-    """Return, per method, the interquartile mean score, its chance to beat the baseline, and its share of best times.
+def summarise(runs: RunSet, default: float, baseline: str = "fobg") -> pd.DataFrame:
+    """Return, per method, the interquartile mean score, the chance to beat the baseline, and the performance profile.
 
-    The score's interval is a bootstrap stratified by problem, that of ``improvement`` Wilson's. ``improvement`` compares final costs with those of the first method
-    whose estimator is ``baseline``, paired by problem and seed.
+    The score's interval is a bootstrap stratified by problem. ``improvement``, with Wilson's interval, compares final
+    costs with those of the first method whose estimator is ``baseline``, paired by problem and seed.
     """
-    reached = targets(found, default)
+    reached = times_to_targets(runs, default)
     fastest = reached.groupby(["problem", "target"])["art"].transform("min") if len(reached) else None
-    base = next((m for m in found.methods if m.partition(",")[0].partition("[")[0] == baseline), None)
+    base = next((m for m in runs.methods if m.partition(",")[0].partition("[")[0] == baseline), None)
     lines = []
-    for method, part in found.best.groupby("method", sort=False):
-        strata = [one["score"].dropna().to_numpy() for _, one in part.groupby("problem", sort=False)]
-        strata = [one for one in strata if len(one)]
-        low, high = performance.bootstrap(strata, _pooled) if strata else (math.nan, math.nan)
-        better, better_low, better_high = _improvement(found, str(method), base)
-        own = reached[reached["method"] == method]
+    for method, part in runs.best_runs.groupby("method", sort=False):
+        strata = [scores["score"].dropna().to_numpy() for _, scores in part.groupby("problem", sort=False)]
+        strata = [scores for scores in strata if len(scores)]
+        low, high = performance.bootstrap(strata, _pooled_score) if strata else (math.nan, math.nan)
+        better, better_low, better_high = _improvement(runs, str(method), base)
+        times = reached.loc[reached["method"] == method, "art"]
         assert fastest is not None
-        ratios = (own["art"] / fastest[own.index]).to_numpy()
-        cells = found.rows[found.rows["method"] == method]
+        ratios = (times / fastest[times.index]).to_numpy()
+        cells = runs.rows[runs.rows["method"] == method]
         lines.append({
             "method": method, "problems": part["problem"].nunique(), "searches": len(part),
-            "score": _pooled(strata) if strata else math.nan, "score_low": low, "score_high": high,
+            "score": _pooled_score(strata), "score_low": low, "score_high": high,
             "improvement": better, "improvement_low": better_low, "improvement_high": better_high,
             "profile": performance.profile_score(ratios), "diverged": int((part["status"] == "diverged").sum()),
             "tunings": int(cells["tuning"].nunique()), "median_score": float(cells["score"].median()),
@@ -259,61 +270,59 @@ def summary(found: RunSet, default: float, baseline: str = "fobg") -> pd.DataFra
     return pd.DataFrame(lines)
 
 
-def _pooled(strata: Sequence[np.ndarray]) -> float:
+def _pooled_score(strata: Sequence[np.ndarray]) -> float:
     return performance.interquartile_mean(np.concatenate(strata)) if strata else math.nan
 
 
-def _improvement(found: RunSet, method: str, base: str | None) -> tuple[float, float, float]:
+def _improvement(runs: RunSet, method: str, base: str | None) -> tuple[float, float, float]:
+    """Return the chance that a method's final cost is below the baseline's, with its interval; NaN without pairs."""
     if base is None or method == base:
         return math.nan, math.nan, math.nan
-    final = found.best.assign(final=found.best["final_cost"].where(found.best["status"] == "ok", math.inf))
+    final = runs.best_runs
+    final = final.assign(final=final["final_cost"].where(final["status"] == "ok", math.inf))
     wide = final.pivot_table(index=["problem", "seed"], columns="method", values="final", aggfunc="first", dropna=False)
     both = wide[[method, base]].dropna()
     strata = [part.to_numpy() for _, part in both.groupby(level="problem")]
     if not strata:
         return math.nan, math.nan, math.nan
-
     share = float(np.mean([performance.improvement(part[:, 0], part[:, 1]) for part in strata]))
-    # of few pairs all may agree, and every resample with them: Wilson's interval of the pairs stays wide
+    # with few pairs that all agree a bootstrap interval would be a point, Wilson's stays wide
     return share, *performance.wilson(round(share * len(both)), len(both))
 
 
 @remember
-def quality(found: RunSet, default: float, factor: float = TARGETS[0]) -> pd.DataFrame:
-    """Return, per problem and method with an estimator: its gradient's quality at the start, and the runtime to a target."""
+def quality_and_runtime(runs: RunSet, default: float, factor: float = TARGETS[0]) -> pd.DataFrame:
+    """Return, per problem and method with an estimator, the gradient's quality at the start and the runtime to a target."""
     lines = []
-    for problem, method, part in found.each():
+    for problem, method, part in runs.by_method():
         first = part.iloc[0]
         if not math.isfinite(first["quality_rmse_rel"]):
             continue
-        ratio = ratio_of(found.rows[found.rows["problem"] == problem], default)
-        pairs = np.array([arrival(row, factor, spent(row, ratio)) for _, row in part.iterrows()])
+        costs, reached = hitting_times(part, factor, runs.gradient_ratio(problem, default))
         lines.append({
             "problem": problem, "method": method, "estimator": method.partition(",")[0], "scene_class": first["scene_class"],
             "rmse_rel": float(part["quality_rmse_rel"].median()), "cosine": float(part["quality_cosine"].median()),
             "bias_share": float(part["quality_bias_share"].median()), "sigma": first["sigma"],
-            "art": performance.average_runtime(pairs[:, 0], pairs[:, 1].astype(bool)), "most": float(pairs[:, 0].max()),
+            "art": performance.average_runtime(costs, reached), "most": float(costs.max()),
         })  # fmt: skip
     return pd.DataFrame(lines)
 
 
-def correlations(points: pd.DataFrame) -> pd.DataFrame:
-    """Return Spearman's rho of gradient error against runtime by class of scene, runtimes ranked within their problem.
+def rank_correlations(points: pd.DataFrame) -> pd.DataFrame:
+    """Return Spearman's rho of gradient error against runtime, by class of scene.
 
-    Problems differ in cost by themselves, so errors and runtimes are compared among the methods of one problem only: each
-    is replaced by its rank there, scaled to 0..1. A positive rho says that the smaller error arrives sooner.
+    Costs vary between problems, so errors and runtimes are ranked within each problem, and ranks scaled to 0..1. With a
+    positive rho the smaller error reaches the target sooner.
     """
     lines = []
     if points.empty:
         return pd.DataFrame(columns=["scene_class", "rho", "rho_low", "rho_high", "chance", "points", "problems"])
     for name, part in itertools.chain([("all", points)], points.groupby("scene_class", sort=False)):
         strata = []
-        for _, one in part.groupby("problem", sort=False):
-            if len(one) > 1:
-                both = np.stack(
-                    [performance.ranks(one["rmse_rel"].to_numpy()), performance.ranks(one["art"].to_numpy())], axis=1
-                )
-                strata.append((both - 1) / (len(one) - 1))
+        for _, methods in part.groupby("problem", sort=False):
+            if len(methods) > 1:
+                ranks = [performance.ranks(methods[column].to_numpy()) for column in ("rmse_rel", "art")]
+                strata.append((np.stack(ranks, axis=1) - 1) / (len(methods) - 1))
         pooled = np.concatenate(strata) if strata else np.empty((0, 2))
         low, high = performance.spearman_interval(strata) if len(pooled) > 2 else (math.nan, math.nan)
         lines.append({
@@ -324,46 +333,36 @@ def correlations(points: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def path_quality(found: RunSet) -> pd.DataFrame:
-    """Return median, 20% and 80% quantile over seeds of the gradient's relative error and cosine, by place on the path.
+def path_quality(runs: RunSet) -> pd.DataFrame:
+    """Return median, 20% and 80% quantile over seeds of the gradient's relative error and cosine along the path.
 
-    A row for each problem, method, quantity and place; empty where quality was measured at the start alone.
+    There is one line per problem, method, quantity and point of the path, and none where quality was measured only at
+    the start.
     """
-    lines = []
-    for problem, method, part in found.each():
-        paths = [row for _, row in part.iterrows() if len(_listed(row["path_quality_iteration"])) > 1]
-        places = max((len(_listed(row["path_quality_iteration"])) for row in paths), default=0)
-        whole = [row for row in paths if len(_listed(row["path_quality_iteration"])) == places]
+    lines: list[tuple[Any, ...]] = []
+    for problem, method, part in runs.by_method():
+        paths = [row for _, row in part.iterrows() if len(_as_list(row["path_quality_iteration"])) > 1]
+        places = max((len(_as_list(row["path_quality_iteration"])) for row in paths), default=0)
+        whole = [row for row in paths if len(_as_list(row["path_quality_iteration"])) == places]
         for quantity in ("rmse_rel", "cosine") if whole else ():
-            values = np.array([_listed(row[f"path_quality_{quantity}"]) for row in whole], dtype=float)
+            values = np.array([_as_list(row[f"path_quality_{quantity}"]) for row in whole], dtype=float)
             moments = np.median(
-                np.array([_listed(row["path_quality_iteration"]) for row in whole], dtype=float), axis=0
+                np.array([_as_list(row["path_quality_iteration"]) for row in whole], dtype=float), axis=0
             )
             low, middle, high = np.quantile(values, [0.2, 0.5, 0.8], axis=0)
-            lines += [
-                {
-                    "problem": problem,
-                    "method": method,
-                    "quantity": quantity,
-                    "iteration": i,
-                    "value": m,
-                    "low": a,
-                    "high": b,
-                }
-                for i, m, a, b in zip(moments, middle, low, high, strict=True)
-            ]
+            lines += [(problem, method, quantity, *values) for values in zip(moments, middle, low, high, strict=True)]
     return pd.DataFrame(lines, columns=["problem", "method", "quantity", "iteration", "value", "low", "high"])
 
 
-def _listed(value: object) -> list[float]:
+def _as_list(value: object) -> list[float]:
     return list(value) if isinstance(value, list | tuple | np.ndarray) else []
 
 
-def rates(found: RunSet) -> pd.DataFrame:
-    """Return median score and its 20% to 80% range by problem, method and value of each tuned axis."""
+def scores_by_tuning(runs: RunSet) -> pd.DataFrame:
+    """Return the median score and its 20% to 80% range by problem, method and value of each tuned parameter."""
     lines = []
-    for axis in found.tuned:
-        known = found.rows[np.isfinite(found.rows[axis.column].astype(float))]
+    for axis in runs.tuned_axes:
+        known = runs.rows[np.isfinite(runs.rows[axis.column].astype(float))]
         for key, part in known.groupby(["problem", "method", axis.column], sort=False):
             low, middle, high = part["score"].fillna(0.0).quantile([0.2, 0.5, 0.8])
             lines.append({

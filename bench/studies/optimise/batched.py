@@ -1,4 +1,4 @@
-"""Searches that differ by seed only, side by side: one batch of rollouts where each alone would make its own."""
+"""Runs searches that differ by seed only together, so that each batch of rollouts serves all of them."""
 
 from __future__ import annotations
 
@@ -18,58 +18,64 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.grid import cells
 from bench.experiment.session import Session
 from bench.model import Problem
-from bench.studies.optimise.measure import OptimizerRun, known_optimum, measure, qualities, scene_class
+from bench.studies.optimise.search import (
+    OptimizerRun,
+    Settings,
+    gradient_quality,
+    known_optimum,
+    run_search,
+    scene_class,
+)
 
-Settings = Any
-"""The study, whose parameters say how to search."""
 Outcome = dict[str, Any] | BaseException
+"""The columns that a search returns, or the exception that it raises."""
 
 
 @dataclasses.dataclass
 class Request:
-    """A call that a search waits for, or how the search ended."""
+    """A call that a search waits for, or the outcome of a search that has ended."""
 
     function: str = ""
     theta: np.ndarray = dataclasses.field(default_factory=lambda: np.empty((0, 0)))
     w: np.ndarray = dataclasses.field(default_factory=lambda: np.empty((0, 0)))
-    ended: Outcome | None = None
+    outcome: Outcome | None = None
 
 
 class Lane(Problem):
-    """A problem for one of several searches: its calls wait until all searches have one, and are made together.
+    """The problem as one of several searches sees it: calls wait until every search has made one, then run as one batch.
 
-    A search runs in a thread of its own, but one at a time and in order, so that nothing depends on who is faster.
-    Trajectories and step Jacobians are computed lane by lane.
+    Each search has a thread of its own, but only one runs at a time and always in the same order, so that results do
+    not depend on scheduling. Trajectories and step Jacobians are computed per lane.
     """
 
     def __init__(self, inner: Problem, search: Callable[[Problem], dict[str, Any]]) -> None:
         super().__init__(inner.program)
         self._inner, self._search = inner, search
         self.device, self.provides = inner.device, inner.provides
-        self._asked: SimpleQueue[Request] = SimpleQueue()
+        self._requests: SimpleQueue[Request] = SimpleQueue()
         self._answers: SimpleQueue[np.ndarray | BaseException] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> Request:
         """Run the search to its first call."""
         self._thread.start()
-        return self._asked.get()
+        return self._requests.get()
 
-    def go_on(self, answer: np.ndarray | BaseException) -> Request:
-        """Run the search from the answer to its next call or its end."""
+    def resume(self, answer: np.ndarray | BaseException) -> Request:
+        """Answer the search's call and run it to its next call or its end."""
         self._answers.put(answer)
-        return self._asked.get()
+        return self._requests.get()
 
     def _run(self) -> None:
         try:
-            ended: Outcome = self._search(self)
+            outcome: Outcome = self._search(self)
         except BaseException as error:  # belongs to this seed's row
-            ended = error
-        self._asked.put(Request(ended=ended))
+            outcome = error
+        self._requests.put(Request(outcome=outcome))
 
-    def _ask(self, function: str, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def _call(self, function: str, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
-        self._asked.put(Request(function, np.broadcast_to(theta, (self.dim, w.shape[1])), w))
+        self._requests.put(Request(function, np.broadcast_to(theta, (self.dim, w.shape[1])), w))
         answer = self._answers.get()
         if isinstance(answer, BaseException):
             raise answer
@@ -78,22 +84,22 @@ class Lane(Problem):
     def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return costs, ``(B,)``."""
         self.usage.rollouts += w.shape[1]
-        return self._ask("value", theta, w)
+        return self._call("value", theta, w)
 
     def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return per-sample gradients, ``(d, B)``."""
         self.usage.gradients += w.shape[1]
-        return self._ask("grad", theta, w)
+        return self._call("grad", theta, w)
 
     def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return per-sample scores, ``(d, B)``."""
-        return self._ask("score", theta, w)
+        return self._call("score", theta, w)
 
     def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return per-sample derivatives by theta along every path but the actions, ``(d, B)``."""
         if self.program.explicit:
             self.usage.gradients += w.shape[1]
-        return self._ask("explicit", theta, w)
+        return self._call("explicit", theta, w)
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
         """Return the step Jacobians."""
@@ -106,37 +112,38 @@ class Lane(Problem):
     _value = _grad = _score = None  # type: ignore[assignment]
 
 
-def side_by_side(problem: Problem, searches: Sequence[Callable[[Problem], dict[str, Any]]]) -> list[Outcome]:
-    """Return what each search returns or raises; their calls to the problem are made together, round by round.
+def run_batched(problem: Problem, searches: Sequence[Callable[[Problem], dict[str, Any]]]) -> list[Outcome]:
+    """Run searches in lockstep and return their outcomes in order.
 
-    A round is one call of the problem per function asked for: of searches with the same optimizer, one per step of theirs.
+    A round makes one call of the problem per requested function. Searches with the same optimizer need one round per
+    call.
     """
     lanes = [Lane(problem, search) for search in searches]
-    asked = {lane: lane.start() for lane in lanes}
-    while waiting := [lane for lane in lanes if asked[lane].ended is None]:
-        for function in list(dict.fromkeys(asked[lane].function for lane in waiting)):
-            group = [lane for lane in waiting if asked[lane].function == function]
-            for lane, answer in zip(group, _together(problem, [asked[lane] for lane in group]), strict=True):
-                asked[lane] = lane.go_on(answer)
-            # those that went on may ask for the same again: they wait for the next round
+    requests = {lane: lane.start() for lane in lanes}
+    while waiting := [lane for lane in lanes if requests[lane].outcome is None]:
+        for function in list(dict.fromkeys(requests[lane].function for lane in waiting)):
+            group = [lane for lane in waiting if requests[lane].function == function]
+            for lane, answer in zip(group, _evaluate(problem, [requests[lane] for lane in group]), strict=True):
+                requests[lane] = lane.resume(answer)
+            # a resumed search may request the same function again: that call waits for the next round
             waiting = [lane for lane in waiting if lane not in group]
-    return [asked[lane].ended or {} for lane in lanes]
+    return [requests[lane].outcome or {} for lane in lanes]
 
 
-def _together(problem: Problem, requests: list[Request]) -> list[np.ndarray | BaseException]:
-    """Return the answers to calls of one function; where the joint call fails, each alone, so that one spoils no other."""
+def _evaluate(problem: Problem, requests: list[Request]) -> list[np.ndarray | BaseException]:
+    """Return the answers to requests of one function, from one call, or from one call each if that fails."""
     function = getattr(problem, requests[0].function)
     widths = [request.w.shape[1] for request in requests]
     try:
         with np.errstate(all="ignore"):
-            found = function(*(np.concatenate([getattr(r, n) for r in requests], axis=1) for n in ("theta", "w")))
+            values = function(*(np.concatenate([getattr(r, n) for r in requests], axis=1) for n in ("theta", "w")))
     except (StorageError, KeyboardInterrupt):
         raise
     except BaseException as error:
         if len(requests) == 1:
             return [error]
-        return list(itertools.chain.from_iterable(_together(problem, [request]) for request in requests))
-    return [np.ascontiguousarray(part) for part in np.split(found, np.cumsum(widths)[:-1], axis=-1)]
+        return list(itertools.chain.from_iterable(_evaluate(problem, [request]) for request in requests))
+    return [np.ascontiguousarray(part) for part in np.split(values, np.cumsum(widths)[:-1], axis=-1)]
 
 
 # ------------------------------------------------------------------------------------------------- cells of a study
@@ -144,7 +151,7 @@ def _together(problem: Problem, requests: list[Request]) -> list[np.ndarray | Ba
 
 @dataclasses.dataclass(frozen=True)
 class LaneSession:
-    """What :func:`measure` needs of a session: the experiment, and the lane as the problem."""
+    """A session for :func:`run_search` whose problem is a lane."""
 
     experiment: Experiment
     lane: Problem
@@ -154,57 +161,57 @@ class LaneSession:
         return self.lane
 
 
-_found: WeakKeyDictionary[Session, dict[str, Outcome]] = WeakKeyDictionary()
-"""By session and key, searches that have ended and whose cell has not been asked for yet."""
+_outcomes: WeakKeyDictionary[Session, dict[str, Outcome]] = WeakKeyDictionary()
+"""By session and key, outcomes of searches whose cells are measured later."""
 _groups: WeakKeyDictionary[Session, dict[str, list[Cell]]] = WeakKeyDictionary()
-"""By session and key without the seed, the cells that differ by it."""
+"""By session and key without the seed, the cells that differ by seed only."""
 
 
 def measure_batched(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
-    """Measure a cell together with those planned after it that differ by the seed only; these are then there when asked for."""
-    found = _found.setdefault(session, {})
-    if cell.key not in found:
-        found |= _search(_seeds(cell, session), session, settings)
-    outcome = found.pop(cell.key)
+    """Return the columns of a cell, and store those of later cells that differ by seed only until they are measured."""
+    outcomes = _outcomes.setdefault(session, {})
+    if cell.key not in outcomes:
+        outcomes |= _run_group(_seed_group(cell, session), session, settings)
+    outcome = outcomes.pop(cell.key)
     if isinstance(outcome, BaseException):
         raise outcome
     return outcome
 
 
-def _seeds(cell: Cell, session: Session) -> list[Cell]:
-    """Return the cell and those after it that differ by the seed only."""
+def _seed_group(cell: Cell, session: Session) -> list[Cell]:
+    """Return the cell and the cells planned after it that differ by seed only."""
     if session not in _groups:
         groups: dict[str, list[Cell]] = {}
         for other in cells(session.experiment):
             groups.setdefault(_without_seed(other), []).append(other)
         _groups[session] = groups
     group = _groups[session].get(_without_seed(cell), [])
-    place = next((i for i, other in enumerate(group) if other.key == cell.key), None)
-    return [cell] if place is None else list({other.key: other for other in group[place:]}.values())
+    index = next((i for i, other in enumerate(group) if other.key == cell.key), None)
+    return [cell] if index is None else list({other.key: other for other in group[index:]}.values())
 
 
 def _without_seed(cell: Cell) -> str:
     return dataclasses.replace(cell, seed=0).key
 
 
-def _search(group: list[Cell], session: Session, settings: Settings) -> dict[str, Outcome]:
+def _run_group(group: list[Cell], session: Session, settings: Settings) -> dict[str, Outcome]:
     problem = session.problem(group[0])
-    _prepare(group[0], problem, session, settings)
+    _fill_caches(group[0], problem, session, settings)
 
     def search(cell: Cell) -> Callable[[Problem], dict[str, Any]]:
-        return lambda lane: measure(cell, LaneSession(session.experiment, lane), settings)  # type: ignore[arg-type]
+        return lambda lane: run_search(cell, LaneSession(session.experiment, lane), settings)  # type: ignore[arg-type]
 
-    outcomes = side_by_side(problem, [search(cell) for cell in group])
+    outcomes = run_batched(problem, [search(cell) for cell in group])
     return {cell.key: outcome for cell, outcome in zip(group, outcomes, strict=True)}
 
 
-def _prepare(cell: Cell, problem: Problem, session: Session, settings: Settings) -> None:
-    """Compute once what does not depend on the seed, and is remembered; what fails here fails in each search again."""
+def _fill_caches(cell: Cell, problem: Problem, session: Session, settings: Settings) -> None:
+    """Compute cached values that do not depend on the seed. An error is ignored, since it recurs in each search."""
     try:
         known_optimum(cell, problem, session, settings)
         scene_class(cell, problem)
         if settings.quality != "none":
             theta0 = np.array(problem.program.theta0, dtype=np.float64)
-            qualities(OptimizerRun(cell, problem, settings), theta0, settings, ("start",))
+            gradient_quality(OptimizerRun(cell, problem, settings), theta0, settings)
     except (Unsupported, ArithmeticError, ValueError, TypeError):
         return

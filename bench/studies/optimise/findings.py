@@ -1,4 +1,4 @@
-"""What searches show, in sentences with their intervals; what they cannot tell is said as such."""
+"""Findings of the searches as sentences, with their intervals, and titles of the charts."""
 
 from __future__ import annotations
 
@@ -7,35 +7,35 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
+from bench.report.study_tables import interval
 from bench.report.text import counted, number
 from bench.studies.optimise import aggregate
 from bench.studies.optimise.aggregate import RunSet
 
 CHANCE = 0.05
-"""Chance above which an order may be random."""
-
+"""Chance of an order among random orders above which it counts as random."""
 FEW_SEEDS = 5
-"""Bootstrap intervals of fewer searches are too narrow: with two, half of the resamples are one search twice."""
+"""Fewest searches for a bootstrap interval. With two, half of the resamples are one search twice."""
 
 
-def sentences(found: RunSet, default: float) -> list[str]:
-    """Return the findings, the answer to the question first."""
-    if not len(found.rows):
+def sentences(runs: RunSet, default: float) -> list[str]:
+    """Return the findings, the answer to the study's question first."""
+    if not len(runs.rows):
         return ["No search gave a result: the table has the reason of each."]
-    summed = aggregate.summary(found, default)
-    said = [
-        pays(aggregate.correlations(aggregate.quality(found, default))),
-        ranking(summed),
-        tuning(summed),
-        stops(found),
+    summary = aggregate.summarise(runs, default)
+    findings = [
+        effect_of_error(aggregate.rank_correlations(aggregate.quality_and_runtime(runs, default))),
+        ranking(summary),
+        tuning(summary),
+        divergence(runs),
     ]
-    return [sentence for sentence in said if sentence]
+    return [sentence for sentence in findings if sentence]
 
 
-def pays(rho: pd.DataFrame) -> str:
-    """Say for each class of scene whether the smaller error arrives sooner: yes, no, or not known."""
+def effect_of_error(rho: pd.DataFrame) -> str:
+    """Write for each class of scenes whether the smaller gradient error reaches the target sooner."""
     if rho.empty:
-        return "Whether a better gradient pays is not known: no search has a gradient whose quality was measured."
+        return "Whether a better gradient pays is not known: no gradient's quality was measured."
     parts = []
     for row in rho[rho["scene_class"] != "all"].to_dict("records"):
         if math.isnan(row["rho"]) or row["points"] < 4:
@@ -44,100 +44,104 @@ def pays(rho: pd.DataFrame) -> str:
         figures = f"rho {row['rho']:.2f} [{row['rho_low']:.2f}, {row['rho_high']:.2f}], {row['points']} points"
         if row["chance"] > CHANCE:
             parts.append(
-                f"{row['scene_class']}: not known ({figures}; random order does as well {row['chance']:.0%} of the time)"
+                f"{row['scene_class']}: not known ({figures}; a random order is as good {row['chance']:.0%} of the time)"
             )
         elif row["rho_low"] > 0:
             parts.append(f"{row['scene_class']}: yes ({figures})")
         elif row["rho_high"] < 0:
-            parts.append(f"{row['scene_class']}: no, the reverse ({figures})")
+            parts.append(f"{row['scene_class']}: no, later ({figures})")
         else:
             parts.append(f"{row['scene_class']}: not known ({figures})")
-    return "Does the gradient with the smaller error at the start arrive sooner? " + "; ".join(parts) + "."
+    return "Does the gradient with the smaller error at the start reach the target sooner? " + "; ".join(parts) + "."
 
 
-def sooner(rho: pd.DataFrame) -> str:
-    """Write in a title on which classes of scenes the smaller error arrives sooner."""
+def effect_title(rho: pd.DataFrame) -> str:
+    """Write the title of quality against runtime: the classes of scenes where the smaller error is sooner or later."""
     classes = rho[rho["scene_class"] != "all"].to_dict("records")
     known = [row for row in classes if row["points"] >= 4 and row["chance"] <= CHANCE]
     sure = {
         "sooner": [row["scene_class"] for row in known if row["rho_low"] > 0],
         "later": [row["scene_class"] for row in known if row["rho_high"] < 0],
     }
-    said = [f"the better gradient arrives {when} on {' and '.join(on)} scenes" for when, on in sure.items() if on]
+    parts = [
+        f"the better gradient reaches the target {when} on {' and '.join(on)} scenes" for when, on in sure.items() if on
+    ]
     unsure = [row["scene_class"] for row in classes if row["scene_class"] not in (*sure["sooner"], *sure["later"])]
-    said += [f"not known on {', '.join(unsure)} scenes"] if unsure else []
-    text = "; ".join(said)
-    return (
-        text[:1].upper() + text[1:] if any(sure.values()) else f"Whether the better gradient arrives sooner is {text}"
-    )
+    parts += [f"not known on {', '.join(unsure)} scenes"] if unsure else []
+    text = "; ".join(parts)
+    if not any(sure.values()):
+        return f"Whether the better gradient reaches the target sooner is {text}"
+    return text[:1].upper() + text[1:]
 
 
-def closest(summed: pd.DataFrame) -> str:
-    """Write in a title which method comes closest to J*, and which first of those with gradients."""
-    known = summed[summed["score"].notna()].sort_values("score", ascending=False)
-    return _first([(row["method"], number(row["score"], 3)) for row in known.to_dict("records")], "the best score")
+def score_title(summary: pd.DataFrame) -> str:
+    """Write the title of the paths: the method with the best score, and the best one that uses gradients."""
+    known = summary[summary["score"].notna()].sort_values("score", ascending=False)
+    return _best("Best score", [(row["method"], number(row["score"], 3)) for row in known.to_dict("records")])
 
 
-def reaches(shares: Mapping[str, float]) -> str:
-    """Write in a title which method reaches most targets, and which first of those with gradients."""
+def targets_title(shares: Mapping[str, float]) -> str:
+    """Write the title of targets reached: the method with the largest share, and the best one that uses gradients."""
     order = sorted(shares.items(), key=lambda item: -item[1])
-    return _first([(name, f"{share:.0%}") for name, share in order], "most targets reached")
+    return _best("Most targets reached", [(name, f"{share:.0%}") for name, share in order])
 
 
-def _first(order: Sequence[tuple[str, str]], what: str) -> str:
+def _best(heading: str, order: Sequence[tuple[str, str]]) -> str:
+    """Write the methods that share the first figure and, if none of them uses gradients, the first one that does."""
     if not order:
-        return "No method got anywhere"
+        return "No method has a score"
     figure = order[0][1]
     level = [name for name, value in order if value == figure]
-    said = f"{what[:1].upper()}{what[1:]}: {' and '.join(level)} ({figure})"
-    if not any(", " in name for name in level):  # they look at costs only
+    text = f"{heading}: {' and '.join(level)} ({figure})"
+    if not any(", " in name for name in level):  # names without a comma have no estimator
         following = next(((name, value) for name, value in order if ", " in name), None)
-        said += f"; with gradients {following[0]} ({following[1]})" if following else ""
-    return said
+        text += f"; with gradients {following[0]} ({following[1]})" if following else ""
+    return text
 
 
-def moved(lines: pd.DataFrame) -> str:
-    """Write in a title where the tuning alone moves a method most."""
+def tuning_title(lines: pd.DataFrame) -> str:
+    """Write the title of scores by tuning: the method and problem whose score changes most."""
     spread = lines.groupby(["method", "problem"], sort=False)["score"].agg(["min", "max"])
     far = (spread["max"] - spread["min"]).sort_values(ascending=False)
     method, problem = far.index[0]
     low, high = spread.loc[far.index[0]]
-    return f"Tuning alone moves {method} from {number(low, 2)} to {number(high, 2)} on {str(problem).partition(',')[0]}"
+    scene = str(problem).partition(",")[0]
+    return f"Tuning alone changes the score of {method} from {number(low, 2)} to {number(high, 2)} on {scene}"
 
 
-def ranking(summed: pd.DataFrame) -> str:
-    """Say which method has the best score, and which cannot be distinguished from it."""
-    known = summed[summed["score"].notna()].sort_values("score", ascending=False)
+def ranking(summary: pd.DataFrame) -> str:
+    """Write which method has the best score, and which methods cannot be distinguished from it."""
+    known = summary[summary["score"].notna()].sort_values("score", ascending=False)
     if known.empty:
         return ""
     first = known.iloc[0]
-    text = f"Best score: {first['method']} with {number(first['score'], 3)} [{number(first['score_low'], 3)}, {number(first['score_high'], 3)}]"
+    text = f"Best score: {first['method']} with {interval(first, 'score', digits=3)}"
     if known["searches"].sum() < FEW_SEEDS * known["problems"].sum():
         text += f" (fewer than {FEW_SEEDS} seeds: the intervals are too narrow)"
     level = known.iloc[1:][known.iloc[1:]["score_high"] >= first["score_low"]]["method"]
     return text + (
-        f"; not distinguishable from it: {', '.join(level)}." if len(level) else "; no other interval reaches it."
+        f"; not distinguishable from it: {', '.join(level)}." if len(level) else "; no other interval overlaps it."
     )
 
 
-def tuning(summed: pd.DataFrame) -> str:
-    """Say how far the tuning alone moves a method, beside how far the methods are apart."""
-    tuned = summed[(summed["tunings"] > 1) & summed["score"].notna()]
+def tuning(summary: pd.DataFrame) -> str:
+    """Write by how much tuning alone changes a score, next to the range of the methods' best scores."""
+    tuned = summary[(summary["tunings"] > 1) & summary["score"].notna()]
     if tuned.empty:
-        return "Nothing was tuned: a comparison at one rate is one of rates as much as of gradients."
-    lost = (tuned["score"] - tuned["median_score"]).max()
-    worst = tuned.loc[(tuned["score"] - tuned["median_score"]).idxmax()]
-    apart = summed["score"].max() - summed["score"].min()
+        return "Nothing was tuned: a comparison at one learning rate compares rates as much as gradients."
+    change = tuned["score"] - tuned["median_score"]
+    worst = tuned.loc[change.idxmax()]
+    spread = summary["score"].max() - summary["score"].min()
     return (
-        f"Tuning alone moves the score of {worst['method']} by {number(lost)} (best of {worst['tunings']} against their "
-        f"median), the methods at their best are {number(apart)} apart."
+        f"Tuning alone changes the score of {worst['method']} by {number(change.max())} (best of {worst['tunings']} "
+        f"tunings minus their median); the methods' best scores span {number(spread)}."
     )
 
 
-def stops(found: RunSet) -> str:
-    """Say how many searches diverged."""
-    lost = found.rows[found.rows["stopped"] == "diverged"]
-    if lost.empty:
+def divergence(runs: RunSet) -> str:
+    """Write how many searches diverged, by method."""
+    diverged = runs.rows[runs.rows["stopped"] == "diverged"]
+    if diverged.empty:
         return "No search diverged."
-    by = ", ".join(f"{name} {count}" for name, count in lost["method"].value_counts().items())
-    return f"Of {counted(len(found.rows), 'search', 'searches')} {len(lost)} diverged: {by}."
+    by = ", ".join(f"{name} {count}" for name, count in diverged["method"].value_counts().items())
+    return f"{len(diverged)} of {counted(len(runs.rows), 'search', 'searches')} diverged: {by}."
