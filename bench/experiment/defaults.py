@@ -1,0 +1,123 @@
+"""Fills in parameters that stored rows lack, so that a parameter added with a default orphans no row.
+
+A stored row keeps every parameter of its plugins and of its study as JSON. Where a plugin has gained a parameter since,
+the row was made with that parameter's present default. Whatever compares, groups or shows rows by their parameters reads
+them through :func:`completed`, :func:`completed_json` or :func:`completed_rows`: ``compare``, ``plan``, ``report``,
+``index`` and :func:`bench.load`. :func:`missing_parameters` names what was filled in, for messages.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.experiment.experiment import Budget
+from bench.model import Decision, Plugin, registry
+from bench.model.parameters import parameters, singular
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RECORDS = {"theta": Decision, "reference": Budget}
+"""Entries of a row's parameters that are dataclasses of the harness instead of plugins."""
+
+
+def completed(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row's parameters with today's defaults where a plugin, the study, theta or the reference lacks one.
+
+    Parameters stand in the order in which they are declared today. Those that are no longer declared follow, and a
+    plugin that is not installed keeps the parameters it has. Rows without parameters have none afterwards.
+    """
+    if not given:
+        return {}
+    result = {axis: _with_defaults(part, defaults_of(axis, given)) for axis, part in given.items()}
+    records = {name: result.pop(name, None) for name in RECORDS}
+    return result | records
+
+
+def missing_parameters(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters that :func:`completed` fills in, with their values: ``{"pushing.hold": 1}``."""
+    return {
+        f"{part.get('name', axis)}.{name}": value
+        for axis, part in given.items()
+        if isinstance(part, Mapping)
+        for name, value in defaults_of(axis, given).items()
+        if name not in part
+    }
+
+
+def completed_json(text: str) -> str:
+    """Return the JSON of :func:`completed` parameters, written as new rows have it; text that is not JSON as it is."""
+    return _completed_json(text, registry.folders())
+
+
+@lru_cache(maxsize=50_000)
+def _completed_json(text: str, folders: tuple[Path, ...]) -> str:
+    """Complete JSON, once per text and set of plugin ``folders``, since a folder that is added may bring a plugin."""
+    try:
+        given = json.loads(text)
+    except (TypeError, ValueError):
+        return text
+    if not isinstance(given, dict) or not given:
+        return text
+    return json.dumps(completed(given), separators=(",", ":"))
+
+
+def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows whose column ``parameters`` is completed, so that rows stored before and after a change are alike."""
+    return rows.assign(parameters=rows["parameters"].map(completed_json)) if "parameters" in rows else rows
+
+
+def defaults_of(axis: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return today's defaults of the entry that stands at ``axis`` of a row's parameters, as JSON-like values.
+
+    The scene's own values of contact parameters take precedence over the contact law's. Parameters without a default
+    are left out. There are none where the entry is empty or its plugin is not installed.
+    """
+    part = given.get(axis)
+    if not isinstance(part, Mapping):
+        return {}
+    if axis in RECORDS:
+        return {name: _json_value(value) for name, value in dataclasses.asdict(RECORDS[axis]()).items()}
+    plugin = _plugin_class(axis, part)
+    if plugin is None:
+        return {}
+    values = {
+        name: parameter.default
+        for name, parameter in parameters(plugin).items()
+        if parameter.default is not dataclasses.MISSING
+    }
+    if axis == "contact":
+        of_scene = getattr(_plugin_class("scene", given.get("scene")), "contact_values", {})
+        values |= {name: value for name, value in of_scene.items() if name in values}
+    return {name: _json_value(value) for name, value in values.items()}
+
+
+def _plugin_class(axis: str, part: Any) -> type[Plugin] | None:
+    kind = next((kind for kind in registry.kinds() if singular(kind) == axis), "")
+    name = part.get("name") if isinstance(part, Mapping) else None
+    entry = registry.entries().get(kind, {}).get(str(name))
+    return entry.plugin if entry is not None else None
+
+
+def _with_defaults(part: Any, defaults: Mapping[str, Any]) -> Any:
+    """Return an entry with its name first, then declared parameters in their order, then all others."""
+    if not isinstance(part, Mapping):
+        return part
+    first = {"name": part["name"]} if "name" in part else {}
+    return (
+        first
+        | {name: part.get(name, value) for name, value in defaults.items()}
+        | {name: value for name, value in part.items() if name not in first and name not in defaults}
+    )
+
+
+def _json_value(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return list(value)
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
