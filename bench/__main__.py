@@ -18,8 +18,8 @@ def command() -> None:
     except Exception:  # a fault of this package: told in full, and the command ends all the same
         traceback.print_exc()
         status = 1
-    guard.end_copies(own)
-    guard.end_children()
+    guard.exit_if_forked(own)
+    guard.kill_children()
     if any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread()):
         # a thread that a plugin left running must not keep the finished command waiting
         atexit._run_exitfuncs()

@@ -1,10 +1,11 @@
-"""Names of the last version that still work for one version, each with a DeprecationWarning that gives the new name."""
+"""Old names that keep working for one version. Each use raises a DeprecationWarning that gives the new name."""
 
 from __future__ import annotations
 
 import importlib
 import importlib.abc
 import importlib.machinery
+import importlib.util
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -15,8 +16,9 @@ NAMES = {
     "GustyScene": "ProcessNoiseScene",
     "HeldScene": "ZeroOrderHoldScene",
     "Judged": "ComparisonRule",
+    "simulator_of": "load_simulator",
 }
-"""Public classes: old names and new ones."""
+"""Public classes and functions: old names and new ones."""
 MEMBERS = {
     "leaves_out": "neglected_effects",
     "across_jumps": "unbiased_at_discontinuities",
@@ -25,65 +27,120 @@ MEMBERS = {
     "explained": "estimate_with_diagnostics",
     "refuses": "unsupported_reason",
     "lacks": "incompatibility",
+    "wants": "required_fields",
 }
 """Members of plugins: old names and new ones."""
 MODULES = {
-    "bench.face": "bench.api",
-    "bench.simulator": "bench.model.simulator",
-    **{
-        f"bench.sweep.{name}": f"bench.experiment.{name}"
-        for name in ("axes", "cell", "columns", "config", "experiment", "grid", "session", "study")
-    },
-    **{f"bench.sweep.{name}": f"bench.run.{name}" for name in ("execute", "files", "plan", "references", "store")},
-    "bench.sweep": "bench.experiment",
+    "bench.face": ("bench.api",),
+    "bench.model.known": ("bench.model.known_solutions",),
+    "bench.model.loaded": ("bench.model.simulator.imports",),
+    "bench.simulator.columns": ("bench.model.simulator.simulator",),
+    "bench.simulator.layout": ("bench.model.simulator.tree",),
+    "bench.simulator.source": ("bench.model.simulator.imports",),
+    "bench.simulator": ("bench.model.simulator",),
+    "bench.sweep.guardian": ("bench.run.reaper",),
+    "bench.sweep.workers": ("bench.run.pool",),
+    "bench.sweep": ("bench.experiment", "bench.run"),
 }
-"""Modules: old names and new ones."""
+"""Modules and packages: old names, and the new ones in which their content is looked up in turn."""
 
 
 def warn(old: str, new: str, level: int = 3) -> None:
-    """Warn that a name will go with the next version."""
-    warnings.warn(f"{old} is now called {new}; the old name goes with the next version", DeprecationWarning, level)
+    """Warn that a name will be removed in the next version."""
+    warnings.warn(
+        f"{old} is now called {new}; the old name will be removed in the next version", DeprecationWarning, level
+    )
 
 
-def lookup(module: str, space: Mapping[str, Any]) -> Callable[[str], Any]:
-    """Return a module's ``__getattr__`` that finds the public classes by their old names."""
+def lookup(module: str, namespace: Mapping[str, Any]) -> Callable[[str], Any]:
+    """Return a ``__getattr__`` for a module that resolves the old names of public classes and functions."""
 
-    def find(name: str) -> Any:
-        if name not in NAMES or NAMES[name] not in space:
+    def resolve(name: str) -> Any:
+        if name not in NAMES or NAMES[name] not in namespace:
             raise AttributeError(f"module '{module}' has no attribute '{name}'")
         warn(f"{module}.{name}", NAMES[name])
-        return space[NAMES[name]]
+        return namespace[NAMES[name]]
 
-    return find
+    return resolve
+
+
+class Alias:
+    """A class's member under its old name. A subclass that calls ``super().old`` gets the member of this class."""
+
+    def __init__(self, old: str, new: str, member: Any) -> None:
+        self.old, self.new, self.member = old, new, member
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        warn(f"{owner.__name__}.{self.old}", self.new)
+        bind = getattr(type(self.member), "__get__", None)
+        return self.member if bind is None else bind(self.member, instance, owner)
 
 
 def rename_members(plugin: type) -> None:
-    """Give a plugin class that defines a member under its old name the same member under the new one."""
+    """Connect the old and new names of a plugin class's members.
+
+    A member that the class, or a mixin of it, defines under an old name is also defined under the new one. A member
+    that the class defines under a new name can still be used under the old one.
+    """
     for old, new in MEMBERS.items():
-        if old in vars(plugin) and new not in vars(plugin) and hasattr(plugin, new):
-            warn(f"{plugin.__name__}.{old}", new, 4)
-            setattr(plugin, new, vars(plugin)[old])
+        if not hasattr(plugin, new):
+            continue
+        for base in plugin.__mro__:
+            if new in vars(base):
+                break
+            if old in vars(base) and not isinstance(vars(base)[old], Alias):
+                _warn_at(plugin, old, new)
+                setattr(plugin, new, vars(base)[old])
+                break
+        if new in vars(plugin):
+            setattr(plugin, old, Alias(old, new, vars(plugin)[new]))
 
 
-class _Renamed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Imports a renamed module under its old name."""
+def _warn_at(plugin: type, old: str, new: str) -> None:
+    """Warn at the statement that defines the class: the first caller outside the ``__init_subclass__`` chain."""
+    frame, level = sys._getframe(2), 4
+    while frame.f_back is not None and frame.f_code.co_name in ("__init_subclass__", "__new__"):
+        frame, level = frame.f_back, level + 1
+    warn(f"{plugin.__name__}.{old}", new, level)
+
+
+class _OldModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Imports renamed modules under their old names."""
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """Return a spec for an old name."""
-        return importlib.machinery.ModuleSpec(name, self, is_package=True) if name in MODULES else None
+        """Return a spec for an old name, with the file of the new module; None for any other name."""
+        new = _new_module(name)
+        if new is None:
+            return None
+        return importlib.machinery.ModuleSpec(name, self, origin=new.origin, loader_state=new.name, is_package=True)
 
     def create_module(self, spec: importlib.machinery.ModuleSpec) -> None:
-        """Let Python make an empty module, which :meth:`exec_module` replaces."""
+        """Let Python create an empty module, which :meth:`exec_module` replaces."""
 
     def exec_module(self, module: ModuleType) -> None:
-        """Put the module of the new name in the place of the old one."""
-        warn(module.__name__, MODULES[module.__name__])
-        sys.modules[module.__name__] = importlib.import_module(MODULES[module.__name__])
+        """Replace the empty module by the module of the new name."""
+        assert module.__spec__ is not None
+        new = module.__spec__.loader_state
+        warn(module.__name__, new)
+        sys.modules[module.__name__] = importlib.import_module(new)
+
+
+def _new_module(name: str) -> importlib.machinery.ModuleSpec | None:
+    """Return the spec of the module that replaces the one of an old name, or None."""
+    old = name
+    while old and old not in MODULES:
+        old = old.rpartition(".")[0]
+    for package in MODULES.get(old, ()):
+        spec = importlib.util.find_spec(package + name.removeprefix(old))
+        if spec is not None:
+            return spec
+    return None
 
 
 def install() -> None:
     """Make renamed modules importable under their old names."""
-    if not any(isinstance(finder, _Renamed) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _Renamed())  # first: the path of the new package would find its modules again
+    if not any(isinstance(finder, _OldModules) for finder in sys.meta_path):
+        # before the standard finders, which would load the modules of the new package a second time
+        sys.meta_path.insert(0, _OldModules())

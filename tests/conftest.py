@@ -52,7 +52,7 @@ def backend(request):
 @pytest.fixture(autouse=True)
 def untried(monkeypatch):
     """Plugin files are imported without a trial in a process of their own; tests of the trial replace this fixture."""
-    monkeypatch.setattr(trial, "fatal", lambda *_: {})
+    monkeypatch.setattr(trial, "find_fatal_modules", lambda *_: {})
 
 
 @pytest.fixture(autouse=True)

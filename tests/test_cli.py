@@ -101,7 +101,7 @@ def test_unsupported_combinations_are_rows(tmp_path):
     assert sorted(table["status"]) == ["ok", "ok", "unsupported", "unsupported"]
     reasons = " ".join(table["reason"].dropna())
     assert "numpy has no root finder" in reasons
-    assert "explicit_euler has no place for the impulses" in reasons
+    assert "explicit_euler cannot apply the impulses" in reasons
 
 
 @pytest.mark.parametrize("value", ["[fobg,reinforce[baseline=none]]", "[fobg,'reinforce[baseline=none]']"])

@@ -121,7 +121,7 @@ def references(settings: Mapping[str, Any], quick: bool) -> Iterator[SpeedRow]:
         other.threads = 1  # as the loop: two threads may share a core
     for count in sizes:
         w = batch(compiled, count)
-        columns = blocks.size(count, NATIVE_COLUMNS, native.LANES, 1)
+        columns = blocks.block_size(count, NATIVE_COLUMNS, native.LANES, 1)
 
         call = partial(blocks.evaluate, kernel, theta[:, None], w, columns, 1, (compiled.dim,))
         line = timed(f"native C kernel, one thread, {count:g} rollouts", call, count)

@@ -49,7 +49,7 @@ def search(optimizer: Optimizer, watch: Watcher | None = None, steps: int = STEP
         require(np.isfinite(points).all(), f"asks about points that are not finite at step {i}")
         if watch is not None:
             state = watch(i, state, points)
-        state = optimizer.tell(state, points, answer(points, optimizer.wants(state)))
+        state = optimizer.tell(state, points, answer(points, optimizer.required_fields(state)))
         require(np.shape(state["theta"]) == (DIM,), f"theta is {np.shape(state['theta'])}, not ({DIM},)")
         path.append(state["theta"])
     return state, path
@@ -61,7 +61,7 @@ def needs_are_declared(optimizer: Optimizer) -> str:
     wanted: set[str] = set()
 
     def note(step: int, state: dict[str, Any], points: np.ndarray) -> dict[str, Any]:
-        wanted.update(optimizer.wants(state))
+        wanted.update(optimizer.required_fields(state))
         return state
 
     require(optimizer.needs <= WANTED, f"needs {sorted(optimizer.needs - WANTED)}, which no answer has")

@@ -33,8 +33,8 @@ def run(words: Sequence[str]) -> Report:
                 raise unknown("setting of examine", key, SETTINGS)
             settings[key] = value
     file = places[0].rpartition(":")[0]
-    cost = imports.attribute(places[0])
-    module = imports.load(file)
+    cost = imports.load_attribute(places[0])
+    module = imports.load_module(file)
     report = examine(
         cost,
         _theta(settings.get("theta", "theta"), module, "theta" in settings),
@@ -82,7 +82,7 @@ def _theta(text: str, module: Any, given: bool) -> Any:
     if re.fullmatch(r"[A-Za-z_][\w.]*", text):
         if not given and not hasattr(module, text):
             raise UserError("say where to examine: theta=1,0, or define theta in the file")
-        found = imports.attribute(text, module)
+        found = imports.load_attribute(text, module)
         return found() if callable(found) else found
     pairs = re.findall(r"([A-Za-z_]\w*):([^,]+)", text)
     if pairs and len(pairs) == text.count(",") + 1:
@@ -96,4 +96,4 @@ def _gradient(text: str | None, module: Any) -> Any:
     if ":" not in text and not hasattr(module, text):
         names = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
         raise unknown("grad", text, (*LIBRARIES, *names))
-    return imports.attribute(text, module)
+    return imports.load_attribute(text, module)

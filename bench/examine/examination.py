@@ -15,7 +15,7 @@ from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
 from bench.examine.report import Report
 from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, smoothed
 from bench.measure.gradcheck import EPS, Check, Options, check
-from bench.model.simulator.clock import Clock, OutOfTime, seconds
+from bench.model.simulator.clock import Clock, OutOfTime, parse_duration
 from bench.model.simulator.simulator import Simulator
 from bench.model.simulator.tree import ParameterTree
 
@@ -80,13 +80,13 @@ def examine(
     >>> report.status, report.cause
     (0, 'smooth')
     """
-    clock = Clock(seconds(budget), progress)
+    clock = Clock(parse_duration(budget), progress)
     levels = _levels(sigma)
     if not isinstance(noise, int | np.integer) or noise < 0:
         raise UserError(f"noise={noise} is the length of w in cost(theta, w), a whole number")
     layout = ParameterTree(theta)
     scales = layout.scales() if scale is None else _scales(layout, scale)
-    clock.stage("first call")
+    clock.start_stage("first call")
     try:
         simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
     except OutOfTime:
@@ -95,7 +95,7 @@ def examine(
     try:
         return _Examination(simulator, layout, scales, levels, clock, seed, name or _called(cost)).run(_called(grad))
     finally:
-        clock.clear()
+        clock.clear_progress()
 
 
 def _levels(sigma: float | Sequence[float]) -> list[float]:
@@ -110,7 +110,7 @@ def _levels(sigma: float | Sequence[float]) -> list[float]:
 
 def _scales(layout: ParameterTree, scale: Any) -> np.ndarray:
     given = (
-        np.full(layout.vector.size, float(scale)) if isinstance(scale, int | float) else layout.take(scale, "scale")
+        np.full(layout.vector.size, float(scale)) if isinstance(scale, int | float) else layout.flatten(scale, "scale")
     ).astype(np.float64)
     if not (np.isfinite(given).all() and (given > 0).all()):
         raise UserError("scale has the size of each input: numbers above 0")
@@ -198,7 +198,7 @@ class _Examination:
 
     def _repeated(self) -> tuple[float, float]:
         """Return the cost at theta, and by how much equal calls differ; another theta stands between them."""
-        self.clock.stage("repeating a call")
+        self.clock.start_stage("repeating a call")
         other = self.theta + 1e-3 * self.scale
         values: list[float] = []
         try:
@@ -215,7 +215,7 @@ class _Examination:
     def _gradient_comes(self) -> bool:
         """Ask for the gradient twice, the second time to see how long it takes; return whether it came."""
         if self.simulator.has_gradient:
-            self.clock.stage("first gradient")
+            self.clock.start_stage("first gradient")
             try:
                 for _ in range(2):
                     self.simulator.gradients(self.theta[:, None], self.w)
@@ -250,7 +250,7 @@ class _Examination:
             # what a wrong gradient asks for besides: scans, ratios at other thetas, and a look at thetas farther away
             calls += effort.scanned * SCAN + effort.draws * POINTS_EACH
             calls += min(effort.draws, 4) * min(effort.components, self.theta.size) * POINTS_EACH // 2
-            if calls * each + (3 * effort.draws + 3) * slope < SHARES["check"] * self.clock.left:
+            if calls * each + (3 * effort.draws + 3) * slope < SHARES["check"] * self.clock.remaining:
                 break
         else:
             effort = EFFORTS[-1]
@@ -260,16 +260,16 @@ class _Examination:
         return replace(effort, scale=self.scale, unit=self.simulator.unit, seed=self.seed)
 
     def _checked(self) -> Check | None:
-        self.clock.stage("checking the gradient")
+        self.clock.start_stage("checking the gradient")
         options = self._options()
         for attempt in (options, replace(options, components=0, draws=0, directions=1, eps=EPS[::2], scanned=0)):
-            self.clock.allow(SHARES["check"] if attempt is options else 1.0)
+            self.clock.limit(SHARES["check"] if attempt is options else 1.0)
             try:
                 return self._one_check(attempt)
             except OutOfTime:
                 continue
             finally:
-                self.clock.allow(1.0)
+                self.clock.limit(1.0)
         self.left_out.append("the gradient check")
         return None
 
@@ -287,22 +287,22 @@ class _Examination:
             return []
         found = []
         options = replace(EFFORTS[0], components=0, draws=0, scale=self.scale, unit=self.simulator.unit, seed=self.seed)
-        self.clock.allow(SHARES["again"])
+        self.clock.limit(SHARES["again"])
         try:
             for _ in range(OTHER_NOISE):
                 found.append(self._one_check(options, self.random.standard_normal((self.simulator.noise, 1))))
         except OutOfTime:
             self.left_out.append("checks under other noise")
-        self.clock.allow(1.0)
+        self.clock.limit(1.0)
         return found
 
     def _lines(self, checked: Check | None) -> list[LineScan]:
         """Scan the cost for jumps and kinks along random directions."""
-        self.clock.stage("scanning lines")
+        self.clock.start_stage("scanning lines")
         spread = self.scale * RELATIVE if not self.levels else np.full(self.theta.size, max(self.levels))
         along = directions(2, spread, self.seed)
         each = self.clock.per_cost()
-        room = SHARES["lines"] * self.clock.left / len(along) / each if each > 0 else math.inf
+        room = SHARES["lines"] * self.clock.remaining / len(along) / each if each > 0 else math.inf
         for most, halvings in LOOKS:
             points = int(min(POINTS, room - 2 * most * halvings))
             if points >= FEWEST_POINTS:
@@ -314,7 +314,7 @@ class _Examination:
             self.left_out.append(f"fine lines: {points} points instead of {POINTS}, and {most} places looked at")
         found = []
         measured = checked.noise if checked is not None and math.isfinite(checked.noise) else 0.0
-        self.clock.allow(2 * SHARES["lines"])
+        self.clock.limit(2 * SHARES["lines"])
         try:
             for direction in along:
                 size = float(np.abs(self._costs(self.theta[:, None])).max())
@@ -323,7 +323,7 @@ class _Examination:
                 found.append(replace(line, missed=self._missed(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
-        self.clock.allow(1.0)
+        self.clock.limit(1.0)
         return found
 
     def _missed(self, line: LineScan, checked: Check | None) -> float:
@@ -360,11 +360,11 @@ class _Examination:
             plain = checked.gradient if self.simulator.has_gradient else None
         found = []
         for index, level in enumerate(levels):
-            self.clock.stage(f"noise of sigma {level:g}")
-            self.clock.allow(1.0 / (len(levels) - index))
+            self.clock.start_stage(f"noise of sigma {level:g}")
+            self.clock.limit(1.0 / (len(levels) - index))
             pairs = min(PAIRS, max(FEWEST, HELD // self.theta.size))
             one = smoothed(self.simulator, self.theta, level, scale, plain, self.clock, self.seed, pairs)
-            self.clock.allow(1.0)
+            self.clock.limit(1.0)
             if one is None:
                 self.left_out.append(f"noise of sigma {level:g}")
             else:

@@ -394,6 +394,6 @@ def _choice(kind: str, text: Any) -> Choice:
     entry = registry.find(kind, name)
     if entry.plugin is not None:
         # a plugin that leaves the working folder would take relative paths with it
-        with guard.quiet(f"{singular(kind)} {name}"), guard.guarded():
+        with guard.capture_output(f"{singular(kind)} {name}"), guard.protect_process():
             build(entry.plugin, values)
     return Choice(entry, tuple(sorted(values.items())))

@@ -1,12 +1,12 @@
 """The contracts between the parts: everything that plugin authors import.
 
-A plugin is a frozen dataclass. Its fields are its parameters, declared with :func:`param` (default, meaning, unit, bounds);
-its class variables are facts about it that the conformance kit verifies.
+A plugin is a frozen dataclass. Its fields are its parameters, declared with :func:`param` (default, meaning, unit, bounds).
+Its class variables declare its properties, which the conformance kit verifies.
 
 Arrays are component-first and batch-last: generalised positions ``q (n_q, B)``, velocities ``v (n_v, B)``, controls
-``(m, B)``, ``theta (d, B)``, noise ``w (n_w, B)``, costs ``(B,)``. Scenes, contact laws and integrators are written once,
-against the array namespace ``ops.xp`` of whichever backend runs them. A parameter annotated ``float`` may be a traced value,
-so never branch on it in Python; every other type is static.
+``(m, B)``, ``theta (d, B)``, noise ``w (n_w, B)``, costs ``(B,)``. Scenes, contact laws and integrators are written once
+and use the array namespace ``ops.xp`` of the backend that runs them. A parameter annotated ``float`` may be a traced value,
+so Python code must not branch on it. All other types are static.
 """
 
 from bench import deprecated
@@ -31,7 +31,6 @@ from bench.model.estimator import (
 )
 from bench.model.integrator import Integrator
 from bench.model.known_solutions import Identified, KnownOptimum, KnownValue
-from bench.model.loaded import simulator_files, simulator_of
 from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
@@ -61,6 +60,7 @@ from bench.model.scene import (
     Scene,
     ZeroOrderHoldScene,
 )
+from bench.model.simulator import load_simulator, simulator_files
 
 __all__ = [
     "SURROGATE",
@@ -121,11 +121,11 @@ __all__ = [
     "cores",
     "first_order",
     "halves",
+    "load_simulator",
     "param",
     "per_repeat",
     "rollout",
     "simulator_files",
-    "simulator_of",
     "slopes",
     "stopped",
     "zeroth_order",

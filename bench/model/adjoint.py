@@ -1,4 +1,4 @@
-"""The adjoint of a rollout step by step: gradients that a caller may cut, and replace by the slope of a value."""
+"""The adjoint of a rollout, step by step. A caller may modify it between steps, for example to truncate the gradient."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from bench.model.ops import LoopOps, State
 from bench.model.problem import Jacobians, Problem
 from bench.model.program import Program, Rollout, rollout
 
-DIFFERENCE = 1e-6
-"""Step of central differences, relative to the size of a number and at least this: error about 1e-10."""
+DIFFERENCE_STEP = 1e-6
+"""Step of central differences, relative to the size of a number or to 1 if that is larger: error about 1e-10."""
 
 Cut = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
-"""Return the adjoint ``(n, B)`` that goes on backwards from step t >= 1, given t, the state there and its adjoint."""
+"""Return the adjoint ``(n, B)`` to propagate backwards from step t >= 1, given t, the state at t and its adjoint."""
 
 
 class Slopes(NamedTuple):
@@ -24,38 +24,38 @@ class Slopes(NamedTuple):
     states: np.ndarray
     """``(T + 1, n, B)``."""
     a: np.ndarray
-    """Next state by state at fixed control, ``(T, n, n, B)``."""
+    """Next state by state at constant control, ``(T, n, n, B)``."""
     b: np.ndarray
     """Next state by control, ``(T, n, m, B)``."""
     cost: np.ndarray
-    """Stage costs and the end's, ``(T + 1, B)``."""
+    """Stage costs and terminal cost, ``(T + 1, B)``."""
     cost_x: np.ndarray
-    """Their derivatives by state at fixed control, ``(T + 1, n, B)``."""
+    """Derivatives of the costs by state at constant control, ``(T + 1, n, B)``."""
     cost_u: np.ndarray
-    """Those by control, ``(T, m, B)``."""
+    """Derivatives of the stage costs by control, ``(T, m, B)``."""
     feedback_x: np.ndarray | None
     """Feedback by state, ``(T, m, n, B)``; None without feedback."""
     theta: np.ndarray
-    """theta with its noise, ``(d, B)``."""
+    """Theta plus its noise, ``(d, B)``."""
 
 
 def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
     """Return derivatives along the rollouts of ``theta (d,)`` under ``w (n_w, B)``.
 
-    Step Jacobians come from the backend where it gives them, else from central differences of the steps in NumPy; those
-    of costs and feedback are central differences. Raises :class:`Unsupported` for a plain function, and where a step
-    solves an equation that the backend does not differentiate by itself.
+    Step Jacobians come from the backend if it provides them, else from central differences of the steps in NumPy.
+    Derivatives of costs and feedback are central differences. Raises :class:`Unsupported` for a plain function, and if
+    a step solves an equation and the backend provides no Jacobians.
     """
     program = rollout(problem.program)
     full = np.repeat(np.reshape(theta, (program.dim, -1)), w.shape[1] if np.ndim(theta) == 1 else 1, axis=1)
     path = (
         problem.jacobians(full, w)
         if type(problem).jacobians is not Problem.jacobians
-        else _differenced(program, full, w)
+        else _difference_jacobians(program, full, w)
     )
     scene, (horizon, m, count) = program.scene, path.controls.shape
     noisy = full if program.action_noise else full + scene.sigma * w[: program.dim]
-    before, controls = _flat(path.states[:-1]), _flat(path.controls)
+    before, controls = _flatten(path.states[:-1]), _flatten(path.controls)
     repeated = np.tile(noisy, (1, horizon))
 
     def stage(x: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -69,88 +69,95 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
 
     last = path.states[-1]
     cost = np.concatenate([stage(before, controls).reshape(horizon, count), end(last)[None]])
-    by_x = _thick(_slope(lambda x: stage(x, controls)[None], before)[0], horizon)
-    cost_x = np.concatenate([by_x, _slope(lambda x: end(x)[None], last)])
+    by_x = _unflatten(_central_differences(lambda x: stage(x, controls)[None], before)[0], horizon)
+    cost_x = np.concatenate([by_x, _central_differences(lambda x: end(x)[None], last)])
     cost_u = (
-        _thick(_slope(lambda u: stage(before, u)[None], controls)[0], horizon) if m else np.zeros((horizon, 0, count))
+        _unflatten(_central_differences(lambda u: stage(before, u)[None], controls)[0], horizon)
+        if m
+        else np.zeros((horizon, 0, count))
     )
     feedback_x = None
     if back(before) is not None:
-        feedback_x = np.stack([_thick(row, horizon) for row in _slope(back, before)], axis=1)  # type: ignore[arg-type]
+        feedback_x = np.stack([_unflatten(row, horizon) for row in _central_differences(back, before)], axis=1)  # type: ignore[arg-type]
     return Slopes(path.states, path.a, path.b, cost, cost_x, cost_u, feedback_x, noisy)
 
 
-def gradient(problem: Problem, found: Slopes, cut: Cut | None = None) -> np.ndarray:
-    """Return per-sample gradients ``(d, B)``; ``cut`` changes the adjoint on its way backwards, None leaves it.
+def gradient(problem: Problem, path: Slopes, cut: Cut | None = None) -> np.ndarray:
+    """Return per-sample gradients ``(d, B)``. ``cut`` may modify the adjoint at each step; with None it stays as it is.
 
-    Without a cut it is the derivative of the cost. The adjoint of the state at step t is that of all costs from t on.
+    Without ``cut`` the result is the derivative of the cost. The adjoint at step t is the derivative of all costs from
+    step t on by the state at t.
     """
-    return by_theta(problem, found, *by_actions(found, cut))
+    return by_theta(problem, path, *by_actions(path, cut))
 
 
-def by_actions(found: Slopes, cut: Cut | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cost's derivatives by each step's action ``(T, m, B)``, later feedback included, and by the first state."""
-    horizon = len(found.a)
-    adjoint, by_control = found.cost_x[-1], np.empty_like(found.cost_u)
+def by_actions(path: Slopes, cut: Cut | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of the cost by each action ``(T, m, B)``, later feedback included, and by the first state."""
+    horizon = len(path.a)
+    adjoint, by_control = path.cost_x[-1], np.empty_like(path.cost_u)
     for t in range(horizon - 1, -1, -1):
-        by_control[t] = found.cost_u[t] + np.einsum("nmb,nb->mb", found.b[t], adjoint)
-        adjoint = found.cost_x[t] + np.einsum("ijb,ib->jb", found.a[t], adjoint)
-        if found.feedback_x is not None:
-            adjoint = adjoint + np.einsum("mnb,mb->nb", found.feedback_x[t], by_control[t])
+        by_control[t] = path.cost_u[t] + np.einsum("nmb,nb->mb", path.b[t], adjoint)
+        adjoint = path.cost_x[t] + np.einsum("ijb,ib->jb", path.a[t], adjoint)
+        if path.feedback_x is not None:
+            adjoint = adjoint + np.einsum("mnb,mb->nb", path.feedback_x[t], by_control[t])
         if cut is not None and t > 0:
-            adjoint = cut(t, found.states[t], adjoint)
+            adjoint = cut(t, path.states[t], adjoint)
     return by_control, adjoint
 
 
-def by_theta(problem: Problem, found: Slopes, by_control: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
-    """Return ``(d, B)``: derivatives by actions ``(T, m, B)`` and by the first state ``(n, B)``, chained to theta."""
+def by_theta(problem: Problem, path: Slopes, by_control: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
+    """Return the gradient ``(d, B)`` from derivatives by actions ``(T, m, B)`` and by the first state ``(n, B)``."""
     program = rollout(problem.program)
-    scene, horizon = program.scene, len(found.a)
+    scene, horizon = program.scene, len(path.a)
     if scene.open_loop:
         each = by_control.reshape(scene.controls, -1, *by_control.shape[1:])
         result = each.sum(axis=1).reshape(program.dim, -1)
     else:
-        result = _by_theta(lambda theta: scene.planned_controls(np, theta), found.theta, by_control)
-    x = _flat(found.states[:-1])
-    flat = _flat(by_control)
+        result = _theta_differences(lambda theta: scene.planned_controls(np, theta), path.theta, by_control)
+    x = _flatten(path.states[:-1])
+    flat = _flatten(by_control)
 
     def back(theta: np.ndarray) -> np.ndarray | None:
         return scene.feedback(np, np.tile(theta, (1, horizon)), *_split(program, x))
 
-    if found.feedback_x is not None:
-        result = result + _by_theta(back, found.theta, flat)
-    start = _by_theta(lambda theta: np.concatenate(scene.initial_state(np, theta)), found.theta, adjoint)
+    if path.feedback_x is not None:
+        result = result + _theta_differences(back, path.theta, flat)
+    start = _theta_differences(lambda theta: np.concatenate(scene.initial_state(np, theta)), path.theta, adjoint)
     return result + start
 
 
 # ---------------------------------------------------------------------------------------------------- differences
 
 
-def _differenced(program: Rollout, theta: np.ndarray, w: np.ndarray) -> Jacobians:
-    """Return the step Jacobians by central differences of the steps, all steps and columns at once."""
+def _difference_jacobians(program: Rollout, theta: np.ndarray, w: np.ndarray) -> Jacobians:
+    """Return the step Jacobians by central differences of all steps and columns together."""
     ops = LoopOps()
     with np.errstate(all="ignore"):
         path = list(program.steps(ops, theta, w))
     states = np.stack([np.concatenate(state) for state, _ in path])
     controls = np.stack([u for _, u in path[:-1]])
-    before, u = _flat(states[:-1]), _flat(controls)
+    before, u = _flatten(states[:-1]), _flatten(controls)
 
     def after(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
             return np.concatenate(program.step(ops, State(*_split(program, x)), u))
 
-    a = np.stack([_thick(row, len(controls)) for row in _slope(lambda x: after(x, u), before)], axis=1)
+    a = np.stack(
+        [_unflatten(row, len(controls)) for row in _central_differences(lambda x: after(x, u), before)], axis=1
+    )
     if not u.shape[0]:
         return Jacobians(states, controls, a, np.zeros((*a.shape[:2], 0, a.shape[3])))
-    b = np.stack([_thick(row, len(controls)) for row in _slope(lambda c: after(before, c), u)], axis=1)
+    b = np.stack(
+        [_unflatten(row, len(controls)) for row in _central_differences(lambda c: after(before, c), u)], axis=1
+    )
     return Jacobians(states, controls, a, b)
 
 
-def _slope(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
+def _central_differences(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
     """Return the derivatives ``(k, n, C)`` of ``function: (n, C) -> (k, C)``, column by column."""
     rows = []
     for i in range(len(x)):
-        h = DIFFERENCE * np.maximum(1.0, np.abs(x[i]))
+        h = DIFFERENCE_STEP * np.maximum(1.0, np.abs(x[i]))
         ahead, behind = x.copy(), x.copy()
         ahead[i] += h
         behind[i] -= h
@@ -158,25 +165,29 @@ def _slope(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.nd
     return np.stack(rows, axis=1)
 
 
-def _by_theta(function: Callable[[np.ndarray], np.ndarray | None], theta: np.ndarray, weight: np.ndarray) -> np.ndarray:
+def _theta_differences(
+    function: Callable[[np.ndarray], np.ndarray | None], theta: np.ndarray, weight: np.ndarray
+) -> np.ndarray:
     """Return the derivatives ``(d, B)`` by theta of the sum of weight times ``function(theta)``, column by column.
 
     The columns of theta repeat along the last axis of the function's value where that is longer.
     """
     if function(theta) is None:
         return np.zeros_like(theta)
-    moved = function(theta + DIFFERENCE * np.maximum(1.0, np.abs(theta)))
-    back = function(theta - DIFFERENCE * np.maximum(1.0, np.abs(theta)))
+    moved = function(theta + DIFFERENCE_STEP * np.maximum(1.0, np.abs(theta)))
+    back = function(theta - DIFFERENCE_STEP * np.maximum(1.0, np.abs(theta)))
     if np.array_equal(np.asarray(moved), np.asarray(back)):
-        return np.zeros_like(theta)  # it does not look at theta: no need to go through its d coordinates
+        return np.zeros_like(
+            theta
+        )  # the function does not depend on theta: no need to differentiate by its d coordinates
     result, count = np.empty_like(theta), theta.shape[1]
     for i in range(len(theta)):
-        h = DIFFERENCE * np.maximum(1.0, np.abs(theta[i]))
+        h = DIFFERENCE_STEP * np.maximum(1.0, np.abs(theta[i]))
         ahead, behind = theta.copy(), theta.copy()
         ahead[i] += h
         behind[i] -= h
         change = weight * (np.asarray(function(ahead)) - np.asarray(function(behind)))
-        # first the axes before the last, then the repetitions of the columns
+        # sums over the axes before the last, then over the repetitions of the columns
         result[i] = change.reshape(-1, change.shape[-1]).sum(axis=0).reshape(-1, count).sum(axis=0) / (2 * h)
     return result
 
@@ -186,11 +197,11 @@ def _split(program: Program, x: np.ndarray) -> State:
     return State(x[:n_q], x[n_q:])
 
 
-def _flat(values: np.ndarray) -> np.ndarray:
-    """Turn ``(T, n, B)`` into ``(n, T * B)``."""
+def _flatten(values: np.ndarray) -> np.ndarray:
+    """Reshape ``(T, n, B)`` to ``(n, T * B)``."""
     return np.moveaxis(values, 1, 0).reshape(values.shape[1], values.shape[0] * values.shape[2])
 
 
-def _thick(values: np.ndarray, steps: int) -> np.ndarray:
-    """Turn ``(n, T * B)`` back into ``(T, n, B)``."""
+def _unflatten(values: np.ndarray, steps: int) -> np.ndarray:
+    """Reshape ``(n, T * B)`` back to ``(T, n, B)``."""
     return np.moveaxis(values.reshape(len(values), steps, -1), 0, 1)

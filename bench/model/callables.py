@@ -1,4 +1,4 @@
-"""Scenes whose cost is code of the user's own, which no array namespace can run: a simulator as it is."""
+"""Scenes whose cost is a user's own simulator, which no array namespace can run."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from bench.model.simulator import Simulator
 
 @dataclass(frozen=True)
 class CallableScene(Scene):
-    """A scene whose cost is a function of theta, or of theta and noise w of its own, as its author wrote it.
+    """A scene whose cost is a user's function of theta, or of theta and its own noise.
 
-    f(theta, w) = cost(theta + sigma u, v) with w = (u, v): d numbers of noise on theta, then those of the cost itself. Its
-    cost counts as discontinuous, since nobody says that it is not.
+    f(theta, w) = cost(theta + sigma u, v) with w = (u, v): d numbers of noise on theta, then the cost's own noise. The
+    cost counts as discontinuous, since it may be.
     """
 
     continuous: ClassVar[bool] = False
 
     @abstractmethod
     def simulator(self) -> Simulator:
-        """Return the cost and its gradient as functions of columns, the same object at each call."""
+        """Return the cost and its gradient as functions of columns; the same object at each call."""
 
     @abstractmethod
     def files(self) -> tuple[Path, ...]:
-        """Return the files whose code decides the cost: when one changes, its cells run again."""
+        """Return the files whose code decides the cost. When one changes, the scene's cells run again."""
 
     def theta0(self) -> np.ndarray:
-        """Return theta as a vector, ``(d,)``."""
+        """Return the simulator's theta as a vector, ``(d,)``."""
         return self.simulator().layout.vector

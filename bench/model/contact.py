@@ -1,4 +1,4 @@
-"""Contact laws: how touching bodies push on each other."""
+"""The contract of a contact law, which computes forces or impulses between bodies in contact."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from bench.model.parameters import Plugin
 
 @dataclass(frozen=True)
 class ContactLaw(Plugin):
-    """A law for how touching bodies push on each other."""
+    """Computes the forces or impulses between bodies in contact."""
 
     kind: ClassVar[str] = "contacts"
     smoothing: ClassVar[str] = ""
     """Name of the parameter that smooths the law, if it has one (``beta``, ``kappa``)."""
     surrogate: ClassVar[bool] = False
-    """Whether automatic differentiation of a step gives, on purpose, another gradient than the step's derivative."""
+    """Whether automatic differentiation of a step intentionally gives a gradient other than the step's derivative."""
     needs_root: ClassVar[bool] = False
     """Whether the law solves an equation each step, so that only backends with ``root`` can run it."""
 
@@ -31,19 +31,19 @@ class ContactLaw(Plugin):
 
 @dataclass(frozen=True)
 class ForceLaw(ContactLaw):
-    """A law whose force depends on gap and gap rate, and enters the acceleration."""
+    """A law whose force is a function of gap and gap rate and is part of the acceleration."""
 
     @abstractmethod
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
-        """Return the normal force ``(n_contacts, B)`` [N], positive in repulsion."""
+        """Return the normal force ``(n_contacts, B)`` [N], positive if the bodies repel each other."""
 
     def spring(self) -> tuple[float, float] | None:
-        """Return stiffness [N/m] and damping [N s/m] of the linear spring that the law is in deep contact, or None."""
+        """Return stiffness [N/m] and damping [N s/m] of the linear spring that the law tends to in deep contact, or None."""
         return None
 
 
 class Contact(NamedTuple):
-    """The scene's contact geometry, as an impulse law sees it. Fields are functions; see :class:`ContactScene`."""
+    """The scene's contact geometry for impulse laws. Its fields are functions, see :class:`ContactScene`."""
 
     gap: Callable[[Array], Array]
     gap_rate: Callable[[Array, Array], Array]
@@ -51,11 +51,11 @@ class Contact(NamedTuple):
     restitution: Any
 
     def response(self, xp: Any, q: Array) -> Array:
-        """Return gap acceleration per unit of a contact's own force, diag(J M^-1 J^T), ``(n_contacts, B)`` [1/kg]."""
+        """Return each contact's gap acceleration per unit of its force, diag(J M^-1 J^T), ``(n_contacts, B)`` [1/kg]."""
         gap = self.gap(q)
         rows = []
         for i in range(gap.shape[0]):
-            # 0 times the gap gives the batch shape, type and library of the backend's arrays
+            # 0 times the gap has the batch shape, type and library of the backend's arrays
             unit = xp.stack([0.0 * gap[j] + float(i == j) for j in range(gap.shape[0])])
             rows.append(self.gap_rate(q, self.acceleration(q, unit))[i])
         return xp.stack(rows)
@@ -63,15 +63,15 @@ class Contact(NamedTuple):
 
 @dataclass(frozen=True)
 class ImpulseLaw(ContactLaw):
-    """A law that changes velocities (and positions) within a step instead of adding a force."""
+    """A law that changes velocities and positions within a step instead of adding a force."""
 
     @abstractmethod
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: Any) -> State:
-        """Return the change of velocity, and of position beyond ``dt`` times the new velocity, over one step.
+        """Return the changes over one step: of velocity, and of position beyond ``dt`` times the change of velocity.
 
-        ``before`` is the state at the start of the step; ``free`` is the state that a contact-free step would reach.
+        ``before`` is the state at the start of the step, ``free`` the state after a step without contact.
         """
 
     def finds_time_of_impact(self) -> bool:
-        """Return whether a free flight into one surface ends as if the impulse acted at the very time of impact."""
+        """Return whether a free flight into one surface ends as if the impulse acted exactly at the time of impact."""
         return False

@@ -1,4 +1,4 @@
-"""A scene and its contact law as an integrator sees them."""
+"""The dynamics of a scene under a contact law, as integrators use them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bench.model.scene import ContactScene, FrictionScene, MechanicalScene
 
 
 class Dynamics:
-    """Accelerations (contact forces included) and impulses of one scene under one contact law, or none."""
+    """Accelerations, contact forces included, and impulses of a scene under a contact law or none."""
 
     def __init__(self, ops: Ops, scene: MechanicalScene, law: ContactLaw | None) -> None:
         self.ops = ops
@@ -34,17 +34,17 @@ class Dynamics:
 
     @property
     def contact(self) -> Contact | None:
-        """The contact geometry, for integrators that resolve impacts themselves; None without an impulse law."""
+        """The contact geometry for integrators that resolve impacts themselves; None without an impulse law."""
         if self._impulse_law is None or not isinstance(self._scene, ContactScene):
             return None
         return self._scene.contact(self.ops.xp)
 
     def carried(self, v: Array) -> Array:
-        """Return the part of the velocity that a step carries over."""
+        """Return the velocity after the scene's numerical damping, ``(n_v, B)``, from which a step starts."""
         return self._scene.carried(v)
 
     def with_impulse(self, before: State, free: State, dt: Any) -> State:
-        """Return the contact-free end state ``free``, corrected by the impulse law if there is one."""
+        """Return the state ``free`` after a step without contact, corrected by the impulse law if there is one."""
         contact, law = self.contact, self._impulse_law
         if contact is None or law is None:
             return free

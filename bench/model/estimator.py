@@ -1,4 +1,4 @@
-"""Estimators: how sampled costs, gradients and scores become estimates of grad J."""
+"""The contract of an estimator, which turns sampled costs, gradients and scores into estimates of grad J."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from bench.model.problem import Problem
 from bench.model.program import Program
 
 Auxiliaries = Mapping[str, np.ndarray]
-"""What decided estimates, by name."""
+"""Diagnostics of estimates, such as weights, by name."""
 
 
 @dataclass(frozen=True)
 class Smoothing:
-    """Another smoothing of the cost than J_sigma's: ``gaussian`` of standard deviation, or ``ball`` of radius, ``radius``."""
+    """A smoothing of the cost other than J_sigma's: ``gaussian`` with standard deviation ``radius``, or a ``ball``."""
 
     shape: str
     radius: float
@@ -27,49 +27,51 @@ class Smoothing:
 
 @dataclass(frozen=True)
 class Estimator(Plugin):
-    """Turns sampled costs and gradients into independent estimates of grad J."""
+    """Computes independent estimates of grad J from sampled costs and gradients."""
 
     kind: ClassVar[str] = "estimators"
     needs: ClassVar[frozenset[str]] = frozenset({"value"})
-    """Backend capabilities used, out of ``value``, ``grad`` and ``score``."""
+    """Backend capabilities used, a subset of ``value``, ``grad`` and ``score``."""
     target: ClassVar[str] = "smoothed"
-    """The quantity estimated: ``smoothed`` grad J_sigma, or the ``plain`` grad f."""
+    """The estimated quantity: ``smoothed`` for grad J_sigma, ``plain`` for grad f."""
     unbiased: ClassVar[bool] = True
-    """Whether the expectation is the target for continuous costs."""
+    """Whether the expectation equals the target for continuous costs."""
     unbiased_at_discontinuities: ClassVar[bool] = False
-    """Whether it is also unbiased when the cost jumps in theta."""
+    """Whether it is also unbiased for costs with jumps in theta."""
     diagnostics: ClassVar[tuple[str, ...]] = ()
-    """Names of the auxiliaries that :meth:`estimate_with_diagnostics` gives beside the estimates, a weight for example."""
+    """Names of the arrays that :meth:`estimate_with_diagnostics` returns with the estimates, for example a weight."""
     includes_explicit_derivative: ClassVar[bool] = False
-    """Whether it adds :meth:`Problem.explicit` to cost times score; if not, it is refused where theta sets the initial
-    state and noise is on the actions, since cost times score alone is then biased."""
+    """Whether it adds :meth:`Problem.explicit` to cost times score.
 
+    Without this term, cost times score is biased where theta sets the initial state and noise is on the actions, so the
+    estimator is not supported there.
+    """
     gives_gradient: ClassVar[bool] = True
-    """Whether its estimates are of a gradient, so that an optimizer can descend along them."""
+    """Whether it estimates a gradient, along which an optimizer can descend."""
 
     @abstractmethod
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return R independent estimates ``(R, d)`` at ``theta (d,)`` from standard normal ``noise (R, N, n_w)``.
 
-        All randomness comes from ``noise``: estimate r depends on ``noise[r]`` and on nothing else random.
+        All randomness comes from ``noise``: the only random input of estimate r is ``noise[r]``.
         """
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates, and by name what decided them: one array ``(R,)`` or ``(R, d)`` for each of ``diagnostics``.
+        """Return the estimates, and by name one array ``(R,)`` or ``(R, d)`` for each of :attr:`diagnostics`.
 
-        An estimator that reports something defines this method, and :meth:`estimate` as its first part.
+        An estimator with diagnostics defines this method, and returns its first part in :meth:`estimate`.
         """
         return self.estimate(problem, theta, noise), {}
 
     def declares_unbiased(self, program: Program) -> bool:
-        """Whether its expectation is grad J_sigma of the program, by what it declares."""
+        """Return whether its declarations imply that its expectation is grad J_sigma of the program."""
         derivative = program.continuous and not program.surrogate
         return self.unbiased and self.target == "smoothed" and (derivative or self.unbiased_at_discontinuities)
 
     def smoothing(self, program: Program) -> Smoothing | None:
-        """Return the smoothing whose gradient its rows are measured against; None for J_sigma."""
+        """Return the smoothing whose gradient is the reference of its rows; None for J_sigma."""
         return None
 
     def unsupported_reason(self, program: Program) -> str | None:
@@ -77,30 +79,29 @@ class Estimator(Plugin):
         return None
 
     def incompatibility(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
-        """Return why it cannot be used on a program run by a backend that ``provides`` certain capabilities, or None."""
+        """Return why it cannot be used on a program with a backend of these capabilities, or None."""
         missing = self.needs - provides
         if missing:
             return f"{self.name} needs {', '.join(sorted(missing))}, which {backend} lacks"
         if "grad" in self.needs and program.surrogate and "surrogate" not in provides:
             law = program.contact.name if program.contact else ""
-            return f"{self.name} needs the surrogate gradient of contact law {law}, and {backend} takes differences of costs"
+            return f"{self.name} needs the surrogate gradient of contact law {law}, and {backend} computes differences of costs"
         if "score" in self.needs and program.explicit:
-            start = f"theta sets the initial state of {program.scene.name} while noise is on the actions, so "
+            condition = f"theta sets the initial state of {program.scene.name} while noise is on the actions, so "
             if not self.includes_explicit_derivative:
-                return f"{start}cost times score lacks a term, which {self.name} does not add"
+                return f"{condition}cost times score lacks a term, which {self.name} does not add"
             if "explicit" not in provides:
-                return f"{start}{self.name} needs explicit, which {backend} lacks"
+                return f"{condition}{self.name} needs explicit, which {backend} lacks"
         return self.unsupported_reason(program)
 
 
 @dataclass(frozen=True)
 class SampleMean(Estimator):
-    """An estimator that is the mean of one term per sample, so that samples may be evaluated in parts."""
+    """An estimator that is the mean of one term per sample, so that samples can be evaluated in batches."""
 
     @property
     def separable(self) -> bool:
-        """Whether an estimate is the mean of the terms, so that samples can be taken in parts, as long as
-        :meth:`estimate` is not defined anew."""
+        """Whether an estimate is the mean of the terms: true unless a subclass overrides :meth:`estimate`."""
         return type(self).estimate is SampleMean.estimate
 
     @abstractmethod
@@ -113,7 +114,7 @@ class SampleMean(Estimator):
 
 
 def columns(noise: np.ndarray) -> np.ndarray:
-    """Reshape noise ``(R, N, n_w)`` to the batch ``(n_w, R * N)`` that problems take."""
+    """Reshape noise ``(R, N, n_w)`` to a batch ``(n_w, R * N)`` for a problem."""
     return np.moveaxis(noise, -1, 0).reshape(noise.shape[-1], -1)
 
 
@@ -126,9 +127,10 @@ def per_repeat(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 
 def halves(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return first-order terms of the first half of the samples, zeroth-order terms of the rest, each ``(R, N/2, d)``.
+    """Return first-order terms of the first half of the samples and zeroth-order terms of the rest, each ``(R, N/2, d)``.
 
-    The zeroth-order terms are (f - f at w = 0) times the score, plus the explicit derivative. Raises ValueError below 4 samples.
+    The zeroth-order terms are (f - f at w = 0) times the score, plus the explicit derivative. Raises ValueError for
+    fewer than 4 samples.
     """
     half = noise.shape[1] // 2
     if half < 2:

@@ -1,4 +1,4 @@
-"""Keeps a process what it is while plugins are at work in it: its working folder, its number, its children, its terminal."""
+"""Protects the process from its plugins: working folder, forked copies, child processes and terminal output."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from collections.abc import Iterator
 
 from bench.errors import INTERRUPTED, printable
 
-HEARD = 300
-"""Letters that are told of what a plugin has printed."""
+MAX_CAPTURED_CHARACTERS = 300
+"""Characters of a plugin's output that are quoted."""
 
 
-def end_copies(own: int) -> None:
-    """End this process if a plugin has forked it from the one of that number, whose work it must not do again."""
-    if os.getpid() != own:
+def exit_if_forked(pid: int) -> None:
+    """Exit this process if it is a copy that a plugin has forked from process ``pid``."""
+    if os.getpid() != pid:
         os._exit(0)
 
 
 @contextlib.contextmanager
-def guarded() -> Iterator[None]:
-    """Keep the process what it is while a plugin is at work: in its working folder, and no forked copy of it goes on.
+def protect_process() -> Iterator[None]:
+    """Restore the working folder after plugin code has run, and end copies of the process that it has forked.
 
-    An interrupt that was swallowed meanwhile is raised when it is over.
+    An interrupt that the plugin has swallowed is raised at the end.
     """
-    own, here = os.getpid(), _folder()
+    pid, folder = os.getpid(), _working_folder()
     try:
         yield
     except KeyboardInterrupt:
         INTERRUPTED.clear()
         raise
     finally:
-        end_copies(own)
-        if here and _folder() != here:
-            os.chdir(here)
+        exit_if_forked(pid)
+        if folder and _working_folder() != folder:
+            os.chdir(folder)
     raise_pending_interrupt()
 
 
@@ -47,49 +47,51 @@ def raise_pending_interrupt() -> None:
 
 
 @contextlib.contextmanager
-def quiet(who: str) -> Iterator[None]:
-    """Keep what a plugin prints from the terminal, raw as it is, and tell the beginning of it on one line of stderr.
+def capture_output(source: str) -> Iterator[None]:
+    """Capture what a plugin prints, and quote its start, without control characters, on one line of stderr.
 
-    Descriptors are turned aside, not ``sys.stdout``: what libraries print goes there too, and a plugin may keep the stream.
+    File descriptors are redirected instead of ``sys.stdout``, since libraries write to them directly and a plugin may
+    keep a reference to the stream.
     """
     _flush()
     with contextlib.ExitStack() as stack:
         try:
-            aside = stack.enter_context(tempfile.TemporaryFile())
-        except OSError:  # no place for it
-            aside = stack.enter_context(open(os.devnull, "w+b"))
+            file = stack.enter_context(tempfile.TemporaryFile())
+        except OSError:  # no temporary folder
+            file = stack.enter_context(open(os.devnull, "w+b"))
         for descriptor in (1, 2):
-            with contextlib.suppress(OSError):  # it is closed
-                kept = os.dup(descriptor)
-                stack.callback(os.close, kept)
-                os.dup2(aside.fileno(), descriptor)
-                stack.callback(os.dup2, kept, descriptor)
+            with contextlib.suppress(OSError):  # the descriptor is closed
+                original = os.dup(descriptor)
+                stack.callback(os.close, original)
+                os.dup2(file.fileno(), descriptor)
+                stack.callback(os.dup2, original, descriptor)
         try:
             yield
         finally:
             _flush()
-            said = os.pread(aside.fileno(), 4 * HEARD, 0).decode(errors="replace")
-    if said.strip():
-        print(f"bench: {who} printed: {printable(said)[:HEARD]}", file=sys.stderr)
+            output = os.pread(file.fileno(), 4 * MAX_CAPTURED_CHARACTERS, 0).decode(errors="replace")
+    if output.strip():
+        print(f"bench: {source} printed: {printable(output)[:MAX_CAPTURED_CHARACTERS]}", file=sys.stderr)
 
 
 def _flush() -> None:
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(Exception):  # a plugin may have closed or replaced it
+        with contextlib.suppress(Exception):  # a plugin may have closed or replaced the stream
             stream.flush()
 
 
-def _folder() -> str:
+def _working_folder() -> str:
+    """Return the working folder, or an empty string if it has been removed."""
     try:
         return os.getcwd()
-    except FileNotFoundError:  # it has been removed
+    except FileNotFoundError:
         return ""
 
 
-def end_children() -> None:
+def kill_children() -> None:
     """Kill the processes that a plugin has started from this one and left running."""
     try:
-        # raises without children, which spares the search through all processes
+        # raises if there are no children, which saves the search through all processes
         os.waitpid(-1, os.WNOHANG)
     except ChildProcessError:
         return

@@ -1,4 +1,4 @@
-"""Plugins as text: identity strings for people, and JSON that keeps every parameter for programs."""
+"""Plugins as text: short identity strings for people, and JSON with every parameter for programs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def identity(name: str, given: Mapping[str, Any]) -> str:
 
 
 def text_of(value: Any) -> str:
-    """Return a parameter value as it is written on the command line.
+    """Return a parameter value in command-line syntax.
 
     >>> [text_of(value) for value in (None, True, 0.5, 1e6, 10.0)]
     ['null', 'true', '0.5', '1e+06', '10']
@@ -52,7 +52,7 @@ def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
                 raise UserError(f"'{item}' in '{text}' is not parameter=value")
             try:
                 raw[key.strip()] = yaml.safe_load(value)
-            except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: a date that there is not
+            except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: a date that does not exist
                 raise UserError(
                     f"'{value}' in '{printable(text)[:200]}' is not a value: write parameter=value"
                 ) from None
@@ -77,7 +77,7 @@ def label(plugin: Plugin | None, given: Mapping[str, Any] | None = None, without
 
 
 def described(plugin: Plugin | None) -> dict[str, Any] | None:
-    """Return name and every parameter of a plugin, defaults included, fit for strict JSON: infinities are strings."""
+    """Return the name and all parameters of a plugin for strict JSON, with infinities as strings; None for no plugin."""
     if plugin is None:
         return None
     return {"name": plugin.name} | {name: _plain(value) for name, value in values(plugin).items()}

@@ -1,4 +1,4 @@
-"""Integrators: time-stepping maps."""
+"""The contract of an integrator, a time-stepping map."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ class Integrator(Plugin):
     order: ClassVar[int] = 1
     """Order of the global error in dt on smooth dynamics."""
     takes_impulses: ClassVar[bool] = False
-    """Whether a step can take an :class:`ImpulseLaw`."""
+    """Whether a step can apply an :class:`ImpulseLaw`."""
     needs_root: ClassVar[bool] = False
     """Whether a step solves an equation, so that only backends with ``root`` can run it."""
 
     @abstractmethod
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: Any) -> State:
-        """Return the state ``dt`` later under the constant control ``u (n_u, B)``."""
+        """Return the state after one step of length ``dt`` under the constant control ``u (n_u, B)``."""
 
     @abstractmethod
     def amplification(self, z: complex) -> complex:
-        """Return the stability function: the factor of one step on v' = a v (no positions) with z = a dt."""
+        """Return the stability function: the factor of one step of v' = a v (without positions) with z = a dt."""
 
     @abstractmethod
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """Return the matrix ``(2, 2)`` of one step on q' = v, v' = -stiffness q - damping v with that velocity factor.
+        """Return the matrix ``(2, 2)`` of one step of q' = v, v' = -stiffness q - damping v with a velocity ``factor``.
 
-        The step is stable while the spectral radius is at most 1.
+        The step is stable if the spectral radius is at most 1.
         """

@@ -1,4 +1,4 @@
-"""Roles of scenes with a known answer: the least cost, the least cost to go, and parameters that a record can tell."""
+"""Roles of scenes with known solutions: the optimal cost, the optimal cost-to-go, and parameters to identify."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from bench.model.parameters import Plugin
 
 
 class KnownOptimum(ABC):
-    """A role: the scene knows the least cost of all theta, without noise."""
+    """A role: the scene knows its optimal cost over theta, without noise."""
 
     @abstractmethod
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
-        """Return J* under that law and integrator and how it is known; None where it is not known for them."""
+        """Return J* under this law and integrator and the method that gives it, or None if it is not known."""
 
 
 class KnownValue(ABC):
-    """A role: the scene knows the least cost to go, so that a short window can end in it."""
+    """A role: the scene knows its optimal cost-to-go, which a short window can use as its terminal cost."""
 
     @abstractmethod
     def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:
-        """Return the least cost from the state before ``step`` on, without noise, ``(B,)``; in NumPy."""
+        """Return the optimal cost-to-go from the state before ``step``, without noise, ``(B,)``, in NumPy."""
 
 
 class Identified(ABC):
-    """A role: a record of the scene's motion is meant to say something about some of its parameters."""
+    """A role: some parameters of the scene are to be identified from a record of its motion."""
 
     unknowns: ClassVar[tuple[str, ...]]
-    """The parameters to find, unless the user names others."""
+    """Names of the parameters to identify, unless the user names others."""
     measured: ClassVar[tuple[int, ...] | None] = None
-    """Which positions are measured after each step; None for all."""
+    """Indices of the positions measured after each step; None for all."""
     end_only: ClassVar[bool] = False
-    """Whether only the end is measured."""
+    """Whether only the final positions are measured."""

@@ -1,4 +1,4 @@
-"""Arrays, the operations a backend lends to model code, and the state of a mechanical system."""
+"""Arrays, the operations that a backend provides to model code, and the state of a mechanical system."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from bench.errors import Unsupported
 
 Array = Any
-"""An array of the backend in use: NumPy, torch or JAX."""
+"""An array of the backend's library: NumPy, torch or JAX."""
 
 
 class Ops(Protocol):
-    """The operations that a backend lends to model code."""
+    """The operations that a backend provides to model code."""
 
     @property
     def xp(self) -> Any:
@@ -26,35 +26,35 @@ class Ops(Protocol):
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
         """Return ``z (n, B)`` with ``residual(z, args) = 0``; column b of the residual depends only on column b of z.
 
-        Its derivative comes from the implicit-function theorem. Raises :class:`Unsupported` on backends without it.
+        The derivative follows from the implicit-function theorem. Raises :class:`Unsupported` on backends without ``root``.
         """
 
 
 class LoopOps:
-    """A Python loop and no equation solver, over any array namespace; backends may subclass it.
+    """Operations of a backend without equation solver, for any array namespace: ``scan`` is a Python loop.
 
-    Raises :class:`Unsupported` where a program solves an equation.
+    Raises :class:`Unsupported` if a program solves an equation.
     """
 
     def __init__(self, xp: Any = np) -> None:
         self.xp = xp
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Loop over the leading axis."""
+        """Fold over the leading axis in a Python loop."""
         for t in range(length):
             carry = step(carry, tuple(x[t] for x in xs))
         return carry
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Refuse: only backends that provide ``root`` solve equations."""
+        """Raise :class:`Unsupported`: only backends that provide ``root`` solve equations."""
         raise Unsupported(NO_ROOT)
 
 
-NO_ROOT = "a step solves an equation, and this backend has no root finder: use one that provides root (see `python -m bench list backends`)"
+NO_ROOT = "a step solves an equation, and this backend has no root finder: use a backend that provides root (see `python -m bench list backends`)"
 
 
 def stopped(array: Array) -> Array:
-    """Return the array as automatic differentiation sees a constant; NumPy arrays as they are."""
+    """Return the array as a constant for automatic differentiation; NumPy arrays are returned unchanged."""
     if hasattr(array, "detach"):
         return array.detach()
     if type(array).__module__.partition(".")[0] in ("jax", "jaxlib"):

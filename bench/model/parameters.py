@@ -1,4 +1,4 @@
-"""Plugins and their parameters: how they are declared, checked and built from values."""
+"""Plugins and their parameters: declaration, validation, and building from values."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from bench import deprecated
 from bench.errors import UserError, printable, unknown
 
 LARGEST = 2**53
-"""The largest whole number that is exact as float64, the type of number columns."""
+"""The largest integer up to which all integers are exact in float64, the type of number columns."""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def remember(function: Function) -> Function:
-    """Cache as ``functools.cache`` does, and keep the function's own type."""
+    """Cache a function like ``functools.cache``, but keep its type for type checkers."""
     return cast(Function, cache(function))
 
 
@@ -38,8 +38,8 @@ def param(
 ) -> Any:
     """Declare a plugin parameter: its default, meaning and unit, and the values it may take.
 
-    ``positive`` asks for a value above 0; ``low`` and ``high`` are inclusive bounds; ``choices`` are the strings
-    allowed.
+    ``positive`` requires a value above 0, ``low`` and ``high`` are inclusive bounds, and ``choices`` are the allowed
+    strings.
     """
     return dataclasses.field(
         default=default,
@@ -48,25 +48,19 @@ def param(
 
 
 @dataclass(frozen=True)
-class Plugin(ABC):  # noqa: B024, each kind has abstract methods of its own
-    """The base of all plugins: a name, and parameters as dataclass fields."""
+class Plugin(ABC):  # noqa: B024, each kind has its own abstract methods
+    """The base class of all plugins: a name, and parameters as dataclass fields."""
 
     kind: ClassVar[str] = ""
-    """The plural of its axis: scenes, contacts, integrators, backends, estimators, optimizers, studies, or a kind of your own."""
+    """The plural of its axis: scenes, contacts, integrators, backends, estimators, optimizers, studies, or a new kind."""
     name: ClassVar[str] = ""
-    """The one name used on the command line, in tables, legends and caches."""
+    """Its name on the command line and in tables, legends and caches."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Modules that must be installed for the plugin to be available, as ``module`` or ``module=distribution``."""
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         deprecated.rename_members(cls)
-
-    def __getattr__(self, name: str) -> Any:
-        if name in deprecated.MEMBERS and hasattr(type(self), deprecated.MEMBERS[name]):
-            deprecated.warn(f"{type(self).__name__}.{name}", deprecated.MEMBERS[name])
-            return getattr(self, deprecated.MEMBERS[name])
-        raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
 
 
 @dataclass(frozen=True)
@@ -102,14 +96,14 @@ def values(plugin: Plugin) -> dict[str, Any]:
 
 
 def traced(plugin: Plugin) -> list[str]:
-    """Return the names of the float parameters: those that a backend may trace and that theta may name."""
+    """Return the names of the float parameters, which a backend may trace and theta may name."""
     return [f.name for f in dataclasses.fields(plugin) if f.type in ("float", float)]
 
 
 def build(plugin: type[Plugin], values: Mapping[str, Any]) -> Plugin:
-    """Build an instance with checked parameter values; raises :class:`UserError` for a bad name, type or value.
+    """Build an instance with validated parameter values.
 
-    And where the plugin's own code fails or exits: it may depend on what was made before it.
+    Raises :class:`UserError` for an unknown name or an invalid type or value, and if the plugin's own code fails or exits.
     """
     declared = parameters(plugin)
     checked = {}
@@ -122,9 +116,9 @@ def build(plugin: type[Plugin], values: Mapping[str, Any]) -> Plugin:
     except (UserError, KeyboardInterrupt):
         raise
     except BaseException as error:
-        said = f"{type(error).__name__}: {printable(error)[:300]}"
+        reason = f"{type(error).__name__}: {printable(error)[:300]}"
         raise UserError(
-            f"{singular(plugin.kind)} '{plugin.name}' cannot be made with these parameters: {said}"
+            f"{singular(plugin.kind)} '{plugin.name}' cannot be built with these parameters: {reason}"
         ) from None
 
 
@@ -138,7 +132,7 @@ def singular(kind: str) -> str:
 
 
 def check(parameter: Parameter, value: Any, where: str) -> Any:
-    """Return ``value`` as the parameter's type; raises :class:`UserError` for another type or a value out of bounds."""
+    """Return ``value`` in the parameter's type; raises :class:`UserError` for a wrong type or a value out of bounds."""
     kinds = typing.get_args(parameter.type) if isinstance(parameter.type, types.UnionType) else (parameter.type,)
     if value is None and type(None) in kinds:
         return None
@@ -157,12 +151,12 @@ def check(parameter: Parameter, value: Any, where: str) -> Any:
 
 
 def coerce(kind: Any, value: Any, where: str) -> Any:
-    """Return ``value`` as ``kind`` (bool, int, float or str) where that loses nothing; else raise :class:`UserError`.
+    """Convert ``value`` to ``kind`` (bool, int, float or str) without loss; raises :class:`UserError` otherwise.
 
     >>> coerce(int, 3.0, "samples"), coerce(float, "1e3", "stiffness")
     (3, 1000.0)
     """
-    # bool is an int in Python, but true is not a number here
+    # bool is a subclass of int, but true is not a number here
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if kind is float:
         if isinstance(value, str):
@@ -171,7 +165,7 @@ def coerce(kind: Any, value: Any, where: str) -> Any:
             except ValueError:
                 number = False
         if number and abs(value) > sys.float_info.max and value not in (math.inf, -math.inf):
-            raise UserError(f"{where} is larger than any number that is calculated with, {sys.float_info.max:g}")
+            raise UserError(f"{where} is larger than the largest float, {sys.float_info.max:g}")
         if number and not math.isnan(value):
             return float(value)
     elif kind is int:

@@ -14,7 +14,7 @@ from bench.errors import Unsupported
 from bench.model import blocks
 from bench.model.program import Program
 
-NO_EXPLICIT = "{} cannot move the initial state by theta under given actions, which the score needs here"
+NO_EXPLICIT = "{} does not differentiate by theta at given actions, which the score of this program needs"
 
 
 class Trajectory(NamedTuple):
@@ -41,10 +41,10 @@ class Jacobians(NamedTuple):
 
 @dataclass
 class Usage:
-    """The cost of some work: rollouts, gradients and the compile time it needed.
+    """Computational cost: numbers of rollouts and gradients, and compile times in seconds.
 
-    ``compile_s`` includes ``trace_s``, running the Python code once, and ``lower_s``, turning it into the compiler's
-    input.
+    ``compile_s`` includes ``trace_s``, which runs the Python code once, and ``lower_s``, which converts it to the
+    compiler's input.
     """
 
     rollouts: int = 0
@@ -56,20 +56,20 @@ class Usage:
 
 @dataclass
 class Compilations:
-    """The compiled programs of one session: where they are kept between runs, and how many were made.
+    """The compilations of one session: their number, and the folder in which compiled programs are stored.
 
-    Backends that compile count here; code that builds several problems hands the same object to all of them.
+    Backends that compile count here. Code that builds several problems passes the same object to all of them.
     """
 
     folder: Path | None = None
-    """Where compiled programs are kept between runs; None for nowhere."""
+    """Folder in which compiled programs are stored between runs; None to store none."""
     made: int = 0
-    """Number of compilations, not counting programs loaded from the folder."""
+    """Number of compilations, without programs loaded from the folder."""
     shapes: set[str] = field(default_factory=set)
-    """Requests for programs: a hash for each program structure, function and shape."""
+    """Requested programs: one hash per program structure, function and shape."""
 
     def restart(self) -> None:
-        """Count from zero."""
+        """Reset the counts to zero."""
         self.made = 0
         self.shapes.clear()
 
@@ -77,15 +77,15 @@ class Compilations:
 class Problem(ABC):
     """A compiled program: costs, gradients and scores of batches of rollouts, in NumPy float64 arrays.
 
-    ``theta`` is ``(d,)`` for one theta shared by all samples or ``(d, B)``; ``w`` is ``(n_w, B)``. Larger batches than
-    ``block`` columns are evaluated block by block, so that memory stays flat; blocks are filled up to a multiple of
-    ``grain`` columns, so that few shapes occur, and ``threads`` of them run at once, each with about ``least`` columns or more.
+    ``theta`` is ``(d,)`` for one theta shared by all samples or ``(d, B)``; ``w`` is ``(n_w, B)``. Batches larger than
+    ``block`` columns are evaluated in blocks to limit memory. Blocks are padded to a multiple of ``grain`` columns, so
+    that few shapes occur. Up to ``threads`` blocks run in parallel, each with about ``least`` columns or more.
     """
 
     block: int = 1 << 16
     grain: int = 1
     threads: int = 1
-    least: int = blocks.LEAST
+    least: int = blocks.MIN_COLUMNS
     device: str = "cpu"
     """The device that the program runs on."""
     provides: frozenset[str] = frozenset({"value", "grad", "score"})
@@ -99,14 +99,14 @@ class Problem(ABC):
         self._measured = False
 
     def reset_usage(self) -> None:
-        """Count usage from zero; from now on, programs are compiled afresh, bypassing the folder."""
+        """Reset usage to zero. From now on, programs are compiled again instead of loaded from the folder."""
         self._measured = True
         self.usage = Usage()
         self._charged.clear()
 
     def fit_blocks(self, column_bytes: int) -> None:
-        """Choose the block size so that each core's block fits in its cache, at ``column_bytes`` per rollout."""
-        self.block, self.threads = blocks.fitting(column_bytes, self.grain), blocks.cores()
+        """Set the block size so that a block fits in a core's cache, at ``column_bytes`` per rollout."""
+        self.block, self.threads = blocks.columns_in_cache(column_bytes, self.grain), blocks.cores()
 
     @property
     def sigma(self) -> float:
@@ -142,10 +142,10 @@ class Problem(ABC):
         return self._blocks(self._score, theta, w, (self.dim,))
 
     def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return per-sample derivatives of the cost by theta along every path but the actions, ``(d, B)``.
+        """Return per-sample derivatives of the cost by theta along every path except the actions, ``(d, B)``.
 
-        The gradient is the mean of cost times score plus these. They are 0 unless the program is
-        :attr:`~Program.explicit`, where they count as gradients.
+        The gradient is the mean of cost times score plus these derivatives. They are 0 unless the program is
+        :attr:`~Program.explicit`; then they count as gradients in :attr:`usage`.
         """
         if not self.program.explicit:
             return np.zeros((self.dim, w.shape[1]))
@@ -153,7 +153,7 @@ class Problem(ABC):
         return self._blocks(self._explicit, theta, w, (self.dim,))
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """Return states and controls along each rollout; raises :class:`Unsupported` where there are none."""
+        """Return states and controls along each rollout; raises :class:`Unsupported` without time steps."""
         raise Unsupported(
             f"{type(self).__name__} does not expose the states of a rollout: use a backend with trajectory()"
         )
@@ -163,23 +163,23 @@ class Problem(ABC):
         raise Unsupported(f"{type(self).__name__} gives no step Jacobians: use a backend with jacobians()")
 
     def centred(self, w: np.ndarray) -> np.ndarray:
-        """Return noise ``(n_w, B)`` with 0 on theta, or on the actions, and the scene's own numbers as they are."""
-        still = np.zeros_like(w)
-        if own := self.program.exogenous:
-            still[-own:] = w[-own:]
-        return still
+        """Return noise ``(n_w, B)`` with zeros for theta or the actions, and the scene's own noise unchanged."""
+        centred = np.zeros_like(w)
+        if count := self.program.exogenous:
+            centred[-count:] = w[-count:]
+        return centred
 
     def directions(self, w: np.ndarray) -> np.ndarray:
-        """Return standard normal directions in theta space made from ``w``, ``(d, B)``.
+        """Return standard normal directions in theta space, ``(d, B)``, taken from ``w``.
 
-        Raises :class:`Unsupported` when a sample carries fewer than d normal numbers.
+        Raises :class:`Unsupported` if a sample has fewer than d normal numbers.
         """
         if w.shape[0] < self.dim:
-            raise Unsupported(f"needs {self.dim} normal numbers per sample, this noise model has {w.shape[0]}")
+            raise Unsupported(f"needs {self.dim} normal numbers per sample, and this noise model has {w.shape[0]}")
         return w[: self.dim]
 
     def displaced(self, shift: np.ndarray, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return the costs at ``theta + shift`` with ``shift (d, B)`` and the noise ``w`` of the cost, ``(B,)``."""
+        """Return the costs at ``theta + shift`` for ``shift (d, B)`` and noise ``w (n_w, B)``: ``(B,)``."""
         return self.value(np.asarray(theta).reshape(self.dim, -1) + shift, w)
 
     def _blocks(
@@ -187,14 +187,14 @@ class Problem(ABC):
     ) -> np.ndarray:
         theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
         w = np.asarray(w, dtype=np.float64)
-        threads = blocks.sharing(w.shape[1], self.threads, self.least)
-        columns = blocks.size(w.shape[1], self.block, self.grain, threads)
+        threads = blocks.n_threads(w.shape[1], self.threads, self.least)
+        columns = blocks.block_size(w.shape[1], self.block, self.grain, threads)
 
         def real(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-            found = function(theta, w)
-            if np.iscomplexobj(found):
-                raise TypeError(f"{type(self).__name__}{function.__name__} returns complex numbers; costs are real")
-            return found
+            values = function(theta, w)
+            if np.iscomplexobj(values):
+                raise TypeError(f"{type(self).__name__}{function.__name__} returns complex numbers: costs must be real")
+            return values
 
         return blocks.evaluate(real, theta, w, columns, threads, lead)
 

@@ -1,4 +1,4 @@
-"""Scene x contact law x integrator: the discrete program that a backend runs and differentiates."""
+"""A scene, contact law and integrator composed into the discrete program that a backend runs and differentiates."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ from bench.model.parameters import Plugin, traced
 from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, MechanicalScene, ProcessNoiseScene, Scene
 
 SURROGATE = "the gradient is a surrogate, not the derivative of the program"
-"""What rows, tables and charts say where :attr:`Program.surrogate` holds."""
+"""The remark in rows, tables and charts if :attr:`Program.surrogate` is true."""
 
 
 @dataclass(frozen=True)
 class Decision:
     """The meaning of theta, and the point at which gradients are taken.
 
-    Without ``names`` theta is the scene's own decision variable; with ``names`` it is those float parameters of the
-    scene or its contact law (``mass``, or ``pushing.mass`` and ``penalty.stiffness`` where both have one), and noise is
-    on theta. ``at`` replaces the value at which gradients are taken.
+    Without ``names`` theta is the scene's own decision variable. With ``names`` it consists of these float parameters of
+    the scene or its contact law (``mass``, or ``pushing.mass`` and ``penalty.stiffness`` if both have the name), and
+    noise is on theta. ``at`` replaces the scene's own value of theta.
     """
 
     names: tuple[str, ...] = ()
     at: tuple[float, ...] | None = None
 
 
-TRIED = 8
-"""Random thetas of each size at which the initial state is compared with that of theta0."""
+N_TRIALS = 8
+"""Number of random thetas per size at which the initial state is compared with that of theta0."""
 OWN = Decision()
-"""The scene's own theta, where the scene puts it."""
+"""The scene's own theta at the scene's own value."""
 
 
 class Program(ABC):
-    """The discrete map (theta, w) -> cost, written against an array namespace; made by :func:`compose`.
+    """The discrete map (theta, w) -> cost for any array namespace, built by :func:`compose`.
 
-    Contact law and integrator are None where the scene has none.
+    Contact law and integrator are None if the scene has none.
     """
 
     def __init__(
@@ -59,12 +59,10 @@ class Program(ABC):
         self.decision = decision
         self._named = tuple(self._place(name) for name in decision.names)
         self._varying: tuple[tuple[str, str], ...] = ()
-        """Parameters (axis, name) that are arrays ``(B,)``: those named by theta, once their values are filled in."""
+        """Parameters (axis, name) that are arrays ``(B,)``: those in theta, after :meth:`_own_theta` has set them."""
         if isinstance(contact, ImpulseLaw) and integrator is not None and not integrator.takes_impulses:
-            raise Unsupported(
-                f"integrator {integrator.name} has no place for the impulses of contact law {contact.name}"
-            )
-        # taken here, since the parameters of a bound program may be traced values
+            raise Unsupported(f"integrator {integrator.name} cannot apply the impulses of contact law {contact.name}")
+        # computed here, since the parameters of a bound program may be traced values
         self._scene_theta0 = scene.theta0() if self._named else np.empty(0)
         if decision != OWN:
             self._check_decision()
@@ -82,7 +80,7 @@ class Program(ABC):
 
     @property
     def parts(self) -> dict[str, Plugin]:
-        """The plugins that make the program, by axis."""
+        """The plugins of the program, by axis."""
         parts = {"scene": self.scene, "contact": self.contact, "integrator": self.integrator}
         return {axis: plugin for axis, plugin in parts.items() if plugin is not None}
 
@@ -106,7 +104,7 @@ class Program(ABC):
 
     @property
     def surrogate(self) -> bool:
-        """Whether its gradient is, by its contact law's design, not the derivative of the program."""
+        """Whether its contact law replaces the derivative of the program by a surrogate gradient."""
         return self.contact is not None and self.contact.surrogate
 
     @cached_property
@@ -125,44 +123,44 @@ class Program(ABC):
 
     @property
     def noise(self) -> str:
-        """The noise model: ``parameter`` or ``action``; always ``parameter`` where theta names parameters."""
+        """The noise model: ``parameter`` or ``action``; always ``parameter`` if theta consists of named parameters."""
         return "parameter" if self._named else self.scene.noise
 
     @property
     def action_noise(self) -> bool:
-        """Whether noise enters at the actions."""
+        """Whether noise is on the actions."""
         return self.noise == "action"
 
     @property
     def noise_on_theta(self) -> bool:
         """Whether the noise of J is noise on theta, so that the score is w / sigma.
 
-        True for parameter noise, and for action noise where theta is the controls themselves; false under a feedback
+        True for parameter noise, and for action noise if theta is the sequence of controls. False under a feedback
         policy.
         """
         return not self.action_noise
 
     @property
     def explicit(self) -> bool:
-        """Whether theta acts on the cost, or on the states that a policy sees, other than through the actions' mean.
+        """Whether theta affects the cost, or the input of a policy, other than through the mean of the actions.
 
-        Then E[f score] is not the gradient: it lacks the derivative of f along that path, see :meth:`explicit_cost`.
+        Then E[f score] lacks the derivative of f along that path, see :meth:`explicit_cost`.
         """
         return False
 
     @property
     def exogenous(self) -> int:
-        """Count of normal numbers of the scene's own, which follow the d numbers on theta."""
+        """Number of the scene's own normal numbers, which follow the d numbers on theta."""
         return 0
 
     @property
     def n_noise(self) -> int:
-        """n_w, the count of normal numbers in one rollout."""
+        """n_w, the number of normal numbers of one rollout."""
         return self.dim + self.exogenous
 
     @cached_property
     def structure(self) -> tuple[Any, ...]:
-        """Everything that decides the shape of the computation: equal structures differ only in :meth:`parameters`."""
+        """All that determines the computation graph: programs of equal structure differ only in :meth:`parameters`."""
         parts = []
         for axis, plugin in self.parts.items():
             changing = set(traced(plugin))
@@ -171,22 +169,22 @@ class Program(ABC):
         return (*parts, self._named, self._scene_theta0.tobytes()) if self._named else tuple(parts)
 
     def parameters(self) -> np.ndarray:
-        """Return the float parameters of all parts, ``(p,)``: the values that may be traced."""
+        """Return the float parameters of all plugins, which may be traced, ``(p,)``."""
         return np.array(
             [getattr(plugin, name) for plugin in self.parts.values() for name in traced(plugin)], dtype=np.float64
         )
 
     def bind(self, parameters: Any) -> Program:
-        """Return this program with other values, possibly traced ones, for :meth:`parameters`."""
-        _ = self.explicit  # kept in the copy: it cannot be found out from traced values
+        """Return a copy of this program with other values, possibly traced, for :meth:`parameters`."""
+        _ = self.explicit  # cached in the copy, since it cannot be computed from traced values
         places = [(axis, name) for axis, plugin in self.parts.items() for name in traced(plugin)]
         return self._with(dict(zip(places, parameters, strict=False)))
 
     def _with(self, values: dict[tuple[str, str], Any]) -> Program:
-        """Return this program with other values for some parameters, by axis and name."""
+        """Return a copy of this program with other values for some parameters, by axis and name."""
         bound = copy.copy(self)
         for axis, plugin in self.parts.items():
-            # plugins are frozen: values are set on a copy that only this program holds
+            # plugins are frozen: values are set on a copy that belongs to this program only
             twin = copy.copy(plugin)
             for name in traced(plugin):
                 if (axis, name) in values:
@@ -195,7 +193,7 @@ class Program(ABC):
         return bound
 
     def _place(self, name: str) -> tuple[str, str]:
-        """Return the axis and parameter that a name in theta means; raises :class:`UserError` if there is none."""
+        """Return the axis and parameter that a name in theta refers to; raises :class:`UserError` if there is none."""
         owner, _, parameter = name.rpartition(".")
         parts = {axis: part for axis, part in (("scene", self.scene), ("contact", self.contact)) if part is not None}
         known = {axis: [f for f in traced(part) if f != "sigma"] for axis, part in parts.items()}
@@ -211,7 +209,7 @@ class Program(ABC):
         return places[0], parameter
 
     def _check_moves_program(self, parameter: str) -> None:
-        """Refuse a parameter that only sets the scene's own theta: its derivative would be 0 and look like a result."""
+        """Raise :class:`UserError` for a parameter that only sets the scene's own theta, since its derivative would be 0."""
         value = getattr(self.scene, parameter)
         if not np.isfinite(value):
             return
@@ -219,32 +217,32 @@ class Program(ABC):
         object.__setattr__(moved, parameter, value * (1 + 1e-6) + 1e-9)
         if not np.array_equal(moved.theta0(), self.scene.theta0()):
             raise UserError(
-                f"theta names '{parameter}', which sets where scene {self.scene.name} puts its own theta: leave theta "
-                "out and give theta0=[..]"
+                f"theta names '{parameter}', which only sets the own theta of scene {self.scene.name}: omit theta "
+                "and give theta0=[..]"
             )
 
-    # ------------------------------------------------------------------------------- what the scene knows
+    # ----------------------------------------------------------------------------------- known solutions
 
     @property
     def _as_declared(self) -> bool:
-        """Whether the scene's statements about its own theta0 hold for this program."""
+        """Whether the scene's known solutions at its own theta0 apply to this program."""
         at = self.decision.at
         return not self._named and (at is None or bool(np.array_equal(at, self.scene.theta0())))
 
     def closed_form_gradient(self) -> np.ndarray | None:
-        """Return grad J_sigma at theta0, or None where the scene does not know it."""
+        """Return grad J_sigma at theta0, ``(d,)``, or None if the scene does not know it."""
         return self.scene.closed_form_gradient(self.contact, self.integrator) if self._as_declared else None
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Return grad f at theta0 of the physics, or None where the scene does not know it."""
+        """Return grad f of the physics at theta0, ``(d,)``, or None if the scene does not know it."""
         return self.scene.physical_gradient() if self._as_declared else None
 
     def physical_cost(self) -> float | None:
-        """Return f at theta0 of the physics, or None where the scene does not know it."""
+        """Return f of the physics at theta0, or None if the scene does not know it."""
         return self.scene.physical_cost() if self._as_declared else None
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return, per coordinate of theta, where the cost jumps or has a kink, as far as the scene knows."""
+        """Return, per coordinate of theta, the known positions of jumps and kinks of the cost."""
         return () if self._named else self.scene.breakpoints()
 
     # ------------------------------------------------------------------------------------------ evaluation
@@ -257,19 +255,19 @@ class Program(ABC):
     def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
         """Return ``(B,)`` whose gradient by ``theta_scored`` at ``theta_scored = theta`` is the score.
 
-        Needed only where noise is on the actions of a policy; elsewhere the score is w / sigma.
+        Needed only for noise on the actions of a policy; otherwise the score is w / sigma.
         """
 
     def explicit_cost(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> Array:
-        """Return the cost at ``theta_moved`` of the actions that theta and w lead to, ``(B,)``.
+        """Return the cost at ``theta_moved`` under the actions that theta and w determine, ``(B,)``.
 
         With E over the actions, grad J = E[f score + d explicit_cost / d theta_moved] (Williams 1992 for the score,
-        Schulman et al. 2015, eq. 3, for both). Needed only where the program is :attr:`explicit`.
+        Schulman et al. 2015, eq. 3, for both). Needed only if the program is :attr:`explicit`.
         """
         return self.cost(ops, theta, w)
 
     def _own_theta(self, xp: Any, theta: Array, w: Array) -> tuple[Program, Array]:
-        """Return the program with the parameter values in theta, ``(B,)`` each, and the scene's theta ``(d', B)``."""
+        """Return the program with the parameter values from theta, ``(B,)`` each, and the scene's own theta ``(d', B)``."""
         noisy = theta + self.scene.sigma * w
         values = {place: noisy[i] for i, place in enumerate(self._named)}
         bound = self._with(values)
@@ -285,7 +283,7 @@ class FunctionProgram(Program):
     scene: FunctionScene
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
-        """Return the scene's cost at theta + sigma w, or sigma times the first d numbers where it has its own."""
+        """Return the scene's cost at theta + sigma w, ``(B,)``; with its own noise, w are the first d numbers."""
         if self.exogenous:
             w, own_noise = w[: self.dim], w[self.dim :]
         bound, own = self._own_theta(ops.xp, theta, w) if self._named else (self, theta + self.scene.sigma * w)
@@ -296,32 +294,32 @@ class FunctionProgram(Program):
 
     @property
     def exogenous(self) -> int:
-        """Count of normal numbers of the scene's own."""
+        """Number of the scene's own normal numbers."""
         return self.scene.exogenous if isinstance(self.scene, DisturbedScene) else 0
 
     def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
-        """Return w . theta_scored / sigma, with the noise on theta."""
+        """Return w . theta_scored / sigma, ``(B,)``, since noise is on theta."""
         return ops.xp.sum((w[: self.dim] if self.exogenous else w) * theta_scored, axis=0) / self.scene.sigma
 
 
 class CallableProgram(Program):
-    """The program of a scene whose cost is the user's own code: no array namespace runs it, only its simulator."""
+    """The program of a scene whose cost is a user's own simulator, which no array namespace can run."""
 
     scene: CallableScene
 
     @property
     def exogenous(self) -> int:
-        """Count of normal numbers of the simulator's own."""
+        """Number of the simulator's own normal numbers."""
         return self.scene.simulator().noise
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
-        """Raise :class:`Unsupported`: the simulator is called in NumPy columns, by a backend made for it."""
+        """Raise :class:`Unsupported`: only the backends of the scene can call the simulator."""
         raise Unsupported(
-            f"scene {self.scene.name} is a simulator of its own: it runs on {' and '.join(self.scene.backends)}"
+            f"scene {self.scene.name} is a user's own simulator: it runs on {' and '.join(self.scene.backends)} only"
         )
 
     def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
-        """Return w . theta_scored / sigma, with the noise on theta."""
+        """Return w . theta_scored / sigma, ``(B,)``, since noise is on theta."""
         return ops.xp.sum(w[: self.dim] * theta_scored, axis=0) / self.scene.sigma
 
 
@@ -333,7 +331,7 @@ class Rollout(Program):
 
     @property
     def noise_on_theta(self) -> bool:
-        """Whether noise is on theta: parameter noise, or action noise where theta is the controls and nothing else."""
+        """Whether noise is on theta: parameter noise, or action noise if theta is the sequence of controls only."""
         return not self.action_noise or (self.scene.open_loop and self._only_controls and not self._moves_start)
 
     @property
@@ -343,16 +341,16 @@ class Rollout(Program):
 
     @property
     def _only_controls(self) -> bool:
-        """Whether u_t = theta_t + sigma w_t: a control law of its own may use theta in another way."""
-        own = type(self.scene)
-        return all(getattr(own, law) is getattr(MechanicalScene, law) for law in ("planned_controls", "feedback"))
+        """Whether u_t = theta_t + sigma w_t. A scene that defines its control law may use theta differently."""
+        scene = type(self.scene)
+        return all(getattr(scene, law) is getattr(MechanicalScene, law) for law in ("planned_controls", "feedback"))
 
     @cached_property
     def _moves_start(self) -> bool:
-        """Whether the initial state differs between thetas: tried at and around theta0, near and far."""
+        """Whether the initial state depends on theta, tested at theta0 and at random thetas near to it and far from it."""
         draw = np.random.default_rng(0)
         theta = self.scene.theta0()[:, None]
-        sizes = np.repeat([1e-3, self.scene.sigma, 1.0 + float(np.abs(theta).max(initial=0.0))], TRIED)
+        sizes = np.repeat([1e-3, self.scene.sigma, 1.0 + float(np.abs(theta).max(initial=0.0))], N_TRIALS)
         moved = np.concatenate([theta, theta + sizes * draw.standard_normal((theta.size, sizes.size))], axis=1)
         with np.errstate(all="ignore"):
             start = self.scene.initial_state(np, moved)
@@ -360,52 +358,52 @@ class Rollout(Program):
 
     @property
     def n_noise(self) -> int:
-        """n_w: one number per control, or one per coordinate of theta and the gusts."""
+        """n_w: one number per control, or one per coordinate of theta and one per gust."""
         return self.scene.controls * self.scene.n_u if self.action_noise else self.dim + self.exogenous
 
     @property
     def exogenous(self) -> int:
-        """Count of the numbers of a scene's gusts: one per step and control."""
+        """Number of the scene's process-noise values: one per step and control."""
         return self.scene.horizon * self.scene.n_u if isinstance(self.scene, ProcessNoiseScene) else 0
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
-        """Return the stage costs and the terminal cost of the rollout."""
+        """Return the sum of stage costs and terminal cost of each rollout, ``(B,)``."""
         program, theta, w = self.resolved(ops, theta, w)
         return program._rollout(ops, theta, w, None)[0]
 
     def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
-        """Return sum_t w_t . pi(theta_scored, x_t) / sigma along the states x_t that theta and w lead to.
+        """Return sum_t w_t . pi(theta_scored, x_t) / sigma along the states x_t of theta and w, ``(B,)``.
 
-        This is the part of log p(actions) that is linear in the policy's change. Where the program is
+        This is the part of log p(actions) that is linear in the change of the policy. If the program is
         :attr:`explicit`, the states are those of ``theta_scored`` under the same actions.
         """
-        # a control that is held is drawn once, and counted at each of its steps
+        # a control that is held is drawn once but counted at each of its steps
         scale = self.scene.sigma * (self.scene.horizon // self.scene.controls)
         if self.explicit:
             return self._replayed(ops, theta, theta_scored, w)[1] / scale
         return self._rollout(ops, theta, w, theta_scored)[1] / scale
 
     def explicit_cost(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> Array:
-        """Return the cost from the initial state of ``theta_moved``, under the actions that theta and w lead to."""
+        """Return the cost from the initial state of ``theta_moved`` under the actions of theta and w, ``(B,)``."""
         return self._replayed(ops, theta, theta_moved, w)[0]
 
     def resolved(self, ops: Ops, theta: Array, w: Array) -> tuple[Rollout, Array, Array]:
-        """Return program, theta and noise with the parameters named by theta filled in; unchanged if it names none."""
+        """Return program, theta and noise after setting the parameters in theta; unchanged if theta names none."""
         if not self._named:
             return self, theta, w
         bound, own = self._own_theta(ops.xp, theta, w[: self.dim])
         assert isinstance(bound, Rollout)
-        still = ops.xp.zeros((bound.n_noise - self.exogenous, own.shape[1]), dtype=own.dtype)
-        return bound, own, ops.xp.concat([still, w[self.dim :]], axis=0) if self.exogenous else still
+        no_noise = ops.xp.zeros((bound.n_noise - self.exogenous, own.shape[1]), dtype=own.dtype)
+        return bound, own, ops.xp.concat([no_noise, w[self.dim :]], axis=0) if self.exogenous else no_noise
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
-        """Take one step of the map."""
+        """Return the state after one step."""
         if self._varying and self.needs_root:
             ops = _VaryingOps(ops, [(self.parts[axis], name) for axis, name in self._varying])
         return self.integrator.step(Dynamics(ops, self.scene, self.contact), state, u, self.scene.dt)
 
     def steps(self, ops: Ops, theta: Array, w: Array) -> Iterator[tuple[State, Array]]:
-        """Yield (state, control) before each step, then the final state with the last control."""
+        """Yield the state and control of each step, then the final state with the last control."""
         program, theta, w = self.resolved(ops, theta, w)
         theta, state, scanned = program.start(ops, theta, w)
         u = None
@@ -416,9 +414,9 @@ class Rollout(Program):
         yield state, u
 
     def start(self, ops: Ops, theta: Array, w: Array) -> tuple[Array, State, tuple[Array, ...]]:
-        """Return theta with parameter noise, the initial state, and the control law's per-step inputs.
+        """Return theta plus its noise, the initial state, and the control law's inputs of each step.
 
-        Those are the plan, and the noise on actions or the gusts.
+        The inputs are the plan and the noise on the actions or the gusts.
         """
         scene, xp = self.scene, ops.xp
         shape = (scene.horizon, scene.n_u, w.shape[1])
@@ -438,7 +436,7 @@ class Rollout(Program):
         return theta, state, tuple(scanned)
 
     def control(self, ops: Ops, theta: Array, state: State, slices: tuple[Array, ...]) -> Array:
-        """Return u_t = plan + feedback + sigma w_t, or the scene's gusts for the latter, ``(n_u, B)``."""
+        """Return u_t = plan + feedback + sigma w_t, ``(n_u, B)``, with the scene's gusts instead of sigma w_t if it has any."""
         scene, xp = self.scene, ops.xp
         parts = list(slices)
         if self.action_noise:
@@ -488,7 +486,7 @@ class Rollout(Program):
             cost = cost + scene.stage_cost(xp, moved.q, moved.v, u)
             return self.step(ops, state, u), self.step(ops, moved, u), cost, logp
 
-        # of the moved program only the plan is needed besides: its noise is the same
+        # of the moved program only the plan is needed in addition, since its noise is the same
         inputs = scanned + scanned_moved[:-1]
         _, last, cost, logp = ops.scan(step, (first, second, zero, zero), inputs, scene.horizon)
         return cost + scene.terminal_cost(xp, last.q, last.v), logp
@@ -497,9 +495,8 @@ class Rollout(Program):
 class _VaryingOps:
     """Operations for a program in which some parameters differ between columns.
 
-    A residual reads its parameters from the scene and the law. A solver that takes columns one by one would find the
-    values of all columns there, so the solver gets the values as arguments, and each residual reads those of its own
-    column.
+    A residual reads its parameters from the scene and the law. A solver that processes columns one by one would read
+    the values of all columns, so the solver gets the values as arguments and each residual uses those of its column.
     """
 
     def __init__(self, ops: Ops, places: list[tuple[Plugin, str]]) -> None:
@@ -512,11 +509,11 @@ class _VaryingOps:
         return self._ops.xp
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Scan as the backend does."""
+        """Call the backend's ``scan``."""
         return self._ops.scan(step, carry, xs, length)
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Find the root as the backend does, with the parameters among the arguments."""
+        """Call the backend's ``root`` with the parameters among the arguments."""
         whole = [getattr(plugin, name) for plugin, name in self._places]
 
         def of_columns(z: Array, both: Any) -> Array:
@@ -530,7 +527,7 @@ class _VaryingOps:
         return self._ops.root(of_columns, guess, (args, whole))
 
     def _set(self, values: list[Array]) -> None:
-        # these are the copies that belong to one evaluation, see Program._with
+        # the plugins are copies that belong to one evaluation, see Program._with
         for (plugin, name), value in zip(self._places, values, strict=True):
             object.__setattr__(plugin, name, value)
 
@@ -538,9 +535,9 @@ class _VaryingOps:
 def compose(
     scene: Scene, contact: ContactLaw | None = None, integrator: Integrator | None = None, decision: Decision = OWN
 ) -> Program:
-    """Return the program of a scene under a contact law and an integrator (None where the scene has none).
+    """Return the program of a scene with a contact law and an integrator, each None if the scene has none.
 
-    Raises :class:`Unsupported` for combinations without meaning and :class:`UserError` for a theta that does not exist.
+    Raises :class:`Unsupported` for an invalid combination and :class:`UserError` for an invalid theta.
     """
     if isinstance(scene, FunctionScene):
         return FunctionProgram(scene, contact, integrator, decision)
@@ -549,12 +546,12 @@ def compose(
     if isinstance(scene, MechanicalScene):
         return Rollout(scene, contact, integrator, decision)
     raise Unsupported(
-        f"scene {scene.name} is neither a FunctionScene, a CallableScene nor a MechanicalScene: derive it from one of them"
+        f"scene {scene.name} is neither a FunctionScene, a CallableScene nor a MechanicalScene: derive it from one of these"
     )
 
 
 def rollout(program: Program) -> Rollout:
-    """Narrow the program to one with time steps; raises :class:`Unsupported` for a plain function."""
+    """Return the program as a :class:`Rollout`; raises :class:`Unsupported` for a plain function."""
     if not isinstance(program, Rollout):
         raise Unsupported(f"scene {program.scene.name} is a plain function: it has no time steps")
     return program

@@ -1,9 +1,8 @@
-"""Finds plugins and reports whether they can be used here.
+"""Finds plugins and reports whether they are available.
 
 Built-in plugins are the files under ``plugins/<kind>/`` and the folders under ``bench/studies/``; others come from
-folders that :func:`add_folder` names, and through the entry-point group ``bench.plugins``, each entry naming a plugin
-class. Importing a plugin must stay cheap: heavy libraries are named in ``requires`` and imported by the plugin when it
-is used.
+folders passed to :func:`add_folder` and from the entry-point group ``bench.plugins``, in which each entry names a plugin
+class. Importing a plugin must stay cheap: it names heavy libraries in ``requires`` and imports them when it is used.
 """
 
 from __future__ import annotations
@@ -31,15 +30,15 @@ from bench.model import guard, trial
 from bench.model.parameters import Plugin, build, parameters, remember, singular
 
 CORE = "bench.studies"
-"""What is no plugin file of anyone's: its import is not tried first."""
+"""The package of the built-in studies, whose import is not tried in a separate process."""
 BUILT_IN = ("bench.plugins", CORE)
 KINDS = ("scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "studies")
 """The kinds that come with the package, in the order in which they are listed; a plugin may declare another."""
 ENTRY_POINT_GROUP = "bench.plugins"
 NAME = re.compile(r"\w[\w.-]*")
-"""Names of plugins: they stand in identity strings, where brackets, commas and spaces have a meaning."""
-LONGEST = 1000
-"""Letters of a reason that are kept."""
+"""Names of plugins. Brackets, commas and spaces have a meaning in identity strings, so names contain none."""
+MAX_REASON_CHARACTERS = 1000
+"""Characters of a reason that are kept."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ _folders: list[Path] = []
 
 
 def add_folder(path: Path) -> None:
-    """Find plugins in a folder's ``.py`` files and its subfolders too; raises :class:`UserError` for a non-folder."""
+    """Register the plugins in a folder's ``.py`` files and its subfolders; raises :class:`UserError` for a non-folder."""
     path = path.expanduser().absolute()
     if not path.is_dir():
         raise UserError(f"plugins={path} is not a folder")
@@ -76,7 +75,7 @@ def add_folder(path: Path) -> None:
 
 
 def folders() -> tuple[Path, ...]:
-    """Return the folders that were added."""
+    """Return the registered plugin folders."""
     return tuple(_folders)
 
 
@@ -90,38 +89,38 @@ def entries() -> Table:
     """Return all plugins by kind and name."""
     table: Table = {kind: {} for kind in KINDS}
     packages = (*BUILT_IN, *map(_package, _folders))
-    modules = [found for name in packages for found in _modules(importlib.import_module(name))]
+    modules = [module for name in packages for module in _modules(importlib.import_module(name))]
     points = sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name)
-    stamps = {module: trial.stamp(module) for _, module in modules if not module.startswith(CORE)}
-    stamps |= {point.module: point.dist.version if point.dist else "" for point in points}
-    fatal = trial.fatal(stamps, {_package(path): path for path in _folders})
+    hashes = {module: trial.file_hash(module) for _, module in modules if not module.startswith(CORE)}
+    hashes |= {point.module: point.dist.version if point.dist else "" for point in points}
+    fatal = trial.find_fatal_modules(hashes, {_package(path): path for path in _folders})
     for kind, module in modules:
-        with guard.quiet(f"{module}, while it was imported,"), guard.guarded():
+        with guard.capture_output(f"{module}, while it was imported,"), guard.protect_process():
             _load_module(table, kind, module, fatal.get(module, ""))
     for point in points:
         try:
             if point.module in fatal:
                 raise ImportError(fatal[point.module])
-            with guard.quiet(f"{point.module}, while it was imported,"), guard.guarded():
+            with guard.capture_output(f"{point.module}, while it was imported,"), guard.protect_process():
                 plugin = point.load()
             if not (isinstance(plugin, type) and issubclass(plugin, Plugin) and plugin.kind):
                 raise TypeError(f"{point.value} is not a plugin class")
         except KeyboardInterrupt:
             raise
-        except BaseException as error:  # a plugin that exits at import, too, must not end the command
-            _fail(table, _guessed_kind(point.name), point.name, error)
+        except BaseException as error:  # even a plugin that exits at import must not end the command
+            _add_unavailable(table, _guess_kind(point.name), point.name, error)
         else:
             _add(table, plugin)
     return table
 
 
 def kinds() -> list[str]:
-    """Return the kinds of all plugins, those of the package first."""
+    """Return the kinds of all plugins, those that come with the package first."""
     return list(entries())
 
 
 def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
-    """Yield kind (the folder's name where that is one) and name of each module of a package and of its folders."""
+    """Yield the kind (the name of its folder) and the full name of each module of a package and of its folders."""
     for module in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
         name = f"{package.__name__}.{module.name}"
         if module.name in KINDS:
@@ -137,7 +136,7 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
                 yield folder.name, f"{space.__name__}.{module.name}"
 
 
-def _load_module(found: Table, kind: str, path: str, fatal: str) -> None:
+def _load_module(table: Table, kind: str, path: str, fatal: str) -> None:
     try:
         if fatal:
             raise ImportError(fatal)
@@ -145,63 +144,65 @@ def _load_module(found: Table, kind: str, path: str, fatal: str) -> None:
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        # one broken plugin must not hide the others, nor end the command by sys.exit(): it is listed with its error
-        _fail(found, kind if kind in found else "estimators", path.rpartition(".")[2], error)
+        # a broken plugin is listed with its error: it must not hide the others, nor end the command by sys.exit()
+        _add_unavailable(table, kind if kind in table else "estimators", path.rpartition(".")[2], error)
         return
     for name, plugin in list(vars(module).items()):
         try:
             own = isinstance(plugin, type) and str(plugin.__module__).startswith(module.__name__)
             concrete = own and issubclass(plugin, Plugin) and plugin.kind and plugin.name != ""
         except Exception as error:
-            _fail(found, kind if kind in found else "estimators", name, error, "cannot be used")
+            _add_unavailable(table, kind if kind in table else "estimators", name, error, "cannot be used")
             continue
         if concrete:
-            _add(found, plugin)
+            _add(table, plugin)
 
 
-def _guessed_kind(name: str) -> str:
+def _guess_kind(name: str) -> str:
     return next((kind for kind in KINDS if name.startswith(kind)), "estimators")
 
 
-def _fail(found: Table, kind: str, name: str, error: BaseException, what: str = "import failed") -> None:
-    said = printable(error)[:LONGEST]
-    while name in found[kind]:  # a sound plugin keeps its name
+def _add_unavailable(table: Table, kind: str, name: str, error: BaseException, problem: str = "import failed") -> None:
+    message = printable(error)[:MAX_REASON_CHARACTERS]
+    while name in table[kind]:  # an available plugin keeps its name
         name += " (another)"
-    found[kind][name] = Entry(kind, name, None, f"{what}: {type(error).__name__}: {said}")
+    table[kind][name] = Entry(kind, name, None, f"{problem}: {type(error).__name__}: {message}")
 
 
-def _add(found: Table, plugin: type[Plugin]) -> None:
+def _add(table: Table, plugin: type[Plugin]) -> None:
     where = printable(f"{plugin.__module__}.{plugin.__qualname__}")
     kind = plugin.kind if isinstance(plugin.kind, str) and plugin.kind.isidentifier() else "estimators"
-    table = found.setdefault(kind, {})
+    kind_entries = table.setdefault(kind, {})
     try:
         faults = _faults(plugin)
     except Exception as error:
-        _fail(found, kind, where, error, "cannot be used")
+        _add_unavailable(table, kind, where, error, "cannot be used")
         return
     if faults:
-        # by its place: what it calls itself may be no name, and classes of several files may be called alike
-        table[where] = Entry(kind, where, None, f"cannot be used: {faults}")
+        # listed by its module: its own name may be invalid, and classes of several files may share a name
+        kind_entries[where] = Entry(kind, where, None, f"cannot be used: {faults}")
         return
-    taken = table.get(plugin.name)
+    taken = kind_entries.get(plugin.name)
     if taken is not None and taken.plugin is not plugin:
         by = taken.plugin and f"{taken.plugin.__module__}.{taken.plugin.__qualname__}"
-        table[f"{plugin.name} of {where}"] = Entry(kind, plugin.name, None, f"the name is taken by {by or taken.name}")
+        kind_entries[f"{plugin.name} of {where}"] = Entry(
+            kind, plugin.name, None, f"the name is taken by {by or taken.name}"
+        )
     elif inspect.isabstract(plugin):
         missing = ", ".join(sorted(plugin.__abstractmethods__))
-        table[plugin.name] = Entry(kind, plugin.name, None, f"{plugin.__qualname__} does not define {missing}")
+        kind_entries[plugin.name] = Entry(kind, plugin.name, None, f"{plugin.__qualname__} does not define {missing}")
     else:
-        table[plugin.name] = Entry(kind, plugin.name, plugin, _missing(plugin))
+        kind_entries[plugin.name] = Entry(kind, plugin.name, plugin, _missing(plugin))
 
 
 def _faults(plugin: type[Plugin]) -> str:
-    """Return what makes a class unusable as a plugin before it is used; its parameters are read, and may raise."""
+    """Return why a class cannot be a plugin, or an empty string. Reading its parameters may raise any exception."""
     if not (isinstance(plugin.kind, str) and plugin.kind.isidentifier()):
-        return f"kind={printable(repr(plugin.kind))[:LONGEST]} must be a name"
+        return f"kind={printable(repr(plugin.kind))[:MAX_REASON_CHARACTERS]} must be a name"
     if not (isinstance(plugin.name, str) and NAME.fullmatch(plugin.name)):
-        return f"name={printable(repr(plugin.name))[:LONGEST]} must be letters, digits, '_', '-' and '.'"
+        return f"name={printable(repr(plugin.name))[:MAX_REASON_CHARACTERS]} must be letters, digits, '_', '-' and '.'"
     if not (isinstance(plugin.requires, tuple | list) and all(isinstance(r, str) and r for r in plugin.requires)):
-        return f"requires={printable(repr(plugin.requires))[:LONGEST]} must be a tuple of modules"
+        return f"requires={printable(repr(plugin.requires))[:MAX_REASON_CHARACTERS]} must be a tuple of modules"
     for parameter in parameters(plugin).values():
         kinds = typing.get_args(parameter.type) if isinstance(parameter.type, types.UnionType) else (parameter.type,)
         if not kinds or not set(kinds) <= {bool, int, float, str, type(None)} or kinds == (type(None),):
@@ -238,7 +239,7 @@ def find(kind: str, name: str) -> Entry:
 
 
 def usable(kind: str, name: str) -> type[Plugin]:
-    """Return the plugin class of that name; raises :class:`UserError` if it does not exist or could not be loaded."""
+    """Return the plugin class of that name; raises :class:`UserError` if there is none or it could not be loaded."""
     entry = find(kind, name)
     if entry.plugin is None:
         raise UserError(f"{singular(kind)} '{name}' cannot be used: {entry.reason}")

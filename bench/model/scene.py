@@ -1,4 +1,4 @@
-"""Scenes: minimal physical problems, and their possible roles (contact, friction, damping, engine twin, oscillator)."""
+"""The contract of a scene, a minimal physical problem, and its roles: contact, friction, damping, engine twin, ..."""
 
 from __future__ import annotations
 
@@ -17,36 +17,34 @@ from bench.model.parameters import Plugin, param
 
 @dataclass(frozen=True)
 class Scene(Plugin):
-    """A problem: decision variable theta, noise, cost. It models only what its question needs.
+    """A problem with decision variable theta, noise and cost. It models only the effects that its question needs.
 
     ``J_sigma(theta) = E_w f(theta, w)`` with ``w ~ N(0, I)``; ``sigma`` always multiplies w.
     """
 
     kind: ClassVar[str] = "scenes"
     neglected_effects: ClassVar[str] = ""
-    """What the scene does not model, in a few words."""
+    """The effects that the scene does not model, in a few words."""
     backends: ClassVar[tuple[str, ...]] = ()
-    """Names of the backends that it runs on; empty for all whose array namespace its code is written for."""
+    """Names of the backends that can run it; empty for all backends with an array namespace."""
     continuous: ClassVar[bool] = True
-    """Whether the cost is continuous in theta (given a continuous contact law)."""
+    """Whether the cost is continuous in theta, provided that the contact law is continuous."""
     identifies: ClassVar[bool] = False
-    """Whether theta are parameters of the scene, to be found from a record that the cost compares it with."""
+    """Whether theta consists of parameters of the scene to be identified, with a cost that compares it with a record."""
 
     sigma: float = param(0.1, "standard deviation of the Gaussian noise in J", positive=True)
-    noise: str = param(
-        "parameter", "what the noise perturbs: theta, or the actions of each step", choices=("parameter",)
-    )
+    noise: str = param("parameter", "whether noise is on theta or on the actions of each step", choices=("parameter",))
 
     @abstractmethod
     def theta0(self) -> np.ndarray:
         """Return the decision variable at which gradients are estimated, ``(d,)``."""
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return, per coordinate of theta, where the cost jumps or has a kink: panel edges of the quadrature."""
+        """Return, per coordinate of theta, the positions of jumps and kinks of the cost, as edges of quadrature panels."""
         return ()
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray | None:
-        """Return grad J_sigma at :meth:`theta0` of the *program* (the scene under that law and integrator), or None."""
+        """Return grad J_sigma at :meth:`theta0` of the *program* (the scene with this law and integrator), or None."""
         return None
 
     def physical_gradient(self) -> np.ndarray | None:
@@ -54,13 +52,13 @@ class Scene(Plugin):
         return None
 
     def physical_cost(self) -> float | None:
-        """Return f at :meth:`theta0`, without noise, of the same physics, or None."""
+        """Return f at :meth:`theta0`, without noise, of the physics (rigid contact, dt -> 0), or None."""
         return None
 
 
 @dataclass(frozen=True)
 class FunctionScene(Scene):
-    """A scene that is a plain function of ``x = theta + sigma w``."""
+    """A scene whose cost is a plain function of ``x = theta + sigma w``."""
 
     @abstractmethod
     def cost(self, xp: Any, x: Array) -> Array:
@@ -69,21 +67,21 @@ class FunctionScene(Scene):
 
 @dataclass(frozen=True)
 class DisturbedScene(FunctionScene):
-    """A role: a plain function with noise of its own, beside the noise on theta.
+    """A role: a plain function with its own noise in addition to the noise on theta.
 
-    ``J_sigma(theta) = E f(theta + sigma u, e)`` over both: d normal numbers u, then ``exogenous`` of the scene's own, e.
-    No estimator smoothes over e by shifting it, and no score takes it.
+    ``J_sigma(theta) = E f(theta + sigma u, e)`` over both: d normal numbers u, then ``exogenous`` numbers e of the scene.
+    No estimator shifts e for smoothing, and no score depends on it.
     """
 
     exogenous: ClassVar[int]
-    """How many normal numbers of its own a sample has."""
+    """Number of the scene's own normal numbers per sample."""
 
     @abstractmethod
     def disturbed_cost(self, xp: Any, x: Array, e: Array) -> Array:
         """Return f at ``x (d, B)`` under the scene's own noise ``e (exogenous, B)``: ``(B,)``."""
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """Return f without noise of its own."""
+        """Return f without the scene's own noise, ``(B,)``."""
         return self.disturbed_cost(xp, x, xp.zeros((self.exogenous, x.shape[1]), dtype=x.dtype))
 
 
@@ -91,20 +89,20 @@ class DisturbedScene(FunctionScene):
 class MechanicalScene(Scene):
     """A scene with dynamics ``q' = v``, ``v' = acceleration(q, v, u) + contact``, ``horizon`` steps of ``dt``.
 
-    Bodies that touch make it a :class:`ContactScene`, Coulomb friction a :class:`FrictionScene`. Mix in
-    :class:`EngineTwin` for a physics engine's model of it, :class:`Oscillator` where its motion is linear.
+    Derive from :class:`ContactScene` for bodies in contact and from :class:`FrictionScene` for Coulomb friction. Mix in
+    :class:`EngineTwin` for a physics engine's model of the scene and :class:`Oscillator` if its motion is linear.
     """
 
     n_q: ClassVar[int]
     n_v: ClassVar[int | None] = None
-    """Length of v if it differs from that of q: n_q = 0 with n_v = 1 makes a first-order scene v' = acceleration(v)."""
+    """Length of v if it differs from that of q: n_q = 0 with n_v = 1 is a first-order scene v' = acceleration(v)."""
     n_u: ClassVar[int] = 0
     n_contacts: ClassVar[int] = 0
-    """Contacts that a contact law acts in; more than 0 only in a :class:`ContactScene` or an :class:`EngineScene`."""
+    """Number of contacts; more than 0 only in a :class:`ContactScene` or an :class:`EngineScene`."""
     open_loop: ClassVar[bool] = False
-    """Whether theta is the sequence of controls itself, step by step."""
+    """Whether theta is the sequence of controls, step by step."""
     contact_values: ClassVar[Mapping[str, Any]] = {}
-    """Values that this scene gives to the parameters of its contact law, whichever it is, unless the user sets them."""
+    """Values for parameters of any contact law of the scene, unless the user sets them."""
 
     horizon: int = param(100, "number of time steps", "steps", positive=True)
     dt: float = param(0.01, "length of a time step", "s", positive=True)
@@ -113,8 +111,8 @@ class MechanicalScene(Scene):
         super().__init_subclass__(**arguments)
         if cls.n_contacts and not issubclass(cls, ContactScene | EngineScene):
             raise TypeError(
-                f"{cls.__name__} has n_contacts={cls.n_contacts}: derive it from ContactScene and give its gap, gap_rate "
-                "and contact_acceleration (or from EngineScene, where only an engine knows its contacts)"
+                f"{cls.__name__} has n_contacts={cls.n_contacts}: derive it from ContactScene and define gap, gap_rate "
+                "and contact_acceleration, or from EngineScene if only an engine computes its contacts"
             )
 
     @abstractmethod
@@ -141,7 +139,7 @@ class MechanicalScene(Scene):
         return self.horizon
 
     def held(self, xp: Any, values: Array) -> Array:
-        """Return what each control has, ``(controls, ...)``, for each step, ``(horizon, ...)``."""
+        """Repeat values per control, ``(controls, ...)``, for each step, ``(horizon, ...)``."""
         return values
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array | None:
@@ -149,16 +147,16 @@ class MechanicalScene(Scene):
         return None
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array | float:
-        """Return the cost of one step, taken at the state before it, ``(B,)``."""
+        """Return the cost of one step from the state before the step, ``(B,)``."""
         return 0.0
 
     def cost_terms(self, xp: Any, q: Array, v: Array, u: Array) -> Mapping[str, Array]:
-        """Return parts of the stage cost by name, each ``(B,)``, which ``trace`` shows separately; none by default."""
+        """Return parts of the stage cost by name, each ``(B,)``, that ``trace`` shows separately; none by default."""
         return {}
 
     def carried(self, v: Array) -> Array:
-        """Return the velocity that a step carries over from the one before it."""
-        # the factor 1 keeps the operations that a compiler sees, and with them the last digit of stored results
+        """Return the velocity from which a step starts, ``(n_v, B)``, after numerical damping if there is any."""
+        # the factor 1 keeps the compiled operations, and therefore the last digit of stored results, unchanged
         return 1.0 * v
 
 
@@ -169,34 +167,34 @@ class DampedScene(MechanicalScene):
     velocity_factor: float = param(1.0, "factor on the velocity each step", low=0.0)
 
     def carried(self, v: Array) -> Array:
-        """Return the factor times v."""
+        """Return the velocity factor times v."""
         return self.velocity_factor * v
 
 
 @dataclass(frozen=True)
 class ProcessNoiseScene(MechanicalScene):
-    """A role: noise from outside on every control of every step, beside the noise on theta.
+    """A role: process noise on every control of every step, in addition to the noise on theta.
 
     ``u_t = plan + feedback + gust e_t`` with ``horizon * n_u`` normal numbers e, which follow the d numbers on theta, so
-    that J averages over both. No estimator smoothes over e by shifting it, and no score takes it. What u does is the
-    scene's own: a channel may be a force of the wind, or a share by which a mass or a stiffness is off in that step.
+    that J averages over both. No estimator shifts e for smoothing, and no score depends on it. The scene decides what u
+    does: a channel may be a wind force, or the relative error of a mass or stiffness in that step.
     """
 
-    noise: str = param("parameter", "what sigma perturbs; the gusts come beside it", choices=("parameter",))
-    gust: float = param(0.1, "standard deviation of the noise from outside on each control", low=0.0)
+    noise: str = param("parameter", "sigma is the noise on theta; gusts are added to it", choices=("parameter",))
+    gust: float = param(0.1, "standard deviation of the process noise on each control", low=0.0)
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         if not cls.n_u:
-            raise TypeError(f"{cls.__name__} has gusts on its controls: set n_u")
+            raise TypeError(f"{cls.__name__} has process noise on its controls: set n_u")
 
 
 @dataclass(frozen=True)
 class ZeroOrderHoldScene(MechanicalScene):
     """A role: each control of an open loop, and its noise, is held over ``hold`` steps (zero-order hold).
 
-    The step can then be refined with theta, the noise and the duration as they were: ``horizon`` and ``hold`` grow by a
-    factor by which ``dt`` falls. Weight a stage cost by ``1 / hold`` to keep the objective as it was too.
+    The step can then be refined at constant theta, noise and duration: multiply ``horizon`` and ``hold`` and divide
+    ``dt`` by the same factor. Divide the stage cost by ``hold`` to keep the objective constant too.
     """
 
     hold: int = param(1, "steps over which each control and its noise are held", "steps", positive=True)
@@ -204,17 +202,19 @@ class ZeroOrderHoldScene(MechanicalScene):
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         if not cls.open_loop:
-            raise TypeError(f"{cls.__name__} holds its controls: set open_loop, a feedback law acts at every step")
+            raise TypeError(
+                f"{cls.__name__} holds its controls: set open_loop, since a feedback law acts at every step"
+            )
 
     @property
     def controls(self) -> int:
-        """Number of controls; raises :class:`UserError` unless they fill the horizon."""
+        """Number of controls; raises :class:`UserError` if ``hold`` does not divide the horizon."""
         if self.horizon % self.hold:
             raise UserError(f"hold={self.hold} does not divide the horizon of {self.horizon} steps")
         return self.horizon // self.hold
 
     def held(self, xp: Any, values: Array) -> Array:
-        """Return each control's values ``hold`` times."""
+        """Repeat the values of each control ``hold`` times."""
         if self.hold == 1:
             return values
         rest = values.shape[1:]
@@ -224,7 +224,7 @@ class ZeroOrderHoldScene(MechanicalScene):
 
 @dataclass(frozen=True)
 class ContactScene(MechanicalScene):
-    """A role: bodies that touch. Give ``n_contacts``, the gaps between bodies, and how a contact force moves them."""
+    """A role: bodies in contact. Set ``n_contacts`` and define the gaps and the effect of contact forces."""
 
     restitution: float = param(1.0, "restitution of impulse laws", low=0.0, high=1.0)
 
@@ -241,7 +241,7 @@ class ContactScene(MechanicalScene):
         """Return M^-1 J^T force for normal forces ``(n_contacts, B)`` [N], linear in them: ``(n_v, B)``."""
 
     def contact(self, xp: Any) -> Contact:
-        """Return the contact geometry, as impulse laws take it."""
+        """Return the contact geometry for impulse laws."""
         return Contact(
             gap=lambda q: self.gap(xp, q),
             gap_rate=lambda q, v: self.gap_rate(xp, q, v),
@@ -255,7 +255,7 @@ class FrictionScene(ContactScene):
     """A role: contacts with Coulomb friction, regularised as friction * normal force * tanh(slip / slip_speed)."""
 
     friction: float = param(0.5, "Coulomb coefficient of the contacts under a force law", low=0.0)
-    slip_speed: float = param(1e-3, "speed at which friction has grown to tanh(1) of its bound", "m/s", positive=True)
+    slip_speed: float = param(1e-3, "slip speed at which friction reaches tanh(1) of its limit", "m/s", positive=True)
 
     @abstractmethod
     def slip(self, xp: Any, q: Array, v: Array) -> Array:
@@ -267,31 +267,33 @@ class FrictionScene(ContactScene):
 
 
 class EngineTwin(ABC):
-    """A role: the scene as a physics engine's model."""
+    """A role: the scene also exists as a physics engine's model, its twin."""
 
     twin_difference: ClassVar[float] = 1e-9
-    """Relative difference allowed between the costs of the twin and of the scene's own program under ``penalty``."""
+    """Largest allowed relative difference between the costs of the twin and of the scene's program with ``penalty``."""
 
     @abstractmethod
     def mjcf(self) -> str:
         """Return the scene's twin for physics engines, as the content of an MJCF ``<mujoco>`` element.
 
         The twin's joints (slides and hinges) are q in order, its motors take u, and its contact pairs are the contacts.
-        The backend sets time step, solver and contact springs; gravity is zero unless an ``<option>`` says otherwise.
+        The backend sets time step, solver and contact springs. Gravity is zero unless an ``<option>`` sets it.
         """
 
 
 @dataclass(frozen=True)
 class EngineScene(EngineTwin, MechanicalScene):
-    """A role: a scene that exists only as its twin, so that only backends that provide ``physics`` run it."""
+    """A role: the scene exists only as its twin, so that only backends with ``physics`` can run it."""
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Raise :class:`Unsupported`: only the engine knows the acceleration."""
-        raise Unsupported(f"scene {self.name} exists only as an engine's model and has no accelerations of its own")
+        """Raise :class:`Unsupported`: only the engine computes the acceleration."""
+        raise Unsupported(
+            f"scene {self.name} exists only as an engine's model and has no acceleration outside the engine"
+        )
 
 
 class Oscillator(ABC):
-    """A role: the scene's motion is that of a linear oscillator, so that its stability has a closed form."""
+    """A role: the scene is a linear oscillator, so that its stability has a closed form."""
 
     @abstractmethod
     def oscillator(self) -> tuple[float, float, float]:

@@ -1,8 +1,9 @@
-"""New plugin files are first tried in a process of their own: one that ends it is listed, and ends no command.
+"""Imports new plugin files in a separate process first, so that a file which ends its process cannot end a command.
 
-A crash, ``os._exit`` or an endless loop cannot be caught where it happens. So each file is imported there, and its plugins
-are built with their defaults and asked what a run asks while it is planned. A file that came through once is not tried
-again until its text changes: its hash stands in ``$XDG_CACHE_HOME/bench/imported`` (``~/.cache`` where that is not set). Where that folder cannot be written, each command tries again, which costs about a second.
+A crash, ``os._exit`` or an endless loop cannot be caught where it happens. The trial process therefore imports each new
+file, builds its plugins with their defaults and calls the methods that planning a run calls. A file that passes is not
+tried again until its text changes: its hash is stored in ``$XDG_CACHE_HOME/bench/imported`` (by default under
+``~/.cache``). If that folder cannot be written, each command tries the files again, which takes about a second.
 """
 
 from __future__ import annotations
@@ -25,38 +26,43 @@ from typing import Any
 
 from bench.model import guard
 
-PATIENCE = 60.0
+TIMEOUT_S = 60.0
 """Seconds that one module may take."""
-STAGES = {b".": "when it was imported", b",": "when it was built with its defaults and asked what a plan asks"}
-"""What a module was at, by the last sign from its process."""
-CHILD = "import json, sys; given = json.load(sys.stdin); sys.path[:] = given['path']; import bench.model.trial as t; t.child(given)"
+STAGES = {b".": "when it was imported", b",": "when it was built with its defaults and called as for a plan"}
+"""The stage that each byte from the trial process announces."""
+CHILD_CODE = (
+    "import json, sys; job = json.load(sys.stdin); sys.path[:] = job['path']; "
+    "import bench.model.trial as trial; trial.run_child(job)"
+)
 
 
-def fatal(
-    modules: Mapping[str, str], packages: Mapping[str, Path] = MappingProxyType({}), patience: float | None = None
+def find_fatal_modules(
+    modules: Mapping[str, str],
+    packages: Mapping[str, Path] = MappingProxyType({}),
+    timeout_s: float | None = None,
 ) -> dict[str, str]:
-    """Return what happened to the process that imported a module, for each one that ended it or did not come back.
+    """Return, for each module whose import ended or blocked the trial process, what happened.
 
-    ``modules`` maps names to what tells one text from another (:func:`stamp`); ``packages`` are names that stand for
-    plugin folders. What merely raises is not fatal.
+    ``modules`` maps module names to the hashes of their files (:func:`file_hash`), ``packages`` the package names of
+    plugin folders to the folders. A module that only raises an exception is not fatal.
     """
-    known = _known()
-    waiting = [name for name, text in modules.items() if _digest(name, text) not in known]
-    found: dict[str, str] = {}
-    while waiting:
-        came, end = _import(waiting, packages, PATIENCE if patience is None else patience)
-        passed = waiting[: came - 1] if end else waiting
-        if end and not came:
-            return found  # the process could not start: nothing can be told, and the import says why
-        if end:
-            found[waiting[came - 1]] = end
-        _remember([_digest(name, modules[name]) for name in passed])
-        waiting = waiting[came:] if end else []
-    return found
+    passed = _load_digests()
+    remaining = [name for name, text in modules.items() if _digest(name, text) not in passed]
+    fatal: dict[str, str] = {}
+    while remaining:
+        n_started, failure = _try_imports(remaining, packages, TIMEOUT_S if timeout_s is None else timeout_s)
+        if failure and not n_started:
+            return fatal  # the trial process did not start: nothing is known, and the import itself reports the cause
+        n_passed = n_started - 1 if failure else len(remaining)
+        _store_digests([_digest(name, modules[name]) for name in remaining[:n_passed]])
+        if failure:
+            fatal[remaining[n_passed]] = failure
+        remaining = remaining[n_passed + 1 :]
+    return fatal
 
 
-def stamp(module: str) -> str:
-    """Return the text of a module's file as a hash; empty where there is none to read."""
+def file_hash(module: str) -> str:
+    """Return the hash of a module's file, or an empty string if there is no file to read."""
     try:
         spec = importlib.util.find_spec(module)
         return hashlib.sha256(Path(spec.origin).read_bytes()).hexdigest() if spec and spec.origin else ""
@@ -64,30 +70,30 @@ def stamp(module: str) -> str:
         return ""
 
 
-def child(given: Mapping[str, Any]) -> None:
-    """Try modules one by one; the pipe hears of each before it is imported, before its plugins are built, and of the end."""
-    own = os.getpid()
+def run_child(job: Mapping[str, Any]) -> None:
+    """Import and call modules one by one in the trial process, and announce each stage by a byte on the pipe."""
+    pid = os.getpid()
     pipe = os.dup(1)
-    nowhere = os.open(os.devnull, os.O_RDWR)
+    null = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
-        os.dup2(nowhere, descriptor)
-    for name, folder in given["packages"].items():
+        os.dup2(null, descriptor)
+    for name, folder in job["packages"].items():
         sys.modules[name] = package = ModuleType(name)
         package.__path__ = [folder]
-    for name in given["modules"]:
+    for name in job["modules"]:
         os.write(pipe, b".")
-        with contextlib.suppress(BaseException):  # it is imported again where its error is listed
+        with contextlib.suppress(BaseException):  # the registry imports the module again and lists its error
             module = importlib.import_module(name)
-            os.write(pipe, b"," if os.getpid() == own else b"")
-            _ask(module)
-        guard.end_copies(own)
-        guard.end_children()
+            os.write(pipe, b"," if os.getpid() == pid else b"")
+            _call_plugins(module)
+        guard.exit_if_forked(pid)
+        guard.kill_children()
     os.write(pipe, b"!")
-    os._exit(0)  # threads that a plugin has left running keep nothing waiting
+    os._exit(0)  # does not wait for threads that a plugin has left running
 
 
-def _ask(module: ModuleType) -> None:
-    """Build the plugins of a module and ask each what a plan asks; an answer that raises is one of a cell."""
+def _call_plugins(module: ModuleType) -> None:
+    """Build the plugins of a module and call the methods that planning calls. Exceptions are left to the cells."""
     import numpy as np
 
     from bench.model.backend import CAPABILITIES
@@ -103,7 +109,7 @@ def _ask(module: ModuleType) -> None:
             return x[0] * x[0]
 
     program = compose(Bowl(), None, None)
-    questions: dict[str, dict[str, tuple[Any, ...]]] = {
+    calls: dict[str, dict[str, tuple[Any, ...]]] = {
         "scenes": {"theta0": (), "breakpoints": (), "closed_form_gradient": (None, None)},
         "contacts": {"spring": ()},
         "integrators": {"transition": (0.01, 1.0, 0.1, 1.0)},
@@ -113,48 +119,48 @@ def _ask(module: ModuleType) -> None:
     for plugin in list(vars(module).values()):
         with contextlib.suppress(Exception):
             if isinstance(plugin, type) and issubclass(plugin, Plugin) and plugin.__module__ == module.__name__:
-                made = plugin()
-                for question, given in questions.get(plugin.kind, {}).items():
+                instance = plugin()
+                for method, arguments in calls.get(plugin.kind, {}).items():
                     with contextlib.suppress(Exception):
-                        getattr(made, question)(*given)
+                        getattr(instance, method)(*arguments)
 
 
-def _import(names: Sequence[str], packages: Mapping[str, Path], patience: float) -> tuple[int, str]:
-    """Return how many modules a process came to, and how the last one ended it; empty where all came through."""
-    command = [sys.executable, "-c", CHILD]
+def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: float) -> tuple[int, str]:
+    """Return how many modules a trial process started, and how the last one ended it; empty if all passed."""
+    command = [sys.executable, "-c", CHILD_CODE]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    given = {
+    job = {
         "path": sys.path,
         "packages": {name: str(folder) for name, folder in packages.items()},
         "modules": list(names),
     }
     with subprocess.Popen(command, start_new_session=True, **pipes) as process:  # type: ignore[call-overload]
         try:
-            process.stdin.write(json.dumps(given).encode())
+            process.stdin.write(json.dumps(job).encode())
             process.stdin.close()
         except BrokenPipeError:
             return 0, "did not start"
-        came, said, stage = 0, b"", "when it was imported"
+        n_started, received, stage = 0, b"", "when it was imported"
         try:
             with selectors.DefaultSelector() as selector:
                 selector.register(process.stdout, selectors.EVENT_READ)
-                until = time.monotonic() + patience
-                while selector.select(max(0.0, until - time.monotonic())):
-                    said = os.read(process.stdout.fileno(), 4096)
-                    came += said.count(b".")
-                    stage = STAGES.get(said[-1:], stage)
-                    if not said or said.endswith(b"!"):
+                deadline = time.monotonic() + timeout_s
+                while selector.select(max(0.0, deadline - time.monotonic())):
+                    received = os.read(process.stdout.fileno(), 4096)
+                    n_started += received.count(b".")
+                    stage = STAGES.get(received[-1:], stage)
+                    if not received or received.endswith(b"!"):
                         break
-                    until = time.monotonic() + patience
+                    deadline = time.monotonic() + timeout_s
                 else:
-                    return came, f"did not come back within {patience:g} s {stage}"
+                    return n_started, f"did not return within {timeout_s:g} s {stage}"
         finally:
-            _end(process)
-    return came, "" if said.endswith(b"!") else f"{_how(process.returncode)} {stage}"
+            _terminate(process)
+    return n_started, "" if received.endswith(b"!") else f"{_exit_description(process.returncode)} {stage}"
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Wait a moment for a process that has said its last word, then kill what it has started with it."""
+def _terminate(process: subprocess.Popen[bytes]) -> None:
+    """Wait a moment for the process to exit, then kill it and the processes that it has started."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(0.5)
     with contextlib.suppress(ProcessLookupError):
@@ -162,35 +168,32 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def _how(status: int) -> str:
-    return (
-        f"ended the process by {signal.Signals(-status).name}"
-        if status < 0
-        else f"ended the process (exit status {status})"
-    )
+def _exit_description(status: int) -> str:
+    cause = f"by {signal.Signals(-status).name}" if status < 0 else f"(exit status {status})"
+    return f"ended the process {cause}"
 
 
 def _digest(name: str, text: str) -> str:
-    """Return what is remembered of a module: its name's last part, its text, and the Python that imported it."""
+    """Return the hash under which a module that passed is stored: of its last name, its text and the Python version."""
     return hashlib.sha256(f"asked {name.rpartition('.')[2]} {text} {sys.version}".encode()).hexdigest()[:24]
 
 
-def _place() -> Path:
+def _digests_path() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "bench" / "imported"
 
 
-def _known() -> frozenset[str]:
+def _load_digests() -> frozenset[str]:
     try:
-        return frozenset(_place().read_text().split())
+        return frozenset(_digests_path().read_text().split())
     except (OSError, UnicodeDecodeError, RuntimeError):
         return frozenset()
 
 
-def _remember(digests: Sequence[str]) -> None:
+def _store_digests(digests: Sequence[str]) -> None:
     try:
-        place = _place()
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with place.open("a") as file:
+        path = _digests_path()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as file:
             file.write("".join(f"{digest}\n" for digest in digests))
     except (OSError, RuntimeError):
         return

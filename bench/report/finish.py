@@ -40,7 +40,8 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write the study's tables and charts, and the page; raises :class:`UserError` where there are no rows."""
     if rows.empty:
         raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
-    with guard.quiet("a plugin"), guard.guarded():  # the commands that repeat a cell are made from its plugins
+    # the commands that repeat a cell are built from its plugins
+    with guard.capture_output("a plugin"), guard.protect_process():
         works = (study_of(experiment).write, _page, averages.write)
         return [path for paths in spread([partial(work, experiment, rows) for work in works]) for path in paths]
 

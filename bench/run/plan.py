@@ -43,7 +43,7 @@ def plan(experiment: Experiment, store: Store) -> list[Planned]:
     rows = store.load()
     facts = zip(rows["status"], rows["versions"], rows["machine"], strict=True)
     stored = dict(zip(rows["key"], facts, strict=True))
-    with guard.quiet("a plugin"), guard.guarded():
+    with guard.capture_output("a plugin"), guard.protect_process():
         return [_planned(experiment, cell, stored) for cell in cells(experiment)]
 
 

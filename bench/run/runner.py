@@ -55,7 +55,8 @@ class _Run:
         if refused:
             self._finish([(cell, result | {"machine": kind_of_machine()}) for cell, result in refused])
         waiting = [item.cell for item in todo if item.refusal is None]
-        with guard.quiet("a plugin"), guard.guarded():  # backends are asked whether they can give references
+        # backends are asked whether they can compute references
+        with guard.capture_output("a plugin"), guard.protect_process():
             references = self._missing_references(waiting)
         if not self._experiment.timing:
             with launchers.of(self._experiment) as pool:
@@ -95,7 +96,7 @@ class _Run:
             self._finish([result for answer, result in done if answer.stored], stored=True)
 
     def _answers(self, tasks: list[Task], pool: Launcher) -> Iterator[list[Answer]]:
-        with guard.quiet("a plugin"), guard.guarded():
+        with guard.capture_output("a plugin"), guard.protect_process():
             groups = grouped(tasks)
         for answers in pool.run(groups):
             guard.raise_pending_interrupt()

@@ -57,7 +57,7 @@ class Measure:
 
     def prepare(self, item: Task) -> None:
         """Have the backend import its libraries, as it does when it gets a program."""
-        with guard.guarded():
+        with guard.protect_process():
             try:
                 self._session.problems.of(item.backend, item.cell)
             except KeyboardInterrupt:
@@ -67,7 +67,7 @@ class Measure:
 
     def __call__(self, item: Task) -> dict[str, Any]:
         """Return the results of the cell, or the status and reason of its failure."""
-        with guard.guarded():
+        with guard.protect_process():
             return self._result(item)
 
     def _result(self, item: Task) -> dict[str, Any]:

@@ -80,8 +80,8 @@ def _serve(channel: Channel) -> None:
     while True:
         waiting = waiting or channel.receive()
         answer = _answered(channel, handle, waiting.pop(0))
-        guard.end_copies(own)
-        guard.end_children()
+        guard.exit_if_forked(own)
+        guard.kill_children()
         with suppress(Exception):
             sys.stdout.flush()
         channel.send(answer)
@@ -101,6 +101,6 @@ def _answered(channel: Channel, handle: Handler, message: bytes) -> bytes:
     except StorageError as error:
         text = json.dumps({"storage": str(error)})
     except BaseException as error:
-        guard.end_copies(own)
+        guard.exit_if_forked(own)
         text = json.dumps({"result": failure(error), "seconds": time.perf_counter() - started})
     return text.encode()

@@ -30,7 +30,7 @@ class Lbfgs(Searching):
         """Start without pairs."""
         return super().start(theta) | {"steps": [], "changes": [], "last": None}
 
-    def noted(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
+    def with_gradient(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
         """Return the state with a new gradient and the pair that it completes."""
         steps, changes = list(state["steps"]), list(state["changes"])
         if state["last"] is not None:

@@ -28,7 +28,7 @@ class Searching(Optimizer):
         """Start by asking for a gradient."""
         return super().start(theta) | {"gradient": None}
 
-    def wants(self, state: OptimizerState) -> frozenset[str]:
+    def required_fields(self, state: OptimizerState) -> frozenset[str]:
         """Return gradient and costs in turn."""
         return frozenset({"gradient"} if state["gradient"] is None else {"value"})
 
@@ -43,7 +43,7 @@ class Searching(Optimizer):
         """Note the gradient, or take the longest step that descends enough."""
         if state["gradient"] is None:
             assert answer.gradient is not None
-            return self.noted(state, answer.gradient[:, 0])
+            return self.with_gradient(state, answer.gradient[:, 0])
         assert answer.value is not None
         promised = self.slope * self.steps(state) * float(state["gradient"] @ self.direction(state))
         good = np.flatnonzero(answer.value[1:] <= answer.value[0] + promised)
@@ -54,7 +54,7 @@ class Searching(Optimizer):
         """Return the steps that are tried, longest first."""
         return self.first * self.shrink ** np.arange(self.tries)
 
-    def noted(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
+    def with_gradient(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
         """Return the state with a new gradient."""
         return state | {"gradient": gradient}
 

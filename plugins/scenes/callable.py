@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
-from bench.model import CallableScene, param, simulator_files, simulator_of
+from bench.model import CallableScene, load_simulator, param, simulator_files
 
 
 @dataclass(frozen=True)
@@ -36,4 +36,4 @@ class Callable(CallableScene):
 
 @cache
 def _loaded(cost: str, theta: str, grad: str, batch: str, noise: int) -> Any:
-    return simulator_of(cost, theta, grad, batch, noise)
+    return load_simulator(cost, theta, grad, batch, noise)

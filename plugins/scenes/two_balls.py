@@ -75,7 +75,7 @@ class TwoBalls(KnownOptimum, ContactScene):
         return q[2] ** 2 + q[3] ** 2
 
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
-        """Return the least f(s, v) over impact times s, for rigid laws; that of doing nothing where no blow is worth it."""
+        """Return the least f(s, v) over impact times s, by grid search, or 2 where no push pays; None without rigid laws."""
         if not isinstance(contact, ImpulseLaw) or self.restitution != 1.0:
             return None
         end, gap, eps = self.horizon * self.dt, 1.0 - math.sqrt(2.0) * self.radius, self.effort
@@ -86,7 +86,7 @@ class TwoBalls(KnownOptimum, ContactScene):
             cost = 2 + 24 * eps * gap**2 / s**3 - slope**2 / (4 * bend)
             best = int(np.argmin(cost))
             s = np.linspace(s[max(best - 1, 0)], s[min(best + 1, s.size - 1)], 1001)
-        return min(2.0, float(cost[best])), "closed form of the blow, for dt -> 0"
+        return min(2.0, float(cost[best])), "grid search over the impact time, for dt -> 0"
 
     def _normal(self, xp: Any, q: Array) -> tuple[Array, Array]:
         """Return the direction from the first centre to the second."""

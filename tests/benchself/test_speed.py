@@ -31,7 +31,7 @@ from bench.run.plan import plan
 @pytest.mark.parametrize(("most", "grain", "threads"), [(1024, 128, 2), (640, 128, 1), (8192, 1, 1), (100, 1, 3)])
 def test_blocks_are_alike_and_few(most, grain, threads):
     for count in (1, 127, 128, 129, 1000, 1024, 1025, 5000, 100_000, 1_000_003):
-        size = blocks.size(count, most, grain, threads)
+        size = blocks.block_size(count, most, grain, threads)
         parts = -(-count // size)
         assert size % grain == 0
         assert size <= -(-most // grain) * grain
@@ -40,7 +40,7 @@ def test_blocks_are_alike_and_few(most, grain, threads):
 
 
 def test_few_shapes_serve_all_batches():
-    shapes = {blocks.size(count, 1024, 128, 2) for count in range(1, 20_000, 7)}
+    shapes = {blocks.block_size(count, 1024, 128, 2) for count in range(1, 20_000, 7)}
     assert len(shapes) <= 1024 // 128
 
 
@@ -82,7 +82,7 @@ def test_failure_in_another_thread_is_raised():
 
 
 def test_small_batches_are_not_shared():
-    assert [blocks.sharing(count, 4, 512) for count in (0, 1, 700, 1000, 1500, 2048, 10**6)] == [1, 1, 1, 2, 3, 4, 4]
+    assert [blocks.n_threads(count, 4, 512) for count in (0, 1, 700, 1000, 1500, 2048, 10**6)] == [1, 1, 1, 2, 3, 4, 4]
 
 
 def test_threads_obey_the_environment(monkeypatch):

@@ -724,7 +724,7 @@ def folder_of_plugins(path):
 
 @pytest.mark.parametrize("base", [MechanicalScene, DoubleIntegrator])
 def test_contacts_without_contact_scene_are_refused_with_the_fix(base):
-    with pytest.raises(TypeError, match=r"Touching has n_contacts=1: derive it from ContactScene and give its gap"):
+    with pytest.raises(TypeError, match=r"Touching has n_contacts=1: derive it from ContactScene and define gap"):
         type("Touching", (base,), {"n_contacts": 1})
     for role in (ContactScene, EngineScene):
         assert type("Touching", (role,), {"n_contacts": 1}).n_contacts == 1

@@ -17,7 +17,7 @@ from bench.examine import smoothing
 from bench.examine.examination import _Examination
 from bench.examine.lines import Break, LineScan, scan
 from bench.examine.smoothing import Smoothed
-from bench.model.simulator.clock import Clock, seconds
+from bench.model.simulator.clock import Clock, parse_duration
 from bench.model.simulator.simulator import Simulator
 from bench.model.simulator.tree import ParameterTree
 
@@ -58,9 +58,9 @@ Pair = namedtuple("Pair", "left right")
 def test_theta_is_taken_apart_and_put_together(theta, names):
     layout = ParameterTree(theta)
     assert layout.names == names
-    built = layout.build(layout.vector + 1)
+    built = layout.unflatten(layout.vector + 1)
     assert type(built) is type(theta) or isinstance(theta, list)
-    np.testing.assert_array_equal(layout.take(built), layout.vector + 1)
+    np.testing.assert_array_equal(layout.flatten(built), layout.vector + 1)
 
 
 @pytest.mark.parametrize(
@@ -75,9 +75,9 @@ def test_theta_without_real_numbers_is_bad_input(theta, match):
 def test_gradients_are_matched_by_name_whatever_their_order():
     """JAX sorts the keys of a dict: a gradient in its order is right."""
     layout = ParameterTree({"speed": 1.0, "mass": 2.0})
-    np.testing.assert_array_equal(layout.take({"mass": 20.0, "speed": 10.0}), [10.0, 20.0])
+    np.testing.assert_array_equal(layout.flatten({"mass": 20.0, "speed": 10.0}), [10.0, 20.0])
     with pytest.raises(UserError, match=r"has shape mass .*, spin"):
-        layout.take({"mass": 20.0, "spin": 10.0})
+        layout.flatten({"mass": 20.0, "spin": 10.0})
     report = bench.examine(
         lambda p: p["speed"] ** 2 * p["mass"], {"speed": 1.0, "mass": 2.0},
         grad=lambda p: {"mass": p["speed"] ** 2, "speed": 2 * p["speed"] * p["mass"]}, **QUICK,
@@ -87,15 +87,15 @@ def test_gradients_are_matched_by_name_whatever_their_order():
 
 def test_list_of_numbers_of_any_library_is_a_vector():
     layout = ParameterTree([1.0, 2.0])
-    np.testing.assert_array_equal(layout.take([np.float32(3), np.array(4.0)]), [3.0, 4.0])
+    np.testing.assert_array_equal(layout.flatten([np.float32(3), np.array(4.0)]), [3.0, 4.0])
     with pytest.raises(UserError, match="theta is theta"):
-        layout.take([np.float32(3)])
+        layout.flatten([np.float32(3)])
 
 
 def test_cost_that_takes_its_argument_apart_is_given_another_each_time():
     report = bench.examine(lambda p: p.pop("mass") ** 2, {"mass": 2.0}, **QUICK)
     assert report.status == 0
-    assert "changes its argument in place" in str(report)
+    assert "modifies its argument in place" in str(report)
 
 
 def test_theta_that_would_fill_the_memory_is_bad_input():
@@ -327,7 +327,7 @@ def test_batches_are_told_from_the_result():
         ({"grad": "tensorflow"}, "unknown grad"),
         ({"batch": "column"}, "did you mean 'columns'"),
         ({"sigma": -1.0}, "above 0"),
-        ({"budget": "soon"}, "is no time"),
+        ({"budget": "soon"}, "is not a duration"),
         ({"noise": -1}, "whole number"),
         ({"sigma": np.float32(-0.5)}, "above 0"),
     ],
@@ -396,7 +396,7 @@ def test_batches_are_planned_by_the_time_of_a_batch():
 
 
 def test_budget_is_read_with_its_unit():
-    assert (seconds("500ms"), seconds("2m"), seconds(3)) == (0.5, 120.0, 3.0)
+    assert (parse_duration("500ms"), parse_duration("2m"), parse_duration(3)) == (0.5, 120.0, 3.0)
 
 
 # ----------------------------------------------------------------------------------- files, command, pytest
@@ -451,7 +451,7 @@ def test_command_gives_text_and_status(mysim, capsys, words, status, said):
         (["{}:cost", "theta=1,x"], "has to be numbers"),
         ([], "name one cost"),
         (["{}:leaves"], "it ended the process by sys.exit"),
-        (["{}:nothing"], "the cost returned nothing"),
+        (["{}:nothing"], "the cost returned None"),
         (["{}:cost", "sigma=0"], "numbers above 0"),
         (["{}:cost", "theta=1"], "index 1 is out of bounds"),
     ],

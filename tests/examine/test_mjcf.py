@@ -85,7 +85,7 @@ def test_start_that_sets_fields_itself_is_told_to_return_them():
     def start(model, data, theta):
         data.qvel[:] = theta
 
-    with pytest.raises(UserError, match="start returned None: it returns fields of the data by name"):
+    with pytest.raises(UserError, match="start returned None: it must return fields of the data by name"):
         bench.Mjcf(CUBE, start, away, steps=1)(np.zeros(6))
     with pytest.raises(UserError, match="did you mean 'qvel'"):
         bench.Mjcf(CUBE, lambda model, data, theta: {"qvell": theta}, away, steps=1)(np.zeros(6))

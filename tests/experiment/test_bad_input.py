@@ -195,4 +195,4 @@ def test_a_study_is_not_asked_about_cells_without_a_program(tmp_path, capsys):
     status = main([*words, "theta=[body_mass]", "optimizers=[adam]", "workers=0", "--quiet", f"results_dir={tmp_path}"])
     said = capsys.readouterr()
     assert status in (0, 2)
-    assert "no place for the impulses of contact law impulse" in said.out + said.err
+    assert "cannot apply the impulses of contact law impulse" in said.out + said.err

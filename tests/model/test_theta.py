@@ -250,7 +250,7 @@ def test_breakpoints_are_those_of_the_scenes_own_theta():
         (Pushing(), Penalty(), Decision(("mass", "pushing.mass")), r"names a parameter twice"),
         (Pushing(), Penalty(), Decision(("mass",), (0.1, 0.2)), r"theta0 has 2 values, theta of scene pushing has 1"),
         (Quadratic(), None, Decision(at=(1.0, 2.0)), r"theta0 has 2 values, theta of scene quadratic has 5"),
-        (BouncingBall(), Impulse(), Decision(("height",)), r"'height', which sets where scene bouncing_ball puts its own theta"),
+        (BouncingBall(), Impulse(), Decision(("height",)), r"'height', which only sets the own theta of scene bouncing_ball"),
         (Pushing(), Complementarity(), Decision(("stiffness",)), r"give finite values by theta0"),
     ],
     ids=lambda value: str(value.names or value.at) if isinstance(value, Decision) else None,

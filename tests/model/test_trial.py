@@ -20,7 +20,7 @@ FATAL = {
         "import os\nfrom dataclasses import dataclass\nfrom bench.plugins.scenes.linear import Linear\n"
         "@dataclass(frozen=True)\nclass Leaves(Linear):\n    name = 'leaves'\n"
         "    def theta0(self):\n        os._exit(3)\n",
-        "ended the process (exit status 3) when it was built with its defaults and asked what a plan asks",
+        "ended the process (exit status 3) when it was built with its defaults and called as for a plan",
     ),
 }
 ODD = "from bench.model import SampleMean\nclass Odd(SampleMean):\n    name = 'odd'\n    requires = None\n"
@@ -42,7 +42,7 @@ def folder(tmp_path, monkeypatch):
 
 def fatal(folder, names, patience=60.0):
     package = registry._package(folder)
-    return trial.fatal(
+    return trial.find_fatal_modules(
         {f"{package}.{name}": (folder / f"{name}.py").read_text() for name in names}, {package: folder}, patience
     )
 
@@ -76,13 +76,13 @@ def test_an_import_that_does_not_come_back(folder):
     (folder / "raises.py").write_text("1 / 0\n")
     found = fatal(folder, ["good", "hangs", "raises"], patience=3.0)
     assert {name.rpartition(".")[2]: said for name, said in found.items()} == {
-        "hangs": "did not come back within 3 s when it was imported"
+        "hangs": "did not return within 3 s when it was imported"
     }
 
 
 def test_a_file_is_tried_once_until_its_text_changes(folder, monkeypatch):
     tried = []
-    monkeypatch.setattr(trial, "_import", lambda names, *_: (tried.append(list(names)), (len(names), ""))[1])
+    monkeypatch.setattr(trial, "_try_imports", lambda names, *_: (tried.append(list(names)), (len(names), ""))[1])
     for text, times in ((GOOD, 1), (GOOD, 1), (f"{GOOD}#", 2)):
         (folder / "good.py").write_text(text)
         assert fatal(folder, ["good"]) == {}
@@ -92,9 +92,9 @@ def test_a_file_is_tried_once_until_its_text_changes(folder, monkeypatch):
 def test_without_a_place_to_remember_each_command_tries_again(folder, monkeypatch):
     (folder / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "file"))
-    monkeypatch.setattr(trial, "_import", lambda names, *_: (len(names), ""))
+    monkeypatch.setattr(trial, "_try_imports", lambda names, *_: (len(names), ""))
     assert fatal(folder, ["good"]) == {}
-    assert trial._known() == frozenset()
+    assert trial._load_digests() == frozenset()
 
 
 def test_a_plugin_at_work_moves_no_command_to_another_folder(tmp_path):
@@ -103,10 +103,10 @@ def test_a_plugin_at_work_moves_no_command_to_another_folder(tmp_path):
         import os
         from bench.model import guard, trial
         before, own = os.getcwd(), os.getpid()
-        with guard.guarded():
+        with guard.protect_process():
             os.chdir("/")
         assert os.getcwd() == before
-        with guard.guarded():
+        with guard.protect_process():
             os.fork()
         assert os.getpid() == own  # the copy has ended
         assert os.wait()[1] == 0

@@ -226,7 +226,7 @@ def test_searches_with_steps_descend_on_a_banana(optimizer):
     for _ in range(200):
         points = optimizer.ask(state, np.empty((2, 0)))
         value, gradient = banana(points)
-        wanted = optimizer.wants(state)
+        wanted = optimizer.required_fields(state)
         known = {"value": value, "gradient": gradient}
         state = optimizer.tell(state, points, Answer(**{name: known[name] for name in wanted}))
         costs.append(banana(state["theta"][:, None])[0][0])
@@ -291,7 +291,7 @@ class Greedy(Cem):
 
     needs = frozenset({"value", "gradient"})
 
-    def wants(self, state):
+    def required_fields(self, state):
         return frozenset({"value"})
 
 

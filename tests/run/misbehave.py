@@ -102,7 +102,7 @@ KINDS = {
 # both are ten times what sound plugins take on an idle machine: nothing that is busy is taken for something that hangs
 WORDS = ["samples=8", "repeats=3", "timing=false", "workers=2", "timeout=45s", "memory=700m", "reference.samples=4096", "formats=[png]", "--quiet"]  # fmt: skip
 START = (
-    "import runpy; from bench.model import trial; trial.PATIENCE = 30.0; runpy.run_module('bench', run_name='__main__')"
+    "import runpy; from bench.model import trial; trial.TIMEOUT_S = 30.0; runpy.run_module('bench', run_name='__main__')"
 )
 SAID = re.compile(r"Traceback|[\x00-\x08\x0b-\x1f]")
 

@@ -349,7 +349,7 @@ def test_a_library_leaves_the_signals_of_its_program_alone():
 COLLECTED = """
 import gc, os, signal
 from bench.cli import _stopped_by_signals
-from bench.model.guard import guarded
+from bench.model.guard import protect_process
 
 def struck(*_):
     gc.callbacks.remove(struck)
@@ -360,7 +360,7 @@ def struck(*_):
 with _stopped_by_signals():
     gc.callbacks.append(struck)
     try:
-        with guarded():
+        with protect_process():
             gc.collect()
     except KeyboardInterrupt:
         print("stopped")

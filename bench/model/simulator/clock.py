@@ -1,4 +1,4 @@
-"""One budget in seconds for everything, counted at every call of the user's code."""
+"""A time budget that every call of the user's code counts against."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from bench.errors import UserError
 
 UNITS = {"ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "": 1.0}
 """Units of a budget, in seconds."""
-
-
-LEAST, AGAIN = 1e-3, 1.0
-"""Seconds of the alarm at least, and until it rings again."""
+MIN_ALARM_S, ALARM_INTERVAL_S = 1e-3, 1.0
+"""Shortest delay of the alarm, and the interval at which it repeats, in seconds."""
+PROGRESS_INTERVAL_S = 0.2
+"""Shortest time between two updates of the progress line, in seconds."""
 
 
 class OutOfTime(BaseException):
-    """Raised when the budget is over, also inside a call: no Exception, which a simulator may catch."""
+    """Raised when the budget is spent, also inside a call. Not an Exception, which a simulator may catch."""
 
 
-def seconds(budget: float | str) -> float:
+def parse_duration(budget: float | str) -> float:
     """Return a budget in seconds: ``60``, ``"60s"``, ``"2m"``; raises :class:`UserError` otherwise.
 
-    >>> seconds("2m"), seconds(0.5)
+    >>> parse_duration("2m"), parse_duration(0.5)
     (120.0, 0.5)
     """
     text = str(budget).strip()
@@ -37,24 +37,24 @@ def seconds(budget: float | str) -> float:
     with suppress(ValueError, KeyError):
         value = float(number) * UNITS[text[len(number) :].strip()]
     if not (value > 0 and math.isfinite(value)):
-        raise UserError(f"budget={budget} is no time: give seconds or a unit, budget=60s, 500ms or 2m")
+        raise UserError(f"budget={budget} is not a duration: give seconds or a unit, budget=60s, 500ms or 2m")
     return value
 
 
 class Clock:
-    """The time that is left, what the calls have taken, and the line that shows progress."""
+    """Remaining budget, time spent per call, and the progress line."""
 
     def __init__(self, budget: float, shown: bool = False) -> None:
         self.start = time.perf_counter()
         self.budget = budget
         self.costs = self.gradients = 0
-        """Calls of one sample each."""
+        """Calls, counted per sample."""
         self.cost_s = self.gradient_s = 0.0
-        """Seconds in them, the first call of each shape left out."""
+        """Seconds in these calls, except the first call of each shape."""
         self._timed = {"costs": 0, "gradients": 0}
         self._shown = shown and sys.stderr.isatty()
-        self._stage, self._said = "", 0.0
-        self._until = math.inf
+        self._stage, self._last_shown = "", 0.0
+        self._deadline = math.inf
 
     @property
     def spent(self) -> float:
@@ -62,45 +62,45 @@ class Clock:
         return time.perf_counter() - self.start
 
     @property
-    def left(self) -> float:
-        """Seconds that are left."""
+    def remaining(self) -> float:
+        """Seconds that remain of the budget."""
         return self.budget - self.spent
 
-    def allow(self, share: float) -> None:
-        """Let the calls that follow take this share of what is left, and no more."""
-        self._until = self.spent + share * max(self.left, 0.0)
+    def limit(self, share: float) -> None:
+        """Limit the following calls to this share of the remaining budget."""
+        self._deadline = self.spent + share * max(self.remaining, 0.0)
 
     def check(self) -> None:
-        """Raise :class:`OutOfTime` when the time is over."""
-        if self.spent > min(self.budget, self._until):
+        """Raise :class:`OutOfTime` if the budget or the limit is spent."""
+        if self.spent > min(self.budget, self._deadline):
             raise OutOfTime
 
     @contextmanager
-    def watched(self) -> Iterator[None]:
-        """Raise :class:`OutOfTime` inside the block when the budget ends in it.
+    def interrupt_when_over(self) -> Iterator[None]:
+        """Raise :class:`OutOfTime` inside the block when the budget is spent.
 
-        A call that runs compiled code is interrupted when that returns. Only the main thread can be interrupted, and only
-        where nobody else uses the alarm.
+        A call of compiled code is interrupted only when it returns. Only the main thread can be interrupted, and only
+        if no other code uses the alarm.
         """
         free = threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
         if not (free and math.isfinite(self.budget) and signal.getsignal(signal.SIGALRM) in (signal.SIG_DFL, None)):
             yield
             return
 
-        def over(number: int, frame: FrameType | None) -> None:
+        def raise_out_of_time(number: int, frame: FrameType | None) -> None:
             raise OutOfTime
 
-        signal.signal(signal.SIGALRM, over)
+        signal.signal(signal.SIGALRM, raise_out_of_time)
         try:
-            # the alarm repeats, in case what it raises is lost in a callback
-            signal.setitimer(signal.ITIMER_REAL, max(self.left, LEAST), AGAIN)
+            # the alarm repeats, since an exception raised in a callback may be lost
+            signal.setitimer(signal.ITIMER_REAL, max(self.remaining, MIN_ALARM_S), ALARM_INTERVAL_S)
             yield
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
 
     def count(self, kind: str, calls: int, taken: float, warm: bool) -> None:
-        """Count calls, and their time where they compiled nothing."""
+        """Count calls, and their time in seconds unless they compiled something."""
         if kind == "costs":
             self.costs += calls
             self.cost_s += taken if warm else 0.0
@@ -108,28 +108,28 @@ class Clock:
             self.gradients += calls
             self.gradient_s += taken if warm else 0.0
         self._timed[kind] += calls if warm else 0
-        self._progress()
+        self._show_progress()
 
     def per_cost(self) -> float:
-        """Seconds of one cost, NaN before any was timed."""
+        """Return the seconds of one cost, NaN before any was timed."""
         return self.cost_s / self._timed["costs"] if self._timed["costs"] else math.nan
 
     def per_gradient(self) -> float:
-        """Seconds of one gradient, NaN before any was timed."""
+        """Return the seconds of one gradient, NaN before any was timed."""
         return self.gradient_s / self._timed["gradients"] if self._timed["gradients"] else math.nan
 
-    def stage(self, name: str) -> None:
-        """Say what comes next."""
+    def start_stage(self, name: str) -> None:
+        """Show the name of the next stage on the progress line."""
         self._stage = name
-        self._progress(force=True)
+        self._show_progress(force=True)
 
-    def _progress(self, force: bool = False) -> None:
-        if self._shown and (force or self.spent - self._said > 0.2):
-            self._said = self.spent
+    def _show_progress(self, force: bool = False) -> None:
+        if self._shown and (force or self.spent - self._last_shown > PROGRESS_INTERVAL_S):
+            self._last_shown = self.spent
             text = f"{self._stage}: {self.costs} costs, {self.gradients} gradients, {self.spent:.0f} of {self.budget:.0f} s"
             print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 
-    def clear(self) -> None:
-        """Take the progress line away."""
+    def clear_progress(self) -> None:
+        """Remove the progress line."""
         if self._shown:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)

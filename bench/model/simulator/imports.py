@@ -1,4 +1,4 @@
-"""A function of a user's file, as the command line names it: ``mysim.py:cost`` or ``package.module:cost``."""
+"""Functions of a user's file, named as on the command line: ``mysim.py:cost`` or ``package.module:cost``."""
 
 from __future__ import annotations
 
@@ -11,29 +11,32 @@ from types import ModuleType
 from typing import Any
 
 from bench.errors import UserError, failure, unknown
+from bench.model.simulator.clock import Clock
+from bench.model.simulator.simulator import LIBRARIES, Simulator
+from bench.model.simulator.tree import ParameterTree
 
 
-def attribute(text: str, otherwise: ModuleType | None = None) -> Any:
-    """Return what ``FILE:NAME`` or ``MODULE:NAME`` names; a bare name is looked up in the module ``otherwise``.
+def load_attribute(text: str, module: ModuleType | None = None) -> Any:
+    """Return the object that ``FILE:NAME`` or ``MODULE:NAME`` names; a name without a file is looked up in ``module``.
 
-    Raises :class:`UserError` where there is no such file or name, or where it fails when imported.
+    Raises :class:`UserError` if the file or name does not exist, or if the file cannot be imported.
     """
     place, _, name = text.rpartition(":")
-    if not place and otherwise is None:
-        raise UserError(f"'{text}' names no function: give FILE:NAME, for example mysim.py:cost")
-    module = load(place) if place else otherwise
-    assert module is not None
-    found: Any = module
+    if place:
+        module = load_module(place)
+    elif module is None:
+        raise UserError(f"'{text}' does not name a function: give FILE:NAME, for example mysim.py:cost")
+    value: Any = module
     for part in name.split("."):
-        if not hasattr(found, part):
-            names = [own for own in vars(module) if not own.startswith("_")]
-            raise unknown(f"name in {place or module.__name__}:", name, names)
-        found = getattr(found, part)
-    return found
+        if not hasattr(value, part):
+            public = [key for key in vars(module) if not key.startswith("_")]
+            raise unknown(f"name in {place or module.__name__}:", name, public)
+        value = getattr(value, part)
+    return value
 
 
-def load(place: str) -> ModuleType:
-    """Import a file or a module, once; its folder can be imported from, as when Python runs the file."""
+def load_module(place: str) -> ModuleType:
+    """Import a file or a module once. A file can import from its own folder, as when Python runs it."""
     if not place.endswith(".py"):
         try:
             return importlib.import_module(place)
@@ -68,3 +71,17 @@ def load(place: str) -> ModuleType:
         del sys.modules[name]
         raise UserError(f"'{place}' cannot be imported: {failure(error)['reason']}") from None
     return module
+
+
+def load_simulator(cost: str, theta: str = "theta", grad: str = "", batch: str = "", noise: int = 0) -> Simulator:
+    """Return the simulator of the cost ``FILE:NAME``. Theta and gradient are named in the same file."""
+    module = load_module(cost.rpartition(":")[0])
+    start = load_attribute(theta, module)
+    gradient = grad if grad in LIBRARIES else load_attribute(grad, module) if grad else None
+    layout = ParameterTree(start() if callable(start) else start)
+    return Simulator(load_attribute(cost), layout, gradient, noise, batch or None, Clock(float("inf")))
+
+
+def simulator_files(cost: str) -> tuple[Path, ...]:
+    """Return the file of the cost ``FILE:NAME``."""
+    return (Path(str(load_module(cost.rpartition(":")[0]).__file__)),)

@@ -1,6 +1,6 @@
-"""A MuJoCo model of the user's own as a cost of theta: free joints, quaternions, motors, in C or in MJX.
+"""A user's MuJoCo model as a cost of theta: free joints, quaternions and motors, in C or in MJX.
 
-Theta and cost are functions of (model, data), written once for both engines: ``start`` returns fields of the data by name.
+Start and cost are functions of (model, data) and work for both engines: ``start`` returns fields of the data by name.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from bench.errors import UserError, unknown
 
 ENGINES = {"mujoco": "mujoco", "mjx": "mujoco-mjx"}
-"""The engines, and what is installed for each."""
+"""The engines and the distributions that provide them."""
 STEP = 1e-6
 """Step of the finite differences, in the model's units."""
 
@@ -66,33 +66,33 @@ class Mjcf:
         """Return the cost of the rollout from theta, ``(d,)``."""
         if self._engine is not None:
             return self._engine.value(theta)
-        data = self._begun(self._data, theta)
+        data = self._reset(self._data, theta)
         for t in range(self.steps):
-            self._controlled(data, theta, t)
+            self._set_control(data, theta, t)
             self._mujoco.mj_step(self.model, data)
-        return self._ended(data)
+        return self._final_cost(data)
 
     def gradient(self, theta: Any) -> np.ndarray:
         """Return the derivative of the cost by theta, ``(d,)``."""
         if self._engine is not None:
             return self._engine.slope(theta)
         theta = np.asarray(theta, dtype=np.float64)
-        data, size = self._begun(self._data, theta), 2 * self.model.nv + self.model.na
-        slopes = self._by_theta(theta)
+        data, size = self._reset(self._data, theta), 2 * self.model.nv + self.model.na
+        slopes = self._initial_slopes(theta)
         a, b = np.zeros((size, size)), np.zeros((size, self.model.nu))
         for t in range(self.steps):
-            self._controlled(data, theta, t)
+            self._set_control(data, theta, t)
             control = self._control_slopes(data, theta, t, slopes)
             self._mujoco.mj_copyData(self._probe, self.model, data)
             self._mujoco.mjd_transitionFD(self.model, self._probe, STEP, True, a, b, None, None)
             slopes = a @ slopes + b @ control
             self._mujoco.mj_step(self.model, data)
-        last = [self._ended(self._moved(data, i, h)) for i in range(size) for h in (STEP, -STEP)]
+        last = [self._final_cost(self._displaced(data, i, h)) for i in range(size) for h in (STEP, -STEP)]
         return (np.array(last[::2]) - np.array(last[1::2])) / (2 * STEP) @ slopes
 
     # ------------------------------------------------------------------------------------------- the C engine
 
-    def _begun(self, data: Any, theta: Any) -> Any:
+    def _reset(self, data: Any, theta: Any) -> Any:
         self._mujoco.mj_resetData(self.model, data)
         for name, value in self._fields(data, theta).items():
             getattr(data, name)[:] = value
@@ -100,45 +100,44 @@ class Mjcf:
 
     def _fields(self, data: Any, theta: Any) -> Mapping[str, Any]:
         """Return the fields that ``start`` sets."""
-        found = self._start(self.model, data, theta)
-        if not isinstance(found, Mapping):
-            what = 'return {"qvel": theta}'
+        fields = self._start(self.model, data, theta)
+        if not isinstance(fields, Mapping):
             raise UserError(
-                f"start returned {found!r}: it returns fields of the data by name, such as {what}, and sets none"
+                f"start returned {fields!r}: it must return fields of the data by name, such as {{'qvel': theta}}, and not set them itself"
             )
-        for name in found:
+        for name in fields:
             if not hasattr(data, name):
-                raise unknown("field of the data", name, [one for one in dir(data) if not one.startswith("_")])
-        return found
+                raise unknown("field of the data", name, [field for field in dir(data) if not field.startswith("_")])
+        return fields
 
-    def _controlled(self, data: Any, theta: Any, t: int) -> None:
+    def _set_control(self, data: Any, theta: Any, t: int) -> None:
         if self._control is not None:
-            # positions of bodies belong to the state before the step
+            # updates the positions of bodies to the current state
             self._mujoco.mj_forward(self.model, data)
             data.ctrl[:] = self._control(self.model, data, theta, t)
 
-    def _ended(self, data: Any) -> float:
+    def _final_cost(self, data: Any) -> float:
         self._mujoco.mj_forward(self.model, data)
         return float(self._cost(self.model, data))
 
-    def _by_theta(self, theta: np.ndarray) -> np.ndarray:
-        """Return the derivative of the first state by theta, in the state's tangent space, ``(2 nv + na, d)``."""
+    def _initial_slopes(self, theta: np.ndarray) -> np.ndarray:
+        """Return the derivative of the initial state by theta, in the state's tangent space, ``(2 nv + na, d)``."""
         columns = []
         for i in range(theta.size):
-            moved = []
+            states = []
             for h in (STEP, -STEP):
                 at = theta.copy()
                 at[i] += h
-                data = self._begun(self._probe, at)
-                moved.append((data.qpos.copy(), data.qvel.copy(), data.act.copy()))
-            up, down = moved
-            turned = np.zeros(self.model.nv)
-            self._mujoco.mj_differentiatePos(self.model, turned, 2 * STEP, down[0], up[0])
-            columns.append(np.concatenate([turned, *((up[k] - down[k]) / (2 * STEP) for k in (1, 2))]))
+                data = self._reset(self._probe, at)
+                states.append((data.qpos.copy(), data.qvel.copy(), data.act.copy()))
+            up, down = states
+            difference = np.zeros(self.model.nv)
+            self._mujoco.mj_differentiatePos(self.model, difference, 2 * STEP, down[0], up[0])
+            columns.append(np.concatenate([difference, *((up[k] - down[k]) / (2 * STEP) for k in (1, 2))]))
         return np.stack(columns, axis=1)
 
-    def _moved(self, data: Any, index: int, by: float) -> Any:
-        """Return the state moved along one direction of its tangent space."""
+    def _displaced(self, data: Any, index: int, by: float) -> Any:
+        """Return the state displaced along one direction of its tangent space."""
         nv, probe = self.model.nv, self._probe
         self._mujoco.mj_copyData(probe, self.model, data)
         if index < nv:
@@ -152,7 +151,7 @@ class Mjcf:
         return probe
 
     def _control_slopes(self, data: Any, theta: np.ndarray, t: int, slopes: np.ndarray) -> np.ndarray:
-        """Return the derivative of the controls by theta, straight and through the state, ``(nu, d)``."""
+        """Return the derivative of the controls by theta, directly and through the state, ``(nu, d)``."""
         if self._control is None:
             return np.zeros((self.model.nu, theta.size))
 
@@ -160,35 +159,35 @@ class Mjcf:
             self._mujoco.mj_forward(self.model, at)
             return np.array(self._control(self.model, at, theta, t), dtype=np.float64)  # type: ignore[misc]
 
-        straight = [control(data, theta + h * row) for row in np.eye(theta.size) for h in (STEP, -STEP)]
-        through = [control(self._moved(data, i, h), theta) for i in range(len(slopes)) for h in (STEP, -STEP)]
-        by_theta = (np.array(straight[::2]) - np.array(straight[1::2])).T / (2 * STEP)
-        return by_theta + (np.array(through[::2]) - np.array(through[1::2])).T / (2 * STEP) @ slopes
+        direct = [control(data, theta + h * row) for row in np.eye(theta.size) for h in (STEP, -STEP)]
+        indirect = [control(self._displaced(data, i, h), theta) for i in range(len(slopes)) for h in (STEP, -STEP)]
+        by_theta = (np.array(direct[::2]) - np.array(direct[1::2])).T / (2 * STEP)
+        return by_theta + (np.array(indirect[::2]) - np.array(indirect[1::2])).T / (2 * STEP) @ slopes
 
 
 class _Mjx:
     """The same rollout in MJX, compiled."""
 
-    def __init__(self, own: Mjcf) -> None:
+    def __init__(self, simulator: Mjcf) -> None:
         try:
             import jax
             from mujoco import mjx
         except ImportError:
             raise UserError("engine=mjx is not installed: pip install mujoco-mjx") from None
-        model = mjx.put_model(own.model)
+        model = mjx.put_model(simulator.model)
 
         def rollout(theta: Any) -> Any:
-            data = _raised(mjx.make_data(model))
-            data = data.replace(**own._fields(data, theta))
+            data = _promoted(mjx.make_data(model))
+            data = data.replace(**simulator._fields(data, theta))
 
             def step(data: Any, t: Any) -> Any:
-                if own._control is not None:
+                if simulator._control is not None:
                     data = mjx.forward(model, data)
-                    data = data.replace(ctrl=own._control(model, data, theta, t))
+                    data = data.replace(ctrl=simulator._control(model, data, theta, t))
                 return mjx.step(model, data), None
 
-            last, _ = jax.lax.scan(step, data, jax.numpy.arange(own.steps))
-            return own._cost(model, mjx.forward(model, last))
+            last, _ = jax.lax.scan(step, data, jax.numpy.arange(simulator.steps))
+            return simulator._cost(model, mjx.forward(model, last))
 
         self._value, self._slope, self._asarray = jax.jit(rollout), jax.jit(jax.jacfwd(rollout)), jax.numpy.asarray
 
@@ -199,13 +198,13 @@ class _Mjx:
         return np.asarray(self._slope(self._asarray(theta, dtype=float)), dtype=np.float64)
 
 
-def _raised(data: Any) -> Any:
-    """Return data whose numbers have the precision that JAX is set to, since MJX may make them shorter."""
+def _promoted(data: Any) -> Any:
+    """Return data in JAX's default precision, since MJX may use a lower one."""
     import jax
 
     wide = jax.numpy.zeros(()).dtype
 
-    def raised(leaf: Any) -> Any:
+    def promoted(leaf: Any) -> Any:
         return leaf.astype(wide) if jax.numpy.issubdtype(getattr(leaf, "dtype", int), jax.numpy.floating) else leaf
 
-    return jax.tree.map(raised, data)
+    return jax.tree.map(promoted, data)

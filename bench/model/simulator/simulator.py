@@ -1,4 +1,4 @@
-"""The user's cost and gradient as functions of columns, with every call counted and timed."""
+"""A user's cost and gradient as functions of columns. Each call is counted and timed."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from bench.model.simulator.clock import Clock
 from bench.model.simulator.tree import ParameterTree, as_numpy
 
 BATCHES = ("loop", "vmap", "columns", "rows")
-"""How a cost takes several thetas: one by one, by the library's vmap, as ``(d, B)`` or as ``(B, d)``."""
+"""How a cost evaluates several thetas: one by one, by the library's vmap, as ``(d, B)`` or as ``(B, d)``."""
 LIBRARIES = ("jax", "torch")
 """Libraries that differentiate a cost."""
 BLOCK = 16
-"""Columns of a compiled batch: few enough for a heavy simulator, and one shape, so that one compilation does."""
+"""Columns of a compiled batch: few enough for an expensive simulator, and one shape, so that it compiles once."""
 CHUNK = 256
-"""Columns of a batch that a cost takes at once without compiling."""
+"""Columns of a batch that is not compiled."""
 
 
-def _kept(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of the user's that cannot end the process: a test that did would pass with status 0."""
+def _without_exit(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap a user's function so that ``sys.exit`` raises RuntimeError; a test that exits would pass with status 0."""
 
-    def kept(*arguments: Any) -> Any:
+    def call(*arguments: Any) -> Any:
         try:
             return function(*arguments)
         except SystemExit as error:
-            given = "" if error.code is None else error.code
-            raise RuntimeError(f"it ended the process by sys.exit({given})") from None
+            code = "" if error.code is None else error.code
+            raise RuntimeError(f"it ended the process by sys.exit({code})") from None
 
-    return kept
+    return call
 
 
 class Simulator:
-    """A cost f(theta) or f(theta, w) and perhaps its gradient, both in NumPy columns.
+    """A cost f(theta) or f(theta, w) and optionally its gradient, both in NumPy columns.
 
-    ``noise`` is the length of w, 0 for a cost without randomness of its own. A call that raises counts as NaN, except
-    the first: then :class:`UserError` says what it raised.
+    ``noise`` is the length of w, 0 for a cost without its own noise. A call that raises an exception counts as NaN,
+    except the first call, whose exception becomes a :class:`UserError`.
     """
 
     def __init__(
@@ -63,36 +63,36 @@ class Simulator:
             )
         self.layout, self.noise, self.clock = layout, noise, clock or Clock(float("inf"))
         self.notes: list[str] = []
-        """What is worth knowing about how it was called."""
+        """Remarks on how the cost is called, for the user."""
         self.raised: dict[str, int] = {}
-        """What later calls of the cost raised, and how often."""
+        """Exceptions of later calls of the cost, and their counts."""
         self.gradient_error = ""
-        """What the gradient raised, empty where it never did."""
+        """The first exception of the gradient, or an empty string."""
         self.precision = "float64"
-        """Floating-point type of what the cost returns."""
-        self._cost, self._grad = _kept(cost), _kept(grad) if callable(grad) else grad
+        """Floating-point type of the cost's value."""
+        self._cost, self._grad = _without_exit(cost), _without_exit(grad) if callable(grad) else grad
         self._shapes: set[Any] = set()
         self._single: Callable[..., Any] | None = None
         self._double = True
-        self.library = self._library()
-        self.batch = self._detected(batch)
+        self.library = self._detect_library()
+        self.batch = self._detect_batch(batch)
 
     # ------------------------------------------------------------------------------------------- columns
 
     @property
     def unit(self) -> float:
-        """Unit roundoff of the shortest floating-point type on the way from theta to the cost."""
+        """Unit roundoff of the least precise floating-point type between theta and the cost."""
         types = {self.precision, *(leaf.dtype for leaf in self.layout.leaves)}
         return max(float(np.finfo(name).eps) if name != "bfloat16" else 2.0**-7 for name in types)
 
     @property
     def width(self) -> int:
-        """How many thetas are taken at once."""
+        """Number of thetas in one call."""
         return 1 if self.batch == "loop" else BLOCK if self.library == "jax" else CHUNK
 
     @property
     def has_gradient(self) -> bool:
-        """Whether there is a gradient to ask for."""
+        """Whether there is a gradient."""
         return self._grad is not None
 
     def costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
@@ -100,7 +100,7 @@ class Simulator:
         return self._in_chunks(self._costs, "costs", thetas, w, ())
 
     def gradients(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
-        """Return the program's gradients, ``(d, B)``; NaN where it raised."""
+        """Return the simulator's gradients, ``(d, B)``; NaN where it raised an exception."""
         return self._in_chunks(self._gradients, "gradients", thetas, w, (self.layout.vector.size,))
 
     def _in_chunks(
@@ -121,53 +121,53 @@ class Simulator:
             if self.library == "jax" and size > 1:
                 columns = np.r_[columns, np.repeat(columns[-1:], size - columns.size)]
             began = time.perf_counter()
-            with self.clock.watched():
-                found = function(thetas[:, columns], None if w is None else w[:, columns])
+            with self.clock.interrupt_when_over():
+                results = function(thetas[:, columns], None if w is None else w[:, columns])
             taken = time.perf_counter() - began
             warm = (kind, columns.size) in self._shapes
             self._shapes.add((kind, columns.size))
             self.clock.count(kind, part.stop - part.start, taken, warm)
-            out[..., part] = found[..., : part.stop - part.start]
+            out[..., part] = results[..., : part.stop - part.start]
         return out
 
     def _costs(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
         try:
             return np.asarray(self._values(thetas, w), dtype=np.float64)
         except Exception as error:
-            self._note_raised(error)
+            self._count_error(error)
             return np.full(thetas.shape[1], np.nan)
 
     def _gradients(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
         try:
-            found = self._slopes(thetas, w)
+            gradients = self._slopes(thetas, w)
         except UserError:
             raise
         except Exception as error:
             self.gradient_error = self.gradient_error or failure(error)["reason"]
             return np.full(thetas.shape, np.nan)
-        if np.iscomplexobj(found):
-            raise UserError("the gradient is complex: a real cost of real numbers has a real one")
-        return np.asarray(found, dtype=np.float64)
+        if np.iscomplexobj(gradients):
+            raise UserError("the gradient is complex: the gradient of a real cost of real numbers is real")
+        return np.asarray(gradients, dtype=np.float64)
 
-    def _note_raised(self, error: Exception) -> None:
+    def _count_error(self, error: Exception) -> None:
         text = f"{type(error).__name__}: {error}"
         self.raised[text] = self.raised.get(text, 0) + 1
 
-    # ---------------------------------------------------------------------------------------- how it is called
+    # ------------------------------------------------------------------------------------------ calling convention
 
-    def _library(self) -> str:
+    def _detect_library(self) -> str:
         if isinstance(self._grad, str):
             return self._grad
-        given = {leaf.library for leaf in self.layout.leaves} & set(LIBRARIES)
-        return given.pop() if given else "numpy"
+        libraries = {leaf.library for leaf in self.layout.leaves} & set(LIBRARIES)
+        return libraries.pop() if libraries else "numpy"
 
-    def _theta(self, vector: Any) -> Any:
-        """Return the theta that the user's function gets for a vector ``(d,)``."""
+    def _build_theta(self, vector: Any) -> Any:
+        """Return the argument of the user's function for a vector ``(d,)``."""
         if self.library == "jax":
-            return self.layout.build(vector, lambda part, leaf: part)
+            return self.layout.unflatten(vector, lambda part, leaf: part)
         if self.library == "torch":
-            return self.layout.build(vector, self._tensor)
-        return self.layout.build(vector)
+            return self.layout.unflatten(vector, self._tensor)
+        return self.layout.unflatten(vector)
 
     def _tensor(self, part: Any, leaf: Any) -> Any:
         import torch
@@ -176,7 +176,7 @@ class Simulator:
         return torch.as_tensor(part).to(dtype)
 
     def _array(self, value: np.ndarray) -> Any:
-        """Return an array as the library's own."""
+        """Convert an array to the library's array type."""
         if self.library == "jax":
             import jax.numpy as jnp
 
@@ -190,78 +190,78 @@ class Simulator:
     def _call(self, theta: Any, w: Any) -> Any:
         return self._cost(theta) if w is None else self._cost(theta, w)
 
-    def _detected(self, batch: str | None) -> str:
-        """Call the cost once, and return how it takes several thetas."""
+    def _detect_batch(self, batch: str | None) -> str:
+        """Return the cost's batching mode, detected by calling it once."""
         vector = self.layout.vector
         w = np.zeros(self.noise) if self.noise else None
         if batch in ("columns", "rows"):
-            if not self._takes(batch):
-                raise UserError(f"the cost does not take batch={batch}: {self._refusal}")
+            if not self._accepts(batch):
+                raise UserError(f"the cost does not accept batch={batch}: {self._batch_error}")
             return batch
         try:
-            found = self._first(vector, w)
+            value = self._call_once(vector, w)
         except Exception as error:
-            said = failure(error)["reason"]
+            problem = failure(error)["reason"]
         else:
-            said = f"it returned an array of shape {found.shape}"
-            if found.size == 1:
-                self._see(found)
-                return self._mapped(vector, float(found.ravel()[0]), batch)
+            problem = f"it returned an array of shape {value.shape}"
+            if value.size == 1:
+                self._check_cost(value)
+                return self._detect_vmap(vector, float(value.ravel()[0]), batch)
         for layout in ("columns", "rows"):
-            if self.layout.flat and self._takes(layout):
+            if self.layout.flat and self._accepts(layout):
                 self.notes.append(f"the cost takes batches as {layout}")
                 return layout
-        raise UserError(f"the cost cannot be called at theta: {said}; it takes theta and returns one number")
+        raise UserError(f"the cost cannot be called at theta: {problem}. It must accept theta and return one number")
 
-    def _first(self, vector: np.ndarray, w: np.ndarray | None) -> np.ndarray:
-        """Call the cost as it is, at theta; note whether it changes its argument."""
+    def _call_once(self, vector: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+        """Call the cost with a single theta, and record whether it modifies its argument."""
         began = time.perf_counter()
-        theta = self._theta(self._array(vector))
+        theta = self._build_theta(self._array(vector))
         try:
-            with self.clock.watched():
+            with self.clock.interrupt_when_over():
                 value = self._call(theta, None if w is None else self._array(w))
         except RuntimeError as error:
             if self.library != "torch" or "dtype" not in str(error) or not self._double:
                 raise
             self._double = False
-            self.notes.append("theta is given in float32, as the torch module asks for")
-            return self._first(vector, w)
-        found = as_numpy(value)
+            self.notes.append("theta is passed in float32, as the torch module requires")
+            return self._call_once(vector, w)
+        array = as_numpy(value)
         self.clock.count("costs", 1, time.perf_counter() - began, warm=False)
-        if self._changed(theta, vector):
-            self.notes.append("the cost changes its argument in place: it is given a copy at each call")
-        return found
+        if self._is_modified(theta, vector):
+            self.notes.append("the cost modifies its argument in place, so each call gets a copy")
+        return array
 
-    def _changed(self, theta: Any, vector: np.ndarray) -> bool:
-        """Return whether theta is no longer what the cost was given."""
+    def _is_modified(self, theta: Any, vector: np.ndarray) -> bool:
+        """Return whether the cost has modified its argument."""
         try:
-            return not np.array_equal(self.layout.take(theta, "theta"), self._as_seen(vector))
+            return not np.array_equal(self.layout.flatten(theta, "theta"), self._rounded(vector))
         except UserError:
             return True
 
-    def _as_seen(self, vector: np.ndarray) -> np.ndarray:
-        """Return the numbers that theta has once they are in the library's own type."""
-        return self.layout.take(self._theta(self._array(vector)), "theta")
+    def _rounded(self, vector: np.ndarray) -> np.ndarray:
+        """Return a vector after rounding to the type in which the cost receives it."""
+        return self.layout.flatten(self._build_theta(self._array(vector)), "theta")
 
-    def _see(self, found: np.ndarray) -> None:
-        """Note the precision of a cost; raise :class:`UserError` for one that is no real number."""
-        if found.dtype.kind == "c":
-            raise UserError(f"the cost is complex ({found.dtype}): it has to be one real number")
-        if found.dtype.kind == "O" and found.size == 1 and found.ravel()[0] is None:
-            raise UserError("the cost returned nothing: does it end in return?")
-        if found.dtype.kind not in "fiub" and str(found.dtype) != "bfloat16":
-            raise UserError(f"the cost is of type {found.dtype}: it has to be one real number")
-        if found.dtype.kind == "f" or str(found.dtype) == "bfloat16":
-            self.precision = str(found.dtype)
+    def _check_cost(self, cost: np.ndarray) -> None:
+        """Record the precision of a cost; raises :class:`UserError` unless it is a real number."""
+        if cost.dtype.kind == "c":
+            raise UserError(f"the cost is complex ({cost.dtype}): it must be one real number")
+        if cost.dtype.kind == "O" and cost.size == 1 and cost.ravel()[0] is None:
+            raise UserError("the cost returned None: does it end with a return statement?")
+        if cost.dtype.kind not in "fiub" and str(cost.dtype) != "bfloat16":
+            raise UserError(f"the cost is of type {cost.dtype}: it must be one real number")
+        if cost.dtype.kind == "f" or str(cost.dtype) == "bfloat16":
+            self.precision = str(cost.dtype)
 
-    def _mapped(self, vector: np.ndarray, value: float, batch: str | None) -> str:
-        """Return ``vmap`` where the library maps the cost over thetas to the same number, else ``loop``."""
+    def _detect_vmap(self, vector: np.ndarray, value: float, batch: str | None) -> str:
+        """Return ``vmap`` if the library can map the cost over thetas with the same result, else ``loop``."""
         if self.library == "jax" and batch in (None, "vmap"):
             try:
                 columns = np.repeat(vector[:, None], BLOCK, axis=1)
                 w = np.zeros((self.noise, BLOCK)) if self.noise else None
                 self._single = None
-                with self.clock.watched():
+                with self.clock.interrupt_when_over():
                     mapped = np.asarray(self._jax_values(columns, w, "vmap"), dtype=np.float64)
                 tolerance = 1e3 * self.unit * max(abs(value), 1.0)
                 if np.allclose(mapped, value, rtol=1e3 * self.unit, atol=tolerance, equal_nan=True):
@@ -271,7 +271,7 @@ class Simulator:
                 if batch == "vmap":
                     raise UserError(f"jax.vmap cannot map the cost: {failure(error)['reason']}") from None
             self._single = None
-            self.notes.append("jax.vmap does not map the cost, so thetas are taken one by one")
+            self.notes.append("jax.vmap cannot map the cost, so thetas are evaluated one by one")
             return "loop"
         if batch == "vmap":
             if self.library != "torch":
@@ -279,27 +279,27 @@ class Simulator:
             return "vmap"
         return "loop"
 
-    def _takes(self, batch: str) -> bool:
-        """Return whether the cost takes several thetas as columns or rows and returns one number for each."""
+    def _accepts(self, batch: str) -> bool:
+        """Return whether the cost accepts several thetas as columns or rows and returns one number per theta."""
         dim = self.layout.vector.size
         count = 5 if dim != 5 else 7
         thetas = np.repeat(self.layout.vector[:, None], count, axis=1)
         w = np.zeros((self.noise, count)) if self.noise else None
-        self._refusal = ""
+        self._batch_error = ""
         try:
-            with self.clock.watched():
-                found = as_numpy(self._batched(self._array(thetas), None if w is None else self._array(w), batch))
+            with self.clock.interrupt_when_over():
+                costs = as_numpy(self._call_batch(self._array(thetas), None if w is None else self._array(w), batch))
         except Exception as error:
-            self._refusal = failure(error)["reason"]
+            self._batch_error = failure(error)["reason"]
             return False
         self.clock.count("costs", count, 0.0, warm=False)
-        if found.shape != (count,):
-            self._refusal = f"{count} thetas gave an array of shape {found.shape}, not {(count,)}"
+        if costs.shape != (count,):
+            self._batch_error = f"{count} thetas gave an array of shape {costs.shape}, not {(count,)}"
             return False
-        self._see(found)
+        self._check_cost(costs)
         return True
 
-    def _batched(self, thetas: Any, w: Any, batch: str) -> Any:
+    def _call_batch(self, thetas: Any, w: Any, batch: str) -> Any:
         if batch == "rows":
             return self._call(thetas.T, None if w is None else w.T)
         return self._call(thetas, w)
@@ -316,27 +316,31 @@ class Simulator:
                 return as_numpy(self._torch_values(self._array(thetas), None if w is None else self._array(w)))
         if self.batch == "loop":
             return [
-                float(as_numpy(self._call(self._theta(thetas[:, i]), None if w is None else w[:, i].copy())).ravel()[0])
+                float(
+                    as_numpy(
+                        self._call(self._build_theta(thetas[:, i]), None if w is None else w[:, i].copy())
+                    ).ravel()[0]
+                )
                 for i in range(thetas.shape[1])
             ]
-        return as_numpy(self._batched(thetas.copy(), None if w is None else w.copy(), self.batch))
+        return as_numpy(self._call_batch(thetas.copy(), None if w is None else w.copy(), self.batch))
 
     def _torch_values(self, thetas: Any, w: Any) -> Any:
-        """Return the costs as a tensor ``(B,)`` that still knows where it came from."""
+        """Return the costs as a tensor ``(B,)`` that is still attached to the graph."""
         import torch
 
         if self.batch in ("columns", "rows"):
-            return self._batched(thetas, w, self.batch)
+            return self._call_batch(thetas, w, self.batch)
         if self.batch == "vmap":
             mapped = torch.func.vmap(
-                lambda vector, *rest: self._call(self._theta(vector), *rest or (None,)).reshape(()),
+                lambda vector, *rest: self._call(self._build_theta(vector), *rest or (None,)).reshape(()),
                 in_dims=1,
                 randomness="same",
             )
             return mapped(thetas) if w is None else mapped(thetas, w)
         columns = range(thetas.shape[1])
-        costs = [self._call(self._theta(thetas[:, i]), None if w is None else w[:, i]) for i in columns]
-        # a Python number has double precision, which torch would cut
+        costs = [self._call(self._build_theta(thetas[:, i]), None if w is None else w[:, i]) for i in columns]
+        # torch would convert a Python number to single precision
         doubles = [cost if torch.is_tensor(cost) else torch.as_tensor(cost, dtype=torch.float64) for cost in costs]
         return torch.stack([cost.reshape(()) for cost in doubles])
 
@@ -346,18 +350,18 @@ class Simulator:
         if self._single is None:
 
             def one(vector: Any, *rest: Any) -> Any:
-                return jax.numpy.reshape(self._call(self._theta(vector), *rest or (None,)), ())
+                return jax.numpy.reshape(self._call(self._build_theta(vector), *rest or (None,)), ())
 
             def all_at_once(columns: Any, *rest: Any) -> Any:
-                return self._batched(columns, rest[0] if rest else None, batch)
+                return self._call_batch(columns, rest[0] if rest else None, batch)
 
             whole = one if batch == "loop" else jax.vmap(one, in_axes=1) if batch == "vmap" else all_at_once
             summed = one if batch == "loop" else lambda columns, *rest: whole(columns, *rest).sum()
             self._single = jax.jit(whole)
             self._slope, self._eager = jax.jit(jax.grad(summed)), (whole, jax.grad(summed))
-        return self._traced(self._single, self._eager[0], thetas, w, batch)
+        return self._call_compiled(self._single, self._eager[0], thetas, w, batch)
 
-    def _traced(self, compiled: Any, eager: Any, thetas: np.ndarray, w: np.ndarray | None, batch: str) -> Any:
+    def _call_compiled(self, compiled: Any, eager: Any, thetas: np.ndarray, w: np.ndarray | None, batch: str) -> Any:
         """Call a compiled function, or the same one uncompiled where JAX cannot trace it."""
         import jax
 
@@ -365,38 +369,40 @@ class Simulator:
         if batch == "loop":
             arguments = [part[:, 0] for part in arguments]
         try:
-            found = compiled(*arguments)
+            result = compiled(*arguments)
         except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError):
             if batch != "loop":
                 raise
-            found = eager(*arguments)
-        return np.asarray(found)[..., None] if batch == "loop" else np.asarray(found)
+            result = eager(*arguments)
+        return np.asarray(result)[..., None] if batch == "loop" else np.asarray(result)
 
     # ---------------------------------------------------------------------------------------- gradients
 
     def _slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
         if callable(self._grad):
-            return self._given(thetas, w)
+            return self._user_slopes(thetas, w)
         if self._grad == "jax":
             if self._single is None:
                 self._jax_values(thetas, w, self.batch)
-            return self._traced(self._slope, self._eager[1], thetas, w, self.batch)
+            return self._call_compiled(self._slope, self._eager[1], thetas, w, self.batch)
         return self._torch_slopes(thetas, w)
 
-    def _given(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+    def _user_slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
         assert callable(self._grad)
         if self.batch in ("columns", "rows"):
-            turned = (lambda a: a.T) if self.batch == "rows" else (lambda a: a)
-            arguments = [turned(self._array(part)) for part in (thetas, w) if part is not None]
-            found = as_numpy(self._grad(*arguments))
-            found = found.T if self.batch == "rows" else found
-            if found.shape != thetas.shape:
-                raise UserError(f"the gradient of {thetas.shape[1]} thetas has shape {found.shape}, not {thetas.shape}")
-            return found
+            transpose = (lambda a: a.T) if self.batch == "rows" else (lambda a: a)
+            arguments = [transpose(self._array(part)) for part in (thetas, w) if part is not None]
+            gradients = as_numpy(self._grad(*arguments))
+            gradients = gradients.T if self.batch == "rows" else gradients
+            if gradients.shape != thetas.shape:
+                raise UserError(
+                    f"the gradient of {thetas.shape[1]} thetas has shape {gradients.shape}, not {thetas.shape}"
+                )
+            return gradients
         columns = []
         for i in range(thetas.shape[1]):
-            arguments = [self._theta(self._array(thetas[:, i]))] + ([] if w is None else [self._array(w[:, i])])
-            columns.append(self.layout.take(self._grad(*arguments)))
+            arguments = [self._build_theta(self._array(thetas[:, i]))] + ([] if w is None else [self._array(w[:, i])])
+            columns.append(self.layout.flatten(self._grad(*arguments)))
         return np.stack(columns, axis=1)
 
     def _torch_slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
@@ -406,5 +412,5 @@ class Simulator:
         total = self._torch_values(leaf, None if w is None else self._array(w)).sum()
         if not total.requires_grad:
             return np.zeros(thetas.shape)
-        (found,) = torch.autograd.grad(total, leaf, allow_unused=True)
-        return np.zeros(thetas.shape) if found is None else found.detach().cpu().numpy()
+        (gradient,) = torch.autograd.grad(total, leaf, allow_unused=True)
+        return np.zeros(thetas.shape) if gradient is None else gradient.detach().cpu().numpy()

@@ -1,6 +1,6 @@
-"""Theta of any shape as one vector: numbers, arrays, and nested dicts, lists, tuples and dataclasses of them.
+"""Flattens a theta of any structure into one vector: numbers, arrays, and nested dicts, lists, tuples and dataclasses.
 
-Each number has a name by its place: ``mass``, ``gains[3]``, ``legs[0].stiffness``.
+Each number is named by its path: ``mass``, ``gains[3]``, ``legs[0].stiffness``.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ import numpy as np
 
 from bench.errors import UserError
 
-ROUNDED = 1e-14
-"""Size of a number, relative to its array, that is a 0 which rounding has left."""
-MOST = 100_000
-"""Numbers of a theta at most: some thousand thetas are held at once."""
+ROUNDING = 1e-14
+"""Size of a number, relative to its array, below which it counts as a 0 with rounding errors."""
+MAX_SIZE = 100_000
+"""Largest number of entries of theta. Some thousand thetas are stored at the same time."""
 
 
 @dataclass(frozen=True)
 class Leaf:
-    """One array of theta: where it stands in the vector, and what it was given as."""
+    """One array of theta: its position in the vector, shape, library and type."""
 
     path: str
     shape: tuple[int, ...]
@@ -35,11 +35,11 @@ class Leaf:
 
     @property
     def size(self) -> int:
-        """How many numbers it has."""
+        """Number of entries."""
         return int(np.prod(self.shape, dtype=int))
 
     def names(self) -> list[str]:
-        """Return a name for each of its numbers."""
+        """Return the name of each entry."""
         path = self.path or "theta"
         if not self.shape:
             return [path]
@@ -47,9 +47,9 @@ class Leaf:
 
 
 class ParameterTree:
-    """How a theta is taken apart into a vector ``(d,)``, and put together again.
+    """Flattens a theta into a vector ``(d,)``, and rebuilds thetas of the same structure from vectors.
 
-    Raises :class:`UserError` for a theta without numbers, or with something that is no number.
+    Raises :class:`UserError` for a theta without numbers, or with an entry that is not a real number.
     """
 
     def __init__(self, theta: Any) -> None:
@@ -57,10 +57,10 @@ class ParameterTree:
         self.leaves: list[Leaf] = []
         values = []
         start = 0
-        for path, value in _walk(theta, ""):
+        for path, value in _traverse(theta, ""):
             array = as_numpy(value)
             if array.dtype.kind not in "fiu":
-                raise UserError(f"{path or 'theta'} is of type {array.dtype}: theta is made of real numbers")
+                raise UserError(f"{path or 'theta'} is of type {array.dtype}: theta consists of real numbers")
             dtype = str(array.dtype) if array.dtype.kind == "f" else "float64"
             self.leaves.append(Leaf(path, array.shape, start, _library(value), dtype))
             values.append(array.astype(np.float64).ravel())
@@ -68,9 +68,9 @@ class ParameterTree:
         if not start:
             raise UserError("theta has no numbers: give an array, or a dict of arrays, theta={'mass': 1.0}")
         self.vector = np.concatenate(values)
-        if start > MOST:
+        if start > MAX_SIZE:
             raise UserError(
-                f"theta has {start:,} numbers; up to {MOST:,} can be examined: give fewer, or a part of them"
+                f"theta has {start:,} numbers and at most {MAX_SIZE:,} can be examined: give fewer, or a part of them"
             )
         if not np.isfinite(self.vector).all():
             bad = self.names[int(np.argmin(np.isfinite(self.vector)))]
@@ -78,56 +78,59 @@ class ParameterTree:
 
     @property
     def names(self) -> list[str]:
-        """A name for each number, ``d`` in all."""
+        """The name of each entry, ``d`` names."""
         return [name for leaf in self.leaves for name in leaf.names()]
 
     @property
     def flat(self) -> bool:
-        """Whether theta is a single vector ``(d,)`` itself."""
+        """Whether theta itself is a single vector ``(d,)``."""
         return len(self.leaves) == 1 and len(self.leaves[0].shape) == 1 and not self.leaves[0].path
 
     def scales(self) -> np.ndarray:
-        """Return the scale of each number: its own size; for 0, that of its array; else 1."""
+        """Return the scale of each entry, ``(d,)``: its own size, for 0 the root mean square of its array, else 1."""
         scale = np.abs(self.vector)
         for leaf in self.leaves:
             part = scale[leaf.start : leaf.start + leaf.size]
             typical = float(np.sqrt(np.mean(part[part > 0] ** 2))) if part.any() else 1.0
-            part[part <= ROUNDED * typical] = typical
+            part[part <= ROUNDING * typical] = typical
         return scale
 
-    def build(self, vector: Any, convert: Any = None) -> Any:
-        """Return a theta like the one given from ``vector (d,)``; ``convert(part, leaf)`` makes its arrays."""
-        make = convert or _as_given
+    def unflatten(self, vector: Any, convert: Any = None) -> Any:
+        """Return a theta of the original structure from ``vector (d,)``; ``convert(part, leaf)`` creates its arrays."""
+        create = convert or _restore
         parts = iter(
-            [make(vector[leaf.start : leaf.start + leaf.size].reshape(leaf.shape), leaf) for leaf in self.leaves]
+            [create(vector[leaf.start : leaf.start + leaf.size].reshape(leaf.shape), leaf) for leaf in self.leaves]
         )
-        return _filled(self._example, parts)
+        return _fill(self._example, parts)
 
-    def take(self, value: Any, what: str = "the gradient") -> np.ndarray:
-        """Return a value of theta's structure, or a vector ``(d,)``, as ``(d,)``; raises :class:`UserError` otherwise."""
+    def flatten(self, value: Any, what: str = "the gradient") -> np.ndarray:
+        """Return a value of theta's structure, or a vector ``(d,)``, as a vector ``(d,)``.
+
+        Raises :class:`UserError` for a value of another structure or size.
+        """
         try:
-            found = [(path, as_numpy(part)) for path, part in _walk(value, "")]
+            leaves = [(path, as_numpy(part)) for path, part in _traverse(value, "")]
         except UserError:
-            found = []
-        parts = self._in_order(value, found)
+            leaves = []
+        parts = self._reorder(value, leaves)
         sizes = [leaf.size for leaf in self.leaves]
         total = sum(part.size for part in parts)
-        # a list of single numbers is a vector, whatever library its numbers are of
-        flat = len(parts) == 1 or (len(self.leaves) == 1 and _sequence(value))
+        # a list of single numbers is a vector, whichever library the numbers come from
+        flat = len(parts) == 1 or (len(self.leaves) == 1 and _is_structure(value))
         if total == self.vector.size and ([part.size for part in parts] == sizes or flat):
             return np.concatenate([part.ravel() for part in parts])
-        shapes = ", ".join(f"{path} {part.shape}".strip() for path, part in found) or type(value).__name__
-        wanted = ", ".join(f"{leaf.path or 'theta'} {leaf.shape}" for leaf in self.leaves)
-        raise UserError(f"{what} has shape {shapes}; theta is {wanted}")
+        shapes = ", ".join(f"{path} {part.shape}".strip() for path, part in leaves) or type(value).__name__
+        expected = ", ".join(f"{leaf.path or 'theta'} {leaf.shape}" for leaf in self.leaves)
+        raise UserError(f"{what} has shape {shapes}, and theta has {expected}")
 
-    def _in_order(self, value: Any, found: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
-        """Return the parts in theta's order: by their names where they have some, since other libraries sort them."""
-        named = dict(found)
+    def _reorder(self, value: Any, leaves: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
+        """Return the arrays in theta's order. Names decide where there are any, since some libraries sort them."""
+        named = dict(leaves)
         paths = [leaf.path for leaf in self.leaves]
         if set(named) == set(paths):
             return [named[path] for path in paths]
-        # names that are not theta's belong to other numbers
-        return [] if isinstance(value, Mapping) or _named_fields(value) else [part for _, part in found]
+        # other names than those of theta belong to other numbers
+        return [] if isinstance(value, Mapping) or _named_fields(value) else [part for _, part in leaves]
 
 
 def as_numpy(value: Any) -> np.ndarray:
@@ -137,7 +140,7 @@ def as_numpy(value: Any) -> np.ndarray:
     try:
         return np.asarray(value)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{type(value).__name__} is no array of numbers: {error}") from None
+        raise UserError(f"{type(value).__name__} is not an array of numbers: {error}") from None
 
 
 def _library(value: Any) -> str:
@@ -149,8 +152,8 @@ def _library(value: Any) -> str:
     return "number" if isinstance(value, int | float) else "numpy"
 
 
-def _as_given(part: np.ndarray, leaf: Leaf) -> Any:
-    """Return a part as what was given: a number, or an array of the same library."""
+def _restore(part: np.ndarray, leaf: Leaf) -> Any:
+    """Return a part of the vector in its original form: a number, or an array of the same library and type."""
     if leaf.library == "number":
         return float(part)
     if leaf.library == "jax":
@@ -170,42 +173,42 @@ def _named_fields(value: Any) -> list[str] | None:
     return list(value._fields) if isinstance(value, tuple) and hasattr(value, "_fields") else None
 
 
-def _sequence(value: Any) -> bool:
-    """Return whether a list or tuple is a structure; one of plain numbers is an array."""
+def _is_structure(value: Any) -> bool:
+    """Return whether a value is a list or tuple that is part of the structure. One of plain numbers is an array."""
     if not isinstance(value, list | tuple):
         return False
     return not all(isinstance(part, int | float) for part in value)
 
 
-def _walk(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield the path and value of every array in a structure, dicts in their own order."""
+def _traverse(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield the path and value of each array in a structure; dicts are traversed in insertion order."""
     if value is None:
         return
     if isinstance(value, Mapping):
         for key in value:
-            yield from _walk(value[key], f"{path}.{key}" if path else str(key))
+            yield from _traverse(value[key], f"{path}.{key}" if path else str(key))
         return
     fields = _named_fields(value)
     if fields is not None:
         for name in fields:
-            yield from _walk(getattr(value, name), f"{path}.{name}" if path else name)
-    elif _sequence(value):
+            yield from _traverse(getattr(value, name), f"{path}.{name}" if path else name)
+    elif _is_structure(value):
         for index, part in enumerate(value):
-            yield from _walk(part, f"{path or 'theta'}[{index}]")
+            yield from _traverse(part, f"{path or 'theta'}[{index}]")
     else:
         yield path, value
 
 
-def _filled(example: Any, parts: Iterator[Any]) -> Any:
+def _fill(example: Any, parts: Iterator[Any]) -> Any:
     if example is None:
         return None
     if isinstance(example, Mapping):
-        filled = {key: _filled(example[key], parts) for key in example}
-        return filled if type(example) is dict else type(example)(filled)  # type: ignore[call-arg]
+        items = {key: _fill(example[key], parts) for key in example}
+        return items if type(example) is dict else type(example)(items)  # type: ignore[call-arg]
     fields = _named_fields(example)
     if fields is not None:
-        values = {name: _filled(getattr(example, name), parts) for name in fields}
+        values = {name: _fill(getattr(example, name), parts) for name in fields}
         return dataclasses.replace(example, **values) if dataclasses.is_dataclass(example) else type(example)(**values)  # type: ignore[type-var]
-    if _sequence(example):
-        return type(example)([_filled(part, parts) for part in example])
+    if _is_structure(example):
+        return type(example)([_fill(part, parts) for part in example])
     return next(parts)

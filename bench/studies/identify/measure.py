@@ -191,7 +191,7 @@ def fitted(fitting: Fitting, optimizer: Optimizer, start: np.ndarray, data: np.n
         asked = [optimizer.ask(state, nothing) for state in states]
         counts = [points.shape[1] for points in asked]
         points, many = np.concatenate(asked, axis=1), np.repeat(data, counts, axis=1)
-        wanted = frozenset().union(*(optimizer.wants(state) for state in states))
+        wanted = frozenset().union(*(optimizer.required_fields(state) for state in states))
         residual = fitting.residuals(points, many)
         jacobian = fitting.jacobians(points, many) if wanted & {"gradient", "jacobian"} else None
         ends = np.cumsum([0, *counts])
@@ -202,7 +202,7 @@ def fitted(fitting: Fitting, optimizer: Optimizer, start: np.ndarray, data: np.n
                 "value": 0.5 * (own**2).sum(axis=0), "residual": own, "jacobian": slope,
                 "gradient": None if slope is None else np.einsum("mdb,mb->db", slope, own),
             }  # fmt: skip
-            answer = Answer(**{name: known[name] for name in optimizer.wants(states[i])})
+            answer = Answer(**{name: known[name] for name in optimizer.required_fields(states[i])})
             states[i] = optimizer.tell(states[i], asked[i], answer)
     return np.stack([state["theta"] for state in states], axis=1)
 

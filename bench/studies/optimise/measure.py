@@ -111,7 +111,7 @@ class OptimizerRun:
             self.cell.seed, self.cell.scene.name, 1, self.optimizer.draws(dim), dim, f"optimise: points {iteration}"
         )[0].T
         points = self.optimizer.ask(state, normal)
-        wanted = self.optimizer.wants(state)
+        wanted = self.optimizer.required_fields(state)
         value = self._values(points, iteration) if "value" in wanted else None
         gradient = self._gradients(points, iteration) if "gradient" in wanted else None
         return self.optimizer.tell(state, points, Answer(value, gradient))
