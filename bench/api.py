@@ -63,13 +63,8 @@ def _hydra_value(value: Any, quoted: bool = True) -> str:
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, Mapping):
-        return (
-            "{"
-            + ",".join(
-                f"{SPECIAL.sub(ESCAPED, str(name))}:{_hydra_value(inner, quoted)}" for name, inner in value.items()
-            )
-            + "}"
-        )
+        items = ((SPECIAL.sub(ESCAPED, str(name)), _hydra_value(inner, quoted)) for name, inner in value.items())
+        return "{" + ",".join(f"{name}:{inner}" for name, inner in items) + "}"
     if isinstance(value, str | Path):
         if not quoted or SIMPLE.fullmatch(str(value)):
             return str(value)
