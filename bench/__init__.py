@@ -1,14 +1,15 @@
 """Compare gradient estimators through physics simulation: bias, variance and cost against a certified gradient.
 
-The Python face (:func:`run`, :func:`load`, :func:`problem`, :func:`estimate`, :func:`examine`) and the contracts that plugin authors import.
+The Python interface (:func:`run`, :func:`load`, :func:`problem`, :func:`estimate`, :func:`examine`) and the contracts of
+plugins.
 """
 
 # ruff: noqa: E402
 from bench.interrupts import exit_on_interrupt
 
-exit_on_interrupt()  # before the imports that take a second
+exit_on_interrupt()  # before the slow imports
 
-import bench.run  # noqa: F401, before the function of the same name takes its place here
+import bench.run  # noqa: F401, before the function of the same name replaces the package here
 from bench import deprecated
 from bench.api import Estimates, estimate, load, problem, run
 from bench.errors import StorageError, UserError

@@ -12,7 +12,7 @@ from helpers import SPRINGY
 
 import bench
 import bench.model
-from bench.api import _words
+from bench.api import _override_words
 from bench.experiment import config, grid
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -28,7 +28,9 @@ TINY = {
 
 def cells(*words, **overrides):
     """The cells that :func:`bench.run` would run."""
-    return grid.cells(config.load([*words, *(word for key, value in overrides.items() for word in _words(key, value))]))
+    return grid.cells(
+        config.load([*words, *(word for key, value in overrides.items() for word in _override_words(key, value))])
+    )
 
 
 # ---------------------------------------------------------------------------------------------------- a notebook
@@ -153,7 +155,7 @@ def test_what_cannot_work_is_unsupported():
 # ------------------------------------------------------------------------------------------------------ keywords
 
 
-def test_keywords_are_the_words_of_the_command_line():
+def test_keywords_are_the_override_words_of_the_command_line():
     same = [
         (["samples=8", "sweep.stiffness=[100,1e4]"], {"samples": np.int64(8), "sweep": {"stiffness": np.array([100, 1e4])}}),
         (["sweep.seed=[0,1,2]"], {"sweep": {"seed": range(3)}}),
@@ -176,14 +178,14 @@ def test_keywords_are_the_words_of_the_command_line():
     "text", ["what, if: anything [x] 'quoted' {a}? \\ b\\' c\\", "ünï", "100% $x #1", 'a "b"', "", "a b"]
 )
 def test_texts_come_through_as_they_are(text):
-    made = config.load(_words("question", text) + _words("results_dir", Path(f"/{text}")))
+    made = config.load(_override_words("question", text) + _override_words("results_dir", Path(f"/{text}")))
     assert made.question == text
     assert made.results_dir == Path(f"/{text}")
 
 
 def test_marks_are_a_table_with_names_of_any_kind():
     marks = {"stiffness": {"step size limit": 6400, "a: (b), [c]=1": 2}}
-    assert config.load(_words("marks", marks)).marks == marks
+    assert config.load(_override_words("marks", marks)).marks == marks
 
 
 # -------------------------------------------------------------------------------------------------- public names

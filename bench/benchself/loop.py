@@ -1,4 +1,4 @@
-"""The gradient of `pushing` as a plain NumPy loop with its adjoint written out, to compare with."""
+"""The gradient of `pushing` as a plain NumPy loop with a hand-written adjoint, as a baseline."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def gradient(scene: Any, stiffness: float, theta: np.ndarray, w: np.ndarray) -> 
         x = x + h * v
     rest = np.array([[s], [0.0]])
     a, b = 2.0 * weight * (x - goal), 0.2 * (v - rest)
-    result = np.empty_like(u)
+    result: np.ndarray = np.empty_like(u)
     for t in range(len(u) - 1, -1, -1):
         x, v = states[t]
         d = b + h * a

@@ -12,8 +12,9 @@ import numpy as np
 
 from bench.benchself import loop, native
 from bench.benchself.lines import SpeedRow
+from bench.experiment.by_name import compile_problem
 from bench.measure import noise, timing
-from bench.model import Problem, blocks, compose, registry
+from bench.model import Problem, blocks, registry
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 QUICK_SIZES = (64, 512)
@@ -36,13 +37,11 @@ def problem(
     """Compile the settings' scene with a contact law or none; ``scale`` multiplies sigma and the law's parameters."""
     scene = registry.make("scenes", settings["scene"], settings["values"])
     law = None if contact is None else registry.make("contacts", contact, settings["contacts"].get(contact))
-    integrator = registry.make("integrators", settings["integrator"])
     if scale:
         scene = replace(scene, sigma=scene.sigma * scale.get("sigma", 1.0))
     if scale and law is not None:
         law = replace(law, **{name: getattr(law, name) * factor for name, factor in scale.items() if name != "sigma"})
-    compiled: Problem = registry.make("backends", backend).compile(compose(scene, law, integrator))
-    return compiled
+    return compile_problem(scene, law, settings["integrator"], backend)
 
 
 def batch(compiled: Problem, count: int) -> np.ndarray:
@@ -93,7 +92,7 @@ def backends(settings: Mapping[str, Any], quick: bool) -> Iterator[SpeedRow]:
 
 def _own_mb(w: np.ndarray, gradient: bool, dim: int) -> float:
     """Return the memory [MB] of what a caller keeps: noise and result."""
-    return (w.nbytes + w.shape[1] * 8 * (dim if gradient else 1)) / 2**20
+    return float(w.nbytes + w.shape[1] * 8 * (dim if gradient else 1)) / 2**20
 
 
 def references(settings: Mapping[str, Any], quick: bool) -> Iterator[SpeedRow]:

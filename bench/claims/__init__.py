@@ -1,4 +1,4 @@
-"""``python -m bench claims``: published results about gradients through simulators, run again, each with a verdict."""
+"""``python -m bench claims``: runs published results about gradients through simulators again, each with a verdict."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.claims.claim import NOT_REPRODUCED, Claim, Figure, Outcome
-from bench.errors import UserError, printable
+from bench.errors import printable
 
 __all__ = ["Claim", "Figure", "Outcome", "main"]
 
@@ -15,43 +15,37 @@ OPTIONS = ("--list", "--quick", "--again")
 
 
 def main(words: Sequence[str]) -> int:
-    """Run the claims named, or all; returns 1 where one is not reproduced or its code fails."""
+    """Run the named claims, or all. Returns 1 if one of them is not reproduced or its code fails."""
     from bench.claims import discovery, results, tables
+    from bench.experiment.words import parse_words
     from bench.report.text import counted
     from bench.run.files import make_directory
 
-    names = [word for word in words if not word.startswith("-") and "=" not in word]
-    directory = Path("results")
-    for word in words:
-        key, equals, value = word.partition("=")
-        if equals and key == "results_dir" and value:
-            directory = Path(value).expanduser()
-        elif word not in OPTIONS and word not in names:
-            raise UserError(f"claims takes names, {', '.join(OPTIONS)} and results_dir=FOLDER, not '{word}'")
-    claims = discovery.chosen(names, "--quick" in words)
-    if "--list" in words:
-        for line in tables.listed(claims):
+    names, settings, options = parse_words(words, "claims", {"results_dir": "results"}, OPTIONS)
+    claims = discovery.claims()
+    selected = discovery.select(claims, names, "--quick" in options)
+    if "--list" in options:
+        for line in tables.list_lines(selected):
             print(printable(line) if not line.startswith("  ") else f"  {printable(line)}")
         return 0
-    directory = directory / "claims"
+    directory = Path(settings["results_dir"]).expanduser() / "claims"
     make_directory(directory)
-    found = {claim.name: results.stored(directory, claim) for claim in discovery.claims().values()}
-    for claim in claims:
-        result = None if "--again" in words else found[claim.name]
-        fresh = result is None
+    by_name = {name: results.read(directory, claim) for name, claim in claims.items()}
+    for claim in selected:
+        result = None if "--again" in options else by_name[claim.name]
+        is_stored = result is not None
         if result is None:
             print(f"{claim.name} ...", file=sys.stderr, flush=True)
-            result = results.measured(claim)
-            results.keep(directory, result)
-        for line in tables.lines(claim, result, fresh):
+            result = results.measure(claim)
+            results.store(directory, result)
+        for line in tables.result_lines(claim, result, is_stored):
             print(line, flush=True)
-        found[claim.name] = result
-    # the page has all that is stored, also of claims that this command did not name, and what failed just now
-    shown = [(claim, result) for claim in discovery.claims().values() if (result := found[claim.name]) is not None]
+        by_name[claim.name] = result
+    # the page also shows stored results of claims that this command did not name
+    shown = [(claim, result) for name, claim in claims.items() if (result := by_name[name]) is not None]
     if shown:
         for path in tables.write(directory, shown)[-4:]:
             print(f"  {path}")
-        print(f"{counted(len(shown), 'claim')}: {tables.counts(shown)}")
-    asked = {claim.name for claim in claims}
+        print(f"{counted(len(shown), 'claim')}: {tables.count_verdicts(shown)}")
     bad = (NOT_REPRODUCED, results.FAILED)
-    return int(any(result.verdict in bad for claim, result in shown if claim.name in asked))
+    return int(any(result.verdict in bad for claim, result in shown if claim in selected))

@@ -1,4 +1,4 @@
-"""What the claims' charts draw with: every estimator's own colour, and points with their 95% intervals."""
+"""Colours of estimators, and points with 95% intervals, for the charts of claims."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ __all__ = ["GREY", "bars", "ink"]
 
 
 def bars(axes: Axes, x: Sequence[float], measured: Sequence[tuple[float, float]], **look: Any) -> None:
-    """Draw points with their 95% intervals; ``measured`` holds pairs of a mean and its standard error.
+    """Draw points with 95% intervals. ``measured`` has pairs of a mean and its standard error.
 
-    On a logarithmic axis an interval that reaches 0 ends at a tenth of its point.
+    On a logarithmic axis an interval that reaches 0 ends at a tenth of its mean.
     """
     y, error = np.asarray(measured, dtype=float).T
     down, up = 1.96 * error, 1.96 * error

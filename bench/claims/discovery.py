@@ -1,22 +1,19 @@
-"""Finds claims: the files of ``bench/claims/published``, and the entry points of other packages."""
+"""Finds claims through the plugin registry, and puts them in the order of the course."""
 
 from __future__ import annotations
 
-import importlib
-import inspect
-import pkgutil
 import re
 import sys
-from collections.abc import Sequence
-from functools import cache
-from importlib.metadata import entry_points
+from collections.abc import Mapping, Sequence
 
-from bench.claims import published
 from bench.claims.claim import Claim
-from bench.errors import UserError, printable, unknown
+from bench.errors import printable, unknown
+from bench.model import registry
 
-ENTRY_POINT_GROUP = "bench.claims"
-"""Each entry point names a :class:`~bench.claims.claim.Claim` class, or a module that holds some."""
+PUBLISHED = "bench.claims.published"
+"""The package of the built-in claims."""
+REQUIRED = ("lesson", "statement", "source", "learned")
+"""Strings that every claim defines."""
 LESSONS = {
     "Low variance is not low bias": "The spread of a gradient says nothing about its distance from the truth.",
     "Which variance is smaller": "Roughness costs the first order, dimension the zeroth.",
@@ -26,53 +23,43 @@ LESSONS = {
     "Chaos": "Beyond the horizon of chaos derivatives are right and useless.",
     "Windows and objectives": "Shorter problems have tamer gradients, of another objective.",
 }
-"""The lessons in the order of the course, each in a sentence. Claims of other packages may bring their own."""
+"""The lessons in the order of the course, each in a sentence. Other claims may bring lessons of their own."""
 
 
-@cache
 def claims() -> dict[str, type[Claim]]:
-    """Return all claims by name, in the order of the course; raises :class:`UserError` for a name used twice."""
-    modules = [f"{published.__name__}.{module.name}" for module in pkgutil.iter_modules(published.__path__)]
-    found = [claim for module in modules for claim in _of(importlib.import_module(module))]
-    for point in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda point: point.name):
-        try:
-            found += _of(point.load())
-        except Exception as error:
-            # one broken package must not hide the claims of the others
-            said = f"{type(error).__name__}: {error}"
-            print(f"bench: claims of entry point '{point.name}' cannot be used: {printable(said)}", file=sys.stderr)
-    table: dict[str, type[Claim]] = {}
-    for claim in sorted(found, key=_place):
-        if claim.name in table:
-            raise UserError(f"two claims are called '{claim.name}': {table[claim.name].__module__}, {claim.__module__}")
-        table[claim.name] = claim
-    return table
+    """Return all claims by name, in the order of the course. A plugin that cannot be used is reported on stderr."""
+    entries = registry.entries_with("claims", PUBLISHED).values()
+    others = (entry for kind, table in registry.entries().items() if kind != "claims" for entry in table.values())
+    for entry in (*entries, *others):
+        if entry.plugin is None:
+            print(f"bench: '{printable(entry.name)}' cannot be used: {printable(entry.reason)}", file=sys.stderr)
+    complete: list[type[Claim]] = []
+    for entry in entries:
+        if entry.plugin is not None and issubclass(entry.plugin, Claim):
+            missing = [name for name in REQUIRED if not isinstance(getattr(entry.plugin, name, None), str)]
+            if missing:
+                print(f"bench: claim '{entry.name}' does not define {', '.join(missing)}", file=sys.stderr)
+            else:
+                complete.append(entry.plugin)
+    return {claim.name: claim for claim in sorted(complete, key=_position)}
 
 
-def _of(thing: object) -> list[type[Claim]]:
-    """Return the claims of a module, or the claim itself."""
-    if inspect.isclass(thing):
-        if not issubclass(thing, Claim):
-            raise UserError(f"entry point of group {ENTRY_POINT_GROUP} names {thing.__qualname__}, which is no Claim")
-        return [thing]
-    own = (value for value in vars(thing).values() if inspect.isclass(value) and issubclass(value, Claim))
-    name = getattr(thing, "__name__", "")
-    return [claim for claim in own if not inspect.isabstract(claim) and claim.__module__ == name]
-
-
-def _place(claim: type[Claim]) -> tuple[int, str, int]:
+def _position(claim: type[Claim]) -> tuple[int, str, int]:
+    """Return the sorting key of a claim: its lesson, then the letters and the number of its name."""
     lessons = list(LESSONS)
-    place = lessons.index(claim.lesson) if claim.lesson in lessons else len(lessons)
+    lesson = lessons.index(claim.lesson) if claim.lesson in lessons else len(lessons)
     letters, number = re.match(r"(\D*)(\d*)", claim.name).groups()  # type: ignore[union-attr]
-    return place, letters, int(number or 0)
+    return lesson, letters, int(number or 0)
 
 
-def chosen(names: Sequence[str], quick: bool) -> list[type[Claim]]:
-    """Return the claims of these names, or all; raises :class:`UserError` for one that does not exist."""
-    table = claims()
-    by_lower = {name.lower(): name for name in table}
+def select(claims: Mapping[str, type[Claim]], names: Sequence[str], quick: bool) -> list[type[Claim]]:
+    """Return the claims of these names, or all, and of those only the quick ones with ``quick``.
+
+    Names count without regard to case. Raises :class:`UserError` for one that does not exist.
+    """
+    by_lower = {name.lower(): name for name in claims}
     for name in names:
         if name.lower() not in by_lower:
-            raise unknown("claim", name, table)
-    wanted = {by_lower[name.lower()] for name in names} or set(table)
-    return [claim for name, claim in table.items() if name in wanted and (claim.quick or not quick)]
+            raise unknown("claim", name, claims)
+    selected = {by_lower[name.lower()] for name in names} or set(claims)
+    return [claim for name, claim in claims.items() if name in selected and (claim.quick or not quick)]

@@ -1,10 +1,9 @@
-"""Results of claims: measured once, kept as JSON, and measured again only when their code has changed."""
+"""Measures claims and stores the results as JSON. A claim is measured again only if its code has changed."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -24,28 +23,28 @@ FAILED = "failed"
 
 @dataclass(frozen=True)
 class ClaimResult:
-    """What was found of one claim."""
+    """The result of one claim."""
 
     name: str
     verdict: str
     seconds: float
-    """Processor seconds, which do not depend on what else the machine does."""
+    """Processor time [s], which does not depend on other load."""
     figures: tuple[Figure, ...] = ()
     remark: str = ""
-    """The reservation, or why nothing could be measured."""
+    """The reservation, or the reason why nothing could be measured."""
     series: Mapping[str, Any] = field(default_factory=dict)
     key: str = ""
-    """Hash of the code that the numbers rest on."""
+    """Hash of the code that the numbers depend on."""
     plugins: tuple[tuple[str, str], ...] = ()
     """Kind and name of the plugins used."""
 
     def to_json(self) -> str:
-        """Write the result as JSON, with every digit."""
+        """Return the result as JSON, with every digit."""
         return json.dumps(asdict(self), indent=1)
 
 
-def measured(claim: type[Claim]) -> ClaimResult:
-    """Measure a claim now; an error in its code is a result of its own."""
+def measure(claim: type[Claim]) -> ClaimResult:
+    """Measure a claim. If its code raises an error, the result has the verdict ``failed``."""
     toolkit.used.clear()
     started = time.process_time()
     try:
@@ -76,12 +75,12 @@ def key_of(claim: type[Claim], used: tuple[tuple[str, str], ...]) -> str:
 
 
 def path_of(directory: Path, name: str) -> Path:
-    """Return the file of a claim's result."""
+    """Return the path of a claim's result."""
     return directory / f"{name}.json"
 
 
-def stored(directory: Path, claim: type[Claim]) -> ClaimResult | None:
-    """Return the stored result, or None where there is none, or it is of other code, or it cannot be read."""
+def read(directory: Path, claim: type[Claim]) -> ClaimResult | None:
+    """Return the stored result, or None if it is missing, unreadable or measured by other code."""
     try:
         values = json.loads(path_of(directory, claim.name).read_text())
         values["figures"] = tuple(Figure(**one) for one in values["figures"])
@@ -89,16 +88,11 @@ def stored(directory: Path, claim: type[Claim]) -> ClaimResult | None:
         result = ClaimResult(**values)
         return result if result.key == key_of(claim, result.plugins) else None
     except Exception:
-        # whatever is wrong with the file, measuring again mends it
+        # a damaged file is replaced when the claim is measured again
         return None
 
 
-def keep(directory: Path, result: ClaimResult) -> None:
-    """Store a result, unless it failed: that is tried again."""
+def store(directory: Path, result: ClaimResult) -> None:
+    """Store a result that has figures. A claim that failed or could not run is measured again next time."""
     if result.key:
         write_whole(path_of(directory, result.name), result.to_json().encode())
-
-
-def off_by(figure: Figure) -> float:
-    """Return the difference over the published number, NaN where that is 0."""
-    return (figure.measured - figure.value) / abs(figure.value) if figure.value else math.nan

@@ -1,4 +1,4 @@
-"""Writes what was found: a chart for each claim, the page, and tables in Markdown, CSV and LaTeX."""
+"""Writes the results of claims: a chart each, one page, and tables in Markdown, CSV and LaTeX."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from bench.report.tables import csv, escape_latex, escape_markdown
 from bench.report.text import counted, duration, number
 from bench.run.files import write_all
 
-Found = Sequence[tuple[type[Claim], ClaimResult]]
+Results = Sequence[tuple[type[Claim], ClaimResult]]
 WIDE = 26
-"""Letters of the longest label with which two fit beside each other below a chart."""
-BOLD_LETTERS, LETTERS = 48, 54
-"""Letters of a line above a chart 3.5 inches wide, bold and small."""
+"""Largest length of a label [characters] with which two fit beside each other below a chart."""
+BOLD_WIDTH, SMALL_WIDTH = 48, 54
+"""Characters of a bold and of a small line above a chart 3.5 inches wide."""
 CSS = """body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
 table{border-collapse:collapse;font-size:14px;margin:.6rem 0}td,th{padding:.15rem .8rem .15rem 0;text-align:left}
 td.n{text-align:right;font-variant-numeric:tabular-nums}th{border-bottom:1px solid #888}img{max-width:100%}
@@ -28,23 +28,23 @@ td.n{text-align:right;font-variant-numeric:tabular-nums}th{border-bottom:1px sol
 section{margin-top:2.2rem}h3{margin:1.8rem 0 .2rem}p{margin:.3rem 0}.bad b{color:#b00020}"""
 
 
-def write(directory: Path, found: Found) -> list[Path]:
-    """Write charts, tables and page of all results; returns their paths."""
-    charts = {claim.name: path for claim, result in found for path in chart(directory, claim, result)}
+def write(directory: Path, results: Results) -> list[Path]:
+    """Write charts, tables and the page of all results. Returns their paths, the charts first."""
+    charts = {claim.name: path for claim, result in results for path in chart(directory, claim, result)}
     paths = write_all(
         directory,
         {
-            "claims.md": markdown(found),
-            "claims.csv": csv(figures_table(found)),
-            "claims.tex": latex(found),
-            "claims.html": page(found, charts),
+            "claims.md": markdown(results),
+            "claims.csv": csv(figures_table(results)),
+            "claims.tex": latex(results),
+            "claims.html": page(results, charts),
         },
     )
     return [*charts.values(), *paths]
 
 
 def chart(directory: Path, claim: type[Claim], result: ClaimResult) -> list[Path]:
-    """Draw one claim from its stored series; returns the picture's path, or nothing without a series."""
+    """Draw one claim from its stored series. Returns the path of the chart, or an empty list without a series."""
     if not result.series:
         return []
     from cycler import cycler
@@ -62,15 +62,15 @@ def chart(directory: Path, claim: type[Claim], result: ClaimResult) -> list[Path
         FigureCanvasAgg(picture)
         axes = picture.add_subplot()
         claim().draw(axes, result.series)
-        # on short logarithmic axes the labels between powers of ten would overlap
+        # on short logarithmic axes, labels between powers of ten would overlap
         for axis in (axes.xaxis, axes.yaxis):
             if axis.get_scale() == "log":
                 axis.set_minor_formatter(NullFormatter())
         axes.set_xlabel(claim.labels[0])
         axes.set_ylabel(claim.labels[1])
-        picture.suptitle(fill(claim.learned, BOLD_LETTERS), x=0.02, ha="left", fontsize=8.5, fontweight="bold")
+        picture.suptitle(fill(claim.learned, BOLD_WIDTH), x=0.02, ha="left", fontsize=8.5, fontweight="bold")
         origin = f"{claim.name}, {claim.source.partition(';')[0]}: {result.verdict}"
-        axes.set_title(fill(origin, LETTERS), loc="left", fontsize=7, color=GREY)
+        axes.set_title(fill(origin, SMALL_WIDTH), loc="left", fontsize=7, color=GREY)
         labels = axes.get_legend_handles_labels()[1]
         if labels:
             columns = 2 if max(map(len, labels)) <= WIDE else 1
@@ -79,96 +79,98 @@ def chart(directory: Path, claim: type[Claim], result: ClaimResult) -> list[Path
 
 
 def measured_text(figure: Figure) -> str:
-    """Write the measured number, with its 95% interval where it has a standard error that shows."""
+    """Return the measured number as text, with its 95% interval unless that is negligible."""
     value = number(figure.measured, 5)
     half = 1.96 * figure.error
     return f"{value} +- {number(half)}" if half > 1e-6 * abs(figure.measured) else value
 
 
-def resolution_text(figure: Figure) -> str:
-    """Write from which change on the figure would have failed."""
+def detectable_text(figure: Figure) -> str:
+    """Return the smallest relative error that the figure detects, as text."""
     if figure.value == 0.0:
         return "any"
-    if figure.resolution < 1e-3:
+    if figure.detectable_error < 1e-3:
         return "<0.1%"
-    return f"{figure.resolution:.1%}" if figure.resolution < 1 else f"factor {1 + figure.resolution:.1f}"
+    return (
+        f"{figure.detectable_error:.1%}" if figure.detectable_error < 1 else f"factor {1 + figure.detectable_error:.1f}"
+    )
 
 
-def sight(figure: Figure) -> str:
-    """Write whether the figure sees an error of 5%, and what keeps it from that."""
-    return f"no: {figure.limit}" if figure.limit else "yes"
+def sensitivity_text(figure: Figure) -> str:
+    """Return whether the figure detects an error of 5%, and the reason if not, as text."""
+    return f"no: {figure.limitation}" if figure.limitation else "yes"
 
 
-def blind(figures: Sequence[Figure]) -> str:
-    """Write how many figures cannot see an error of 5%, and why; empty where all do."""
-    limits = [figure.limit for figure in figures if figure.limit]
+def insensitive_text(figures: Sequence[Figure]) -> str:
+    """Return how many figures cannot detect an error of 5%, and why, as text. Empty if all can."""
+    limits = [figure.limitation for figure in figures if figure.limitation]
     if not limits:
         return ""
     reasons = ", ".join(f"{limits.count(limit)} for {limit}" for limit in dict.fromkeys(limits))
-    return f"{len(limits)} of {counted(len(figures), 'figure')} cannot see an error of 5%: {reasons}"
+    return f"{len(limits)} of {counted(len(figures), 'figure')} cannot detect an error of 5%: {reasons}"
 
 
-def figures_table(found: Found) -> pd.DataFrame:
+def figures_table(results: Results) -> pd.DataFrame:
     """Return one row per figure, with every digit."""
     rows = [
         {
             "claim": claim.name, "lesson": claim.lesson, "source": claim.source, "figure": figure.what,
             "published": figure.published, "measured": figure.measured, "standard_error": figure.error,
-            "slack": figure.slack, "agrees": figure.agrees, "resolution": figure.resolution,
-            "sees_5_percent": figure.sees, "limited_by": figure.limit,
+            "slack": figure.tolerance, "agrees": figure.agrees, "resolution": figure.detectable_error,
+            "sees_5_percent": figure.is_sensitive, "limited_by": figure.limitation,
             "verdict": result.verdict, "seconds": round(result.seconds, 2),
         }
-        for claim, result in found
+        for claim, result in results
         for figure in result.figures
     ]  # fmt: skip
     return pd.DataFrame(rows)
 
 
-def lessons(found: Found) -> Iterator[tuple[str, str, Found]]:
-    """Yield the lessons in order, each with its sentence and its claims."""
-    names = dict.fromkeys([*LESSONS, *(claim.lesson for claim, _ in found)])
+def by_lesson(results: Results) -> Iterator[tuple[str, str, Results]]:
+    """Yield each lesson in the order of the course, with its summary and its claims."""
+    names = dict.fromkeys([*LESSONS, *(claim.lesson for claim, _ in results)])
     for lesson in names:
-        own = [(claim, result) for claim, result in found if claim.lesson == lesson]
+        own = [(claim, result) for claim, result in results if claim.lesson == lesson]
         if own:
             yield lesson, LESSONS.get(lesson, ""), own
 
 
-def counts(found: Found) -> str:
-    """Return how many claims got which verdict."""
-    tally = [(verdict, sum(result.verdict == verdict for _, result in found)) for verdict in (*VERDICTS, FAILED)]
+def count_verdicts(results: Results) -> str:
+    """Return the number of claims per verdict, as text."""
+    tally = [(verdict, sum(result.verdict == verdict for _, result in results)) for verdict in (*VERDICTS, FAILED)]
     return ", ".join(f"{count} {verdict}" for verdict, count in tally if count)
 
 
-def markdown(found: Found) -> str:
-    """Write the verdicts and figures in Markdown, by lesson."""
-    parts = [f"# Published claims, run again\n\n{counted(len(found), 'claim')}: {counts(found)}.\n"]
-    for lesson, sentence, own in lessons(found):
-        parts.append(f"## {lesson}\n\n{sentence}\n")
+def markdown(results: Results) -> str:
+    """Return the verdicts and figures as Markdown, by lesson."""
+    parts = [f"# Published claims, run again\n\n{counted(len(results), 'claim')}: {count_verdicts(results)}.\n"]
+    for lesson, summary, own in by_lesson(results):
+        parts.append(f"## {lesson}\n\n{summary}\n")
         for claim, result in own:
             parts.append(f"### {claim.name}: {result.verdict}\n\n{claim.statement} ({claim.source})\n")
             if result.figures:
                 lines = [
-                    "| figure | published | measured | agrees | would fail at | sees 5% |",
+                    "| figure | published | measured | agrees | would fail at | detects 5% |",
                     "|---|---|---|---|---|---|",
                 ]
                 lines += [
                     f"| {escape_markdown(f.what)} | {f.published} | {measured_text(f)} | {'yes' if f.agrees else '**no**'} "
-                    f"| {resolution_text(f)} | {sight(f)} |"
+                    f"| {detectable_text(f)} | {sensitivity_text(f)} |"
                     for f in result.figures
                 ]
                 parts.append("\n".join(lines) + "\n")
             if result.remark:
                 parts.append(f"*{escape_markdown(result.remark)}*\n")
-            if said := blind(result.figures):
-                parts.append(f"{said}.\n")
+            if sentence := insensitive_text(result.figures):
+                parts.append(f"{sentence}.\n")
             parts.append(
                 f"Learned: {claim.learned} `python -m bench claims {claim.name}`, {duration(result.seconds)}.\n"
             )
     return "\n".join(parts)
 
 
-def latex(found: Found) -> str:
-    """Write one line per claim, across both columns of a paper: its most sharply resolved figure, and the verdict."""
+def latex(results: Results) -> str:
+    """Return a LaTeX table across both columns of a paper: per claim its most sensitive figure and the verdict."""
     lines = [
         r"\begin{table*}\centering\footnotesize\setlength{\tabcolsep}{3pt}",
         r"\begin{tabular}{@{}lp{3.7cm}p{5cm}rrp{2.7cm}@{}}",
@@ -176,22 +178,24 @@ def latex(found: Found) -> str:
         r"claim & source & figure & published & measured & verdict \\",
         r"\midrule",
     ]
-    for claim, result in found:
+    for claim, result in results:
         shown = [f for f in result.figures if f.value] or list(result.figures)
-        figure = min(shown, key=lambda f: (f.agrees, f.resolution), default=None)
+        figure = min(shown, key=lambda f: (f.agrees, f.detectable_error), default=None)
         cells = [claim.name, claim.source]
         cells += [figure.what, figure.published, number(figure.measured, 4)] if figure else ["", "", ""]
         lines.append(" & ".join(map(escape_latex, [*cells, result.verdict])) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table*}", ""])
 
 
-def page(found: Found, charts: dict[str, Path]) -> str:
-    """Write the page: lessons, claims, figures, charts, in one file with the pictures inside."""
+def page(results: Results, charts: dict[str, Path]) -> str:
+    """Return the HTML page with lessons, claims, figures and embedded charts."""
     import base64
 
-    body = [f"<h1>Published claims, run again</h1><p>{counted(len(found), 'claim')}: {escape(counts(found))}.</p>"]
-    for lesson, sentence, own in lessons(found):
-        body.append(f"<section><h2>{escape(lesson)}</h2><p>{escape(sentence)}</p>")
+    body = [
+        f"<h1>Published claims, run again</h1><p>{counted(len(results), 'claim')}: {escape(count_verdicts(results))}.</p>"
+    ]
+    for lesson, summary, own in by_lesson(results):
+        body.append(f"<section><h2>{escape(lesson)}</h2><p>{escape(summary)}</p>")
         for claim, result in own:
             look = {VERDICTS[0]: "reproduced", VERDICTS[1]: "reserved"}.get(result.verdict, "bad")
             body.append(
@@ -202,12 +206,12 @@ def page(found: Found, charts: dict[str, Path]) -> str:
                 rows = "".join(_row(figure) for figure in result.figures)
                 body.append(
                     "<table><tr><th>figure</th><th>published</th><th>measured (95%)</th><th>agrees</th>"
-                    f"<th>would fail at</th><th>sees 5%</th></tr>{rows}</table>"
+                    f"<th>would fail at</th><th>detects 5%</th></tr>{rows}</table>"
                 )
             if result.remark:
                 body.append(f"<p><b>Reservation:</b> {escape(result.remark)}</p>")
-            if said := blind(result.figures):
-                body.append(f"<p>{escape(said)}.</p>")
+            if sentence := insensitive_text(result.figures):
+                body.append(f"<p>{escape(sentence)}.</p>")
             if claim.name in charts:
                 picture = base64.b64encode(charts[claim.name].read_bytes()).decode()
                 body.append(f'<img alt="{escape(claim.statement)}" src="data:image/png;base64,{picture}" width="525">')
@@ -228,28 +232,28 @@ def _row(figure: Figure) -> str:
         figure.published,
         measured_text(figure),
         "yes" if figure.agrees else "no",
-        resolution_text(figure),
-        sight(figure),
+        detectable_text(figure),
+        sensitivity_text(figure),
     ]
     kinds = ("", "n", "n", "", "n", "")
     line = "".join(f'<td class="{kind}">{escape(cell)}</td>' for kind, cell in zip(kinds, cells, strict=True))
     return f'<tr class="{"" if figure.agrees else "bad"}">{line}</tr>'
 
 
-def lines(claim: type[Claim], result: ClaimResult, again: bool) -> Iterator[str]:
-    """Yield what the terminal shows of one claim."""
+def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> Iterator[str]:
+    """Yield the lines that the terminal shows for one claim."""
     worst = [figure for figure in result.figures if not figure.agrees]
-    kept = "" if again else ", as stored"
-    yield f"{claim.name:<4} {result.verdict:<29} {duration(result.seconds):>7}{kept}  {claim.statement}"
+    origin = ", as stored" if is_stored else ""
+    yield f"{claim.name:<4} {result.verdict:<29} {duration(result.seconds):>7}{origin}  {claim.statement}"
     for figure in worst:
         yield f"       {figure.what}: published {figure.published}, measured {measured_text(figure)}"
     if result.remark:
         yield f"       {result.remark}"
-    if said := blind(result.figures):
-        yield f"       {said}"
+    if sentence := insensitive_text(result.figures):
+        yield f"       {sentence}"
 
 
-def listed(claims: Sequence[type[Claim]]) -> Iterator[str]:
+def list_lines(claims: Sequence[type[Claim]]) -> Iterator[str]:
     """Yield the lines of ``--list``."""
     for lesson in dict.fromkeys(claim.lesson for claim in claims):
         yield f"{lesson}: {LESSONS.get(lesson, '')}"

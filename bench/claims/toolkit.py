@@ -1,66 +1,51 @@
-"""What claims are made of: problems from plugin names or scenes of their own, exact and sampled moments, descents."""
+"""Building blocks of claims: problems by plugin name or scene, exact and sampled moments, gradient descent."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from bench.errors import Unsupported
-from bench.model import Estimator, MechanicalScene, Plugin, Problem, Scene, compose, registry
+from bench.experiment.by_name import compile_problem, make
+from bench.model import Estimator, Problem, Scene
 from bench.model.identity import parse_identity
-from bench.model.parameters import build, parameters
 
 used: set[tuple[str, str]] = set()
-"""Kind and name of the plugins made since the set was cleared: what the numbers of a claim rest on."""
+"""Kind and name of the plugins made since the set was cleared. The numbers of a claim depend on them."""
 WIDTH = 9.0
-"""Standard deviations to which the rules below reach: 2e-19 of a normal variable lies outside."""
+"""Range of the quadrature rules [standard deviations]. A normal variable is outside with probability 2e-19."""
 
 
-def plugin_class(kind: str, name: str) -> type[Any]:
-    """Return a plugin class by its name; raises :class:`Unsupported` where its library is missing."""
-    used.add((kind, name))
-    entry = registry.find(kind, name)
-    if not entry.available:
-        raise Unsupported(f"{kind} {name} is {entry.reason}")
-    return registry.usable(kind, name)
+def plugin(kind: str, identity: str, defaults: Mapping[str, Any] | None = None) -> Any:
+    """Return a plugin by its identity string, ``penalty[stiffness=1e4]``, over the values ``defaults`` of a scene.
 
-
-def plugin(kind: str, identity: str, given: Any = None) -> Any:
-    """Return a plugin by its identity string, ``penalty[stiffness=1e4]``, over the values ``given`` by a scene."""
-    name, values = parse_identity(identity)
-    cls = plugin_class(kind, name)
-    declared = parameters(cls)
-    return build(cls, {k: v for k, v in (given or {}).items() if k in declared} | values)
+    Raises :class:`Unsupported` if a library that it needs is not installed.
+    """
+    used.add((kind, parse_identity(identity)[0]))
+    return make(kind, identity, defaults)
 
 
 def estimator(identity: str) -> Estimator:
-    """Return an estimator by its identity string."""
-    made: Estimator = plugin("estimators", identity)
-    return made
+    """Return an estimator by its identity string. Raises :class:`Unsupported` if a library is missing."""
+    result: Estimator = plugin("estimators", identity)
+    return result
 
 
 def problem(
     scene: Scene | str, contact: str = "penalty", backend: str = "jax", integrator: str = "semi_implicit_euler"
 ) -> Problem:
-    """Compile a scene, given by name or itself, under a contact law and an integrator where it has them."""
-    chosen: Scene = plugin("scenes", scene) if isinstance(scene, str) else scene
-    law: Plugin | None = None
-    step: Plugin | None = None
-    if isinstance(chosen, MechanicalScene):
-        law = plugin("contacts", contact, chosen.contact_values) if chosen.n_contacts else None
-        step = plugin("integrators", integrator)
-    program = compose(chosen, law, step)  # type: ignore[arg-type]
-    engine = plugin("backends", backend)
-    if reason := engine.incompatibility(program):
-        raise Unsupported(reason)
-    compiled: Problem = engine.compile(program)
-    return compiled
+    """Compile a scene, given by its identity string or as an object.
+
+    The contact law and the integrator count if the scene has contacts and a motion. Raises :class:`Unsupported` for a
+    combination that cannot run here.
+    """
+    return compile_problem(scene, contact, integrator, backend, make=plugin)
 
 
 def native(scene: Scene | str, contact: str = "penalty") -> Problem:
-    """Compile a scene as a native loop, or with JAX where that library is missing: for thousands of small calls."""
+    """Compile a scene for thousands of small calls: as a native loop, or with JAX if the native library is missing."""
     try:
         return problem(scene, contact, backend="fused")
     except Unsupported:
@@ -68,7 +53,7 @@ def native(scene: Scene | str, contact: str = "penalty") -> Problem:
 
 
 def terms(problem: Problem, estimator: Estimator, w: np.ndarray, theta: np.ndarray | None = None) -> np.ndarray:
-    """Return the estimates of one sample each, ``(B, d)``, for noise ``w (n_w, B)``."""
+    """Return single-sample estimates ``(B, d)`` at ``theta``, by default ``theta0``, for noise ``w (n_w, B)``."""
     at = problem.program.theta0 if theta is None else np.atleast_1d(theta)
     return estimator.estimate(problem, at, w.T[:, None, :])
 
@@ -82,15 +67,15 @@ def rule(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def hermite(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights that are exact for polynomials of a standard normal variable."""
+    """Return nodes ``(1, count)`` and weights of Gauss-Hermite quadrature for a standard normal variable."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(count)
     return nodes[None], weights / weights.sum()
 
 
 def expectation(function: Callable[[np.ndarray], np.ndarray], count: int = 400_000) -> tuple[float, float]:
-    """Return E function(w) of one standard normal variable, and the change against a rule of other nodes.
+    """Return E function(w) for one standard normal variable, and its difference from a rule with other nodes.
 
-    ``function`` maps ``(1, B)`` to ``(B,)`` and may jump: the error then is about a node's share of the jump.
+    ``function`` maps ``(1, B)`` to ``(B,)``. If it jumps, the error is about the weight of one node times the jump.
     """
     values = []
     for n in (count, round(0.7 * count) | 1):
@@ -102,20 +87,20 @@ def expectation(function: Callable[[np.ndarray], np.ndarray], count: int = 400_0
 def moments(
     problem: Problem, estimator: Estimator, theta: np.ndarray | float | None = None, count: int = 400_000
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return mean and per-sample variance of an estimator with one noise number, each with its error."""
+    """Return mean and per-sample variance of an estimator with one noise variable, each with its quadrature error."""
     at = problem.program.theta0 if theta is None else np.atleast_1d(np.asarray(theta, dtype=float))
-    found = []
+    results = []
     for n in (count, round(0.7 * count) | 1):
         nodes, weights = rule(n)
         values = terms(problem, estimator, nodes, at)[:, 0]
         mean = float(values @ weights)
-        found.append((mean, float((values - mean) ** 2 @ weights)))
-    (mean, variance), (other_mean, other_variance) = found
+        results.append((mean, float((values - mean) ** 2 @ weights)))
+    (mean, variance), (other_mean, other_variance) = results
     return (mean, abs(mean - other_mean)), (variance, abs(variance - other_variance))
 
 
 def spread(values: np.ndarray, batches: int = 50) -> tuple[float, float]:
-    """Return the variance (trace) of samples ``(B, d)`` and its standard error from batches."""
+    """Return the variance of samples ``(B, d)``, summed over components, and its standard error from batches."""
     groups = np.array_split(values, batches)
     each = np.array([group.var(axis=0, ddof=1).sum() for group in groups])
     return float(values.var(axis=0, ddof=1).sum()), float(each.std(ddof=1) / np.sqrt(batches))
@@ -129,7 +114,7 @@ def centre(values: np.ndarray) -> tuple[float, float]:
 def descend(
     step: Callable[[np.ndarray, int], np.ndarray], start: np.ndarray, rate: float, iterations: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return where gradient descent ends, and the path ``(iterations + 1, ...)``; ``step(theta, i)`` is the gradient."""
+    """Return the last point of gradient descent and the path ``(iterations + 1, ...)``. ``step(theta, i)`` is the gradient."""
     theta = np.array(start, dtype=float)
     path = [theta.copy()]
     for i in range(iterations):
@@ -148,9 +133,9 @@ def stochastic_descent(
     runs: int = 20,
     samples: int = 50,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Descend on one variable, ``runs`` times beside each other; returns the ends ``(runs,)`` and the paths.
+    """Descend on one variable in ``runs`` independent runs. Returns the last points ``(runs,)`` and the paths.
 
-    A step takes the mean of ``samples`` gradients or, with ``zeroth``, of (f - f at w = 0) w / sigma.
+    A step uses the mean of ``samples`` gradients or, with ``zeroth``, of (f - f at w = 0) w / sigma.
     """
     noise = np.random.default_rng(seed).standard_normal((iterations, 1, runs * samples))
 
@@ -161,6 +146,6 @@ def stochastic_descent(
             values = (problem.value(every, w) - np.repeat(base, samples)) * w[0] / problem.sigma
         else:
             values = problem.grad(every, w)[0]
-        return values.reshape(runs, samples).mean(axis=1)
+        return np.asarray(values.reshape(runs, samples).mean(axis=1))
 
     return descend(step, np.full(runs, start), rate, iterations)

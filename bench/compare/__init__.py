@@ -9,20 +9,18 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench.compare.cells import compared
+from bench.compare.cells import assumed_defaults, compare_cells
 from bench.compare.report import Comparison, show, write
-from bench.compare.sources import Results, opened
+from bench.compare.sources import Results, open_results
 from bench.compare.timings import RUNS
-from bench.errors import UserError, unknown
+from bench.errors import UserError
 from bench.experiment.columns import Column
-from bench.model import registry
-
-SETTINGS = ("timings", "again", "out", "plugins")
+from bench.experiment.words import parse_flag, parse_words
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What a command line asks for."""
+class Request:
+    """What to compare, from the command line."""
 
     before: str
     after: str
@@ -33,23 +31,24 @@ class Asked:
 
 
 def main(words: Sequence[str]) -> int:
-    """Compare the two results named in ``words``; returns 1 if something got worse. Raises :class:`UserError`."""
-    asked = _parsed(words)
+    """Compare the two results named in ``words``. Returns 1 if something got worse. Raises :class:`UserError`."""
+    request = _parse(words)
     with ExitStack() as stack:
-        old, new, *again = (stack.enter_context(opened(name)) for name in (asked.before, asked.after, *asked.again))
-        comparison = compare(asked, old, new, again)
-    show(comparison, write(comparison, asked.out))
+        names = (request.before, request.after, *request.again)
+        old, new, *again = (stack.enter_context(open_results(name)) for name in names)
+        comparison = compare(request, old, new, again)
+    show(comparison, write(comparison, request.out))
     return 1 if comparison.worse else 0
 
 
 def compare(
-    asked: Asked,
+    request: Request,
     old: Mapping[str, Results],
     new: Mapping[str, Results],
     again: Sequence[Mapping[str, Results]] = (),
 ) -> Comparison:
-    """Compare the experiments that two results have in common: accuracy, and times only where they are asked for."""
-    before, after = asked.before, asked.after
+    """Compare the accuracy of the experiments that two results have in common, and their times if requested."""
+    before, after = request.before, request.after
     shared = [name for name in old if name in new]
     if not shared:
         raise UserError(f"{before} ({', '.join(old)}) and {after} ({', '.join(new)}) have no experiment in common")
@@ -67,32 +66,38 @@ def compare(
             raise UserError(f"{name} is of study {one.study} in {before} and of study {two.study} in {after}")
         runs = [results[name].rows for results in again if name in results]
         judged |= {column.name: column for column in one.columns.compared}
-        table, said = compared(one.rows, two.rows, one.columns, asked.timings, runs)
-        remarks += [
-            f"{name}: {remark}" for remark in (*_older(one, two), *machine_remarks(one, two, asked.timings), *said)
-        ]
+        table, time_remarks = compare_cells(one.rows, two.rows, one.columns, request.timings, runs)
+        own = (*row_remarks(one, two), *machine_remarks(one, two, request.timings), *time_remarks)
+        remarks += [f"{name}: {remark}" for remark in own]
         parts.append(table.assign(experiment=name))
     table = pd.concat(parts, ignore_index=True)
     return Comparison(f"{before} against {after}", table, remarks, list(judged.values()), old[shared[0]].study)
 
 
-def _older(old: Results, new: Results) -> list[str]:
-    return [
-        f"{results.older} rows {when} were made by an older version and are left out"
+def row_remarks(old: Results, new: Results) -> list[str]:
+    """Return which rows are left out, and which parameters are missing on one side and assumed to have their default."""
+    remarks = [
+        f"{results.n_outdated} rows {when} were made by an older version and are left out"
         for when, results in (("before", old), ("after", new))
-        if results.older
+        if results.n_outdated
     ]
+    missing = {"before": assumed_defaults(old.rows), "after": assumed_defaults(new.rows)}
+    for when, other in (("before", "after"), ("after", "before")):
+        own = [f"{name}={value}" for name, value in missing[when].items() if name not in missing[other]]
+        if own:
+            remarks.append(f"rows {when} do not store {', '.join(own)}: the present default is assumed")
+    return remarks
 
 
 def machine_remarks(old: Results, new: Results, timings: bool) -> list[str]:
-    """Return what other machines mean for the comparison, and, where times are judged, why those are doubtful."""
+    """Return how different machines affect the comparison, and why times are doubtful if they are judged."""
     remarks: list[str] = []
-    which = f"{old.machine or 'unknown'}; {new.machine or 'unknown'}"
-    other = not old.machine or old.machine != new.machine
-    if timings and other:
-        remarks.append(f"WARNING: timings of different machines ({which}) are compared")
-    elif other:
-        remarks.append(f"made on different machines ({which}): rounding may move the estimates of chaotic cells")
+    machines = f"{old.machine or 'unknown'}; {new.machine or 'unknown'}"
+    is_same = bool(old.machine) and old.machine == new.machine
+    if timings and not is_same:
+        remarks.append(f"WARNING: timings of different machines ({machines}) are compared")
+    elif not is_same:
+        remarks.append(f"made on different machines ({machines}): rounding may change the estimates of chaotic cells")
     if timings:
         for when, results in (("before", old), ("after", new)):
             if results.busy:
@@ -100,31 +105,19 @@ def machine_remarks(old: Results, new: Results, timings: bool) -> list[str]:
     return remarks
 
 
-def _parsed(words: Sequence[str]) -> Asked:
-    names, settings = [], {"timings": "false", "out": "runs/compare", "again": ""}
-    for word in words:
-        key, equals, value = word.partition("=")
-        if word == "--timings":
-            settings["timings"] = "true"
-        elif equals and not key.startswith("-") and "/" not in key:
-            if key not in SETTINGS:
-                raise unknown("setting of compare", key, SETTINGS)
-            if key == "plugins":
-                registry.add_folder(Path(value))
-            settings[key] = value
-        else:
-            names.append(word)
+def _parse(words: Sequence[str]) -> Request:
+    defaults = {"timings": "false", "again": "", "out": "runs/compare"}
+    names, settings, options = parse_words(words, "compare", defaults, ("--timings",))
     if len(names) != 2:
         raise UserError(
             "name two results: python -m bench compare BEFORE AFTER (directories, or revisions as REV or REV:PATH)"
         )
-    if settings["timings"] not in ("true", "false"):
-        raise unknown("value for timings:", settings["timings"], ("true", "false"))
+    timings = bool(options) or parse_flag(settings, "timings")
     again = tuple(filter(None, settings["again"].split(",")))
-    if again and settings["timings"] == "false":
+    if again and not timings:
         raise UserError("again= names further runs for their times: add --timings")
     if again and len(again) + 1 < RUNS:
         raise UserError(
-            f"a spread between runs takes {RUNS} runs of before or more: again= names {len(again)} besides it"
+            f"the spread between runs needs {RUNS} or more runs of before: again= names {len(again)} besides the first"
         )
-    return Asked(names[0], names[1], Path(settings["out"]).expanduser(), settings["timings"] == "true", again)
+    return Request(names[0], names[1], Path(settings["out"]).expanduser(), timings, again)

@@ -1,4 +1,4 @@
-"""Follows results over versions: one small chart of how accurate each estimator was, and what failed."""
+"""Follows results over versions: a chart and a table of each estimator's error and failures."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ import numpy as np
 import pandas as pd
 
 from bench.compare.cells import rows_by_cell
-from bench.compare.sources import Results, opened
-from bench.errors import UserError, unknown
+from bench.compare.sources import Results, open_results
+from bench.errors import UserError
 from bench.experiment.columns import Column, Columns
+from bench.experiment.words import parse_words
 from bench.model import registry
 from bench.report.tables import plain_markdown
 from bench.report.text import number
@@ -24,39 +25,41 @@ from bench.run.files import make_directory, write_all
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SETTINGS = ("out", "plugins")
 WIDTH, HEIGHT = 7.16, 2.4
+"""Size of the chart [inches]."""
 ERRORS = ("paired", "interval", "exact")
-"""How a column is judged that history can follow, the first of them that a study has."""
-REFUSED = ("unsupported", "unavailable")
-"""Statuses of cells that never ran, which are no failure."""
+"""Comparison rules of columns that hold an error. History follows the first such column of a study."""
+NOT_RUN = ("unsupported", "unavailable")
+"""Statuses of cells that never ran, which do not count as failures."""
 LONGEST = 18
-"""Characters of a result's name in the chart, its end."""
+"""Largest number of characters of a result's name in the chart. The end of a longer name is shown."""
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """A line per result, experiment and series."""
+    """Errors and failures, one line per result, experiment and series."""
 
     table: pd.DataFrame
-    """``result``, ``experiment``, ``series``, ``error`` (geometric mean of its ratios to the first result, over the cells
-    that ended well in all), ``cells`` behind it, ``failed`` and ``of`` (all cells of the series)."""
+    """``result``, ``experiment``, ``series``, ``error`` (geometric mean of the ratios to the first result, over the cells
+    that are ok in all results), ``cells`` (their number), ``failed`` and ``of`` (all cells of the series)."""
     names: Sequence[str]
 
 
 def main(words: Sequence[str]) -> int:
-    """Write the history of the results named in ``words``, in their order. Raises :class:`UserError`."""
-    names, out = _parsed(words)
+    """Write the history of the results named in ``words``, the oldest first. Raises :class:`UserError`."""
+    names, settings, _ = parse_words(words, "history", {"out": "runs/history"})
+    if len(names) < 2:
+        raise UserError("name two results or more, the oldest first: python -m bench history DIR DIR ... [out=DIR]")
     with ExitStack() as stack:
-        results = [stack.enter_context(opened(name)) for name in names]
-        history = follow(names, results)
-    for path in write(history, out):
+        results = [stack.enter_context(open_results(name)) for name in names]
+        history = compute_history(names, results)
+    for path in write(history, Path(settings["out"]).expanduser()):
         print(f"  {path}")
     return 0
 
 
-def follow(names: Sequence[str], results: Sequence[Mapping[str, Results]]) -> History:
-    """Return the history of the experiments that all results have."""
+def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results]]) -> History:
+    """Return the history of the experiments that all results have. Raises :class:`UserError` if there are none."""
     shared = [name for name in results[0] if all(name in other for other in results)]
     if not shared:
         raise UserError(f"{', '.join(names)} have no experiment in common")
@@ -68,21 +71,23 @@ def follow(names: Sequence[str], results: Sequence[Mapping[str, Results]]) -> Hi
         estimators = dict.fromkeys(str(row["estimator"]) for row in first)
         for series in estimators:
             keys = [
-                key for key, row in tables[0].items() if row["estimator"] == series and row["status"] not in REFUSED
+                key for key, row in tables[0].items() if row["estimator"] == series and row["status"] not in NOT_RUN
             ]
-            of_all = [key for key in keys if all(table.get(key, {}).get("status") == "ok" for table in tables)]
+            ok_in_all = [key for key in keys if all(table.get(key, {}).get("status") == "ok" for table in tables)]
             for name, table in zip(names, tables, strict=True):
                 mine = [table[key] for key in keys if key in table]
-                error, count = _ratio(columns, [(tables[0][key], table[key]) for key in of_all])
+                error, count = _mean_ratio(columns, [(tables[0][key], table[key]) for key in ok_in_all])
                 failed = len(keys) - len(mine) + sum(row["status"] != "ok" for row in mine)
                 lines.append((name, experiment, series if len(estimators) > 1 else "", error, count, failed, len(keys)))
     titles = ["result", "experiment", "series", "error", "cells", "failed", "of"]
     return History(pd.DataFrame(lines, columns=titles), list(names))
 
 
-def _ratio(columns: Columns, pairs: Sequence[tuple[Mapping[str, object], Mapping[str, object]]]) -> tuple[float, int]:
-    """Return the geometric mean of a column's ratios over pairs of rows, and how many of them are positive."""
-    column = _followed(columns)
+def _mean_ratio(
+    columns: Columns, pairs: Sequence[tuple[Mapping[str, object], Mapping[str, object]]]
+) -> tuple[float, int]:
+    """Return the geometric mean of the error's ratios over pairs of rows, and the number of pairs that have one."""
+    column = _error_column(columns)
     if column is None:
         return math.nan, 0
     values = np.array([[float(str(row.get(column.name, "nan"))) for row in pair] for pair in pairs]).reshape(-1, 2)
@@ -90,12 +95,12 @@ def _ratio(columns: Columns, pairs: Sequence[tuple[Mapping[str, object], Mapping
     return (float(np.exp(np.log(values[:, 1] / values[:, 0]).mean())), len(values)) if len(values) else (math.nan, 0)
 
 
-def _followed(columns: Columns) -> Column | None:
+def _error_column(columns: Columns) -> Column | None:
     return next((c for by in ERRORS for c in columns.compared if c.comparison and c.comparison.by == by), None)
 
 
 def write(history: History, out: Path) -> list[Path]:
-    """``history`` as .csv, .md and .png in a directory; raises :class:`StorageError` where it cannot be written."""
+    """Write ``history`` as .csv, .md and .png into a folder. Raises :class:`StorageError` if that fails."""
     from bench.report.figures import save, styled
 
     make_directory(out)
@@ -104,8 +109,8 @@ def write(history: History, out: Path) -> list[Path]:
         failed=[f"{f} of {n}" for f, n in zip(history.table["failed"], history.table["of"], strict=True)],
     ).drop(columns="of")
     text = (
-        "# History\n\n`error` is the geometric mean of the errors' ratios to those of the first result, over the cells that "
-        f"ended well in all; below 1 is better.\n\n{plain_markdown(readable.astype(str))}\n"
+        "# History\n\n`error` is the geometric mean of the ratios to the errors of the first result, over the cells that are ok "
+        f"in all results. Below 1 is better.\n\n{plain_markdown(readable.astype(str))}\n"
     )
     paths = write_all(out, {"history.csv": history.table.to_csv(index=False, lineterminator="\n"), "history.md": text})
     with styled():
@@ -113,7 +118,7 @@ def write(history: History, out: Path) -> list[Path]:
 
 
 def figure(history: History) -> Figure:
-    """Draw the errors relative to the first result, and the cells that did not end well."""
+    """Draw the errors relative to the first result, and the share of failed cells."""
     from matplotlib.figure import Figure
 
     from bench.report.scales import log_axis
@@ -137,10 +142,10 @@ def figure(history: History) -> Figure:
     log_axis(left, "y", low, high)
     left.axhline(1.0, color="#595959", linewidth=0.9, linestyle=(0, (3, 2)), zorder=1)
     left.set_title("Error, relative to the first result")
-    right.set_title("Cells that did not end well [%]")
+    right.set_title("Failed cells [%]")
     right.set_ylim(bottom=-2 if history.table["failed"].max() else -0.1)
     for panel in (left, right):
-        panel.set_xticks(places, [_short(name) for name in history.names], rotation=20, ha="right")
+        panel.set_xticks(places, [_shorten(name) for name in history.names], rotation=20, ha="right")
         panel.set_xlim(-0.2, len(places) - 0.8)
     if len(lines) > 1:
         handles, labels = right.get_legend_handles_labels()
@@ -148,23 +153,6 @@ def figure(history: History) -> Figure:
     return drawn
 
 
-def _short(name: str) -> str:
+def _shorten(name: str) -> str:
     name = name.rstrip("/")
     return name if len(name) <= LONGEST else "..." + name[-LONGEST:]
-
-
-def _parsed(words: Sequence[str]) -> tuple[list[str], Path]:
-    names, settings = [], {"out": "runs/history"}
-    for word in words:
-        key, equals, value = word.partition("=")
-        if equals and "/" not in key:
-            if key not in SETTINGS:
-                raise unknown("setting of history", key, SETTINGS)
-            if key == "plugins":
-                registry.add_folder(Path(value))
-            settings[key] = value
-        else:
-            names.append(word)
-    if len(names) < 2:
-        raise UserError("name two results or more, the oldest first: python -m bench history DIR DIR ... [out=DIR]")
-    return names, Path(settings["out"]).expanduser()

@@ -1,17 +1,17 @@
 """Judges whether a column of a cell changed by more than the uncertainty of both measurements.
 
-The study says how a column is judged (:class:`bench.experiment.columns.ComparisonRule`):
+The study names the rule of each column (:class:`bench.experiment.columns.ComparisonRule`):
 
-- ``paired``: the cells of both sides have the same seed and noise, so unchanged code gives the same mean estimate. It
-  moved where the mean or the variance differ by more than ROUNDING. It got worse or better where the root mean squared
-  error changed by a factor of PAIRED at least, with both sides' errors measured against the reference of *before*.
-- ``interval``: the two 95% intervals are apart.
-- ``spread``: the two 95% intervals are apart where both are stored, else the ratio leaves the central 99% of an F
-  distribution with R - 1 degrees of freedom on both sides (normal estimates with one dominant component, the fewest
+- ``paired``: the cells of both sides have the same seed and noise, so unchanged code gives the same mean estimate. The
+  estimate changed if the mean or the variance differ by more than ROUNDING. It got worse or better if the root mean
+  squared error changed by a factor of at least PAIRED, with both sides measured against the reference of *before*.
+- ``interval``: the two 95% intervals do not overlap.
+- ``spread``: the two 95% intervals do not overlap. If an interval is not stored, the ratio must leave the central 99% of
+  an F distribution with R - 1 degrees of freedom on both sides (normal estimates with one dominant component, the fewest
   possible). In either case the change must also be at least EFFECT.
-- ``exact``, computed and not estimated: it changed by EFFECT at least, and by more than ROUNDING of what it is relative
-  to.
-- ``verdict``: it moved in the study's order, which is worst first.
+- ``exact``, for columns that are computed without noise: the value changed by a factor of at least EFFECT, and by more
+  than ROUNDING.
+- ``verdict``: the verdict moved in the study's order, which lists the worst first.
 
 Times (``time``) are judged by :mod:`bench.compare.timings`, over all cells together.
 """
@@ -29,103 +29,110 @@ from bench.measure.statistics import UNEXPLAINED, is_unexplained
 from bench.report.text import number
 
 EFFECT = 1.25
-"""Ratio below which neither a variance nor a computed error counts as changed."""
+"""Smallest ratio at which a variance or a computed error counts as changed."""
 PAIRED = 1.01
-"""Ratio below which an error measured with the same noise counts as neither worse nor better, only as changed."""
+"""Smallest ratio at which an error measured with the same noise counts as worse or better, not only as changed."""
 ALPHA = 0.01
+"""Significance level of the F test."""
 ROUNDING = 1e-6
-"""Relative change that the rounding of another machine may cause through a long rollout."""
+"""Relative change that rounding on another machine may cause over a long rollout."""
 SIGMAS = 4.0
-"""Standard errors between two references beyond which the reference itself moved."""
+"""Distance of two references, in standard errors, above which the reference itself changed."""
 NOTES = (
     "Both sides have the same seeds and noise, so unchanged code gives the same estimates. A mean estimate or a variance "
-    f"that moved by more than {ROUNDING:g} is a change of the code: worse or better where the RMSE about the reference of "
-    f"before changed by {PAIRED - 1:.0%} or more, else changed.",
-    "Also worse or better: a bias whose 95% interval no longer overlaps the one before; a variance whose interval "
-    "no longer overlaps either (or, where no interval is stored, that is outside 99% of an F test) and that changed by a "
-    f"factor of {EFFECT:g} or more.",
-    f"Errors computed without noise count where they changed by a factor of {EFFECT:g} or more and by more than {ROUNDING:g}. "
-    "Verdicts count by the order that their study gives them. Where neither more nor less is better, a "
-    "change counts as changed, neither worse nor better.",
-    "A cell that was ok and no longer is, or is gone, is worse. New cells are neither. A bias or variance whose interval a "
-    "remark calls doubtful is changed, neither worse nor better, unless the paired RMSE decides.",
+    f"that moved by more than {ROUNDING:g} shows that the code changed. The cell is worse or better if the RMSE about the "
+    f"reference of before changed by {PAIRED - 1:.0%} or more, otherwise changed.",
+    "A bias is also worse or better if its 95% interval no longer overlaps the one before. A variance is also worse or "
+    f"better if it changed by a factor of {EFFECT:g} or more and its interval no longer overlaps (without stored "
+    "intervals, if the ratio fails an F test at 99%).",
+    f"Errors computed without noise count if they changed by a factor of {EFFECT:g} or more and by more than {ROUNDING:g}. "
+    "Verdicts count by the order that their study gives them. A column for which neither more nor less is better counts "
+    "as changed.",
+    "A cell that was ok and no longer is, or is gone, is worse. A new cell counts as changed. A bias or variance whose "
+    "interval a remark calls doubtful counts as changed, unless the paired RMSE decides.",
+    "Rows are of one cell if all their parameters, samples, repeats and seed are equal. A parameter that a stored row lacks "
+    "has its present default.",
 )
 
 Row = Mapping[str, Any]
 
 
 class Change(NamedTuple):
-    """What became of one column: ``worse``, ``better`` or ``changed``, and a few words."""
+    """The change of one column of a cell."""
 
     outcome: str
+    """``worse``, ``better`` or ``changed``."""
     text: str
+    """The change in a few words."""
+    subject: str = ""
+    """What changed: a column as a reader calls it, ``status``, or ``gone`` and ``new`` for a whole cell."""
 
 
 def judge(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
-    """Return the change of one judged column between two rows that both ended well, or None."""
-    assert column.comparison is not None
-    change = RULES[column.comparison.by](column, columns, old, new)
+    """Return the change of one judged column between two rows of status ok, or None if it did not change."""
+    rule = _rule(column)
+    change = RULES[rule.by](column, columns, old, new)
     if change is None:
         return None
-    if column.comparison.neutral:
-        change = change._replace(outcome="changed")
+    change = change._replace(subject=rule.called, outcome="changed" if rule.neutral else change.outcome)
     remarks = [str(row["reason"]) for row in (old, new) if isinstance(row.get("reason"), str) and row["reason"]]
-    if remarks and column.comparison.by in ("interval", "spread"):
+    if remarks and rule.by in ("interval", "spread"):
         doubt = UNEXPLAINED if any(map(is_unexplained, remarks)) else "intervals doubtful"
-        return Change("changed", f"{change.text}, {doubt}")
+        return change._replace(outcome="changed", text=f"{change.text}, {doubt}")
     return change
 
 
 class _Pair(NamedTuple):
-    """Two mean estimates on the same noise, with variances and references; each before and after."""
+    """Mean estimates on the same noise with their variances and references, each as [before, after]."""
 
     means: list[np.ndarray]
     variances: list[float]
     references: list[np.ndarray]
     scale: float
-    """The larger root mean square of one estimate."""
+    """The larger of the two root mean squares of one estimate."""
 
     @property
-    def moved(self) -> float:
-        """Distance between the two means."""
+    def distance(self) -> float:
+        """Euclidean distance between the two means."""
         return float(np.linalg.norm(self.means[1] - self.means[0]))
 
     @property
-    def same(self) -> bool:
-        """Whether the estimates are the same, up to rounding."""
+    def is_same(self) -> bool:
+        """Whether the estimates are equal up to rounding."""
         was, now = map(math.sqrt, self.variances)
-        return max(self.moved, abs(now - was)) <= ROUNDING * self.scale
+        return max(self.distance, abs(now - was)) <= ROUNDING * self.scale
 
 
-def _pair(judged: ComparisonRule, old: Row, new: Row) -> _Pair | None:
-    """Return what two rows of the same noise store, or None where a side does not."""
-    if judged.by != "paired":
+def _pair(rule: ComparisonRule, old: Row, new: Row) -> _Pair | None:
+    """Return the stored estimates of two rows of the same noise, or None if a row does not store them."""
+    if rule.by != "paired":
         return None
-    means, references = ([_list(row, name) for row in (old, new)] for name in (judged.mean, judged.reference))
-    variances = [value(row, judged.variance) for row in (old, new)]
+    means, references = ([_numbers(row, name) for row in (old, new)] for name in (rule.mean, rule.reference))
+    variances = [value(row, rule.variance) for row in (old, new)]
     if not means[0].size or not means[0].shape == means[1].shape == references[0].shape:
         return None
     if not np.isfinite([*means[0], *means[1], *references[0], *variances]).all():
         return None
-    # hypot, since the squares of exploding gradients overflow
+    # hypot does not overflow where squares of exploding gradients would
     scale = max(math.hypot(*mean, math.sqrt(v)) for mean, v in zip(means, variances, strict=True))
     return _Pair(means, variances, references, scale)
 
 
-def same_estimates(column: Column, old: Row, new: Row) -> bool:
-    """Return whether a paired column has the same estimates on both sides; False where they are not stored."""
-    pair = _pair(_judged(column), old, new)
-    return pair is not None and pair.same
+def has_same_estimates(column: Column, old: Row, new: Row) -> bool:
+    """Return whether a paired column has equal estimates on both sides. False if they are not stored."""
+    pair = _pair(_rule(column), old, new)
+    return pair is not None and pair.is_same
 
 
 def _paired(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
-    """Judge an error by the mean estimates on the same noise; None where a side does not store them."""
-    judged = _judged(column)
-    pair = _pair(judged, old, new)
+    """Judge an error by the mean estimates on the same noise, or return None if a row does not store them."""
+    rule = _rule(column)
+    pair = _pair(rule, old, new)
     if pair is None:
         return None
-    if pair.same:
-        return _other_reference(pair, [value(row, f"{_stem(judged.reference)}_se") for row in (old, new)])
+    if pair.is_same:
+        stem = rule.reference.partition("_")[0]  # of reference_gradient: its standard error is reference_se
+        return _reference_change(pair, [value(row, f"{stem}_se") for row in (old, new)])
     was, now = (
         math.hypot(*(mean - pair.references[0]), math.sqrt(v))
         for mean, v in zip(pair.means, pair.variances, strict=True)
@@ -133,53 +140,51 @@ def _paired(column: Column, columns: Columns, old: Row, new: Row) -> Change | No
     outcome = "changed"
     if max(was, now) >= PAIRED * min(was, now) and abs(now - was) > ROUNDING * pair.scale:
         outcome = "worse" if now > was else "better"
-    text = f"{judged.called} {number(was, 3)} to {number(now, 3)} on the same noise"
+    text = f"{rule.called} {number(was, 3)} to {number(now, 3)} on the same noise"
     norm = math.hypot(*pair.means[0])
     if norm > 0:
-        text += f", the mean estimate moved by {number(pair.moved / norm)} of itself"
+        text += f", the mean estimate moved by {number(pair.distance / norm)} of itself"
     return Change(outcome, text)
 
 
-def _other_reference(pair: _Pair, errors: list[float]) -> Change | None:
-    """Return a change where the estimates are the same and the reference is not, beyond both standard errors."""
+def _reference_change(pair: _Pair, errors: list[float]) -> Change | None:
+    """Return a change if the reference moved by more than both standard errors allow, though the estimates are equal."""
     old, new = pair.references
     if new.shape != old.shape or not np.isfinite(new).all():
         return None
-    uncertain = SIGMAS * math.hypot(*(error if error > 0 else 0.0 for error in errors))
-    apart = float(np.linalg.norm(new - old))
-    if apart <= uncertain + ROUNDING * float(np.linalg.norm(old)):
+    tolerance = SIGMAS * math.hypot(*(error if error > 0 else 0.0 for error in errors))
+    distance = float(np.linalg.norm(new - old))
+    if distance <= tolerance + ROUNDING * float(np.linalg.norm(old)):
         return None
-    return Change("changed", f"the same estimates, but the reference moved by {number(apart, 3)}")
+    return Change("changed", f"the same estimates, but the reference moved by {number(distance, 3)}")
 
 
-def _stem(reference: str) -> str:
-    """Return the prefix of the columns beside a reference: ``reference`` of ``reference_gradient``."""
-    return reference.partition("_")[0]
-
-
-def _list(row: Row, name: str) -> np.ndarray:
+def _numbers(row: Row, name: str) -> np.ndarray:
     numbers = row.get(name)
     return np.asarray(numbers, dtype=float) if isinstance(numbers, list | np.ndarray) else np.empty(0)
 
 
 def _interval(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
-    return _by_size(column, old, new) if _apart(column, columns, old, new) else None
+    return _size_change(column, old, new) if _intervals_disjoint(column, columns, old, new) else None
 
 
 def _spread(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
     was, now = value(old, column.name), value(new, column.name)
     if not (was > 0 and now > 0) or max(was, now) < EFFECT * min(was, now):
         return None
-    ends = [value(row, name) for row in (old, new) for name in _ends(column, columns)]
+    ends = [value(row, name) for row in (old, new) for name in _interval_columns(column, columns)]
     if all(map(math.isfinite, ends)):
-        changed = _apart(column, columns, old, new)
+        is_changed = _intervals_disjoint(column, columns, old, new)
     else:
-        changed = outside_f(now / was, value(old, "repeats"), value(new, "repeats"))
-    return _by_size(column, old, new) if changed else None
+        is_changed = outside_f(now / was, value(old, "repeats"), value(new, "repeats"))
+    return _size_change(column, old, new) if is_changed else None
 
 
 def outside_f(ratio: float, before: float, after: float) -> bool:
-    """Return whether a ratio of variances from that many repeats is outside 99% of the ratios of equal variances."""
+    """Return whether a ratio of two variances fails the F test of equal variances at 99%.
+
+    ``before`` and ``after`` are the numbers of repeats that each variance was measured from.
+    """
     from scipy.special import fdtri
 
     low, high = (float(fdtri(after - 1, before - 1, p)) for p in (ALPHA / 2, 1 - ALPHA / 2))
@@ -188,20 +193,18 @@ def outside_f(ratio: float, before: float, after: float) -> bool:
 
 def _exact(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
     was, now = value(old, column.name), value(new, column.name)
-    changed = abs(now - was) > ROUNDING and max(was, now) >= EFFECT * min(was, now)
-    return _by_size(column, old, new) if changed else None
+    is_changed = abs(now - was) > ROUNDING and max(was, now) >= EFFECT * min(was, now)
+    return _size_change(column, old, new) if is_changed else None
 
 
 def _verdict(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
     was, now = old.get(column.name, ""), new.get(column.name, "")
     if was == now:
         return None
-    judged = _judged(column)
-    if was in judged.order and now in judged.order:
-        outcome = "worse" if judged.order.index(now) < judged.order.index(was) else "better"
-    else:
-        outcome = "changed"
-    return Change(outcome, f"{judged.called} {was or 'none'} to {now or 'none'}")
+    rule, outcome = _rule(column), "changed"
+    if was in rule.order and now in rule.order:
+        outcome = "worse" if rule.order.index(now) < rule.order.index(was) else "better"
+    return Change(outcome, f"{rule.called} {was or 'none'} to {now or 'none'}")
 
 
 RULES: dict[str, Callable[[Column, Columns, Row, Row], Change | None]] = {
@@ -209,28 +212,28 @@ RULES: dict[str, Callable[[Column, Columns, Row, Row], Change | None]] = {
 }  # fmt: skip
 
 
-def _judged(column: Column) -> ComparisonRule:
+def _rule(column: Column) -> ComparisonRule:
     assert column.comparison is not None
     return column.comparison
 
 
-def _by_size(column: Column, old: Row, new: Row) -> Change:
+def _size_change(column: Column, old: Row, new: Row) -> Change:
     was, now = value(old, column.name), value(new, column.name)
-    text = f"{_judged(column).called} {number(was, 3)} to {number(now, 3)}"
+    text = f"{_rule(column).called} {number(was, 3)} to {number(now, 3)}"
     return Change("worse" if now > was else "better", text)
 
 
 def value(row: Row, name: str) -> float:
-    """Return a number of a row; NaN where it has none."""
+    """Return a number of a row, NaN if it has none of that name."""
     return float(row.get(name, math.nan))
 
 
-def _ends(column: Column, columns: Columns) -> tuple[str, str]:
-    """Return the columns of an interval: ``bias_low``, or ``stretch_low`` of ``stretch_rate`` if there is no other."""
+def _interval_columns(column: Column, columns: Columns) -> tuple[str, str]:
+    """Return the columns of an interval: ``bias_low`` and ``bias_high``, or ``stretch_low`` for ``stretch_rate``."""
     stem = column.name if f"{column.name}_low" in columns.by_name else column.name.rpartition("_")[0]
     return f"{stem}_low", f"{stem}_high"
 
 
-def _apart(column: Column, columns: Columns, old: Row, new: Row) -> bool:
-    low, high = _ends(column, columns)
+def _intervals_disjoint(column: Column, columns: Columns, old: Row, new: Row) -> bool:
+    low, high = _interval_columns(column, columns)
     return value(new, low) > value(old, high) or value(new, high) < value(old, low)

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,9 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.compare import timings
-from bench.compare.cells import FIRST, LAST, OUTCOMES, both_sides
+from bench.compare.cells import FIRST, LAST, OUTCOMES, WORSE_IN, both_sides, differing_parameters, flat_parameters
+from bench.compare.exports import as_json, as_junit, count_outcomes
 from bench.compare.judging import NOTES
-from bench.compare.machine import as_json, as_junit, counts
 from bench.experiment.columns import Column
 from bench.experiment.experiment import Experiment
 from bench.model import registry
@@ -29,9 +30,11 @@ from bench.report.web.document import assemble
 from bench.run.files import make_directory, write_all
 
 PRINTED = 30
-"""Most changes that are printed; the files have all of them."""
+"""Largest number of changes that are printed. The files have all of them."""
 LISTED = 100
-"""Most changes that the Markdown lists, since CI servers show it above a run."""
+"""Largest number of changes in the Markdown file, which CI servers show above a run."""
+PHRASES = {"gone": "gone", "status": "no longer ok"}
+"""How the summary names changes that are not of one column."""
 LOOKS = dict(
     zip(
         OUTCOMES,
@@ -50,58 +53,68 @@ class Comparison:
 
     title: str
     table: pd.DataFrame
-    """The lines of :func:`bench.compare.cells.compared`, with the column ``experiment``."""
+    """The lines of :func:`bench.compare.cells.compare_cells`, with the column ``experiment``."""
     remarks: Sequence[str]
     judged: Sequence[Column]
     """The judged columns of all studies, each name once."""
     study: str
-    """Return a study of the rows."""
+    """The study of the first experiment."""
 
     @property
     def worse(self) -> bool:
         """Whether some cell got worse."""
         return bool((self.table["outcome"] == "worse").any())
 
+    @cached_property
+    def cells(self) -> list[str]:
+        """The name of each cell, in the order of the table."""
+        return cell_names(self.table)
+
+    @property
+    def changes(self) -> pd.DataFrame:
+        """The columns ``outcome``, ``experiment``, ``cell`` and ``change`` of the changed cells, the worst first."""
+        named = self.table.assign(cell=self.cells)[["outcome", "experiment", "cell", "change"]]
+        return _worst_first(named[named["outcome"] != "same"])
+
 
 def summary(table: pd.DataFrame) -> str:
-    """Say how many cells got worse, got better and stayed the same, and which columns of the worse ones did."""
-    counts = table["outcome"].value_counts()
-    parts = [f"{counts.get(kind, 0)} got {kind}" for kind in ("worse", "better")]
-    text = f"{', '.join(parts)}, {counts.get('same', 0)} are the same within what was measured"
-    worse = table.loc[table["outcome"] == "worse", "change"]
-    changes = Counter(change.partition(" ")[0] for text in worse for change in text.split("; "))
-    most = ", ".join(f"{count} in {kind}" for kind, count in changes.most_common())
-    return f"Of {counted(len(table), 'cell')} {text}" + (f"; of the worse, {most}." if most else ".")
+    """Return a sentence: how many cells got worse and in which columns, how many got better, how many are the same."""
+    counts = count_outcomes(table)
+    subjects = Counter(subject for subjects in table[WORSE_IN] for subject in subjects)
+    reasons = ", ".join(f"{n} {PHRASES.get(subject, f'in {subject}')}" for subject, n in subjects.most_common())
+    return (
+        f"Of {counted(len(table), 'cell')}, {counts['worse']} got worse{f' ({reasons})' if reasons else ''}, "
+        f"{counts['better']} got better, {counts['same']} are the same within the uncertainty."
+    )
 
 
 def write(comparison: Comparison, out: Path) -> list[Path]:
-    """``compare`` as .csv, .md, .json, .xml (JUnit) and .html; raises :class:`StorageError` where it cannot be written."""
+    """Write ``compare`` as .csv, .md, .json, .xml (JUnit) and .html. Raises :class:`StorageError` if that fails."""
     make_directory(out)
     table = comparison.table
-    names = _cells(table, _names(table))
     columns = ["experiment", *FIRST, *both_sides(comparison.judged), *LAST]
     return write_all(
         out,
         {
             "compare.csv": table[columns].to_csv(index=False, lineterminator="\n"),
             "compare.md": markdown(comparison),
-            "compare.json": as_json(comparison.title, table, names, comparison.remarks),
-            "compare.xml": as_junit(comparison.title, table, names),
+            "compare.json": as_json(comparison.title, table, comparison.cells, comparison.remarks),
+            "compare.xml": as_junit(comparison.title, table, comparison.cells),
             "compare.html": page(comparison),
         },
     )
 
 
 def markdown(comparison: Comparison) -> str:
-    """Return the summary: the sentence, counts by experiment, the remarks and the first changes, the worst first."""
+    """Return the summary, counts by experiment, remarks, first changes (the worst first) and rules as Markdown."""
     table = comparison.table
-    listed = _worst_first(table[table["outcome"] != "same"])
+    listed = comparison.changes
     by_experiment = pd.DataFrame(
-        [{"experiment": str(name)} | counts(part) for name, part in table.groupby("experiment", sort=False)]
+        [{"experiment": str(name)} | count_outcomes(part) for name, part in table.groupby("experiment", sort=False)]
     ).astype(str)
     texts = [f"# {comparison.title}", summary(table), plain_markdown(by_experiment), *comparison.remarks]
     if not listed.empty:
-        texts.append(plain_markdown(_readable(listed, _names(table)).head(LISTED)))
+        texts.append(plain_markdown(listed.head(LISTED)))
     if len(listed) > LISTED:
         texts.append(f"And {len(listed) - LISTED} more in `compare.csv`.")
     return "\n\n".join([*texts, "\n".join(f"- {note}" for note in (*NOTES, timings.NOTE))]) + "\n"
@@ -116,12 +129,12 @@ def show(comparison: Comparison, paths: Sequence[Path]) -> None:
     console.print(summary(comparison.table))
     for remark in comparison.remarks:
         console.print(f"  {remark}")
-    listed = _worst_first(comparison.table[comparison.table["outcome"] != "same"])
+    listed = comparison.changes
     if not listed.empty:
         shown = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="underline")
         for name in ("outcome", "experiment", "cell", "change"):
             shown.add_column(name, overflow="fold")
-        for outcome, *texts in _readable(listed, _names(comparison.table)).head(PRINTED).to_numpy():
+        for outcome, *texts in listed.head(PRINTED).to_numpy():
             shown.add_row(Text(outcome, "red" if outcome == "worse" else ""), *texts)
         console.print(shown)
     if len(listed) > PRINTED:
@@ -135,33 +148,37 @@ def _worst_first(table: pd.DataFrame) -> pd.DataFrame:
     return table.iloc[table["outcome"].map(OUTCOMES.index).argsort(kind="stable")]
 
 
-def _names(table: pd.DataFrame) -> list[str]:
-    """Return the identity columns that distinguish the cells of a comparison."""
-    return [column.name for column in identity_columns(table)]
+def cell_names(table: pd.DataFrame) -> list[str]:
+    """Return a name for each cell: the identity columns that vary, and the parameters in which cells of one name differ."""
+    columns = [column.name for column in identity_columns(table)]
+    names = [", ".join(filter(None, map(_name_part, columns, row))) for row in table[columns].to_numpy(dtype=object)]
+    positions: dict[tuple[str, str], list[int]] = {}
+    for position, key in enumerate(zip(table["experiment"], names, strict=True)):
+        positions.setdefault(key, []).append(position)
+    for (_, name), same_name in positions.items():
+        if len(same_name) > 1:
+            flat = [flat_parameters(table.iloc[position].to_dict()) for position in same_name]
+            differing = differing_parameters(flat)
+            for position, parameters in zip(same_name, flat, strict=True):
+                parts = [_name_part(key, parameters.get(key)) for key in differing]
+                names[position] = ", ".join(filter(None, [name, *parts]))
+    return names
 
 
-def _cells(table: pd.DataFrame, names: Sequence[str]) -> list[str]:
-    """Return a name for each cell, from some identity columns."""
-    return [", ".join(filter(None, map(_named, names, row))) for row in table[list(names)].to_numpy(dtype=object)]
-
-
-def _readable(table: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
-    """Return the changed cells as texts, each by some identity columns."""
-    if table.empty:
-        return pd.DataFrame({"outcome": [], "experiment": [], "cell": [], "change": []})
-    return table[["outcome", "experiment"]].assign(cell=_cells(table, names), change=table["change"])
-
-
-def _named(name: str, value: Any) -> str:
+def _name_part(name: str, value: Any) -> str:
     if isinstance(value, str):
         return "" if value == "none" else value
-    return f"{name}={axis_value(value)}" if math.isfinite(value) else ""
+    if isinstance(value, float) and not math.isfinite(value):
+        return ""
+    return f"{name}={axis_value(value) if isinstance(value, float) else value}"
 
 
 def page(comparison: Comparison) -> str:
     """Return the comparison as a page like that of an experiment."""
     table = _worst_first(comparison.table).reset_index(drop=True)
-    rows = table.assign(series=table["outcome"], status=table["status_after"], reason=table["change"])
+    rows = table.drop(columns=WORSE_IN).assign(
+        series=table["outcome"], status=table["status_after"], reason=table["change"]
+    )
     numbers = [column for column in comparison.judged if column.kind == "number"]
     content = Content(
         finding=summary(table),
@@ -179,7 +196,7 @@ def page(comparison: Comparison) -> str:
         ],
         charts=[_before_after(column) for column in numbers if rows[f"{column.name}_after"].notna().any()],
         answers=pd.DataFrame({"remark": [*comparison.remarks, *NOTES, timings.NOTE]}),
-        answers_title="How it was judged",
+        answers_title="How cells are judged",
         looks=LOOKS,
     )
     study = registry.make("studies", comparison.study)

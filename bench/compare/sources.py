@@ -1,4 +1,4 @@
-"""Reads stored results of a directory or of a git revision, by experiment."""
+"""Reads the stored results of a directory or a git revision, by experiment."""
 
 from __future__ import annotations
 
@@ -22,23 +22,24 @@ from bench.model import registry
 STANDARD = "standard"
 """The folder of committed results inside the results folder."""
 CELLS = {*IDENTITY, "status"}
-"""Columns of every table with a row per cell, those of older versions too."""
+"""Columns of every table that has one row per cell, also if an older version wrote it."""
 NEEDED = {*CELLS, "key", "study", "parameters"}
+"""Columns without which rows cannot be compared."""
 BUSY = 1.5
-"""Load per core above which a machine was busy."""
+"""Load per core above which a machine counts as busy."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """The rows of one experiment, and the machine that made them as far as it is known."""
+    """The rows of one experiment, and the machine that ran it, if known."""
 
     rows: pd.DataFrame
     study: str
     machine: str = ""
     busy: str = ""
     """The machine's load, if it was more than BUSY per core."""
-    older: int = 0
-    """Rows that were left out, since an older version wrote them and did not store their parameters."""
+    n_outdated: int = 0
+    """Number of rows left out, since an older version wrote them without their parameters."""
 
     @property
     def columns(self) -> Columns:
@@ -47,7 +48,7 @@ class Results:
 
 
 def columns_of(study: str) -> Columns:
-    """Return the columns of a study's rows; raises :class:`UserError` for a study that is not installed here."""
+    """Return the columns of a study's rows. Raises :class:`UserError` if the study is not installed."""
     plugin = registry.usable("studies", study)
     if not issubclass(plugin, Study):
         raise UserError(f"study '{study}' does not derive from bench.Study")
@@ -55,85 +56,86 @@ def columns_of(study: str) -> Columns:
 
 
 @contextmanager
-def opened(name: str) -> Iterator[dict[str, Results]]:
-    """Open the results under a directory, or under ``results`` (``REV``) or a path (``REV:PATH``) of a git revision.
+def open_results(name: str) -> Iterator[dict[str, Results]]:
+    """Open the results in a directory, or in ``results`` (``REV``) or a path (``REV:PATH``) of a git revision.
 
-    Results in a folder ``standard`` count where there are no others. Raises :class:`UserError` if the name is neither a
-    directory nor a revision, or if there are no results.
+    Results in a folder ``standard`` are read only if there are no others. Raises :class:`UserError` if the name is
+    neither a directory nor a revision, or if there are no results.
     """
     directory = Path(name).expanduser()
     if directory.is_dir():
-        yield _found(directory, name)
+        yield _read_all(directory, name)
         return
     with tempfile.TemporaryDirectory() as temporary:
         revision, _, path = name.partition(":")
         _extract(name, revision, path or "results", Path(temporary))
-        yield _found(Path(temporary), name)
+        yield _read_all(Path(temporary), name)
 
 
-def _extract(name: str, revision: str, path: str, where: Path) -> None:
-    known = subprocess.run(
+def _extract(name: str, revision: str, path: str, target: Path) -> None:
+    """Extract a path of a git revision into a folder."""
+    commit = subprocess.run(
         # --end-of-options: a name that starts with a dash must not act as an option
         ["git", "rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}"],
         capture_output=True,
         text=True,
     )
-    if known.returncode or not revision:
+    if commit.returncode or not revision:
         raise UserError(
             f"'{name}' is neither a directory nor a git revision (REV, or REV:PATH with the path from the top)"
         )
     top = subprocess.run(["git", "rev-parse", "--show-toplevel"], capture_output=True, text=True).stdout.strip()
     packed = subprocess.run(
-        ["git", "-C", top, "archive", "--format=tar", known.stdout.strip(), "--", path], capture_output=True
+        ["git", "-C", top, "archive", "--format=tar", commit.stdout.strip(), "--", path], capture_output=True
     )
     if packed.returncode:
         raise UserError(f"revision '{revision}' has no '{path}'")
     with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as archive:
-        # the filter refuses links and paths that lead out of the folder
-        archive.extractall(where, filter="data")
+        # the filter rejects links and paths that lead out of the folder
+        archive.extractall(target, filter="data")
 
 
-def _found(directory: Path, name: str) -> dict[str, Results]:
-    """Return every experiment at or below a directory that has rows, or the committed table of them."""
-    places = sorted({path.parent for path in directory.rglob("*") if path.suffix in (".parquet", ".csv")})
-    own = [place for place in places if STANDARD not in place.relative_to(directory).parts]
-    results = _gathered(own, name) or _gathered(places, name)
+def _read_all(directory: Path, name: str) -> dict[str, Results]:
+    """Return every experiment at or below a directory that has stored rows or a committed table of them."""
+    folders = sorted({path.parent for path in directory.rglob("*") if path.suffix in (".parquet", ".csv")})
+    own = [folder for folder in folders if STANDARD not in folder.relative_to(directory).parts]
+    results = _read_folders(own, name) or _read_folders(folders, name)
     if not results:
         raise UserError(f"'{name}' has no results: no rows.parquet and no table (.csv) with a row per cell")
     return results
 
 
-def _gathered(places: Sequence[Path], name: str) -> dict[str, Results]:
+def _read_folders(folders: Sequence[Path], name: str) -> dict[str, Results]:
     results: dict[str, Results] = {}
-    for place in places:
-        rows = _rows(place)
+    for folder in folders:
+        rows = _read_rows(folder)
         if rows is None:
             continue
-        label = str(rows["experiment"].iloc[0]) if "experiment" in rows else place.name
+        label = str(rows["experiment"].iloc[0]) if "experiment" in rows else folder.name
         if label in results:
             raise UserError(f"'{name}' has results of '{label}' in more than one directory: name one of them")
-        results[label] = _results(rows, place, label, name)
+        results[label] = _validate(rows, folder, label, name)
     return results
 
 
-def _results(rows: pd.DataFrame, place: Path, label: str, name: str) -> Results:
-    """Return the rows that store their identity, typed as their study says."""
-    if not set(rows) >= NEEDED or not (known := _says_what_it_is(rows)).any():
+def _validate(rows: pd.DataFrame, folder: Path, label: str, name: str) -> Results:
+    """Return the rows that store their study and parameters, with the column types of their study."""
+    if not set(rows) >= NEEDED or not (complete := _stores_identity(rows)).any():
         raise UserError(
             f"the results of '{label}' in '{name}' were made by an older version, which did not store the parameters of each "
-            "cell: run the experiment again with this version to compare it"
+            "cell: run the experiment again to compare it"
         )
-    rows = rows[known]
+    rows = rows[complete]
     studies = list(rows["study"].unique())
     if len(studies) > 1:
         raise UserError(f"the results of '{label}' in '{name}' are of several studies ({', '.join(studies)})")
     columns = columns_of(studies[0])
     typed = _one_per_cell(columns.typed(rows).reset_index(drop=True), columns)
-    return Results(typed, studies[0], *_machine(place), older=int((~known).sum()))
+    return Results(typed, studies[0], *_read_machine(folder), n_outdated=int((~complete).sum()))
 
 
 def _one_per_cell(rows: pd.DataFrame, columns: Columns) -> pd.DataFrame:
-    """Return the last row of each key; of several lines of one cell (one per check) that of the worst verdict."""
+    """Return the last row of each key, or the one with the worst verdict if a cell has several lines, one per check."""
     for column in columns.compared:
         if column.comparison and column.comparison.by == "verdict":
             rank = {verdict: -place for place, verdict in enumerate(column.comparison.order)}
@@ -143,13 +145,13 @@ def _one_per_cell(rows: pd.DataFrame, columns: Columns) -> pd.DataFrame:
     return rows.drop_duplicates("key", keep="last").sort_index().reset_index(drop=True)
 
 
-def _says_what_it_is(rows: pd.DataFrame) -> pd.Series:
+def _stores_identity(rows: pd.DataFrame) -> pd.Series:
     return rows[["study", "parameters"]].map(lambda text: isinstance(text, str) and bool(text)).all(axis=1)
 
 
-def _rows(place: Path) -> pd.DataFrame | None:
-    """Read ``rows.parquet`` of a directory, else its table as strings; None where there is neither."""
-    stored = place / "rows.parquet"
+def _read_rows(folder: Path) -> pd.DataFrame | None:
+    """Read ``rows.parquet`` of a folder, else its table with every value as a string, else return None."""
+    stored = folder / "rows.parquet"
     if stored.exists():
         try:
             rows = pd.read_parquet(stored)
@@ -157,7 +159,7 @@ def _rows(place: Path) -> pd.DataFrame | None:
             raise UserError(f"'{stored}' cannot be read as Parquet ({error})") from None
         return rows if len(rows) else None
     older = None
-    for path in sorted(place.glob("*.csv")):
+    for path in sorted(folder.glob("*.csv")):
         try:
             table = pd.read_csv(path, dtype=str, keep_default_na=False)
         except (ValueError, UnicodeDecodeError):
@@ -169,10 +171,10 @@ def _rows(place: Path) -> pd.DataFrame | None:
     return older
 
 
-def _machine(place: Path) -> tuple[str, str]:
-    """Return processor, cores and system from ``run.json``, and the load if the machine was busy."""
+def _read_machine(folder: Path) -> tuple[str, str]:
+    """Return processor, cores and system from ``run.json``, and the load if the machine was busy. Empty if unknown."""
     try:
-        machine = json.loads((place / "run.json").read_text())["machine"]
+        machine = json.loads((folder / "run.json").read_text())["machine"]
         name = f"{machine['processor']}, {machine['cores']} cores, {machine['system']}"
         load = (machine["load_average"] or [0.0])[0]
         return name, f"load {load:.1f}" if load > BUSY * machine["cores"] else ""

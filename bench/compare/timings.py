@@ -1,15 +1,15 @@
-"""Judges times against the spread between runs, never against that within one run.
+"""Judges times by the spread between runs, never by the spread within one run.
 
-The calls of one run share its load, clock and memory layout, so their spread says little about the next run. Two rules:
+The calls of one run share its load, clock and memory layout, so their spread does not predict the next run. Two rules:
 
-- With further runs of *before* (``again=DIR,DIR``): the logarithms of a cell's times over K runs have a mean and, pooled
-  over all cells, a variance; a time after is changed where it leaves the central 1 - 2 ALPHA of Student's t with K - 1
-  degrees of freedom, the prediction interval of one more run. K - 1, since the cells of one run are not independent.
-- Without: each cell against all others of its backend. The median of the logarithmic ratios is what the whole run
-  gained or lost, which no single pair of runs can divide between machine and code: it is reported as a remark. A cell is
-  changed where it is FAR robust standard deviations from that median.
+- With further runs of *before* (``again=DIR,DIR``), K in all: the logarithms of a cell's times have a mean, and a variance
+  that is pooled over all cells. A time changed if it leaves the prediction interval of one more run: the central
+  1 - 2 ALPHA of Student's t with K - 1 degrees of freedom, not more, since the cells of one run are not independent.
+- Without further runs, each cell is compared with all others of its backend. The median of their logarithmic ratios is
+  the change of the whole run. Two runs cannot attribute it to the machine or the code, so it is a remark. A time changed
+  if it is FAR robust standard deviations from that median.
 
-In both cases the change is also at least EFFECT.
+In both cases the time must also change by at least EFFECT.
 """
 
 from __future__ import annotations
@@ -23,29 +23,33 @@ from bench.compare.judging import Change, Row, value
 from bench.report.text import duration
 
 EFFECT = 1.5
-"""Ratio below which no time counts as changed."""
+"""Smallest ratio at which a time counts as changed."""
 FAR = 6.0
-"""Robust standard deviations from the median ratio of the backend's cells beyond which a cell differs from them."""
+"""Distance from the median ratio of the backend's cells, in robust standard deviations, above which a cell differs."""
 LEAST_SPREAD = 0.05
-"""Least standard deviation between runs of a logarithmic time that is assumed."""
+"""Smallest standard deviation of a logarithmic time between runs that is assumed."""
 ALPHA = 1e-3
+"""Significance level on each side."""
 FEW = 8
-"""Cells of a backend below which it is judged together with the others."""
+"""Smallest number of cells with which a backend has a median of its own."""
 RUNS = 3
-"""Least runs of before, the first one included, whose spread is used."""
+"""Smallest number of runs of before, the first included, from which a spread is computed."""
 NOTE = (
-    f"A time counts where it changed by a factor of {EFFECT:g} or more and by more than the spread between runs: that of "
-    f"the further runs of before, {RUNS} in all or more (p < {2 * ALPHA:g} in Student's t), or without them {FAR:g} robust "
-    "standard deviations of the ratios of all cells of its backend, measured from their median."
+    f"A time counts if it changed by a factor of {EFFECT:g} or more and by more than the spread between runs. That spread "
+    f"comes from {RUNS} or more runs of before (p < {2 * ALPHA:g} in Student's t). Without them, the ratio of the two times "
+    f"must be {FAR:g} robust standard deviations from the median ratio of its backend's cells."
 )
 
 Runs = Mapping[Hashable, Row]
 
 
-def judged(
+def judge_times(
     name: str, called: str, before: Runs, after: Runs, again: Sequence[Runs]
 ) -> tuple[dict[Hashable, Change], list[str]]:
-    """Return the changes of a time by cell, and remarks; ``before``, ``after`` and ``again`` are rows by cell."""
+    """Return the changes of the time column ``name`` by cell, and remarks. Rows are given by cell.
+
+    ``again`` are further runs of before. ``called`` is the column's name in the messages.
+    """
     keys = [key for key in before if key in after and value(before[key], name) > 0 and value(after[key], name) > 0]
     if not keys:
         return {}, []
@@ -54,25 +58,27 @@ def judged(
     if runs.shape[1] >= RUNS:
         complete = np.asarray(np.isfinite(runs).all(axis=1))
         if not complete.any():
-            return {}, ["the further runs of before have no cell in common with it: times are not judged"]
+            return {}, ["no cell is in all runs of before, so times are not judged"]
         usual, far = _by_runs(runs, complete, now)
-        remarks = (
-            [] if complete.all() else [f"times of {(~complete).sum()} cells are not judged: not in every run of before"]
-        )
+        remarks = []
+        if not complete.all():
+            remarks.append(
+                f"times of {(~complete).sum()} cells are not judged, since some run of before lacks the cell"
+            )
     else:
         backends = [str(before[key].get("backend", "")) for key in keys]
         usual, far, remarks = _by_cells(runs[:, 0], now, backends)
     changes = {}
-    for key, was, is_now, differs in zip(keys, usual, now, far, strict=True):
-        ratio = math.exp(is_now - was) if math.isfinite(was) else 1.0
+    for key, was, new, differs in zip(keys, usual, now, far, strict=True):
+        ratio = math.exp(new - was) if math.isfinite(was) else 1.0
         if differs and max(ratio, 1 / ratio) >= EFFECT:
-            text = f"{called} {duration(math.exp(was))} to {duration(math.exp(is_now))} ({ratio:.2g} times)"
-            changes[key] = Change("worse" if ratio > 1 else "better", text)
+            text = f"{called} {duration(math.exp(was))} to {duration(math.exp(new))} ({ratio:.2g} times)"
+            changes[key] = Change("worse" if ratio > 1 else "better", text, called)
     return changes, remarks
 
 
 def _by_runs(runs: np.ndarray, complete: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return each cell's usual logarithmic time, and whether the one after is outside the spread between runs."""
+    """Return each cell's mean logarithmic time before, and whether the time after is outside the spread between runs."""
     from scipy.special import stdtrit
 
     count = runs.shape[1]
@@ -83,23 +89,26 @@ def _by_runs(runs: np.ndarray, complete: np.ndarray, now: np.ndarray) -> tuple[n
 
 
 def _by_cells(was: np.ndarray, now: np.ndarray, backends: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Return each cell's time before, shifted as all of its backend's were, whether it is far from that, and remarks."""
+    """Return each cell's expected logarithmic time, whether the time after is far from it, and remarks.
+
+    Expected is the time before plus the median change of the cells of its backend.
+    """
     ratios = now - was
     names = np.array(backends)
     usual, far, remarks = was.copy(), np.zeros(len(was), dtype=bool), []
     common = float(np.median(ratios))
-    everywhere = 1.4826 * float(np.median(np.abs(ratios - common)))
+    common_spread = 1.4826 * float(np.median(np.abs(ratios - common)))
     for name in dict.fromkeys(backends):
         mine = names == name
-        several = mine.sum() >= FEW
-        median = float(np.median(ratios[mine])) if several else common
-        spread = 1.4826 * float(np.median(np.abs(ratios[mine] - median))) if several else everywhere
-        spread = max(LEAST_SPREAD, spread, everywhere)
+        is_large = mine.sum() >= FEW
+        median = float(np.median(ratios[mine])) if is_large else common
+        spread = 1.4826 * float(np.median(np.abs(ratios[mine] - median))) if is_large else common_spread
+        spread = max(LEAST_SPREAD, spread, common_spread)
         usual[mine] += median
         far[mine] = np.abs(ratios[mine] - median) > FAR * spread
-        if several and abs(median) > math.log(EFFECT):
+        if is_large and abs(median) > math.log(EFFECT):
             remarks.append(
-                f"times on {name} are {math.exp(median):.2g} times those before in the median: two runs cannot say whether "
-                f"that is the machine or the code; name further runs of before with again=DIR,DIR ({RUNS} in all)"
+                f"times on {name} are {math.exp(median):.2g} times those before in the median. Two runs cannot show "
+                f"whether the machine or the code changed: name further runs of before with again=DIR,DIR ({RUNS} in all)"
             )
     return usual, far, remarks

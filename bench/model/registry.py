@@ -114,6 +114,34 @@ def entries() -> Table:
     return table
 
 
+def entries_with(kind: str, package: str) -> dict[str, Entry]:
+    """Return the plugins of one kind by name: those of a package, of the entry points ``bench.KIND``, and registered ones.
+
+    For a kind that only one command uses: no other command imports the package. An entry point names a plugin class or a
+    module of several.
+    """
+    table: Table = {kind: {}}
+    for _, module in _modules(importlib.import_module(package)):
+        _load_module(table, kind, module, "")
+    for point in sorted(entry_points(group=f"bench.{kind}"), key=lambda p: p.name):
+        try:
+            part = point.load()
+            if isinstance(part, ModuleType):
+                _add_members(table, kind, part)
+            elif isinstance(part, type) and issubclass(part, Plugin) and part.kind == kind:
+                _add(table, part)
+            else:
+                raise TypeError(f"{point.value} is not a plugin class of kind {kind}")
+        except Exception as error:
+            _add_unavailable(table, kind, point.name, error)
+    for name, entry in entries().get(kind, {}).items():
+        if entry.plugin is None:
+            table[kind].setdefault(name, entry)
+        else:
+            _add(table, entry.plugin)
+    return table[kind]
+
+
 def kinds() -> list[str]:
     """Return the kinds of all plugins, those that come with the package first."""
     return list(entries())
@@ -147,6 +175,11 @@ def _load_module(table: Table, kind: str, path: str, fatal: str) -> None:
         # a broken plugin is listed with its error: it must not hide the others, nor end the command by sys.exit()
         _add_unavailable(table, kind if kind in table else "estimators", path.rpartition(".")[2], error)
         return
+    _add_members(table, kind, module)
+
+
+def _add_members(table: Table, kind: str, module: ModuleType) -> None:
+    """Add the plugin classes that a module defines."""
     for name, plugin in list(vars(module).items()):
         try:
             own = isinstance(plugin, type) and str(plugin.__module__).startswith(module.__name__)

@@ -3,7 +3,6 @@
 import json
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,13 +14,13 @@ from bench.claims.claim import NOT_REPRODUCED, REPRODUCED, RESERVED, UNDECIDED, 
 CHEAP = ("C5", "C19", "L4")
 """Claims that take a second or two."""
 BLIND = {"C2": 6, "C8": 1, "C10": 1, "C14": 2, "C16": 6, "C17": 12, "C20": 3}
-"""Figures that cannot see an error of 5%, since what is published is rounded or spread by more: none may join them."""
+"""Number of figures that cannot detect an error of 5%, since the published number is less precise. It must not grow."""
 
 
 @pytest.fixture(scope="module")
 def measured():
     """What the cheap claims measure."""
-    return {name: results.measured(discovery.claims()[name]) for name in CHEAP}
+    return {name: results.measure(discovery.claims()[name]) for name in CHEAP}
 
 
 @pytest.mark.parametrize("name", CHEAP)
@@ -33,7 +32,7 @@ def planted(figure):
     """The same figure with a wrong published number: off by 5%, by its sign, by a square."""
     value = figure.value
     wrongs = [value**2] if not 0.5 < abs(value) < 2 and figure.factor == 0 else []
-    if figure.sees:
+    if figure.is_sensitive:
         wrongs += [1.05 * value, 0.95 * value]
     # a wrong number is printed as coarsely as the right one
     coarse = figure.spread + last_digit(figure.published) / 2
@@ -58,34 +57,34 @@ def test_planted_wrong_figures_are_not_reproduced(measured):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(discovery.claims()))
 def test_every_claim_holds_and_would_fail_with_a_wrong_figure(name):
-    result = results.measured(discovery.claims()[name])
+    result = results.measure(discovery.claims()[name])
     assert result.verdict in (REPRODUCED, RESERVED), (result.remark, [f for f in result.figures if not f.agrees])
     assert unnoticed(result) == []
-    assert sum(not figure.sees for figure in result.figures) == BLIND.get(name, 0)
+    assert sum(not figure.is_sensitive for figure in result.figures) == BLIND.get(name, 0)
 
 
-def test_a_figure_that_cannot_see_5_percent_says_so_and_why():
-    assert Figure("x", "1.00", 1.0, spread=0.02).sees
+def test_a_figure_that_cannot_detect_5_percent_says_so_and_why():
+    assert Figure("x", "1.00", 1.0, spread=0.02).is_sensitive
     for figure, why in (
         (Figure("x", "7", 7.0), "the printed digits"),
         (Figure("x", "1.00", 1.0, spread=0.1), "the source's own spread"),
         (Figure("x", "1.00", 1.0, error=0.02), "the measurement's error"),
         (Figure("x", "1e10", 2e10, factor=10.0), "heavy tails, compared by a factor of 10"),
     ):
-        assert not figure.sees
-        assert figure.limit == why
+        assert not figure.is_sensitive
+        assert figure.limitation == why
         # and so it is with a number that is wrong by 5%
-        assert replace(figure, published=f"{1.05 * figure.value:g}", spread=figure.spread + figure.slack).agrees
-    assert not Figure("x", "0.00", 0.0).limit
+        assert replace(figure, published=f"{1.05 * figure.value:g}", spread=figure.spread + figure.tolerance).agrees
+    assert not Figure("x", "0.00", 0.0).limitation
 
 
-def test_a_claim_none_of_whose_figures_sees_5_percent_is_reserved_and_says_so(toy, tmp_path, monkeypatch, capsys):
+def test_a_claim_none_of_whose_figures_detects_5_percent_is_reserved_and_says_so(toy, tmp_path, monkeypatch, capsys):
     coarse = [Figure("one", "1.0", 1.0, spread=0.2), Figure("seven", "7", 7.0)]
     assert verdict(coarse) == RESERVED
     assert verdict([*coarse, Figure("fine", "2.000", 2.0)]) == REPRODUCED
     monkeypatch.setattr(toy, "measure", lambda self: Outcome(coarse))
     assert cli.main(["claims", f"results_dir={tmp_path}"]) == 0
-    said = "2 of 2 figures cannot see an error of 5%: 1 for the source's own spread, 1 for the printed digits"
+    said = "2 of 2 figures cannot detect an error of 5%: 1 for the source's own spread, 1 for the printed digits"
     assert said in capsys.readouterr().out
     made = tmp_path / "claims"
     assert said in (made / "claims.md").read_text()
@@ -190,18 +189,6 @@ def test_names_options_and_folders_are_checked(capsys):
     assert "C19" in capsys.readouterr().out
 
 
-def test_claims_of_other_packages_are_found(monkeypatch):
-    point = SimpleNamespace(name="toys", load=lambda: Toy)
-    monkeypatch.setattr(
-        discovery, "entry_points", lambda group: [point] if group == discovery.ENTRY_POINT_GROUP else []
-    )
-    discovery.claims.cache_clear()
-    try:
-        assert list(discovery.claims())[-1] == "T1"
-    finally:
-        discovery.claims.cache_clear()
-
-
 OF_ANOTHER = """
 from bench.claims import Claim, Figure, Outcome
 
@@ -218,39 +205,60 @@ class Mine(Claim):
 """
 
 
-def test_an_installed_package_brings_claims_by_its_entry_point(tmp_path, monkeypatch, capsys):
-    """Nothing is replaced here: the package has the metadata that an installer writes."""
-    made = tmp_path / "mine-1.0.dist-info"
+def test_a_claim_in_a_plugin_folder_is_found(tmp_path, capsys):
+    """Directly in the folder, or in its folder ``claims``; what is broken there is reported and hides nothing."""
+    own = tmp_path / "own"
+    (own / "claims").mkdir(parents=True)
+    (own / "claims" / "mine.py").write_text(OF_ANOTHER)
+    (own / "also.py").write_text(OF_ANOTHER.replace("M1", "M2"))
+    (own / "broken.py").write_text("import no_such_module")
+    (own / "bare.py").write_text(OF_ANOTHER.replace('"M1", "My lesson"', '"M3", None'))
+    (own / "again.py").write_text(OF_ANOTHER.replace("M1", "C1"))
+    place = [f"plugins={own}", f"results_dir={tmp_path}"]
+    assert cli.main(["claims", "m1", "M2", *place]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.count("two is two") == 2
+    assert "'broken' cannot be used: import failed: ModuleNotFoundError" in printed.err
+    assert "claim 'M3' does not define lesson" in printed.err
+    assert "'C1' cannot be used: the name is taken by bench.claims.published.step" in printed.err
+    assert cli.main(["claims", "M1", *place]) == 0
+    assert "as stored" in capsys.readouterr().out
+    assert cli.main(["claims", "--list", *place]) == 0
+    assert "My lesson" in capsys.readouterr().out
+
+
+def install(folder, entry_points):
+    """The metadata that an installer writes, beside modules with claims."""
+    made = folder / "mine-1.0.dist-info"
     made.mkdir()
     (made / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
-    (made / "entry_points.txt").write_text("[bench.claims]\nmine = claims_of_mine\n")
-    (tmp_path / "claims_of_mine.py").write_text(OF_ANOTHER)
+    (made / "entry_points.txt").write_text(f"[bench.claims]\n{entry_points}\n")
+    (folder / "claims_of_mine.py").write_text(OF_ANOTHER)
+
+
+@pytest.mark.parametrize("target", ["claims_of_mine", "claims_of_mine:Mine"])
+def test_an_installed_package_brings_claims_by_its_entry_point(target, tmp_path, monkeypatch, capsys):
+    """Nothing is replaced here: the entry point names a module of claims, or a claim."""
+    install(tmp_path, f"mine = {target}")
     monkeypatch.syspath_prepend(tmp_path)
-    discovery.claims.cache_clear()
     try:
         assert cli.main(["claims", "M1", f"results_dir={tmp_path}"]) == 0
         assert "two is two" in capsys.readouterr().out
         assert "<h2>My lesson</h2>" in (tmp_path / "claims" / "claims.html").read_text()
+        assert list(discovery.claims())[-1] == "M1", "lessons of others follow those of the course"
     finally:
-        discovery.claims.cache_clear()
         sys.modules.pop("claims_of_mine", None)
 
 
-def test_a_broken_package_hides_no_other_claim(monkeypatch, capsys):
-    def broken():
-        raise ImportError("no such module")
-
-    points = [SimpleNamespace(name="bad", load=broken), SimpleNamespace(name="odd", load=lambda: int)]
-    monkeypatch.setattr(discovery, "entry_points", lambda group: points)
-    discovery.claims.cache_clear()
-    try:
-        assert "C1" in discovery.claims()
-    finally:
-        discovery.claims.cache_clear()
-    said = capsys.readouterr().err
-    assert "'bad'" in said
-    assert "no such module" in said
-    assert "'odd'" in said
+def test_a_broken_package_hides_no_other_claim(tmp_path, monkeypatch, capsys):
+    install(tmp_path, "bad = no_such_module\nodd = builtins:int")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert "C1" in discovery.claims()
+    printed = capsys.readouterr().err
+    assert "'bad' cannot be used: import failed: ModuleNotFoundError: No module named 'no_such_module'" in printed
+    assert (
+        "'odd' cannot be used: import failed: TypeError: builtins:int is not a plugin class of kind claims" in printed
+    )
 
 
 def test_every_claim_says_what_where_and_why():

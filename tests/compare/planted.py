@@ -97,7 +97,7 @@ def judged(scene: str, faults: Sequence[str] = FAULTS) -> pd.DataFrame:
         return before
     parts = []
     for fault in faults:
-        table, _ = cells.compared(before, rows(scene, fault)[1], columns, False)
+        table, _ = cells.compare_cells(before, rows(scene, fault)[1], columns, False)
         parts.append(table.assign(fault=fault))
     return pd.concat(parts)
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -18,6 +20,7 @@ from helpers import experiment, loaded, small_rows
 
 from bench import cli, compare
 from bench.compare import cells, judging, sources, timings
+from bench.errors import UserError
 from bench.experiment import axes
 from bench.experiment.columns import Columns
 from bench.model import registry
@@ -25,6 +28,7 @@ from bench.report.tables import csv
 from bench.run.tasks import blank_row
 from bench.studies.bias_variance.columns import COLUMNS
 
+INHERITED = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
 MACHINE = {"processor": "a chip", "cores": 2, "system": "Linux", "load_average": [0.1, 0.1, 0.1]}
 
 
@@ -38,7 +42,7 @@ def given(calls=20, seed=1):
 
 
 def compared(before, after, timings=False, columns: Columns = COLUMNS, again=()):
-    return cells.compared(before, after, columns, timings, again)[0]
+    return cells.compare_cells(before, after, columns, timings, again)[0]
 
 
 def of_study(name, *words):
@@ -118,7 +122,7 @@ def test_the_columns_that_a_rule_needs_are_columns_of_the_study(study):
     assert columns.compared
     for column in columns.compared:
         if column.comparison.by == "interval":
-            assert set(judging._ends(column, columns)) <= set(columns.by_name)
+            assert set(judging._interval_columns(column, columns)) <= set(columns.by_name)
         if column.comparison.by == "verdict":
             assert column.comparison.order
 
@@ -127,11 +131,107 @@ def test_cells_are_matched_by_all_their_parameters():
     """Labels leave out defaults and timed calls; the parameters do not. Their order does not matter."""
     columns, rows = of_study("bias_variance", "scenes=[quadratic]")
     _, other = of_study("bias_variance[timed_calls=7]", "scenes=[quadratic]")
-    assert set(compared(rows, other, False, columns)["change"]) == {"gone, it was ok", "new"}
+    before, after = (json.loads(r["parameters"][0])["study"]["timed_calls"] for r in (rows, other))
+    assert set(compared(rows, other, False, columns)["change"]) == {
+        f"gone, it was ok; the nearest cell after has bias_variance.timed_calls={after} instead of {before}",
+        f"new; the nearest cell before has bias_variance.timed_calls={before} instead of {after}",
+    }
     given = json.loads(rows["parameters"][0])
     turned = rows.assign(parameters=json.dumps(dict(reversed(given.items()))))
     assert list(compared(rows, turned, False, columns)["outcome"]) == ["same"]
     assert len(compared(rows, rows.assign(seed=1), False, columns)) == 2
+
+
+def without(rows, *names):
+    """The rows as they were stored before some parameters (``axis.name``) existed."""
+
+    def remove(text):
+        given = json.loads(text)
+        for axis, name in (name.split(".") for name in names):
+            del given[axis][name]
+        return json.dumps(given)
+
+    return rows.assign(parameters=rows["parameters"].map(remove))
+
+
+def test_a_parameter_that_a_stored_row_lacks_is_its_present_default():
+    columns, rows = of_study("bias_variance", "scenes=[pushing]", "contacts=[penalty]")
+    stored = without(rows, "scene.mass", "study.timed_calls", "reference.tolerance")
+    for before, after in ((stored, rows), (rows, stored)):
+        assert list(compared(before, after, False, columns)["outcome"]) == ["same"]
+    _, heavy = of_study("bias_variance", "scenes=[pushing]", "contacts=[penalty]", "scene.pushing.mass=9")
+    changes = compared(stored, heavy, False, columns)["change"]
+    assert changes[0].startswith("gone, it was ok; the nearest cell after has pushing.mass=9.0 instead of ")
+    assert "," not in changes[0].partition(";")[2], "no other parameter differs"
+
+
+def test_a_missing_parameter_is_named_in_a_remark(tmp_path, capsys):
+    _, rows = of_study("bias_variance", "scenes=[pushing]", "contacts=[penalty]")
+    rows = rows.assign(experiment="some")
+    old, new = save(without(rows, "scene.mass"), tmp_path / "old", "some"), save(rows, tmp_path / "new", "some")
+    assert run(old, new, out=tmp_path / "out") == 0
+    assert "some: rows before do not store pushing.mass=" in capsys.readouterr().out
+
+
+def test_the_summary_counts_cells_by_what_got_worse(tmp_path):
+    rows = given()
+    gone = compared(rows, rows.iloc[:0], False)
+    n_ok, n = (rows["status"] == "ok").sum(), len(rows)
+    assert compare.report.summary(gone) == (
+        f"Of {n} cells, {n_ok} got worse ({n_ok} gone), 0 got better, 0 are the same within the uncertainty."
+    )
+    after = rows.copy()
+    after.loc[good(rows), ["bias", "bias_low", "bias_high"]] = [9.0, 8.0, 10.0]
+    assert ", 1 got worse (1 in bias), 0 got better," in compare.report.summary(compared(rows, after))
+    same = compare.report.summary(compared(rows, rows))
+    assert same == f"Of {n} cells, 0 got worse, 0 got better, {n} are the same within the uncertainty."
+
+
+def test_cells_that_the_identity_columns_do_not_distinguish_are_named_by_their_parameters():
+    (columns, one), (_, two) = (
+        of_study(f"bias_variance[timed_calls={count}]", "scenes=[quadratic]") for count in (3, 7)
+    )
+    rows = pd.concat([one, two], ignore_index=True)
+    table = compared(rows, rows.assign(status="error"), False, columns).assign(experiment="some")
+    names = compare.report.cell_names(table)
+    assert [name.rpartition(", ")[2] for name in names] == [f"bias_variance.timed_calls={count}" for count in (3, 7)]
+
+
+SCENE = """
+from dataclasses import dataclass
+import numpy as np
+from bench.model import FunctionScene, param
+
+@dataclass(frozen=True)
+class Bowl(FunctionScene):
+    \"\"\"A bowl.\"\"\"
+    name = "bowl"
+    def theta0(self):
+        return np.array([1.0])
+    def cost(self, xp, x):
+        return x[0] * x[0]
+"""
+
+
+def test_a_scene_with_one_parameter_more_compares_as_the_same(tmp_path):
+    """From its file to the exit status, each version in a process of its own."""
+    (tmp_path / "own").mkdir()
+    words = ["scenes=[bowl]", "backends=[numpy]", "estimators=[fobg]", "samples=8", "repeats=4", "timing=false"]
+    words += ["name=bowls", "workers=0", "plugins=own"]
+
+    def bench(*words):
+        command = [sys.executable, "-m", "bench", *words]
+        return subprocess.run(command, cwd=tmp_path, env=INHERITED, capture_output=True, text=True)
+
+    more = '    friction: float = param(0.5, "not used yet")\n'
+    for folder, text in (("old", SCENE), ("new", SCENE.replace("    def theta0", f"{more}    def theta0"))):
+        (tmp_path / "own" / "bowl.py").write_text(text)
+        done = bench(*words, f"results_dir={folder}")
+        assert done.returncode == 0, done.stderr
+    done = bench("compare", "old", "new", "plugins=own")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Of 1 cell, 0 got worse, 0 got better, 1 are the same" in done.stdout
+    assert "rows before do not store bowl.friction=0.5: the present default is assumed" in done.stdout
 
 
 @pytest.mark.parametrize(("factor", "outcome"), [(10.0, "worse"), (0.1, "better")])
@@ -241,7 +341,7 @@ def test_times_of_unchanged_code_are_the_same_although_every_call_of_one_run_agr
     for _ in range(repeats):
         logs = usual + generator.normal(0, 0.2, (2 + again, 1)) + generator.normal(0, 0.2, (2 + again, cells))
         made = [{i: {"backend": "jax", "time_s": math.exp(log)} for i, log in enumerate(run)} for run in logs]
-        alarms += len(timings.judged("time_s", "time", made[0], made[1], made[2:])[0])
+        alarms += len(timings.judge_times("time_s", "time", made[0], made[1], made[2:])[0])
     assert alarms <= 0.01 * cells * repeats
 
 
@@ -257,10 +357,10 @@ def test_a_time_beyond_the_spread_between_runs_is_a_change_where_times_are_asked
 def test_a_slower_run_is_a_remark_with_two_runs_and_a_finding_with_more():
     before, after, *more = runs(5, spread=0.02)
     after["time_s"] *= 2
-    table, remarks = cells.compared(before, after, COLUMNS, True)
+    table, remarks = cells.compare_cells(before, after, COLUMNS, True)
     assert set(table["outcome"]) == {"same"}
-    assert "2 times those before in the median: two runs cannot say" in remarks[0]
-    table, remarks = cells.compared(before, after, COLUMNS, True, more)
+    assert "2 times those before in the median. Two runs cannot show" in remarks[0]
+    table, remarks = cells.compare_cells(before, after, COLUMNS, True, more)
     assert set(table["outcome"]) == {"worse"}
     assert not remarks
 
@@ -374,18 +474,23 @@ def test_git_revisions_are_compared(tmp_path, monkeypatch, capsys):
     [
         (["here"], "name two results"),
         (["no-such-thing", "."], "neither a directory nor a git revision"),
-        (["--output=/tmp/x", "."], "neither a directory nor a git revision"),
+        (["--output=/tmp/x", "."], "unknown option of compare '--output=/tmp/x'"),
         ([".", "."], "no results"),
         ([".", ".", "timing=true"], "did you mean 'timings'"),
         ([".", ".", "timings=perhaps"], "allowed: false, true"),
         ([".", ".", "again=a,b"], "add --timings"),
-        ([".", ".", "--timings", "again=a"], "takes 3 runs of before or more"),
+        ([".", ".", "--timings", "again=a"], "needs 3 or more runs of before"),
     ],
 )
 def test_bad_input_is_refused(words, said, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert cli.main(["compare", *words]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_name_that_starts_with_a_dash_is_no_option_of_git():
+    with pytest.raises(UserError, match="neither a directory nor a git revision"), sources.open_results("--output=/x"):
+        pass
 
 
 def test_results_kept_in_git_are_found_in_their_own_folder(tmp_path):
@@ -493,8 +598,8 @@ def test_the_workflow_of_the_docs_runs_the_gate_as_it_is():
     assert list(scripts) == ["Before", "After", "Gate"]
     (line,) = (line for line in scripts["Gate"].splitlines() if "compare runs" in line)
     words = line.split("bench compare ")[1].partition(" || ")[0].split()
-    asked = compare._parsed([word for word in words if not word.startswith("plugins=")])
-    assert (asked.before, asked.after) == ("runs/before", "runs/after")
+    request = compare._parse([word for word in words if not word.startswith("plugins=")])
+    assert (request.before, request.after) == ("runs/before", "runs/after")
     assert scripts["Gate"].strip().endswith("exit $status")
-    for script, folder in (("Before", asked.before), ("After", asked.after)):
+    for script, folder in (("Before", request.before), ("After", request.after)):
         assert f"results_dir={folder}" in scripts[script]

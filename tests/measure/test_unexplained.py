@@ -59,7 +59,7 @@ def test_measure_says_so(monkeypatch):
         def terms(self, problem, theta, w):
             return 1.5 * problem.grad(theta, w)
 
-    monkeypatch.setattr("bench.api._made", lambda kind, text, given=None: Off())
+    monkeypatch.setattr("bench.api.make", lambda kind, identity: Off())
     problem = Numpy().compile(compose(Quadratic()))
     assert is_unexplained(bench.estimate(problem, "fobg", samples=16, repeats=16).summary.note)
 

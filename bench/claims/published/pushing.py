@@ -33,7 +33,7 @@ def sampled(
     return spread(first, 20), spread(other, 20)
 
 
-def of_the_source(values: tuple[float, float], count: int) -> float:
+def source_error(values: tuple[float, float], count: int) -> float:
     """Return two standard errors of a variance from the source's 1,000 samples, from its error on ``count`` of them.
 
     The sources give one number of about a thousand samples each, and no interval.
@@ -65,7 +65,7 @@ class SmoothedPush(Claim):
         for beta in first:
             at = problem("pushing[sigma=0.3]", f"softplus[stiffness=1e5,beta={float(beta)!r}]")
             (v1, e1), (v0, e0) = sampled(at, SMOOTHED, 16)
-            once = of_the_source((v1, e1), SMOOTHED), of_the_source((v0, e0), SMOOTHED)
+            once = source_error((v1, e1), SMOOTHED), source_error((v0, e0), SMOOTHED)
             series["beta"].append(float(beta))
             series["first"].append((v1, e1))
             series["zeroth"].append((v0, e0))
@@ -127,7 +127,7 @@ class StiffPush(Claim):
             series["coarse"].append((v1, e1))
             series["zeroth"].append((v0, e0))
             figures.append(_heavy(f"first order, k = {k:g}", text, v1, e1, COARSE))
-            once = of_the_source((v0, e0), COARSE)
+            once = source_error((v0, e0), COARSE)
             figures.append(Figure(f"zeroth order, k = {k:g}", "1.3e7", v0, e0, spread=once))
         for k, text in fine.items():
             at = problem(f"pushing[{finer}]", f"penalty[stiffness={k!r}]")
@@ -156,5 +156,5 @@ class StiffPush(Claim):
 def _heavy(what: str, text: str, measured: float, error: float, count: int) -> Figure:
     """Return a figure compared by its errors and the source's, or by a factor where tails rule and no error is one."""
     if error * math.sqrt(count / 1000) < TAILS * measured:
-        return Figure(what, text, measured, error, spread=of_the_source((measured, error), count))
+        return Figure(what, text, measured, error, spread=source_error((measured, error), count))
     return Figure(what, text, measured, error, factor=10.0)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.claims.claim import ERRORS, Claim, Figure, Outcome
+from bench.claims.claim import STANDARD_ERRORS, Claim, Figure, Outcome
 from bench.claims.colours import GREY
 from bench.claims.published.ball_with_wall import BallWithWall
 from bench.claims.published.pivot import Pivot
@@ -58,11 +58,13 @@ class Switching(Claim):
         figures = [
             # the source's words are "improves" and "often": more than half
             Figure("share of 3 jumps at which switching is better", "1.0", _share(safer, _default_wins), spread=0.45),
-            Figure("share of 4 rollouts on which weighting is better", "1.0", _share(better, _loses), spread=0.45),
+            Figure(
+                "share of 4 rollouts on which weighting is better", "1.0", _share(better, _weighting_wins), spread=0.45
+            ),
             Figure(
                 "share on which it is at least as good as the best switch",
                 "1.0",
-                _share(better, _no_worse),
+                _share(better, _is_not_worse),
                 spread=0.45,
             ),
         ]
@@ -77,9 +79,9 @@ class Switching(Claim):
             ),
             series={
                 "name": [*jumps, *rollouts],
-                "best": [found.best for found in (*safer, *better)],
-                "weighted": [found.weighted for found in (*safer, *better)],
-                "errors": [found.errors for found in (*safer, *better)],
+                "best": [errors.best for errors in (*safer, *better)],
+                "weighted": [errors.weighted for errors in (*safer, *better)],
+                "errors": [errors.errors for errors in (*safer, *better)],
             },
         )
 
@@ -95,8 +97,8 @@ class Switching(Claim):
         axes.plot(ends, ends, color=GREY, linewidth=0.6, label="the same error")
 
 
-class _Found:
-    """Errors of one problem: the weighted estimator's, each switch's, and the paired difference to the best."""
+class _Errors:
+    """Relative errors of the weighted estimator and of each switch on one problem, and the difference to the best switch."""
 
     def __init__(self, truth: np.ndarray, weighted: np.ndarray, switches: list[np.ndarray]) -> None:
         squares = [((values - truth) ** 2).sum(axis=1) for values in (weighted, *switches)]
@@ -105,36 +107,36 @@ class _Found:
         self.weighted, self.switches = roots[0], roots[1:]
         self.best = min(self.switches)
         place = 1 + self.switches.index(self.best)
-        # by the delta method: a root's error is that of its square over twice the root
+        # delta method: the error of a root is the error of its square divided by twice the root
         self.errors = [
             float(squares[i].std(ddof=1) / np.sqrt(len(squares[i])) / (2 * size**2 * roots[i])) for i in (place, 0)
         ]
-        apart = squares[0] - squares[place]
-        self.apart = float(apart.mean()), float(apart.std(ddof=1) / np.sqrt(len(apart)))
+        difference = squares[0] - squares[place]
+        self.difference = float(difference.mean()), float(difference.std(ddof=1) / np.sqrt(len(difference)))
 
 
-def _errors(at: Any, weighting: str) -> _Found:
+def _errors(at: Any, weighting: str) -> _Errors:
     truth = certify(at, frozenset({"value", "grad", "score"}), 1 << 15, 0.01).gradient
     noise = np.random.default_rng(20).standard_normal((REPEATS, SAMPLES, at.program.n_noise))
     weighted, *switches = (
         estimator(name).estimate(at, at.program.theta0, noise) for name in (weighting, *map(SWITCH.format, RATIOS))
     )
-    return _Found(truth, weighted, switches)
+    return _Errors(truth, weighted, switches)
 
 
-def _share(found: list[_Found], question: Any) -> float:
-    return float(np.mean([question(one) for one in found]))
+def _share(problems: list[_Errors], question: Any) -> float:
+    return float(np.mean([question(errors) for errors in problems]))
 
 
-def _default_wins(found: _Found) -> bool:
-    return found.switches[RATIOS.index(1.5)] < found.weighted
+def _default_wins(errors: _Errors) -> bool:
+    return errors.switches[RATIOS.index(1.5)] < errors.weighted
 
 
-def _loses(found: _Found) -> bool:
-    return found.weighted < found.switches[RATIOS.index(1.5)]
+def _weighting_wins(errors: _Errors) -> bool:
+    return errors.weighted < errors.switches[RATIOS.index(1.5)]
 
 
-def _no_worse(found: _Found) -> bool:
-    """Whether weighting is no worse than the best switch by more than the errors of the paired difference."""
-    mean, error = found.apart
-    return mean <= ERRORS * error
+def _is_not_worse(errors: _Errors) -> bool:
+    """Return whether weighting is not worse than the best switch beyond the errors of the paired difference."""
+    mean, error = errors.difference
+    return mean <= STANDARD_ERRORS * error

@@ -58,12 +58,12 @@ class Windows(Claim):
         excesses = ("", "0.68526", "0.15146", "0.04044", "0.01129", "0.00319")
         figures: list[Figure] = []
         series: dict[str, list[float]] = {"window": [], "excess": []}
-        best = _endless(GAIN)
+        best = _infinite_horizon_cost(GAIN)
         for steps, (gain, excess) in enumerate(zip(gains, excesses, strict=True), 1):
             plain = _first_gain(Window(steps=steps))
             figures.append(Figure(f"gain of a window of {steps}", gain, plain, 1e-9))
             if excess:
-                off = _endless(plain) / best - 1
+                off = _infinite_horizon_cost(plain) / best - 1
                 figures.append(Figure(f"excess cost of a window of {steps}", excess, off, 1e-9))
                 series["window"].append(steps)
                 series["excess"].append(off)
@@ -86,8 +86,8 @@ def _first_gain(scene: Window) -> float:
     return float(-np.linalg.solve(hessian, -gradient[:, 0])[0])
 
 
-def _endless(gain: float) -> float:
-    """Return the cost of the policy u = -gain x for ever, from x = 1."""
+def _infinite_horizon_cost(gain: float) -> float:
+    """Return the infinite-horizon cost of the policy u = -gain x from x = 1."""
     return (1 + EFFORT * gain * gain) / (1 - (1 - gain) ** 2)
 
 

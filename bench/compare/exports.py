@@ -1,4 +1,4 @@
-"""Writes a comparison for other programs: JSON, and JUnit XML as CI servers show it."""
+"""Exports a comparison to other programs, as JSON and as JUnit XML for CI servers."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ import pandas as pd
 from bench.compare.cells import OUTCOMES
 
 CONTROL = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-"""Characters that XML 1.0 cannot hold, from messages of other people's code."""
+"""Characters that XML 1.0 does not allow. Error messages of plugins may contain them."""
 
 
-def counts(table: pd.DataFrame) -> dict[str, int]:
+def count_outcomes(table: pd.DataFrame) -> dict[str, int]:
     """Return the number of cells by outcome, the worst first."""
-    found = table["outcome"].value_counts()
-    return {outcome: int(found.get(outcome, 0)) for outcome in OUTCOMES}
+    outcomes = table["outcome"].value_counts()
+    return {outcome: int(outcomes.get(outcome, 0)) for outcome in OUTCOMES}
 
 
 def as_json(title: str, table: pd.DataFrame, names: Sequence[str], remarks: Sequence[str]) -> str:
-    """Write the verdict, the counts, the remarks and every cell that is not the same; ``names`` are those of its cells."""
+    """Return the verdict, counts, remarks and changed cells as JSON. ``names`` has the name of each cell."""
     result = {
         "comparison": title,
         "worse": bool((table["outcome"] == "worse").any()),
-        "counts": counts(table),
-        "experiments": {str(name): counts(part) for name, part in table.groupby("experiment", sort=False)},
+        "counts": count_outcomes(table),
+        "experiments": {str(name): count_outcomes(part) for name, part in table.groupby("experiment", sort=False)},
         "remarks": list(remarks),
         "cells": [
             {
@@ -43,26 +43,29 @@ def as_json(title: str, table: pd.DataFrame, names: Sequence[str], remarks: Sequ
 
 
 def as_junit(title: str, table: pd.DataFrame, names: Sequence[str]) -> str:
-    """Write a test suite per experiment and a test case per cell, a failure where it got worse."""
+    """Return JUnit XML with a suite per experiment and a test case per cell, which fails if the cell got worse."""
     root = ElementTree.Element(
-        "testsuites", name=_plain(title), tests=str(len(table)), failures=str(counts(table)["worse"])
+        "testsuites", name=_xml_safe(title), tests=str(len(table)), failures=str(count_outcomes(table)["worse"])
     )
-    named = table.assign(_name=list(names))
-    for experiment, part in named.groupby("experiment", sort=False):
+    for experiment, part in table.assign(_name=list(names)).groupby("experiment", sort=False):
         suite = ElementTree.SubElement(
-            root, "testsuite", name=_plain(str(experiment)), tests=str(len(part)), failures=str(counts(part)["worse"])
+            root,
+            "testsuite",
+            name=_xml_safe(str(experiment)),
+            tests=str(len(part)),
+            failures=str(count_outcomes(part)["worse"]),
         )
         for row in part.to_dict("records"):
             case = ElementTree.SubElement(
-                suite, "testcase", classname=_plain(str(experiment)), name=_plain(row["_name"])
+                suite, "testcase", classname=_xml_safe(str(experiment)), name=_xml_safe(row["_name"])
             )
             if row["outcome"] == "worse":
-                ElementTree.SubElement(case, "failure", message=_plain(row["change"]))
+                ElementTree.SubElement(case, "failure", message=_xml_safe(row["change"]))
             elif row["outcome"] != "same":
-                ElementTree.SubElement(case, "system-out").text = _plain(f"{row['outcome']}: {row['change']}")
+                ElementTree.SubElement(case, "system-out").text = _xml_safe(f"{row['outcome']}: {row['change']}")
     ElementTree.indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _plain(text: str) -> str:
+def _xml_safe(text: str) -> str:
     return CONTROL.sub("?", text)

@@ -1,0 +1,64 @@
+"""Makes plugins and compiles problems by the names used on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from bench.errors import Unsupported
+from bench.model import (
+    Backend,
+    ContactLaw,
+    Decision,
+    Integrator,
+    MechanicalScene,
+    Problem,
+    Scene,
+    compose,
+    registry,
+)
+from bench.model.identity import parse_identity
+from bench.model.parameters import build, parameters
+
+
+def make(kind: str, identity: str, defaults: Mapping[str, Any] | None = None) -> Any:
+    """Return a plugin by its identity string: ``make("contacts", "penalty[stiffness=1e4]")``.
+
+    ``defaults`` are a scene's own values of parameters. Raises :class:`bench.UserError` for a bad name or value and
+    :class:`bench.Unsupported` if a library that the plugin needs is not installed.
+    """
+    name, values = parse_identity(identity)
+    plugin = registry.usable(kind, name)
+    if reason := registry.find(kind, name).reason:
+        raise Unsupported(f"{kind} {name} is {reason}")
+    declared = parameters(plugin)
+    return build(plugin, {key: value for key, value in (defaults or {}).items() if key in declared} | values)
+
+
+def compile_problem(
+    scene: Scene | str,
+    contact: ContactLaw | str | None,
+    integrator: Integrator | str,
+    backend: str,
+    decision: Decision | None = None,
+    make: Callable[..., Any] = make,
+) -> Problem:
+    """Compile a scene on a backend, under a contact law and an integrator if the scene has contacts and a motion.
+
+    Each part is an identity string or a plugin. ``make`` makes plugins from identity strings. Raises what :func:`make`
+    raises, and :class:`bench.Unsupported` for a combination that cannot run.
+    """
+    given_scene: Scene = make("scenes", scene) if isinstance(scene, str) else scene
+    law: ContactLaw | None = None
+    step: Integrator | None = None
+    if isinstance(given_scene, MechanicalScene):
+        if given_scene.n_contacts:
+            law = make("contacts", contact, given_scene.contact_values) if isinstance(contact, str) else contact
+        step = make("integrators", integrator) if isinstance(integrator, str) else integrator
+    program = compose(given_scene, law, step, decision or Decision())
+    engine: Backend = make("backends", backend)
+    if reason := engine.incompatibility(program):
+        raise Unsupported(reason)
+    problem = engine.compile(program)
+    problem.provides = engine.provides
+    return problem
