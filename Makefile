@@ -18,6 +18,7 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python tests/programs/words.py
 
 # The generated pages: gallery, columns and API.
 docs: $(VENV)/.installed

@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -125,7 +126,13 @@ def test_architecture_names_every_package():
             assert f"`bench/{path.name}`" in DOCS["architecture.md"], path
 
 
-def test_versions_agree():
+def test_version_has_one_source():
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert "version" in pyproject["project"]["dynamic"]
+    assert pyproject["tool"]["hatch"]["version"] == {"path": "bench/__init__.py"}
+
+
+def test_citation_and_changelog_have_the_version():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == bench.__version__
     assert f"\n## {bench.__version__} (" in (ROOT / "CHANGELOG.md").read_text()
 
