@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m bench
 
-.PHONY: run test lint slow gallery examples clean
+.PHONY: run test lint slow docs gallery examples clean
 
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
@@ -18,11 +18,16 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python tests/programs/words.py
 
-# All experiments again into results/standard (what is stored is not repeated), then the gallery from them.
+# The generated pages: gallery, columns and API.
+docs: $(VENV)/.installed
+	$(BIN)/python docs/build.py
+
+# Run the missing cells of all experiments into results/standard, then build the gallery from them.
 gallery: $(VENV)/.installed
 	for file in conf/experiment/*.yaml; do $(RUN) +experiment=$$(basename $$file .yaml) results_dir=results/standard || exit 1; done
-	$(BIN)/python -m bench.gallery docs/gallery.md results/standard
+	$(BIN)/python docs/build.py gallery
 
 # The examples on other people's engines, in environments of their own: their pins and ours do not live together.
 examples: .venv-engines/.installed .venv-nimble/.installed

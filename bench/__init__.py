@@ -23,7 +23,7 @@ from bench.model import *  # noqa: F403
 from bench.model import __all__ as _contracts
 from bench.model.simulator.mjcf import Mjcf
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 __all__ = [
     *_contracts,
     "Cell",

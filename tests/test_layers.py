@@ -20,7 +20,7 @@ LAYERS = [
     ["run"],
     ["report"],
     ["studies", "trace"],
-    ["compare", "gallery", "benchself", "examine", "claims"],
+    ["compare", "benchself", "examine", "claims"],
     ["api"],
     ["__init__"],
     ["cli"],
@@ -104,7 +104,7 @@ def test_plugins_import_only_public_names(path):
 
 
 def test_the_core_names_no_plugin():
-    """Store, sweep, report kit, compare and gallery know plugins and studies only through the registry."""
+    """Store, run, report kit and compare know plugins and studies only through the registry."""
     from bench.model import registry
 
     names = {

@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,6 @@ import yaml
 import bench
 from bench import cli
 from bench.experiment import config
-from bench.experiment.columns import COMMON
 from bench.model import registry
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -39,9 +39,8 @@ def commands(text):
     lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
     lines += re.findall(r"`(python -m bench [^`]+)`", re.sub(r"\s+", " ", text))
     words = [shlex.split(line, comments=True)[3:] for line in lines if line.startswith("python -m bench ")]
-    return [
-        found for found in words if not any(re.search(r"\b[A-Z]{3,}\b", w) for w in found if not w.startswith("HEAD"))
-    ]
+    placeholder = re.compile(r"\b(?!HEAD)[A-Z]{3,}\b")
+    return [command for command in words if not any(map(placeholder.search, command))]
 
 
 COMMANDS = [(path.name, words) for path in PAGES for words in commands(path.read_text())]
@@ -89,6 +88,16 @@ def test_readme_is_short():
     assert len(README.splitlines()) <= 150
 
 
+def test_readme_names_the_two_commands_that_set_everything_up():
+    section = README.partition("## Two commands\n")[2].partition("\n## ")[0]
+    commands = re.findall(r"^    (make \w+)", section, re.MULTILINE)
+    assert commands == ["make run", "make test"]
+    for command in commands:
+        assert f"| `{command}` |" in section
+        assert f"\n{command.split()[1]}: $(VENV)/.installed\n" in (ROOT / "Makefile").read_text()
+    assert "\nmake test\n" in (ROOT / ".ci" / "run").read_text()
+
+
 def test_every_page_is_linked_from_the_readme():
     for name in DOCS:
         assert f"(docs/{name}" in README, name
@@ -109,7 +118,7 @@ def test_every_command_and_setting_is_described():
         assert re.search(rf"^\|.*`{key}`.*\|", DOCS["commands.md"], re.MULTILINE), key
 
 
-def test_architecture_names_every_room():
+def test_architecture_names_every_package():
     for path in (ROOT / "bench").iterdir():
         if path.is_dir() and (path / "__init__.py").exists():
             assert f"`bench/{path.name}/`" in DOCS["architecture.md"], path
@@ -117,17 +126,13 @@ def test_architecture_names_every_room():
             assert f"`bench/{path.name}`" in DOCS["architecture.md"], path
 
 
-def test_columns_are_those_of_all_studies():
-    listed = {
-        title.strip("`"): re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)
-        for title, section in re.findall(r"^## (.+?)\n(.*?)(?=^## |\Z)", DOCS["columns.md"], re.MULTILINE | re.DOTALL)
-    }
-    assert listed.pop("Common columns") == list(COMMON)
-    studies = {name: entry.plugin for name, entry in registry.entries()["studies"].items()}
-    assert listed == {name: [c for c in study.columns.stored if c not in COMMON] for name, study in studies.items()}
+def test_version_has_one_source():
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert "version" in pyproject["project"]["dynamic"]
+    assert pyproject["tool"]["hatch"]["version"] == {"path": "bench/__init__.py"}
 
 
-def test_versions_agree():
+def test_citation_and_changelog_have_the_version():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == bench.__version__
     assert f"\n## {bench.__version__} (" in (ROOT / "CHANGELOG.md").read_text()
 

@@ -75,7 +75,7 @@ def numbers(name: str, doc: str = "", unit: str = "", **more: Any) -> Column:
 
 
 FIRST = (
-    text("experiment", "the experiment that the row was made for"),
+    text("experiment", "experiment of the row"),
     text("scene", "identity string of the scene: its name and the parameters that differ from their defaults"),
     text("contact", "identity string of the contact law, `none` where the scene has no contact"),
     text("integrator", "identity string of the integrator, `none` where the scene has no time steps"),
@@ -85,7 +85,7 @@ FIRST = (
     text("noise", "what the noise perturbs: `parameter` (theta) or `action`"),
     Column("horizon", "number of time steps T", "steps"),
     Column("dt", "length of a time step", "s"),
-    Column("stiffness", "stiffness of the contact law, else of the scene", "N/m"),
+    Column("stiffness", "stiffness of the contact law, or of the scene without one", "N/m"),
     Column("sigma", "standard deviation of the noise in J"),
     Column("smoothing", "smoothing parameter of the contact law: beta, kappa"),
     Column("samples", "samples N in one estimate"),
@@ -96,24 +96,27 @@ FIRST = (
 IDENTITY = tuple(column.name for column in FIRST[1:])
 """The columns that show which cell a row is. The cell's whole identity is in ``parameters``."""
 DIM = Column("dim", "length d of theta")
-STATUS = (text("status", "ok, or how the cell failed"), text("reason", "why it failed, or what to bear in mind"))
+STATUS = (
+    text("status", "ok, or how the cell failed"),
+    text("reason", "reason of a failure, or a remark about the numbers"),
+)
 LAST = (
-    text("versions", "versions of the libraries that the numbers rest on"),
-    text("key", "hash of everything that decides the numbers"),
+    text("versions", "versions of the libraries that produced the numbers"),
+    text("key", "hash of all parameters and code that decide the numbers"),
 )
 HIDDEN = (
-    text("study", "the study that made the row", table=False),
+    text("study", "study that measured the row", table=False),
     text(
         "parameters", "JSON with every parameter of every plugin, defaults included: the cell's identity", table=False
     ),
-    Column("wall_s", "seconds that the cell took in all", "s", table=False),
-    Column("stored_at", "when the row was stored, since 1970", "s", table=False),
+    Column("wall_s", "seconds spent on the cell in total", "s", table=False),
+    Column("stored_at", "time of storing, in seconds since 1970", "s", table=False),
     Column(
         "sequence",
-        "a count that grows with every storing; the row of a key with the largest is its newest",
+        "counter of stored rows; of the rows of a key the one with the largest is the newest",
         table=False,
     ),
-    text("machine", "processor, cores and system of the machine that made the row", table=False),
+    text("machine", "processor, cores and system of the machine that measured the row", table=False),
 )
 COMMON = {column.name: column for column in (*FIRST, DIM, *STATUS, *LAST, *HIDDEN)}
 

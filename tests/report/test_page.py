@@ -16,7 +16,7 @@ import pytest
 from browser import CHROMIUM, chromium
 from helpers import experiment, row, small_rows, stiffness_rows, table
 
-from bench import cli, gallery
+from bench import cli
 from bench.experiment import config, grid
 from bench.experiment.columns import Columns
 from bench.experiment.study import Study
@@ -191,23 +191,6 @@ def test_report_writes_the_page_again_with_machine_and_versions(ran):
     assert cli.main(["report", *RUN, f"results_dir={ran}"]) == 0
     text = path.read_text()
     assert "numpy" in text.partition("Configuration")[0].partition('id="made"')[2]
-
-
-def test_gallery_has_the_finding_and_keeps_what_it_cannot_make_anew(ran, tmp_path, monkeypatch):
-    loaded = {"experiment=absent": ["name=absent"], "experiment=mine": RUN}
-    monkeypatch.setattr(config, "experiments", lambda: ["absent", "mine"])
-    monkeypatch.setattr(config, "load", lambda words, load=config.load: load([*loaded[words[0]], words[1]]))
-    readme = tmp_path / "README.md"
-    readme.write_text(f"before {gallery.MARKS[0]}\n\n### `absent`\n\nkept\n{gallery.MARKS[1]} after")
-    gallery.main(readme, ran)
-    text = readme.read_text()
-    assert text.startswith("before ")
-    assert text.endswith(" after")
-    assert "### `absent`\n\nkept\n" in text
-    assert "at equal rollouts" in text
-    assert "bias_variance_stiffness.png" in text
-    gallery.main(readme, ran)
-    assert readme.read_text() == text
 
 
 # -------------------------------------------------------------------------------------------------------- browser

@@ -3,21 +3,31 @@
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
 
 COLUMNS = Columns.of(
-    Column("cost", "f at theta, without noise"),
-    Column("physical_cost", "the same of the physics"),
-    Column("forward_error", "their difference"),
-    Column("forward_error_rel", "relative to the physics' cost", comparison=ComparisonRule("exact", "forward error")),
+    Column("cost", "cost f at theta, without noise"),
+    Column("physical_cost", "cost of the physics at theta, without noise"),
+    Column("forward_error", "difference of cost and physical_cost"),
+    Column(
+        "forward_error_rel",
+        "forward_error relative to physical_cost",
+        comparison=ComparisonRule("exact", "forward error"),
+    ),
     Column("program_norm", "norm of the program's gradient"),
     Column("program_error", "norm of (program's gradient - its best central difference)"),
-    Column("program_error_rel", "relative to the difference", comparison=ComparisonRule("exact", "program error")),
-    Column("difference_step", "step of that difference, in the units of theta"),
+    Column(
+        "program_error_rel",
+        "program_error relative to the norm of that difference",
+        comparison=ComparisonRule("exact", "program error"),
+    ),
+    Column("difference_step", "step of the best central difference, in the units of theta"),
     Column("physical_norm", "norm of the physics' gradient"),
     Column("model_error", "norm of (program's gradient - physics' gradient)"),
-    Column("model_error_rel", "relative to the physics' gradient", comparison=ComparisonRule("exact", "model error")),
-    Column("model_cosine", "cosine between the two"),
-    Column("model_signs", "share of coordinates whose sign is the physics'"),
+    Column(
+        "model_error_rel", "model_error relative to physical_norm", comparison=ComparisonRule("exact", "model error")
+    ),
+    Column("model_cosine", "cosine between the program's gradient and the physics' gradient"),
+    Column("model_signs", "share of coordinates in which both gradients have the same sign"),
     Column("reference_norm", "norm of the reference gradient of the program"),
-    Column("reference_se", "its standard error"),
+    Column("reference_se", "standard error of the reference gradient"),
     Column(
         "bias",
         "norm of the estimator's bias, corrected for its own noise",
