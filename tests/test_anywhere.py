@@ -71,13 +71,20 @@ def command(python: Path | str, *words: str, cwd: Path) -> subprocess.CompletedP
     return done
 
 
+def install(wheel: Path, python: str, folder: Path, *options: str) -> str:
+    """Install the wheel into ``folder/own``, an environment of that Python; returns what pip complains about."""
+    command(python, "-m", "venv", "--without-pip", "own", cwd=folder)
+    own = str(folder / "own" / "bin" / "python")
+    words = ["-m", "pip", "--python", own, "install", "--quiet", "--disable-pip-version-check", *options, str(wheel)]
+    done = subprocess.run([sys.executable, *words], cwd=folder, capture_output=True, text=True)
+    return done.stderr.strip() if done.returncode else ""
+
+
 @pytest.mark.slow
 def test_installed_wheel_runs_an_experiment_with_numpy_only(wheel, tmp_path):
     """In an environment of its own, by the command that the package installs; libraries are those of this one."""
-    command(sys.executable, "-m", "venv", "--without-pip", "own", cwd=tmp_path)
+    assert not install(wheel, sys.executable, tmp_path, "--no-deps", "--no-index")
     scripts = tmp_path / "own" / "bin"
-    pip = ["-m", "pip", "--python", str(scripts / "python"), "install", "--quiet", "--no-deps", "--no-index"]
-    command(sys.executable, *pip, str(wheel), cwd=tmp_path)
     place = "import sysconfig; print(sysconfig.get_path('purelib'))"
     site = Path(command(scripts / "python", "-c", place, cwd=tmp_path).stdout.strip())
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
@@ -97,7 +104,7 @@ def newest_python() -> str | None:
     places = [Path(place) for place in os.environ.get("PATH", "").split(os.pathsep)]
     paths = [path for place in places for path in place.glob("python3.[0-9]*") if path.name[-1].isdigit()]
     paths += Path.home().glob(".pyenv/versions/3.*/bin/python3")
-    asked = "import ensurepip, sys; print(*sys.version_info[:3], sys.version_info.releaselevel)"
+    asked = "import sys, venv; print(*sys.version_info[:3], sys.version_info.releaselevel)"
     versions = {}
     for path in paths:
         answer = subprocess.run([str(path), "-c", asked], capture_output=True, text=True).stdout.split()
@@ -113,12 +120,9 @@ def test_wheel_runs_under_the_newest_python(wheel, tmp_path):
     python = newest_python()
     if python is None:
         pytest.skip("this machine has no newer Python")
-    command(python, "-m", "venv", "own", cwd=tmp_path)
+    if reason := install(wheel, python, tmp_path, "-c", str(ROOT / "constraints.txt")):
+        pytest.skip(f"its libraries cannot be installed: {reason.splitlines()[-1]}")
     own = tmp_path / "own" / "bin" / "python"
-    words = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-c", str(ROOT / "constraints.txt")]
-    done = subprocess.run([str(own), *words, str(wheel)], cwd=tmp_path, capture_output=True, text=True)
-    if done.returncode != 0:
-        pytest.skip(f"its libraries cannot be installed: {done.stderr.strip().splitlines()[-1]}")
     command(own, "-W", "error::SyntaxWarning", "-m", "bench", *TINY, cwd=tmp_path)
     rows = pd.read_csv(tmp_path / "results" / "tiny" / "bias_variance.csv")
     assert list(rows["status"]) == ["ok", "ok"]
