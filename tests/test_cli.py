@@ -12,13 +12,16 @@ from bench.cli import VERBS, main
 from bench.experiment.columns import IDENTITY
 from bench.studies.bias_variance.columns import COLUMNS
 
-TINY = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny"]
+TINY = [
+    "scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny",
+    "workers=0",
+]  # fmt: skip
 TIMES = ["time_s", "time_iqr_s", "compile_s", "peak_memory_mb"]
 
 
 def test_run_then_report_then_plan(tmp_path, capsys):
     where = f"results_dir={tmp_path}"
-    assert main([*TINY, where, "sweep.sigma=[0.1,0.2]"]) == 0
+    assert main([*TINY, where, "sweep.sigma=[0.1,0.2]", "workers=2"]) == 0
     directory = tmp_path / "tiny"
     for name in ("rows.parquet", "bias_variance.csv", "bias_variance.md", "bias_variance.tex", "run.json"):
         assert (directory / name).stat().st_size > 0
@@ -48,7 +51,7 @@ def test_only_missing_cells_run_and_rows_are_kept(tmp_path, monkeypatch):
     real = module.measure
     monkeypatch.setattr(module, "measure", lambda cell, *rest: (measured.append(cell.key), real(cell, *rest))[1])
     where = f"results_dir={tmp_path}"
-    here = [*TINY, where, "workers=0"]
+    here = [*TINY, where]
     assert main([*here, "sweep.sigma=[0.1]"]) == 0
     assert main([*here, "sweep.sigma=[0.1,0.2]"]) == 0
     assert len(measured) == len(set(measured)) == 4
@@ -58,7 +61,7 @@ def test_only_missing_cells_run_and_rows_are_kept(tmp_path, monkeypatch):
 
 
 def test_record_of_a_run_outlasts_one_that_finds_all_rows_stored(tmp_path):
-    here = [*TINY, f"results_dir={tmp_path}", "workers=0"]
+    here = [*TINY, f"results_dir={tmp_path}", "formats=[]"]
     path = tmp_path / "tiny" / "run.json"
     assert main([*here, "sweep.sigma=[0.1,0.2]"]) == 0
     first = path.read_text()
@@ -267,7 +270,7 @@ def test_nothing_raw_reaches_the_terminal(tmp_path, capsys):
     (folder / "escaping.py").write_text(ESCAPING)
     assert main(["list", "escaping", f"plugins={folder}"]) == 0
     words = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[escaping]", "samples=8", "repeats=4", "name=raw"]
-    assert main([*words, f"plugins={folder}", f"results_dir={tmp_path}"]) == 1
+    assert main([*words, "workers=0", f"plugins={folder}", f"results_dir={tmp_path}"]) == 1
     answer = capsys.readouterr()
     assert "alert" in answer.out
     for letter in ("\x1b", "\x07"):

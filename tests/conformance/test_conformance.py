@@ -18,8 +18,11 @@ from bench.plugins.scenes.mass_spring import MassSpring
 from bench.plugins.scenes.pushing import Pushing
 from bench.plugins.scenes.quadratic import Quadratic
 
+from bench import conformance
 from bench.conformance import Skipped, check, main, parametrize
 from bench.conformance.kit import variants
+from bench.conformance.subjects import all_programs, available, distinguishing_programs, sound_scenes
+from bench.conformance.subjects import programs as programs_of
 from bench.errors import UserError
 from bench.model import (
     Array,
@@ -59,14 +62,33 @@ def test_registered_plugin_loads(entry):
     assert entry.plugin is not None, entry.reason
 
 
+@pytest.fixture
+def few_programs(monkeypatch):
+    """Checks of backends, scenes and contact laws run one program of each sort, or every fourth scene with contacts.
+
+    Scenes are compared on backends that differ and compile within a second: without equations ``implicit`` is ``jax``.
+    """
+    programs, scenes = tuple(distinguishing_programs(all_programs())), sound_scenes()
+    touching = [scene for scene in scenes if isinstance(scene, ContactScene) and scene.continuous]
+    monkeypatch.setattr(conformance.backends, "all_programs", lambda: programs)
+    monkeypatch.setattr(conformance.scenes, "programs", lambda scene: distinguishing_programs(programs_of(scene)))
+    monkeypatch.setattr(
+        conformance.scenes,
+        "available",
+        lambda kind: [p for p in available(kind) if p.name not in ("fused", "implicit")],
+    )
+    monkeypatch.setattr(conformance.contacts, "sound_scenes", lambda: touching[::4])
+
+
+@pytest.mark.usefixtures("few_programs")
 @parametrize([plugin for plugin in PLUGINS if not _is_long(plugin)])
 def test_registered_plugin_conforms(plugin, check):
     check(plugin)
 
 
 @pytest.mark.slow
-@parametrize([plugin for plugin in PLUGINS if _is_long(plugin)])
-def test_registered_engine_or_solver_conforms(plugin, check):
+@parametrize([p for p in PLUGINS if _is_long(p) or p.kind in ("backends", "scenes", "contacts")])
+def test_registered_plugin_conforms_on_every_program(plugin, check):
     check(plugin)
 
 

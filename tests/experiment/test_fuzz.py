@@ -83,7 +83,7 @@ def no_reports(monkeypatch):
         monkeypatch.setattr(entry.plugin, "write", lambda study, experiment, rows: [])
 
 
-@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=12, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(words=st.lists(word, min_size=1, max_size=4).filter(affordable), verb=st.sampled_from(["run", "plan"]))
 @example(words=["name=../../x"], verb="run")
 @example(words=["name=.."], verb="run")

@@ -253,7 +253,7 @@ def test_every_kind_of_law_shows_when_it_acts(law):
 
 # -------------------------------------------------------------------------------------------------- the command
 
-TINY = ["contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[1,5]"]
+TINY = ["contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[1,5]", "workers=0"]
 
 
 def test_command_writes_files_and_exits_with_0(tmp_path, capsys):
@@ -281,7 +281,7 @@ def test_command_writes_files_and_exits_with_0(tmp_path, capsys):
 
 
 def test_scene_without_steps_is_checked(tmp_path):
-    assert main(["gradcheck", "quadratic", "backends=[numpy]", f"results_dir={tmp_path}"]) == 0
+    assert main(["gradcheck", "quadratic", "backends=[numpy]", "workers=0", f"results_dir={tmp_path}"]) == 0
     table = pd.read_csv(tmp_path / "gradcheck" / "gradient_check.csv")
     assert set(table["verdict"]) == {"smooth"}
 

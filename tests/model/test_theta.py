@@ -119,13 +119,7 @@ SOLVING = {
         Pushing(sigma=SIGMA, horizon=10),
         Complementarity(stiffness=1e3),
         SemiImplicitEuler(),
-        ("mass", "stiffness"),
-    ),
-    "smoothing": (
-        Pushing(sigma=SIGMA, horizon=10),
-        Complementarity(stiffness=1e3),
-        SemiImplicitEuler(),
-        ("mass", "kappa"),
+        ("mass", "stiffness", "kappa"),
     ),
     "integrator": (MassSpring(sigma=SIGMA, horizon=10), None, ImplicitEuler(), ("stiffness", "mass")),
     "two unknowns": (
@@ -145,7 +139,8 @@ def test_columns_of_a_batch_have_parameters_of_their_own_in_equations(case, back
     *parts, names = SOLVING[case]
     problem = backend.compile(compose(*parts, Decision(names)))
     theta = problem.program.theta0
-    spread = theta[:, None] * np.array([np.linspace(0.5, 2.0, 4), np.linspace(1.5, 0.7, 4)])[: theta.size]
+    factors = np.array([np.linspace(0.5, 2.0, 4), np.linspace(1.5, 0.7, 4), np.linspace(0.8, 1.6, 4)])
+    spread = theta[:, None] * factors[: theta.size]
     costs, gradients = (function(spread, np.zeros(spread.shape)) for function in (problem.value, problem.grad))
     for i, values in enumerate(spread.T):
         single = compose(*rebuilt(parts, names, values))

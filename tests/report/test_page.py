@@ -163,7 +163,7 @@ RUN = (
 def ran(tmp_path_factory):
     """A small run through the command line: the directory of its results."""
     directory = tmp_path_factory.mktemp("results")
-    assert cli.main([*RUN, f"results_dir={directory}"]) == 0
+    assert cli.main([*RUN, "workers=0", f"results_dir={directory}"]) == 0
     return directory
 
 
@@ -177,7 +177,7 @@ def test_command_in_the_page_gives_the_same_numbers_of_that_cell_alone(ran, tmp_
     place = column(found, "status").index("ok")
     words = [c["values"][c["index"][place]] for c in found["command"]["words"]]
     told = shlex.split(" ".join([found["command"]["head"], *filter(None, words)]))
-    assert cli.main([*told[3:], f"results_dir={tmp_path}"]) == 0
+    assert cli.main([*told[3:], "workers=0", f"results_dir={tmp_path}"]) == 0
     alone = stored(tmp_path, "one_cell")
     assert len(alone) == 1
     before = stored(ran, "mine").loc[alone.index[0]]

@@ -52,9 +52,11 @@ PROBLEMS = {
     "bounce_once": (BounceOnce(), Penalty(stiffness=1e4)),
     "bounce_once, impulse": (BounceOnce(), Impulse()),
 }
+ALIKE = {"cartpole", "pushing, softplus", "pushing, impulse"}
+"""Problems whose scene and sort of law other problems have too."""
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ALIKE)) for n in PROBLEMS])
 def test_adjoints_give_the_programs_gradient(name):
     problem = compiled(*PROBLEMS[name])
     w = drawn(problem)

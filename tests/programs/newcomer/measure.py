@@ -1,6 +1,6 @@
 """What a new user goes through: a fresh environment, the install, and a first script, each timed.
 
-    python tests/examine/newcomer/measure.py KIND ...
+    python tests/programs/newcomer/measure.py KIND ...
 
 makes an environment per kind in a temporary folder, installs this checkout with what the kind needs, runs the kind's
 script, and prints a line of seconds and lines. The scripts beside this file are those of a first try. pip has to reach a package index.

@@ -1,4 +1,4 @@
-"""Planted faults for the gate: which are caught, on which scenes? ``python tests/compare/planted.py`` prints the table.
+"""Planted faults for the gate: which are caught, on which scenes? ``python tests/programs/planted.py`` prints the table.
 
 Every cell runs in this process on the NumPy backend, twice: as it is, and with the fault in the program that both the
 estimates and the reference use, as in a simulator whose next version is broken.

@@ -1,4 +1,4 @@
-"""How often the intervals of bias and variance hold the truth: `python tests/measure/intervals.py [seeds a cell]`.
+"""How often the intervals of bias and variance hold the truth: `python tests/programs/intervals.py [seeds a cell]`.
 
 Cells are the ridges of the bank, whose bias is known for every estimator: none for those that are unbiased, the slopes
 of the jumps for first order, the difference of two smoothings for another radius. Their variance is that of a million

@@ -1,4 +1,4 @@
-"""Plants one-line faults in the core and reports which a test kills: `python tests/mutants.py [words of file or fault]`.
+"""Plants one-line faults in the core and reports which a test kills: `python tests/programs/mutants.py [words of file or fault]`.
 
 Each fault is planted in a copy of the tree, in a process forked after the libraries are loaded, and the tests named beside
 it run until one fails. Run by hand: it takes some minutes.
@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 CPU, MEMORY = 40, 6 << 30
 """Seconds and bytes that the tests of one fault may take."""
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 COPIED = ("bench", "plugins", "conf", "tests", "docs", "README.md", "CONTRIBUTING.md", "pyproject.toml")
 
 
@@ -379,7 +379,8 @@ def main(words: list[str]) -> int:
                 shutil.copytree(source, folder / part, ignore=ignored)
             else:
                 shutil.copy(source, folder / part)
-        sys.path[:] = [path for path in sys.path if Path(path or ".").resolve() not in (ROOT, ROOT / "tests")]
+        own = (ROOT, ROOT / "tests", ROOT / "tests/programs")
+        sys.path[:] = [path for path in sys.path if Path(path or ".").resolve() not in own]
         sys.dont_write_bytecode = True
         for tests in dict.fromkeys(fault.tests for fault in chosen):
             if killed(Fault(R, "BATCHES = 64", "BATCHES = 64", tests), folder):

@@ -1,4 +1,4 @@
-"""A bank of problems whose smoothed gradient is known, to hold certified references to: `python tests/measure/bank.py`.
+"""A bank of problems whose smoothed gradient is known, to hold certified references to: `python tests/programs/bank.py`.
 
 Ridges f(x) = sum_j g_j(a_j . x) have grad J = sum_j a_j dE[g_j]/du with one-dimensional Gaussian expectations of powers,
 hinges, steps, bumps, waves and exponentials; shipped scenes have their closed forms, which the reference does not see.

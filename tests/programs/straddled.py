@@ -1,4 +1,4 @@
-"""Counts the steps of the tossed box in MuJoCo whose difference straddles a switch: `python tests/measure/straddled.py`.
+"""Counts the steps of the tossed box in MuJoCo whose difference straddles a switch: `python tests/programs/straddled.py`.
 
 A step's Jacobian from differences of 1e-6 is held to that of 1e-8, and the gradients to differences of whole rollouts.
 """

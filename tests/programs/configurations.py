@@ -1,4 +1,4 @@
-"""Random configurations that mean something: ``python tests/experiment/configurations.py COUNT [SEED]``.
+"""Random configurations that mean something: ``python tests/programs/configurations.py COUNT [SEED]``.
 
 Studies, plugins, parameters within their bounds, sweeps and settings are drawn from what the registry declares; then a word
 of every fourth configuration is spoilt. Each is run in this process, tiny, into a folder that others have filled before it.

@@ -1,6 +1,6 @@
 """Measures from how many references of one program on ``fused`` would be faster than ``jax``.
 
-``python tests/plugins/fused_references.py`` prints, for each scene that bench-self compares, the seconds of the first
+``python tests/programs/fused_references.py`` prints, for each scene that bench-self compares, the seconds of the first
 reference, which compiles with nothing kept on disk, and of the next one, on both backends.
 """
 

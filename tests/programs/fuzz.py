@@ -1,4 +1,4 @@
-"""Random configurations in this process: ``python tests/experiment/fuzz.py COUNT [SEED]``; one in fifty is run, the rest planned.
+"""Random configurations in this process: ``python tests/programs/fuzz.py COUNT [SEED]``; one in fifty is run, the rest planned.
 
 Every word is either a setting with a value of a random kind, a setting of the defaults with a letter changed, or noise.
 Prints what went wrong and one line of counts; status 1 for a traceback, a status that is none, or a message of two lines.

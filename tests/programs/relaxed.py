@@ -1,4 +1,4 @@
-"""Measures how far the central path at ``kappa`` is from the spring it relaxes: ``python tests/measure/relaxed.py 1e-6``.
+"""Measures how far the central path at ``kappa`` is from the spring it relaxes: ``python tests/programs/relaxed.py 1e-6``.
 
 Per stiffness of ``stiffness_sweep``: the mean gradient of ``pushing`` over the same draws, beside that at ``kappa`` / 1000.
 """

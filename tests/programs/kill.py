@@ -1,4 +1,4 @@
-"""Kills runs at random moments of every phase and looks for what is lost: ``python tests/run/kill.py COUNT [SEED]``.
+"""Kills runs at random moments of every phase and looks for what is lost: ``python tests/programs/kill.py COUNT [SEED]``.
 
 A round starts in an empty folder and goes through the phases of a run: its references, its cells, its tables, its page, and
 then a comparison with the sweep that nobody killed. In each it is killed a few times and started again. A kill takes a

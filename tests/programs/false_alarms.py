@@ -1,6 +1,6 @@
 """Checks right gradients of smooth scenes, at many thetas and horizons up to 2,000: how often the check blames one.
 
-    python tests/measure/false_alarms.py 5000
+    python tests/programs/false_alarms.py 5000
 
 prints the counts of verdicts, every gradient blamed, and the seconds of a check, the first of each program with its compilation.
 """

@@ -1,6 +1,6 @@
 """Planted faults and right gradients in NumPy, torch and JAX simulators, and the table of what each checker finds.
 
-    python tests/examine/simulators.py [numpy] [torch] [jax]
+    python tests/programs/simulators.py [numpy] [torch] [jax]
 
 prints a line per case: the cause that `bench.examine` names, its exit status, calls and seconds. `checkers.py` asks other
 gradient checkers about the same cases.

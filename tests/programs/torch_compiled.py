@@ -1,4 +1,4 @@
-"""Measures whether torch.compile would make the torch backend faster: ``python tests/plugins/torch_compiled.py``.
+"""Measures whether torch.compile would make the torch backend faster: ``python tests/programs/torch_compiled.py``.
 
 One gradient of ``pushing`` under the penalty law for batches of 1,000 and 100,000 rollouts, eager and compiled whole, by
 horizon: seconds to compile with nothing kept on disk, and microseconds per rollout of both. torch unrolls the loop over

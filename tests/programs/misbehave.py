@@ -1,4 +1,4 @@
-"""A bank of misbehaving plugins, faults x places: ``python tests/run/misbehave.py COUNT [SEED]``.
+"""A bank of misbehaving plugins, faults x places: ``python tests/programs/misbehave.py COUNT [SEED]``.
 
 Each is a file of its own in one folder of plugins, drawn so that faults and places come equally often. Looked for are: a
 listing or a row of its own for each, with a status and a reason of one line where it did harm; sound cells beside them

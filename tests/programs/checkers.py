@@ -1,6 +1,6 @@
 """Other gradient checkers on the bank's cases: whether they complain, and what that took.
 
-    python tests/examine/checkers.py gradcheck|check_grads|tesseract
+    python tests/programs/checkers.py gradcheck|check_grads|tesseract
 
 prints a line per case and one of sums. Each checker has its own default steps and tolerances, and gets a cost in its own
 library as it is; others as a function with a gradient of its own: `torch.autograd.Function`, `jax.custom_vjp`, or the
