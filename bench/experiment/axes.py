@@ -183,7 +183,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     extra = [axis.column for axis in axes(experiment.sweep, rows) if axis.column not in rows]
     wide = with_axes(experiment, rows)
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
-    texts = [name for name in experiment.columns.named("text") if name in wide]
+    texts = [name for name in experiment.columns.of_kind("text") if name in wide]
     return wide.assign(**{name: wide[name].map(_harmless) for name in texts})
 
 

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
@@ -13,6 +14,7 @@ from typing import Any, cast
 from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
 from bench.experiment.keys import PROGRAM, REFERENCE, fingerprint, hashed, module_hash
+from bench.experiment.reference_backends import able_backends
 from bench.model import (
     Backend,
     ContactLaw,
@@ -23,6 +25,7 @@ from bench.model import (
     Plugin,
     Program,
     Scene,
+    Smoothing,
     compose,
     registry,
 )
@@ -55,6 +58,10 @@ def labels(parts: Mapping[str, Plugin | None], without: Mapping[str, Collection[
         hidden = without.get("estimator", ())
         strings["estimator_params"] = label(estimator, None, tuple(hidden)).removeprefix(estimator.name).strip("[]")
     return strings
+
+
+_ranked: dict[str, tuple[Backend, ...]] = {}
+"""Backends for references by the key of the program."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +115,10 @@ class Cell:
     def key(self) -> str:
         """Hash of everything that decides the cell's numbers, except library versions, which have a column."""
         counts = [self.samples, self.repeats, self.seed, self.timing]
-        reference = None if self.budget is None else [self.program_key, module_hash(REFERENCE)]
+        reference = None if self.budget is None else [self.reference_key, module_hash(REFERENCE)]
+        best = fingerprint(next(iter(self.ranked_backends), None))  # any study may ask it beside the cell's own
         return hashed(
-            {axis: fingerprint(part) for axis, part in self.parts.items()}, counts, reference, self._budget(),
+            {axis: fingerprint(part) for axis, part in self.parts.items()}, counts, reference, best, self._budget(),
             self._theta(), fingerprint(self.study), module_hash(PROGRAM),
         )  # fmt: skip
 
@@ -119,6 +127,43 @@ class Cell:
         """Hash of everything that decides the program."""
         parts = [fingerprint(part) for part in (self.scene, self.contact, self.integrator)]
         return hashed(parts, self._theta(), module_hash(PROGRAM))
+
+    @cached_property
+    def reference_key(self) -> str:
+        """Hash of everything that decides the reference gradient; raises ValueError if the study computes none."""
+        if self.budget is None:
+            raise ValueError(
+                f"study {self.study.name} computes no reference: add a column `reference_method` to its columns to get one"
+            )
+        budget = [self.budget.samples, self.budget.tolerance]
+        smoothing = self.smoothing()
+        radius = [] if smoothing is None else [[smoothing.shape, smoothing.radius]]
+        return hashed(self.program_key, budget, fingerprint(self.reference_backends[0]), *radius)
+
+    @property
+    def reference_backends(self) -> tuple[Backend, ...]:
+        """The backends able to run the program for a reference, best first, the cell's own last.
+
+        A backend with physics of its own runs its own program, so only it can compute that program's reference.
+        """
+        return (*(() if "physics" in self.backend.provides else self.ranked_backends), self.backend)
+
+    @property
+    def ranked_backends(self) -> tuple[Backend, ...]:
+        """The available backends that compute references and can run the scene's own program, best first."""
+        if self.program_key not in _ranked:
+            _ranked[self.program_key] = ()
+            with suppress(Unsupported, UserError):
+                _ranked[self.program_key] = tuple(able_backends(self.program(), ranked=True))
+        return _ranked[self.program_key]
+
+    def smoothing(self) -> Smoothing | None:
+        """Return the smoothing that the estimator is measured against; None for J_sigma."""
+        estimator = self.parts.get("estimator")
+        try:
+            return estimator.smoothing(self.program()) if isinstance(estimator, Estimator) else None
+        except (Unsupported, UserError):  # a combination without meaning has no reference
+            return None
 
     @cached_property
     def parameters(self) -> dict[str, Any]:

@@ -30,7 +30,6 @@ HARMLESS = {
     "bench.model.trial": "imports new plugin files in a process of their own",
     "bench.report": "shows rows",
     "bench.run.files": "writes files as they are given",
-    "bench.run.reference_backends": "chooses the backend of a reference, which is in the key",
     "bench.studies.bias_variance.columns": "names, units and meanings of columns",
     "bench.studies.growth.columns": "names, units and meanings of columns",
     "bench.studies.three_errors.columns": "names, units and meanings of columns",

@@ -17,7 +17,6 @@ from bench.measure import reference, smoothed
 from bench.measure.reference import Reference
 from bench.model import Backend
 from bench.run.files import make_directory, write_whole
-from bench.run.reference_backends import ranked_backends, reference_backends, reference_key, smoothing_of
 
 
 class References:
@@ -36,7 +35,7 @@ class References:
 
     def of(self, cell: Cell) -> Reference:
         """Return the reference of the cell's program, from the best backend that can run it."""
-        key = reference_key(cell)
+        key = cell.reference_key
         if key not in self._known:
             result = load(self._path(cell))
             if result is None:
@@ -52,7 +51,7 @@ class References:
         """
         failed: list[tuple[str, Exception]] = []
         budget = self._budget.samples, self._budget.tolerance
-        for backend in {fingerprint(b): b for b in reference_backends(cell)}.values():
+        for backend in {fingerprint(b): b for b in cell.reference_backends}.values():
             try:
                 result = self._of_backend(backend, cell, *budget)
             except Exception as error:
@@ -67,7 +66,7 @@ class References:
 
     def _of_backend(self, backend: Backend, cell: Cell, samples: int, tolerance: float) -> Reference:
         """Compute the reference on one backend: of J_sigma, or of the smoothing that the estimator asks for."""
-        asked = smoothing_of(cell)
+        asked = cell.smoothing()
         if asked is None:
             problem = self._problems.of(backend, cell)
             return reference.certify(problem, backend.provides, samples, tolerance, self._stood_for(cell))
@@ -79,7 +78,7 @@ class References:
         return replace(found, method=f"gaussian[radius={asked.radius:g}],{found.method}")
 
     def _path(self, cell: Cell) -> Path:
-        return self._directory / f"{reference_key(cell)}.parquet"
+        return self._directory / f"{cell.reference_key}.parquet"
 
     def _stood_for(self, cell: Cell) -> np.ndarray | None:
         """Return the gradient that the program's own, at w = 0, approximates: the physics', if the scene knows it.
@@ -90,7 +89,7 @@ class References:
         program = cell.program()
         physical = program.physical_gradient()
         if physical is None and "physics" in cell.backend.provides:
-            for backend in ranked_backends(cell):
+            for backend in cell.ranked_backends:
                 if "grad" in backend.provides:
                     still = np.zeros((program.n_noise, 1))
                     with suppress(Exception):  # a backend that fails at the program gives way to the next

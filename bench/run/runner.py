@@ -14,7 +14,6 @@ from bench.run.launchers.launcher import Launcher
 from bench.run.plan import Planned
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
-from bench.run.reference_backends import reference_key
 from bench.run.session import Session
 from bench.run.store import Store
 from bench.run.tasks import FAILED, Task, group_by_program, result_of, row_of
@@ -81,7 +80,7 @@ class _Run:
             return []
         references = Session(self._experiment).references
         # reversed twice, to keep the first cell of each key and the planned order
-        first = {reference_key(cell): cell for cell in reversed(cells)}
+        first = {cell.reference_key: cell for cell in reversed(cells)}
         return [cell for cell in reversed(first.values()) if not references.stored(cell) and not _has_closed_form(cell)]
 
     def _compute_references(self, cells: list[Cell], references: list[Cell], launcher: Launcher) -> list[Cell]:
@@ -90,11 +89,11 @@ class _Run:
         failed: dict[str, dict[str, Any]] = {}
         for answer in itertools.chain.from_iterable(self._answers(tasks, launcher)):
             if answer.result["status"] != "ok":
-                failed[reference_key(answer.item.cell)] = result_of(answer, "its reference gradient: ")
+                failed[answer.item.cell.reference_key] = result_of(answer, "its reference gradient: ")
         if not failed:
             return cells
-        self._finish([(cell, failed[reference_key(cell)]) for cell in cells if reference_key(cell) in failed])
-        return [cell for cell in cells if reference_key(cell) not in failed]
+        self._finish([(cell, failed[cell.reference_key]) for cell in cells if cell.reference_key in failed])
+        return [cell for cell in cells if cell.reference_key not in failed]
 
     def _measure(self, cells: list[Cell], launcher: Launcher) -> None:
         for answers in self._answers([Task(cell) for cell in cells], launcher):

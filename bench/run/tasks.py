@@ -15,7 +15,6 @@ from bench.model import Backend, guard
 from bench.run.plan import versions
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
-from bench.run.reference_backends import reference_backends
 from bench.run.session import Session
 
 MAX_REASON = 2000
@@ -39,7 +38,7 @@ class Task:
     @property
     def backend(self) -> Backend:
         """The backend that runs the task."""
-        return next(reference_backends(self.cell)) if self.reference else self.cell.backend
+        return self.cell.reference_backends[0] if self.reference else self.cell.backend
 
 
 class TaskHandler:

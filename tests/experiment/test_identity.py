@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from trees import Tree
+from trees import ROOT, Tree
 
 from bench import model
 from bench.cli import main

@@ -54,7 +54,6 @@ MOVED = {
     "model/adjoint": "windowed total_propagation",
     "model/estimator": ESTIMATED,
     "model/known_solutions": "windowed adam cem identify",
-    "model/loaded": "callable",
     "model/optimizer": "adam cem identify",
     "model/simulator/__init__": "",
     "model/simulator/clock": "callable",

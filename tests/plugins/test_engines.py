@@ -38,7 +38,6 @@ from bench.measure import noise
 from bench.measure.reference import certify
 from bench.model import EngineScene, EngineTwin, compose, registry
 from bench.plugins import mjcf
-from bench.run.reference_backends import reference_key
 from bench.studies.bias_variance import BiasVariance
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -203,8 +202,8 @@ def test_scene_for_engines_is_refused_elsewhere():
 def test_reference_of_an_engine_is_its_own():
     law = Penalty()
     own, engine, other = (cell(Pushing(), law, backend) for backend in (Jax(), Mujoco(), Mujoco(impedance=0.9)))
-    assert reference_key(own) == reference_key(own.with_part("backend", Numpy()))
-    assert len({reference_key(one) for one in (own, engine, other)}) == 3
+    assert own.reference_key == own.with_part("backend", Numpy()).reference_key
+    assert len({one.reference_key for one in (own, engine, other)}) == 3
 
 
 def test_every_twin_is_listed_with_its_difference():

@@ -32,7 +32,6 @@ from bench.model import (
     Unsupported,
     rollout,
 )
-from bench.run.reference_backends import reference_backends
 
 NEGLIGIBLE = 1e-9
 """Share of the truth's norm below which one of its components counts as 0."""
@@ -179,7 +178,7 @@ def _refined(cell: Cell, steps: int) -> Cell:
 def _gradient_at(cell: Cell, steps: int) -> np.ndarray:
     """Return the cell's gradient with its duration cut into ``steps`` steps."""
     fine = _refined(cell, steps)
-    return _kept(fine.program_key, lambda: _gradient(next(reference_backends(fine)), fine.program()))
+    return _kept(fine.program_key, lambda: _gradient(fine.reference_backends[0], fine.program()))
 
 
 def _kept(key: str, make: Callable[[], np.ndarray]) -> np.ndarray:
@@ -268,7 +267,7 @@ def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
 
     def differences() -> np.ndarray:
         program = fine.program()
-        problem = next(reference_backends(fine)).compile(program)
+        problem = fine.reference_backends[0].compile(program)
         theta, still = program.theta0, np.zeros((program.n_noise, 1))
         h = span * (float(np.abs(theta).max(initial=0.0)) or 1.0)
         ends = [

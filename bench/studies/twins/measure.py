@@ -14,7 +14,6 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise, timing
 from bench.model import Problem, Unsupported, rollout
-from bench.run.reference_backends import ranked_backends
 
 
 def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
@@ -26,7 +25,7 @@ def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
     scene = rollout(cell.program()).scene
     if "physics" not in cell.backend.provides:
         raise Unsupported(f"backend {cell.backend.name} has no twin to compare: its steps are the scene's own")
-    able = ranked_backends(cell)
+    able = cell.ranked_backends
     if not able:
         raise Unsupported(
             f"scene {scene.name} exists only as an engine's model: it has no program of its own to compare with"

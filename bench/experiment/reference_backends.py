@@ -1,0 +1,38 @@
+"""Chooses the backends that can compute the reference gradient of a program, and those that can run it at all."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+from bench.model import Backend, Problem, Program, registry
+from bench.model.parameters import build, remember
+
+
+def able_backends(program: Program, ranked: bool = False) -> list[Backend]:
+    """Return the available backends, with default parameters, that can run a program.
+
+    With ``ranked``, only those that compute references are returned, best first.
+    """
+    backends = []
+    for entry in registry.entries()["backends"].values():
+        if entry.plugin is None or not entry.available or not issubclass(entry.plugin, Backend):
+            continue
+        if ranked and entry.plugin.reference_rank is None:  # not asked, since a backend may have to trace the program
+            continue
+        with suppress(Exception):  # a backend that fails at this question cannot run the program
+            backend = _default(entry.plugin)
+            if backend.incompatibility(program) is None:
+                backends.append(backend)
+    return sorted(backends, key=lambda backend: backend.reference_rank or 0) if ranked else backends
+
+
+@remember
+def _default(plugin: type[Backend]) -> Backend:
+    backend = build(plugin, {})
+    assert isinstance(backend, Backend)
+    return backend
+
+
+def linearising_backends(program: Program) -> list[str]:
+    """Return the names of the available backends whose problems give step Jacobians for a program."""
+    return [b.name for b in able_backends(program) if type(b.compile(program)).jacobians is not Problem.jacobians]
