@@ -16,6 +16,7 @@ from bench.report.text import number
 from bench.run.files import make_directory, write_all, write_whole
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 WIDTH = 7.16
@@ -90,7 +91,7 @@ def charts(report: Findings) -> dict[str, tuple[str, Figure]]:
     return drawn
 
 
-def _figure(panels: int, height: float = 2.6) -> tuple[Figure, list]:
+def _figure(panels: int, height: float = 2.6) -> tuple[Figure, list[Axes]]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -197,7 +197,7 @@ def _terms(u: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 def _means(terms: np.ndarray) -> np.ndarray:
     """Return independent means of ``terms (d, n)``, ``(GROUPS, d)``; each takes equally many terms of both halves."""
-    return terms.reshape(terms.shape[0], GROUPS, -1).mean(axis=2).T
+    return np.asarray(terms.reshape(terms.shape[0], GROUPS, -1).mean(axis=2).T)
 
 
 def _methods(norm: float, bias: float, terms: np.ndarray, slopes: np.ndarray, clock: Clock) -> tuple[Method, ...]:
