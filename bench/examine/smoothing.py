@@ -71,7 +71,7 @@ class Smoothed:
 
     @property
     def defined(self) -> bool:
-        """Whether every cost was a number, so that there is a grad J."""
+        """Whether every cost is finite, so grad J exists."""
         return math.isfinite(self.norm)
 
     @property
