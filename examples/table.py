@@ -71,7 +71,7 @@ def row(report: Any, version: str, example: str) -> list[str]:
     off = f"{number(100 * max(part.error for part in parts))}%" if parts and report.gradient else "-"
     judged = "not checked" if not report.gradient else "right" if report.check and report.check.trusted else "wrong"
     if report.gradient and report.cause in ("undecided", "unsettled", "nonfinite", "nondeterministic"):
-        judged = "cannot tell"
+        judged = "unknown"
     biases = []
     for one in report.smoothed:
         biases.append(report._bias(one).replace("the gradient ", "") if report.gradient else "-")

@@ -1,11 +1,11 @@
-"""The conformance kit: each fact a plugin declares is verified by running it.
+"""The conformance kit: every fact that a plugin declares is verified by running the plugin.
 
-One function is one check, registered for a kind of plugin. It takes an instance, returns the numbers it measured,
-and raises :class:`Failed` or :class:`Skipped`. A plugin is checked with its default parameters and once more for every
-other choice it offers (``reinforce[baseline=none]``). Noise is drawn from fixed seeds, so that results repeat; limits on
-sample means are set at 4.5 standard errors, a false alarm in 150,000.
+Each check is one function, registered for a kind of plugin. It takes an instance, returns the numbers it measured as
+text, and raises :class:`Failed` or :class:`Skipped`. A plugin is checked with its default parameters and once more for every
+other choice it offers (``reinforce[baseline=none]``). Noise has fixed seeds, so results repeat. Limits on sample
+means are 4.5 standard errors, one false alarm in 150,000.
 
-``python -m bench check`` prints a line for each check; :func:`parametrize` makes each a test of its own in pytest.
+``python -m bench check`` prints a line for each check; :func:`parametrize` makes each check a pytest test.
 """
 
 # the modules of checks register them as they are imported

@@ -1,4 +1,4 @@
-"""Checks of backends: their numbers against those of NumPy, differences, and known solutions."""
+"""Checks of backends: their numbers compared with NumPy's, with differences, and with known solutions."""
 
 from __future__ import annotations
 
@@ -53,29 +53,31 @@ GRADIENT = 1e-4
 SCORE = 1e-5
 """Relative error allowed against differences of log p, which is linear in theta: rounding over a step of 1e-3."""
 SINGLE = 1e-2
-"""Relative error allowed in single precision: rollouts round hundreds of times by 6e-8, and central differences in it
-keep two or three digits."""
+"""Relative error allowed in single precision: rollouts round hundreds of times by 6e-8, and central differences keep
+two or three digits."""
 ELSEWHERE = 30.0
-"""How many times further from theta0 gradients are checked again: 3 sigma."""
+"""Factor by which the second check of gradients is further from theta0: 3 sigma."""
 FAR = 1e200
 """Size of a theta whose square is not finite."""
 PRESSED = 1e-3
 """Penetration [m] at which the force of a contact with friction is compared."""
 PUSHED = 0.02
-"""Relative error allowed to that force: an impedance of 1e-4 hides 5e-4 of it at a friction of 0.5."""
+"""Relative error allowed in that force: an impedance of 1e-4 hides 5e-4 of it at a friction of 0.5."""
 SOLVED = 1e-9
 """Relative error allowed where equations are solved to 1e-12 in the unknown, through a condition number below 100."""
 
 
 def programs_for(
-    backend: Backend, sort: Callable[[list[Program]], list[Program]], found: Iterable[Program] | None = None
+    backend: Backend, sort: Callable[[list[Program]], list[Program]], candidates: Iterable[Program] | None = None
 ) -> list[Program]:
     """Return programs of a sort that the backend can run; with non-default parameters, smooth ones and equations."""
     runs = [
-        program for program in (all_programs() if found is None else found) if backend.incompatibility(program) is None
+        program
+        for program in (all_programs() if candidates is None else candidates)
+        if backend.incompatibility(program) is None
     ]
     if not runs:
-        raise Skipped("refuses every program")
+        raise Skipped("supports no program")
     if backend == type(backend)():
         return sort(runs)
     few = distinguishing_programs(runs)
@@ -113,7 +115,7 @@ def _allowed(backend: Backend, program: Program, exact: float) -> float:
 def gradient_is_that_of_value(backend: Backend) -> str:
     """Verify gradients against central differences of the costs along random directions, except at kinks and jumps."""
     if "grad" not in backend.provides:
-        raise Skipped("gives no gradients")
+        raise Skipped("computes no gradients")
     worst, judged, programs = 0.0, 0, programs_for(backend, representative_programs)
     for program in programs:
         theta, w = samples(program)
@@ -122,20 +124,23 @@ def gradient_is_that_of_value(backend: Backend) -> str:
         require(gradient.shape == theta.shape, f"{describe(program)}: shape {gradient.shape}, not {theta.shape}")
         require(np.isfinite(gradient).all(), f"{describe(program)}: not finite")
         off, smooth = _against_differences(problem, gradient, theta, w)
-        require(smooth.any(), f"{describe(program)}: no column on which differences settle")
+        require(smooth.any(), f"{describe(program)}: differences converge on no column")
         if program.surrogate and "surrogate" in backend.provides:
             require(
-                off.max() > GRADIENT, f"{describe(program)}: declares a surrogate gradient, but gives the derivative"
+                off.max() > GRADIENT, f"{describe(program)}: declares a surrogate gradient, but returns the derivative"
             )
             continue
         off = np.where(smooth, off, 0.0)
         require(off.max() < GRADIENT, f"{describe(program)}: differs from central differences by {off.max():.1e}")
-        # theta that is not the scene's own, where an adjoint may use what it kept of that
+        # another theta than the scene's own, where an adjoint may use values it stored for theta0
         theta = program.theta0[:, None] + ELSEWHERE * (theta - program.theta0[:, None])
         with np.errstate(all="ignore"):
-            beside, agree = _against_differences(problem, problem.grad(theta, w), theta, w)
-        worse = np.where(agree, beside, 0.0).max()
-        require(worse < GRADIENT, f"{describe(program)}: differs from central differences by {worse:.1e} beside theta0")
+            far_error, agree = _against_differences(problem, problem.grad(theta, w), theta, w)
+        worse = np.where(agree, far_error, 0.0).max()
+        require(
+            worse < GRADIENT,
+            f"{describe(program)}: differs from central differences by {worse:.1e} at 3 sigma from theta0",
+        )
         worst, judged = max(worst, off.max()), judged + smooth.sum()
     return f"to {worst:.0e} on {judged} of {len(programs) * COLUMNS} columns of {len(programs)} programs"
 
@@ -157,7 +162,7 @@ def _against_differences(
 def score_is_that_of_actions(backend: Backend) -> str:
     """Verify scores: w / sigma without feedback; with it, the derivative of log p(actions), of mean zero."""
     if "score" not in backend.provides:
-        raise Skipped("gives no scores")
+        raise Skipped("computes no scores")
     details = []
     for program in programs_for(backend, distinguishing_programs):
         theta, w = samples(program)
@@ -221,12 +226,12 @@ def shared_theta_is_spread(backend: Backend) -> str:
 
 @verifies(Backend)
 def failed_rollouts_have_no_gradient(backend: Backend) -> str:
-    """Verify that a cost is not finite where the plain backend's is not, nor a gradient where its cost is not.
+    """Verify that costs are not finite where the plain backend's are not, nor gradients where their costs are not.
 
-    Theta is far out in one column of a batch. An engine that stops, resets or repeats its last state has to say so.
+    Theta is very large in one column of a batch. An engine that stops, resets or repeats its last state has to report it.
     """
     if "grad" not in backend.provides:
-        raise Skipped("gives no gradients")
+        raise Skipped("computes no gradients")
     lost, plain = [], plain_backend()
     for program in programs_for(backend, distinguishing_programs):
         theta, w = samples(program)
@@ -237,9 +242,7 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
             gone = ~np.isfinite(problem.grad(far, w)).all(axis=0)
             if plain.incompatibility(program) is None:
                 beyond = ~np.isfinite(plain.compile(program).value(far, w))
-                require(
-                    failed[beyond].all(), f"{describe(program)}: a rollout that leaves all numbers has a finite cost"
-                )
+                require(failed[beyond].all(), f"{describe(program)}: a rollout that overflows has a finite cost")
         require(gone[failed].all(), f"{describe(program)}: a cost that is not finite has a finite gradient")
         lost.append(failed.any())
     if not any(lost):
@@ -249,7 +252,7 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
 
 @verifies(Backend)
 def single_precision_is_finite(backend: Backend) -> str:
-    """Verify that ``dtype=float32`` gives costs and gradients near those in double precision, on smooth scenes."""
+    """Verify that costs and gradients with ``dtype=float32`` are close to double precision, on smooth scenes."""
     single = dataclasses.replace(backend, dtype="float32")
     worst = dict.fromkeys(sorted(backend.provides & {"value", "grad"}), 0.0)
     smooth = [p for p in programs_for(single, distinguishing_programs) if p.contact is None and p.continuous]
@@ -259,16 +262,16 @@ def single_precision_is_finite(backend: Backend) -> str:
         off = distance(actual, expected)
         require(off < SINGLE, f"{capability} of {describe(program)}: float32 differs by {off:.1e}")
         worst[capability] = max(worst[capability], off)
-    require(any(worst.values()), "float32 gives the numbers of float64")
+    require(any(worst.values()), "float32 returns the numbers of float64")
     return ", ".join(f"{capability} to {off:.0e}" for capability, off in worst.items())
 
 
 @verifies(Backend)
 def provides_is_truthful(backend: Backend) -> str:
-    """Verify that declared capabilities are known and present, and that equations are refused without ``root``."""
+    """Verify that declared capabilities are known and present, and that equations are rejected without ``root``."""
     strange = sorted(set(backend.provides) - CAPABILITIES)
-    require(not strange, f"{', '.join(strange)} are none of {', '.join(sorted(CAPABILITIES))}")
-    require("value" in backend.provides, "gives no costs")
+    require(not strange, f"{', '.join(strange)}: not among {', '.join(sorted(CAPABILITIES))}")
+    require("value" in backend.provides, "computes no costs")
     for program in programs_for(backend, distinguishing_programs):
         problem, (theta, w) = backend.compile(program), samples(program)
         for capability in sorted(backend.provides & {"value", "grad", "score"}):
@@ -282,7 +285,7 @@ def provides_is_truthful(backend: Backend) -> str:
         try:
             _implicit_problem(backend, 1).value(np.zeros(1), np.zeros((1, 1)))
         except Unsupported:
-            return f"{', '.join(sorted(backend.provides))}; refuses equations"
+            return f"{', '.join(sorted(backend.provides))}; rejects equations"
         raise Failed("runs a program that solves an equation, but does not declare root")
     return ", ".join(sorted(backend.provides))
 
@@ -392,10 +395,11 @@ class _Pressed(EngineScene):
 def frictional_contact_has_the_force_of_its_law(backend: Backend) -> str:
     """Verify the normal force of a contact with friction at rest, closing, parting and creeping, against the spring law's.
 
-    The same ball sliding at 1 m/s is reported and not judged: an engine's friction adds to the normal force there.
+    The result for the same ball sliding at 1 m/s is reported but not limited, since an engine's friction adds to the
+    normal force there.
     """
     if "physics" not in backend.provides:
-        raise Skipped("has no physics of its own")
+        raise Skipped("does not have its own physics")
     scene = _Pressed()
     laws = [law_for(scene, law) for law in available("contacts")]
     springs = [law for law in laws if isinstance(law, ForceLaw) and law.spring() is not None]
@@ -409,8 +413,8 @@ def frictional_contact_has_the_force_of_its_law(backend: Backend) -> str:
     assert isinstance(law, ForceLaw)
     force, expected = (after - away) / scene.dt, law.force(np, np.full((1, along.size), -PRESSED), away[None])[0]
     off = np.abs(force / expected - 1.0)[:-1].max()
-    told = ", ".join(f"{f:.4g} ({e:.4g})" for f, e in zip(force[:-1], expected, strict=False))
-    require(off < PUSHED, f"normal forces, and those of the law, in N: {told}")
+    forces = ", ".join(f"{f:.4g} ({e:.4g})" for f, e in zip(force[:-1], expected, strict=False))
+    require(off < PUSHED, f"normal forces (and the law's) in N: {forces}")
     return f"to {off:.0e}; sliding at 1 m/s it pushes with {force[-1] / expected[-1]:.2g} times the law's force"
 
 

@@ -1,4 +1,4 @@
-"""Checks of contact laws, on two masses over a floor and in rollouts of the registered scenes."""
+"""Checks of contact laws on two masses over a floor, and in rollouts of the registered scenes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _push(law: ContactLaw, gap: Any, rate: Any, ops: Ops | None = None) -> np.nd
     """Return the normal impulse over 0.01 s on both contacts of a tower, ``(2, B)``, for the gaps and rates of each."""
     gaps, rates = (np.asarray(part, dtype=float).reshape(2, -1) for part in (gap, rate))
     if isinstance(law, ForceLaw):
-        return PUSH_DT * law.force(np, gaps, rates)
+        return np.asarray(PUSH_DT * law.force(np, gaps, rates))
     assert isinstance(law, ImpulseLaw)
     scene = _Tower()
     before = State(np.stack([gaps[0], gaps[0] + gaps[1] + 1.0]), np.stack([rates[0], rates[0] + rates[1]]))
@@ -76,7 +76,7 @@ FAR = ([[0.05, 0.2, 1.0], [0.05, 0.2, 1.0]], [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
 
 
 def _sharpened(law: ContactLaw, factor: float) -> ContactLaw:
-    """Return the law with its smoothing changed by a factor, up or down, whichever pushes less from afar."""
+    """Return the law with its smoothing multiplied or divided by a factor, whichever pushes less at a distance."""
     value = getattr(law, law.smoothing)
     changed = [dataclasses.replace(law, **{law.smoothing: value * f}) for f in (factor, 1 / factor)]
     return min(changed, key=lambda one: np.abs(_push(one, *FAR)).max())
@@ -84,11 +84,11 @@ def _sharpened(law: ContactLaw, factor: float) -> ContactLaw:
 
 @verifies(ContactLaw)
 def does_not_push_from_afar(law: ContactLaw) -> str:
-    """Verify that separated bodies feel no force; with smoothing, one that vanishes as it sharpens."""
+    """Verify that there is no force on separated bodies; with smoothing, that the force vanishes as it sharpens."""
     push = np.abs(_push(law, *FAR)).max() / PUSH_DT
     if not law.smoothing:
-        require(push == 0, f"a force of {push:.3g} N on bodies apart")
-        return "no force apart"
+        require(push == 0, f"a force of {push:.3g} N on separated bodies")
+        return "no force on separated bodies"
     sharp = np.abs(_push(_sharpened(law, 100.0), *FAR)).max() / PUSH_DT
     detail = f"{push:.2g} N at 5 cm or more, {sharp:.2g} N at 100 times sharper {law.smoothing}"
     require(sharp <= 0.05 * push + 1e-12, detail)
@@ -122,8 +122,8 @@ def contacts_are_separate(law: ForceLaw) -> str:
     gap, rate = 0.02 * draw.standard_normal((2, 50)), draw.standard_normal((2, 50))
     together = law.force(np, gap, rate)
     alone = np.concatenate([law.force(np, gap[i : i + 1], rate[i : i + 1]) for i in range(2)])
-    require(distance(together, alone) < ROUNDED, "two contacts together differ from each by itself")
-    return "2 contacts as each by itself"
+    require(distance(together, alone) < ROUNDED, "two contacts together differ from each contact separately")
+    return "2 contacts equal to each separately"
 
 
 @verifies(ContactLaw)
@@ -166,7 +166,7 @@ def needs_root_of_law_is_truthful(law: ContactLaw) -> str:
 
 @verifies(ContactLaw)
 def continuity_in_rollouts_is_as_declared(law: ContactLaw) -> str:
-    """Verify that costs of continuous scenes do not jump along theta if ``continuous``, and do in some scene if not."""
+    """Verify that costs of continuous scenes do not jump along theta if ``continuous``, and jump in some scene if not."""
     values = {f.name: getattr(law, f.name) for f in dataclasses.fields(law) if getattr(law, f.name) != f.default}
     scenes = [s for s in sound_scenes() if isinstance(s, ContactScene) and s.continuous]
     jumps: dict[bool, dict[str, float]] = {True: {}, False: {}}

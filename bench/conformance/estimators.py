@@ -1,4 +1,4 @@
-"""Checks of estimators, on costs whose smoothed gradient is known."""
+"""Checks of estimators on costs whose smoothed gradient is known."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from bench.conformance.subjects import (
     plain_backend,
     rng,
     sound_scenes,
+    standard_errors,
     stepping,
 )
 from bench.model import Estimator, FunctionScene, MechanicalScene, Problem, SampleMean, compose
@@ -29,7 +30,7 @@ SIGMAS = (0.1, 0.5)
 
 
 class RecordingProblem(Problem):
-    """A problem that notes which capabilities are used, and refuses those that are not allowed."""
+    """A problem that records which capabilities are used and rejects undeclared ones."""
 
     def __init__(self, inner: Problem, allowed: frozenset[str]) -> None:
         super().__init__(inner.program)
@@ -56,13 +57,13 @@ class RecordingProblem(Problem):
     def _use(self, capability: str, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         require(capability in self._allowed, f"uses {capability}, which is not in needs")
         self.used.add(capability)
-        return getattr(self._inner, capability)(theta, w)
+        return np.asarray(getattr(self._inner, capability)(theta, w))
 
     _value = _grad = _score = None  # type: ignore[assignment]
 
 
 class Oracle(NamedTuple):
-    """A problem whose gradient is known: ``truth (d,)`` to within standard errors ``error (d,)``."""
+    """A problem with a known gradient: ``truth (d,)`` with standard errors ``error (d,)``."""
 
     problem: Problem
     truth: np.ndarray
@@ -110,18 +111,18 @@ def feedback_oracle() -> Oracle:
 
 
 def varying_oracle(estimator: Estimator) -> Oracle:
-    """Return the first oracle on which no two samples have the same gradient, and sigma matters."""
+    """Return the first oracle on which all samples have different gradients, and sigma changes the gradient."""
     for oracle in usable(estimator, [o for o in oracles() if o.continuous]):
         w = rng("lively").standard_normal((oracle.problem.program.n_noise, 64))
         gradients = oracle.problem.grad(oracle.problem.program.theta0, w)
         plain = oracle.problem.grad(oracle.problem.program.theta0, 0.0 * w[:, :1])
         if len(np.unique(gradients[0])) == 64 and distance(oracle.truth, plain[:, 0]) > 1e-3:
             return oracle
-    raise Skipped("refuses every oracle whose samples all differ")
+    raise Skipped("supports no oracle whose samples all differ")
 
 
 def usable(estimator: Estimator, candidates: Iterable[Oracle]) -> Iterator[Oracle]:
-    """Yield the oracles that the estimator does not refuse."""
+    """Return the oracles that the estimator supports."""
     return (oracle for oracle in candidates if estimator.unsupported_reason(oracle.problem.program) is None)
 
 
@@ -159,32 +160,32 @@ def shape_and_repeatability(estimator: Estimator) -> str:
         require(np.array_equal(first, second), f"a second call with the same noise differs on {oracle.label}")
         labels.append(oracle.label)
     if not labels:
-        raise Skipped("refuses every oracle")
+        raise Skipped("supports no oracle")
     return f"{len(labels)} oracles"
 
 
 @verifies(Estimator)
 def diagnostics_are_as_declared(estimator: Estimator) -> str:
-    """Verify that ``explained`` gives the estimates, and finite ``(R,)`` or ``(R, d)`` arrays of the declared names."""
+    """Verify that ``estimate_with_diagnostics`` returns the estimates, and finite arrays of the declared diagnostics."""
     oracle = varying_oracle(estimator)
     noise = draw_noise(oracle, 6, 8)
-    values, decided = estimator.estimate_with_diagnostics(oracle.problem, oracle.problem.program.theta0, noise)
+    values, diagnostics = estimator.estimate_with_diagnostics(oracle.problem, oracle.problem.program.theta0, noise)
     same = np.array_equal(values, estimates(estimator, oracle, noise))
-    require(same, "explained and estimate give different estimates")
+    require(same, "estimate_with_diagnostics and estimate return different estimates")
     require(
-        tuple(decided) == estimator.diagnostics,
-        f"reports {', '.join(decided)}, declares {', '.join(estimator.diagnostics)}",
+        tuple(diagnostics) == estimator.diagnostics,
+        f"returns diagnostics {', '.join(diagnostics)}, declares {', '.join(estimator.diagnostics)}",
     )
-    for name, array in decided.items():
+    for name, array in diagnostics.items():
         shapes = [(6,), (6, oracle.problem.dim)]
         require(np.shape(array) in shapes, f"{name} has shape {np.shape(array)}, not one of {shapes}")
         require(np.isfinite(array).all(), f"{name} is not finite")
-    return ", ".join(decided) or "nothing"
+    return ", ".join(diagnostics) or "no diagnostics"
 
 
 @verifies(Estimator)
 def repeats_are_independent(estimator: Estimator) -> str:
-    """Verify that estimate r depends on ``noise[r]`` and on no other."""
+    """Verify that estimate r depends only on ``noise[r]``."""
     oracle = varying_oracle(estimator)
     noise = np.array(draw_noise(oracle, 6, 8))
     whole = estimates(estimator, oracle, noise)
@@ -193,7 +194,7 @@ def repeats_are_independent(estimator: Estimator) -> str:
     require(worst < DIFFERENCED, f"permuting the repeats changes the estimates by {worst:.1e}")
     for r in range(len(noise)):
         alone = distance(estimates(estimator, oracle, noise[r : r + 1]), whole[r : r + 1])
-        require(alone < DIFFERENCED, f"estimate {r} by itself differs from the one in the batch by {alone:.1e}")
+        require(alone < DIFFERENCED, f"estimate {r} computed separately differs from the batch by {alone:.1e}")
         changed = noise.copy()
         changed[r] = draw_noise(oracle, 1, 8, "other")[0]
         moved = np.abs(estimates(estimator, oracle, changed) - whole).max(axis=1) > DIFFERENCED * np.abs(whole).max()
@@ -205,7 +206,7 @@ def repeats_are_independent(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def uses_every_sample(estimator: Estimator) -> str:
-    """Verify that other noise in any one of 8 samples (or any eighth of 4096, if needed) changes the estimate."""
+    """Verify that changing the noise of any of 8 samples (or any eighth of 4096, if needed) changes the estimate."""
     oracle = varying_oracle(estimator)
     unused = set(range(8))
     for size in (1, 512):
@@ -223,7 +224,7 @@ def uses_every_sample(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def variance_falls_as_one_over_n(estimator: Estimator) -> str:
-    """Verify the slope of log variance against log N: -1 for sample means and unbiased ones, else at most -1."""
+    """Verify the slope of log variance against log N: -1 for sample means and unbiased estimators, else at most -1."""
     oracle = varying_oracle(estimator)
     counts, groups = np.array([32, 128, 512]), 16
     logs = np.empty((len(counts), groups))
@@ -244,23 +245,23 @@ def variance_falls_as_one_over_n(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def bias_is_as_declared(estimator: Estimator) -> str:
-    """Verify the bias on continuous costs: none if ``unbiased``, else less than that of answering zero."""
+    """Verify the bias on continuous costs: none if ``unbiased``, else less than that of the zero estimate."""
     candidates = list(usable(estimator, [o for o in oracles() if o.continuous]))
     if not candidates:
-        raise Skipped("refuses every continuous oracle")
-    return _bias_held(estimator, candidates)
+        raise Skipped("supports no continuous oracle")
+    return _verify_bias(estimator, candidates)
 
 
 @verifies(Estimator)
 def bias_across_jumps_is_as_declared(estimator: Estimator) -> str:
-    """Verify the bias on costs that jump: none if ``unbiased_at_discontinuities``, a visible one if not."""
+    """Verify the bias on discontinuous costs: none if ``unbiased_at_discontinuities``, else a significant one."""
     candidates = list(usable(estimator, [o for o in oracles() if not o.continuous]))
     if not estimator.unbiased:
-        raise Skipped("declares a bias anyway")
+        raise Skipped("declares a bias everywhere")
     if not candidates or estimator.target != "smoothed":
-        raise Skipped("no oracle with a jump applies")
+        raise Skipped("supports no oracle with a jump")
     if estimator.unbiased_at_discontinuities:
-        return _bias_held(estimator, candidates)
+        return _verify_bias(estimator, candidates)
     details = []
     for oracle in candidates:
         z, bias = _standard_errors(estimator, oracle, 4, 4096)
@@ -274,18 +275,18 @@ def bias_across_jumps_is_as_declared(estimator: Estimator) -> str:
 def bias_under_action_feedback(estimator: Estimator) -> str:
     """Verify the bias with noise on the actions of a feedback policy, for estimators that use the policy's score."""
     if "score" not in estimator.needs or estimator.target != "smoothed":
-        raise Skipped("uses no score")
+        raise Skipped("does not use the score")
     candidates = list(usable(estimator, [feedback_oracle()]))
     if not candidates:
-        raise Skipped("refuses feedback policies")
-    return _bias_held(estimator, candidates)
+        raise Skipped("does not support feedback policies")
+    return _verify_bias(estimator, candidates)
 
 
-def _bias_held(estimator: Estimator, candidates: list[Oracle]) -> str:
-    return (_is_unbiased if estimator.unbiased else _beats_zero)(estimator, candidates)
+def _verify_bias(estimator: Estimator, candidates: list[Oracle]) -> str:
+    return (_verify_no_bias if estimator.unbiased else _verify_smaller_than_zero_estimate)(estimator, candidates)
 
 
-def _is_unbiased(estimator: Estimator, candidates: list[Oracle]) -> str:
+def _verify_no_bias(estimator: Estimator, candidates: list[Oracle]) -> str:
     worst = 0.0
     for oracle in candidates:
         z, bias = _standard_errors(estimator, oracle, 4, 8192)
@@ -295,33 +296,32 @@ def _is_unbiased(estimator: Estimator, candidates: list[Oracle]) -> str:
     return f"at most {worst:.1f} standard errors on {len(candidates)} oracles"
 
 
-def _beats_zero(estimator: Estimator, candidates: list[Oracle]) -> str:
+def _verify_smaller_than_zero_estimate(estimator: Estimator, candidates: list[Oracle]) -> str:
     worst = 0.0
     for oracle in candidates:
         z, bias = _standard_errors(estimator, oracle, 256, 512)
         size, norm = float(np.linalg.norm(bias)), float(np.linalg.norm(target(estimator, oracle)))
-        detail = f"bias {size:.3g} at 256 samples on {oracle.label} is not below the gradient's norm, {norm:.3g}"
+        detail = f"the bias of {size:.3g} at 256 samples on {oracle.label} is not below the gradient's norm, {norm:.3g}"
         require(size < norm or z.max() <= LIMIT, detail)
         worst = max(worst, size / norm if norm else 0.0)
-    return f"declared; at 256 samples up to {worst:.2g} of the gradient on {len(candidates)} oracles"
+    return f"declared; at most {worst:.2g} of the gradient at 256 samples on {len(candidates)} oracles"
 
 
 def _standard_errors(estimator: Estimator, oracle: Oracle, count: int, repeats: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bias of each coordinate in its standard errors, beyond rounding, and the bias itself."""
+    """Return the bias of each coordinate in standard errors, beyond rounding, and the bias itself."""
     values = estimates(estimator, oracle, draw_noise(oracle, repeats, count, oracle.label, count))
     truth = target(estimator, oracle)
     bias = values.mean(axis=0) - truth
     error = np.sqrt(values.var(axis=0, ddof=1) / repeats + oracle.error**2)
-    beyond = np.maximum(np.abs(bias) - DIFFERENCED * (1 + np.abs(truth)), 0.0)
-    return np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0), bias
+    return standard_errors(bias, error, DIFFERENCED * (1 + np.abs(truth))), bias
 
 
 @verifies(Estimator)
 def needs_are_truthful(estimator: Estimator) -> str:
-    """Verify that the estimator runs with only what it needs, and uses all of that."""
+    """Verify that the estimator uses every capability in ``needs``, and no other."""
     oracle = varying_oracle(estimator)
     recording = RecordingProblem(oracle.problem, estimator.needs)
     estimates(estimator, oracle, draw_noise(oracle, 4, 8), recording)
     unused = sorted(estimator.needs - recording.used)
-    require(not unused, f"never uses {', '.join(unused)}, which it needs")
+    require(not unused, f"never uses {', '.join(unused)}, which it declares in needs")
     return ", ".join(sorted(recording.used))

@@ -1,4 +1,4 @@
-"""Checks of every plugin: a value with a name, documented parameters, and a way to other processes."""
+"""Checks of every plugin: value semantics, name, documented parameters, and pickling to other processes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bench.model.parameters import build, check, parameters
 
 @verifies(Plugin)
 def is_frozen_dataclass(plugin: type[Plugin]) -> str:
-    """Verify that instances are values: they can be compared, hashed and used as keys."""
+    """Verify that instances are values that can be compared, hashed and used as keys."""
     require("__dataclass_fields__" in plugin.__dict__, "is not decorated with @dataclass(frozen=True)")
     require(plugin.__dataclass_params__.frozen, "is not frozen: write @dataclass(frozen=True)")  # type: ignore[attr-defined]
     require(build(plugin, {}) == build(plugin, {}), "two default instances are not equal")
@@ -27,7 +27,7 @@ def is_frozen_dataclass(plugin: type[Plugin]) -> str:
 
 @verifies(Plugin)
 def has_docstring(plugin: type[Plugin]) -> str:
-    """Verify that the plugin has a docstring of its own, not the one that dataclass makes up."""
+    """Verify that the plugin has its own docstring, not the one that dataclass generates."""
     text = (plugin.__dict__.get("__doc__") or "").strip()
     require(text and not text.startswith(f"{plugin.__name__}("), "has no docstring")
     return text.splitlines()[0]
@@ -35,11 +35,11 @@ def has_docstring(plugin: type[Plugin]) -> str:
 
 @verifies(Plugin)
 def has_good_name(plugin: type[Plugin]) -> str:
-    """Verify that the name is one word for command line and tables; a built-in plugin has its file's or folder's."""
+    """Verify that the name is one word for command line and tables; a built-in plugin is named after its file or folder."""
     name, module = plugin.name, plugin.__module__
-    require(name.isidentifier() and name.islower(), f"'{name}' must be lower-case letters, digits and '_'")
+    require(name.isidentifier() and name.islower(), f"'{name}' must have only lower-case letters, digits and '_'")
     kinds = registry.kinds()
-    require(plugin.kind in kinds, f"kind '{plugin.kind}' is none of {', '.join(kinds)}")
+    require(plugin.kind in kinds, f"kind '{plugin.kind}' is not one of {', '.join(kinds)}")
     package = "bench" if plugin.kind == "studies" else "bench.plugins"
     if module.startswith(f"{package}.{plugin.kind}."):
         expected = f"{package}.{plugin.kind}.{name}"
@@ -49,11 +49,11 @@ def has_good_name(plugin: type[Plugin]) -> str:
 
 @verifies(Plugin)
 def declares_parameters(plugin: type[Plugin]) -> str:
-    """Verify that every field comes from ``param``, says what it means, and has a default that it would accept."""
+    """Verify that every field comes from ``param``, has a description, and accepts its default."""
     metadata = {field.name: field.metadata for field in dataclasses.fields(plugin)}
     for name, parameter in parameters(plugin).items():
         require({"doc", "unit", "choices"} <= metadata[name].keys(), f"{name} is not declared with param(...)")
-        require(parameter.doc, f"{name} does not say what it means")
+        require(parameter.doc, f"{name} has no description")
         accepted = check(parameter, parameter.default, f"{plugin.name}.{name}")
         require(accepted == parameter.default, f"{name}: the default {parameter.default!r} becomes {accepted!r}")
     return ", ".join(metadata)
@@ -70,7 +70,7 @@ def survives_spawned_process(plugin: type[Plugin]) -> str:
 
 @cache
 def _round_trips(plugins: tuple[type[Plugin], ...]) -> dict[type[Plugin], str]:
-    """Return what went wrong on the way to one spawned process and back; empty for plugins that came back equal."""
+    """Return the fault of each plugin on its way to a spawned process and back; empty if it returns equal."""
     faults = dict.fromkeys(plugins, "")
     sent: dict[type[Plugin], bytes] = {}
     for plugin in plugins:
@@ -91,7 +91,7 @@ def _round_trips(plugins: tuple[type[Plugin], ...]) -> dict[type[Plugin], str]:
         if isinstance(reply, str):
             faults[plugin] = f"cannot be unpickled in a spawned process: {reply}"
         elif pickle.loads(reply) != list(variants(plugin).values()):
-            faults[plugin] = "comes back from a spawned process as something else"
+            faults[plugin] = "returns from a spawned process as a different value"
     return faults
 
 

@@ -1,4 +1,4 @@
-"""Checks of integrators, on a smooth motion and on linear ones."""
+"""Checks of integrators on a smooth motion and on linear motions."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class _Swing(DampedScene):
 
 @dataclass(frozen=True)
 class _Kick(ImpulseLaw):
-    """Adds 1 to the velocity and 0.1 to the position, whatever the contact."""
+    """Adds 1 to the velocity and 0.1 to the position, regardless of the contact."""
 
     name = "conformance_kick"
 
@@ -148,7 +148,7 @@ def free_motion_is_exact(integrator: Integrator) -> str:
     state = State(np.array([[1.0, 0.3]]), np.array([[0.5, -1.0]]))
     end = integrator.step(Dynamics(NewtonOps(), scene, None), state, np.zeros((1, 2)), 0.01)
     off = distance(end.v, 0.5 * state.v)
-    require(off < EXACT, f"the velocity factor is missed by {off:.1e}")
+    require(off < EXACT, f"the velocity after the step is off by {off:.1e}")
     whole = integrator.step(
         Dynamics(NewtonOps(), dataclasses.replace(scene, velocity_factor=1.0), None), state, np.zeros((1, 2)), 0.01
     )
@@ -196,8 +196,8 @@ def takes_impulses_is_truthful(integrator: Integrator) -> str:
     plain, kicked = (_advance(integrator, Dynamics(NewtonOps(), _Kicked(), law), 1, 0.01) for law in (None, _Kick()))
     change = np.array([np.abs(kicked.q - plain.q).max(), np.abs(kicked.v - plain.v).max()])
     if not integrator.takes_impulses:
-        require(not change.any(), "takes impulses, but does not declare it")
-        return "takes none"
+        require(not change.any(), "applies impulses, but does not declare it")
+        return "applies none"
     require(
         distance(change, np.array([0.11, 1.0])) < EXACT, f"an impulse of (0.1, 1) changes (q, v) by {change.tolist()}"
     )

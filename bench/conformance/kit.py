@@ -1,4 +1,4 @@
-"""Registers checks, and runs them on plugins: as printed lines, as a list of results, or as pytest items."""
+"""Registers checks, and runs them on plugins as printed lines, as a list of results, or as pytest tests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bench.model.parameters import build, parameters
 
 @dataclass(frozen=True)
 class CheckResult:
-    """The outcome of one check: ``pass``, ``fail`` or ``skip``, and what was measured or why."""
+    """The outcome of one check: ``pass``, ``fail`` or ``skip``, with the measured numbers or the reason."""
 
     plugin: str
     check: str
@@ -53,7 +53,7 @@ def require(condition: Any, message: str) -> None:
 
 
 def main(names: Sequence[str]) -> int:
-    """Check the plugins of those names, or all, and print a line per check; returns the exit status."""
+    """Check the named plugins, or all, print a line per check, and return the exit status."""
     started = time.perf_counter()
     tally = dict.fromkeys(("pass", "fail", "skip"), 0)
     plugins = 0
@@ -75,21 +75,24 @@ def main(names: Sequence[str]) -> int:
 
 
 def check(plugin_class: type[Plugin], only: Collection[str] = ()) -> list[CheckResult]:
-    """Run every check that applies to a plugin class, with default parameters and with each other choice it offers. Names in ``only`` leave out the other checks."""
+    """Run every check that applies to a plugin class, with default parameters and with each other choice it offers.
+
+    ``only`` has the names of the checks to run, if not all.
+    """
     results = [
         _outcome(function, subject, name)
         for name, subject, function in _items(plugin_class)
         if not only or function.__name__ in only
     ]
-    asked = something_was_checked.__name__
-    return [result for result in results if result.check != asked or result.outcome == "fail"]
+    summary = something_was_checked.__name__
+    return [result for result in results if result.check != summary or result.outcome == "fail"]
 
 
 def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str, str] | None = None) -> Any:
     """Make a ``pytest.mark.parametrize`` over (plugin, check) pairs, one per check of each variant of the classes.
 
-    ``expected_failures`` gives reasons by name of a check, or by id of one item (``variant-check``); if such a check
-    passes, the test fails. Plugins that lack a module they require are skipped::
+    ``expected_failures`` maps the name of a check, or the id of one test (``variant-check``), to the reason; if such a
+    check passes, the test fails. Plugins whose required modules are not installed are skipped::
 
         @bench.conformance.parametrize([MyEstimator], expected_failures={
             "bias_is_as_declared": "biased below 4 samples, see #12"})
@@ -118,7 +121,7 @@ def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str,
 
 
 def variants(plugin_class: type[Plugin]) -> dict[str, Plugin]:
-    """Return instances by identity: the default one, and one per other choice of a text or switch except ``dtype``."""
+    """Return instances by identity: the default one, and one per other choice of a string or switch except ``dtype``."""
     instances = {plugin_class.name: build(plugin_class, {})}
     for name, parameter in parameters(plugin_class).items():
         choices = (True, False) if parameter.type is bool else parameter.choices or ()
@@ -130,9 +133,9 @@ def variants(plugin_class: type[Plugin]) -> dict[str, Plugin]:
 
 
 def _items(plugin_class: type[Plugin]) -> Iterator[tuple[str, Any, Check]]:
-    """Yield identity, subject and check for everything that is verified of a plugin class.
+    """Yield identity, subject and check for every check of a plugin class.
 
-    The class's own checks come first, since the last check asks whether any of them applied.
+    The last one verifies that any of the others applied, so it comes last.
     """
     for function in _CHECKS[Plugin]:
         yield plugin_class.name, plugin_class, function
@@ -155,7 +158,7 @@ def _own_checks(plugin: Plugin) -> list[Check]:
 
 
 def builds(plugin_class: type[Plugin]) -> str:
-    """Verify that an instance can be made with default parameters, and with each other choice."""
+    """Verify that an instance can be created with default parameters, and with each other choice."""
     return f"{len(variants(plugin_class))} variants"
 
 
@@ -187,7 +190,7 @@ def _outcome(function: Check, subject: Any, name: str) -> CheckResult:
 
 
 def _remembered(function: Check, subject: Any, name: str) -> str:
-    """Run the check, note whether it applied, and return its details."""
+    """Run the check, record whether it applied, and return its details."""
     skipped = False
     try:
         return function(subject)

@@ -1,4 +1,4 @@
-"""Checks of optimizers, on a bowl with residuals."""
+"""Checks of optimizers on a quadratic bowl with residuals."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Watcher = Callable[[int, dict[str, Any], np.ndarray], dict[str, Any]]
 
 
 def answer(points: np.ndarray, wanted: frozenset[str]) -> Answer:
-    """Return the fields wanted of |A (theta - goal)|^2 / 2 at points ``(d, B)``."""
+    """Return the requested fields of |A (theta - goal)|^2 / 2 at points ``(d, B)``."""
     residual = SLOPES @ (points - GOAL[:, None])
     known = {
         "value": 0.5 * (residual**2).sum(axis=0),
@@ -57,25 +57,25 @@ def search(optimizer: Optimizer, watch: Watcher | None = None, steps: int = STEP
 
 @verifies(Optimizer)
 def needs_are_declared(optimizer: Optimizer) -> str:
-    """Verify that it wants only fields of an answer, each declared, each at some step, and that these suffice."""
+    """Verify that the optimizer requests exactly the declared fields of an answer, each at some step."""
     wanted: set[str] = set()
 
     def note(step: int, state: dict[str, Any], points: np.ndarray) -> dict[str, Any]:
         wanted.update(optimizer.required_fields(state))
         return state
 
-    require(optimizer.needs <= WANTED, f"needs {sorted(optimizer.needs - WANTED)}, which no answer has")
+    require(optimizer.needs <= WANTED, f"needs {sorted(optimizer.needs - WANTED)}, which an answer does not have")
     search(optimizer, note)
-    require(wanted == optimizer.needs, f"wants {sorted(wanted)} and declares {sorted(optimizer.needs)}")
+    require(wanted == optimizer.needs, f"requests {sorted(wanted)} and declares {sorted(optimizer.needs)}")
     return ", ".join(sorted(wanted))
 
 
 @verifies(Optimizer)
 def path_repeats_after_a_stop(optimizer: Optimizer) -> str:
-    """Verify that a search stored with pickle in its middle and resumed takes the same path to the last digit."""
+    """Verify that a search that is pickled halfway and resumed takes the same path to the last digit."""
 
     def stopped(step: int, state: dict[str, Any], points: np.ndarray) -> dict[str, Any]:
-        return pickle.loads(pickle.dumps(state)) if step == TURN else state  # type: ignore[no-any-return]
+        return pickle.loads(pickle.dumps(state)) if step == TURN else state
 
     _, whole = search(optimizer)
     _, resumed = search(optimizer, stopped)
@@ -85,7 +85,7 @@ def path_repeats_after_a_stop(optimizer: Optimizer) -> str:
 
 @verifies(Optimizer)
 def state_is_left_alone(optimizer: Optimizer) -> str:
-    """Verify that ask and tell change neither the state nor the points they are given: a search can go back."""
+    """Verify that ask and tell modify neither the state nor the points, so that a search can return to a state."""
     before = b""
     kept: dict[str, Any] = {}
 
@@ -102,7 +102,7 @@ def state_is_left_alone(optimizer: Optimizer) -> str:
 
 @verifies(Optimizer)
 def descends_on_a_bowl(optimizer: Optimizer) -> str:
-    """Verify that it lowers the cost of a quadratic bowl."""
+    """Verify that the optimizer lowers the cost of a quadratic bowl."""
     first = float(answer(np.zeros((DIM, 1)), frozenset({"value"})).value[0])  # type: ignore[index]
     state, _ = search(optimizer, steps=4 * STEPS)
     last = float(answer(state["theta"][:, None], frozenset({"value"})).value[0])  # type: ignore[index]

@@ -1,4 +1,4 @@
-"""Checks of scenes: costs, continuity, gradients they state, contact geometry."""
+"""Checks of scenes: costs, continuity, stated gradients, contact geometry."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from bench.conformance.subjects import (
     rng,
     samples,
     sound_laws,
+    standard_errors,
     stepping,
     with_changed_column,
 )
@@ -45,20 +46,20 @@ from bench.model import (
 )
 
 SCORED_STEPS = 8
-"""Longest rollouts whose scores are compared with differences."""
+"""Most steps of rollouts whose scores are compared with differences."""
 FINER = (4, 16)
 """Factors by which steps are refined towards the physics."""
 SPAN, POINTS = 0.2, 65
-"""Reach in sigma of the costs, and their number, that tell the slope of the physics from the jumps between steps of a program."""
+"""Range in sigma and number of the costs in the fit that separates the slope of the physics from jumps between steps."""
 LIMITING = 0.05
-"""Relative difference, of a coordinate, between two refinements that have settled, and between them and the physics."""
+"""Largest relative difference of a coordinate between two converged refinements, and between them and the physics."""
 ELSEWHERE = 6.0
-"""Distance in sigma of the other thetas through which lines are searched for jumps."""
+"""Offset in sigma of the other lines that are searched for jumps."""
 
 
 @verifies(Scene)
 def theta_and_noise_are_declared(scene: Scene) -> str:
-    """Verify that theta0 is a finite vector, noise is one of the two models, breakpoints are in order."""
+    """Verify that theta0 is a finite vector, noise is one of the two models, and breakpoints are sorted."""
     theta = scene.theta0()
     require(isinstance(theta, np.ndarray) and theta.ndim == 1 and theta.size, "theta0 must be a vector (d,)")
     require(theta.dtype == np.float64 and np.isfinite(theta).all(), "theta0 must be finite and of type float64")
@@ -68,7 +69,7 @@ def theta_and_noise_are_declared(scene: Scene) -> str:
     breaks = scene.breakpoints()
     require(len(breaks) <= theta.size, f"{len(breaks)} lists of breakpoints for {theta.size} coordinates")
     for edges in breaks:
-        require(np.isfinite(edges).all() and (np.diff(edges) > 0).all(), f"breakpoints {edges} are not in order")
+        require(np.isfinite(edges).all() and (np.diff(edges) > 0).all(), f"breakpoints {edges} are not sorted")
     return f"d = {theta.size}, {scene.noise} noise"
 
 
@@ -90,7 +91,7 @@ def costs_are_finite(scene: Scene) -> str:
 
 @verifies(Scene)
 def noise_is_where_declared(scene: Scene) -> str:
-    """Verify that costs at (theta, w) are those at (theta + sigma w, 0), except for action noise under a policy."""
+    """Verify that costs at (theta, w) equal costs at (theta + sigma w, 0), except for action noise under a policy."""
     program = programs(scene)[0]
     if not program.noise_on_theta:
         raise Skipped("its noise is on the actions of a policy")
@@ -99,15 +100,15 @@ def noise_is_where_declared(scene: Scene) -> str:
     (theta, w), problem = samples(program), able_backend(program).compile(program)
     shift = scene.sigma * w[: program.dim]
     off = distance(problem.value(theta + shift, problem.centred(w)), problem.value(theta, w))
-    require(off < SAME, f"noise w and a step of sigma w in theta differ by {off:.1e}: theta is not the controls")
+    require(off < SAME, f"noise w and a step of sigma w in theta differ by {off:.1e}: theta and the controls differ")
     return f"on theta, to {off:.0e}"
 
 
 @verifies(Scene)
 def backends_agree(scene: Scene) -> str:
-    """Verify that every available backend gives the same cost under every contact law it can run.
+    """Verify that every available backend computes the same cost under every contact law that it can run.
 
-    Backends with physics of their own have their own checks, with the tolerance that the scene declares for its twin.
+    Backends with their own physics have a separate check, with the tolerance that the scene declares for its twin.
     """
     if isinstance(scene, EngineScene):
         raise Skipped("runs in physics engines only")
@@ -126,7 +127,7 @@ def backends_agree(scene: Scene) -> str:
 
 @verifies(Scene)
 def continuity_is_as_declared(scene: Scene) -> str:
-    """Verify jumps along lines through theta0 and thetas 6 sigma beside it: none if ``continuous``, one if not.
+    """Verify jumps along lines through theta0, and 6 sigma away from it: none if ``continuous``, at least one if not.
 
     The contact law is a continuous one.
     """
@@ -137,8 +138,11 @@ def continuity_is_as_declared(scene: Scene) -> str:
     jump = largest_jump(runs[0], lines=2)
     if scene.continuous:
         require(not jump, f"declares to be continuous, but jumps by {jump:.1e} of its range under {describe(runs[0])}")
-        beside = max(largest_jump(runs[0], offset=side * ELSEWHERE) for side in (1, -1))
-        require(not beside, f"declares to be continuous, but jumps by {beside:.1e} of its range beside theta0")
+        jump = max(largest_jump(runs[0], offset=side * ELSEWHERE) for side in (1, -1))
+        require(
+            not jump,
+            f"declares to be continuous, but jumps by {jump:.1e} of its range at an offset of {ELSEWHERE:g} sigma",
+        )
         return f"no jump within {ELSEWHERE + 4:g} sigma of theta0"
     require(jump, "declares to jump, but no jump was found within 4 sigma of theta0")
     return f"a jump of {jump:.2g} of the range"
@@ -146,7 +150,7 @@ def continuity_is_as_declared(scene: Scene) -> str:
 
 @verifies(Scene)
 def closed_form_is_right(scene: Scene) -> str:
-    """Verify the closed form against long sampling, for every law and integrator, at the default sigma and twice it."""
+    """Verify the closed form against long sampling for every law and integrator, at the default sigma and twice it."""
     worst, count = 0.0, 0
     for sigma in (scene.sigma, 2 * scene.sigma):
         for program in _all_combinations(dataclasses.replace(scene, sigma=sigma)):
@@ -156,8 +160,7 @@ def closed_form_is_right(scene: Scene) -> str:
             shape = np.shape(closed)
             require(shape == (program.dim,), f"{describe(program)}: shape {shape}, not {(program.dim,)}")
             mean, error = _sampled_gradient(program)
-            beyond = np.maximum(np.abs(mean - closed) - DIFFERENCED * (1 + np.abs(closed)), 0.0)
-            z = float(np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0).max())
+            z = float(standard_errors(mean - closed, error, DIFFERENCED * (1 + np.abs(closed))).max())
             detail = f"{describe(program)}, sigma = {sigma:g}: {z:.1f} standard errors from the sampled gradient"
             require(z < LIMIT, detail)
             worst, count = max(worst, z), count + 1
@@ -189,9 +192,9 @@ def _sampled_gradient(program: Program) -> tuple[np.ndarray, np.ndarray]:
 
 @verifies(Scene)
 def score_gives_the_gradient(scene: Scene) -> str:
-    """Verify that cost times score, plus the explicit derivative, has the mean of the cost's differences.
+    """Verify that the mean of cost times score plus the explicit derivative equals the mean gradient of the cost.
 
-    Rollouts are cut to :data:`SCORED_STEPS` steps, since the spread of both grows with their length.
+    Rollouts are shortened to :data:`SCORED_STEPS` steps, since the variance of both grows with their length.
     """
     if isinstance(scene, MechanicalScene):
         scene = dataclasses.replace(scene, horizon=min(scene.horizon, SCORED_STEPS))
@@ -202,7 +205,7 @@ def score_gives_the_gradient(scene: Scene) -> str:
     problem, theta = plain_backend().compile(program), program.theta0[:, None]
     w = rng("score", scene.name).standard_normal((program.n_noise, 1 << 13))
     centre = problem.value(theta, np.zeros((program.n_noise, 1)))
-    # w and -w together: their mean has the same expectation, and less spread
+    # averaging w and -w keeps the expectation and reduces the variance
     terms = sum(
         (
             (problem.value(theta, s) - centre) * problem.score(theta, s)
@@ -214,10 +217,9 @@ def score_gives_the_gradient(scene: Scene) -> str:
     )
     mean, error = terms.mean(axis=1), terms.std(axis=1) / math.sqrt(w.shape[1])
     size = DIFFERENCED * (1 + np.abs(problem.grad(theta, w[:, :1])).max())
-    beyond = np.maximum(np.abs(mean) - size, 0.0)
-    z = float(np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0).max())
+    z = float(standard_errors(mean, error, size).max())
     require(
-        z < LIMIT, f"{describe(program)}: E[cost score] is {z:.1f} standard errors from the mean difference of costs"
+        z < LIMIT, f"{describe(program)}: E[cost score] is {z:.1f} standard errors from the mean gradient of the cost"
     )
     return f"{z:.1f} standard errors from differences, {'with' if program.explicit else 'no'} explicit dependence"
 
@@ -235,10 +237,10 @@ def physical_gradient_is_finite(scene: Scene) -> str:
 
 @verifies(Scene)
 def physical_gradient_is_the_limit(scene: Scene) -> str:
-    """Verify that the slope of the cost tends to the physical gradient as steps get finer, under one law at least.
+    """Verify that the slope of the cost converges to the physical gradient as steps get finer, under at least one law.
 
-    Others may settle elsewhere, as a spring does that stands for a rigid impact. Where the slopes settle nowhere, a finer
-    step cannot tell.
+    Other laws may converge to another slope, such as a spring that approximates a rigid impact. The check is skipped
+    where the slopes do not converge under any law.
     """
     if scene.physical_gradient() is None:
         raise Skipped("has none")
@@ -249,24 +251,24 @@ def physical_gradient_is_the_limit(scene: Scene) -> str:
             program = _refined(scene, factor, law, integrator)
             physical = program.scene.physical_gradient()
             if physical is None:
-                raise Failed(f"has a physical gradient at its own step, and none at one of a {factor}th")
+                raise Failed(f"has a physical gradient at its own step, but none at a step finer by {factor}")
             ratios.append(_ratios(program, physical))
         off = float(np.abs(ratios[1] - 1.0).max())
         if off <= LIMITING:
             return f"{describe(program)} is {off:.1g} from it at a step finer by {FINER[1]}"
-        # a coordinate may count one step, and so change with it: what settles is its ratio to the physics' own
+        # a coordinate may act for one step only, and so change with the step: its ratio to the physical gradient converges
         if np.isfinite(ratios).all() and np.abs(ratios[1] - ratios[0]).max() <= LIMITING:
             apart[describe(program)] = off
     if not apart:
-        raise Skipped("no program's differences settle at finer steps")
+        raise Skipped("the differences of no program converge at finer steps")
     nearest = min(apart, key=lambda name: apart[name])
     raise Failed(
-        f"{', '.join(apart)} settle elsewhere as steps get finer, the nearest, {nearest}, {apart[nearest]:.0%} off"
+        f"{', '.join(apart)} converge to other slopes as steps get finer; the nearest, {nearest}, differs by {apart[nearest]:.0%}"
     )
 
 
 def _towards_physics(scene: Scene) -> Iterator[tuple[ContactLaw | None, Integrator | None]]:
-    """Yield the laws and integrators under which a scene's program may tend to its physics, the likeliest first."""
+    """Yield the laws and integrators under which a scene's program may converge to its physics, the likeliest first."""
     if not isinstance(scene, MechanicalScene):
         yield None, None
     elif scene.n_contacts:
@@ -302,13 +304,13 @@ def _ratios(program: Program, physical: np.ndarray) -> np.ndarray:
     cost = problem.value(theta[:, None] + shifts, np.zeros((program.n_noise, d * POINTS))).reshape(d, POINTS)
     slope = np.polynomial.polynomial.polyfit(along, cost.T, 3)[1] / span
     none = np.maximum(np.abs(slope), np.abs(physical)) <= 1e-12 * np.abs(cost).max(axis=1) / span
-    return np.divide(slope, physical, out=np.where(none, 1.0, np.inf), where=~none & (physical != 0.0))
+    return np.asarray(np.divide(slope, physical, out=np.where(none, 1.0, np.inf), where=~none & (physical != 0.0)))
 
 
 @verifies(MechanicalScene)
 def state_has_declared_size(scene: MechanicalScene) -> str:
     """Verify that the initial state is ``q (n_q, B)`` and ``v (n_v, B)``."""
-    require(hasattr(scene, "n_q"), "does not say the length of q: set the class variable n_q")
+    require(hasattr(scene, "n_q"), "does not declare the length of q: set the class variable n_q")
     state = scene.initial_state(np, scene.theta0()[:, None])
     n_v = scene.n_q if scene.n_v is None else scene.n_v
     require(state.q.shape == (scene.n_q, 1), f"n_q = {scene.n_q}, but q has shape {state.q.shape} for one column")

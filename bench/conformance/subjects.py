@@ -1,4 +1,4 @@
-"""Subjects of the checks: programs of the registered plugins, samples, and NumPy operations."""
+"""Inputs of the checks: programs of the registered plugins, samples, and NumPy operations."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from bench.model import (
 from bench.model.parameters import build, parameters
 
 LIMIT = 4.5
-"""Standard errors by which a sample mean may miss its expectation."""
+"""Standard errors by which a sample mean may differ from its expectation."""
 ROUNDED = 1e-12
 """Relative difference allowed between numbers from the same few operations: vectorised functions may round differently
 from one batch to the next, by some 1e-16 each."""
@@ -44,7 +44,7 @@ DIFFERENCED = 1e-7
 PARTS = 512
 """Intervals that a line is divided into at first in a search for jumps."""
 COLUMNS = 6
-"""Samples on which backends are compared; one number for all, since some compile for each."""
+"""Samples on which backends are compared: the same number everywhere, since some backends compile for each."""
 
 
 def available(kind: str) -> list[type[Any]]:
@@ -54,34 +54,34 @@ def available(kind: str) -> list[type[Any]]:
 
 @cache
 def plain_backend() -> Backend:
-    """Return the backend that needs no library and compiles nothing, with which everything else is compared."""
+    """Return the reference backend of all comparisons: it needs no library and compiles nothing."""
     for plugin in available("backends"):
-        plain = not plugin.requires and not plugin.compiles and "simulator" not in plugin.provides
-        if plain and {"value", "grad", "score"} <= plugin.provides:
-            return plugin()
-    raise Skipped("no backend without a library of its own is registered")
+        is_plain = not plugin.requires and not plugin.compiles and "simulator" not in plugin.provides
+        if is_plain and {"value", "grad", "score"} <= plugin.provides:
+            return cast(Backend, plugin())
+    raise Skipped("no backend is registered that needs no library")
 
 
 def able_backend(program: Program) -> Backend:
-    """Return the plain backend if it can run the program, else the first that can; compiling ones come last."""
+    """Return the plain backend if it can run the program, else the first backend that can, compiling ones last."""
     others = sorted((plugin() for plugin in available("backends")), key=lambda backend: backend.compiles)
     for backend in (plain_backend(), *others):
         if backend.incompatibility(program) is None:
-            return backend
+            return cast(Backend, backend)
     raise Skipped("no available backend can run it")
 
 
 @cache
 def stepping() -> Integrator:
-    """Return a first-order integrator that works with every contact law: it leaves impacts to the law."""
+    """Return a first-order integrator that works with every contact law, since it applies the law's impulses."""
     for plugin in available("integrators"):
         if plugin.takes_impulses and not plugin.needs_root and plugin.order == 1:
-            return plugin()
+            return cast(Integrator, plugin())
     raise Skipped("no explicit first-order integrator that takes impulses is registered")
 
 
 def law_for(scene: MechanicalScene, law: type[ContactLaw], values: dict[str, Any] | None = None) -> ContactLaw:
-    """Return a contact law with the values that the scene gives to its parameters."""
+    """Return a contact law with the scene's values for its parameters."""
     given = {**scene.contact_values, **(values or {})}
     return cast(ContactLaw, build(law, {k: v for k, v in given.items() if k in parameters(law)}))
 
@@ -127,7 +127,7 @@ def all_programs() -> tuple[Program, ...]:
 
 
 def _is_sound(program: Program) -> bool:
-    """Return whether the plain backend finds finite costs or cannot run the program."""
+    """Return whether the plain backend computes finite costs or cannot run the program."""
     if plain_backend().incompatibility(program) is not None:
         return True
     try:
@@ -142,7 +142,7 @@ def sound_scenes() -> list[Scene]:
 
 
 def representative_programs(programs: Iterable[Program]) -> list[Program]:
-    """Choose fewer programs in which every scene and every contact law still occurs."""
+    """Return a subset of the programs in which every scene and every contact law still occurs."""
     few = []
     for index, (_, group) in enumerate(itertools.groupby(programs, key=lambda p: type(p.scene))):
         laws = list(group)
@@ -156,7 +156,7 @@ def representative_programs(programs: Iterable[Program]) -> list[Program]:
 
 
 def distinguishing_programs(programs: Iterable[Program]) -> list[Program]:
-    """Choose one program of each sort: function, feedback, open loop, force law, impulse law, equation to solve."""
+    """Return one program of each sort: function, feedback, open loop, force law, impulse law, equation to solve."""
     sorts: dict[tuple[bool, ...], Program] = {}
     for program in programs:
         law = (isinstance(program.contact, ForceLaw), isinstance(program.contact, ImpulseLaw), program.needs_root)
@@ -177,7 +177,7 @@ def samples(program: Program, count: int = COLUMNS) -> tuple[np.ndarray, np.ndar
 
 
 def with_changed_column(theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same samples with another column 2."""
+    """Return the same samples with column 2 changed."""
     column = np.arange(COLUMNS) == 2
     return theta + 1e-3 * column, w * (1 - 0.5 * column)
 
@@ -188,9 +188,18 @@ def describe(program: Program) -> str:
 
 
 def distance(actual: np.ndarray, expected: np.ndarray) -> float:
-    """Return the largest difference, relative to the size of the numbers."""
+    """Return the largest difference, relative to the largest expected number."""
     scale = np.abs(expected).max() or 1.0
     return float(np.abs(actual - expected).max() / scale)
+
+
+def standard_errors(difference: np.ndarray, error: np.ndarray, tolerance: np.ndarray | float) -> np.ndarray:
+    """Return by how many standard errors ``error (d,)`` differences ``(d,)`` exceed a tolerance for rounding.
+
+    A difference beyond the tolerance with an error of 0 is infinitely many.
+    """
+    beyond = np.maximum(np.abs(difference) - tolerance, 0.0)
+    return np.asarray(np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0))
 
 
 class NewtonOps(LoopOps):
@@ -201,7 +210,7 @@ class NewtonOps(LoopOps):
         self.solved = 0
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Solve by Newton's method with forward differences, until it no longer moves."""
+        """Solve by Newton's method with forward differences, until the steps are rounding."""
         self.solved += 1
         z = np.array(guess, dtype=float)
         for _ in range(50):

@@ -1,4 +1,4 @@
-"""Someone's own simulator: is its gradient right, where does it break, what to use, and what does that cost?"""
+"""Examines a user's own simulator: whether its gradient is right, where it breaks, which method to use, and its cost."""
 
 from bench.examine.examination import examine
 from bench.examine.report import Report

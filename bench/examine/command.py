@@ -1,4 +1,4 @@
-"""``python -m bench examine mysim.py:cost theta=1,0 ...``: the words of the command line."""
+"""``python -m bench examine mysim.py:cost theta=1,0 ...``: parses the command line and runs the examination."""
 
 from __future__ import annotations
 
@@ -20,10 +20,13 @@ QUIET = "--quiet"
 
 
 def run(words: Sequence[str]) -> Report:
-    """Examine what the words say, print the text, and write files where ``save=`` says; raises :class:`UserError`."""
-    places = [word for word in words if "=" not in word and word != QUIET]
-    if len(places) != 1:
-        given = f", not {len(places)}" if places else ""
+    """Run the examination of a command line, print the report, and save it where ``save=`` is given.
+
+    Raises :class:`UserError` for a command line that cannot be parsed.
+    """
+    costs = [word for word in words if "=" not in word and word != QUIET]
+    if len(costs) != 1:
+        given = f", not {len(costs)}" if costs else ""
         raise UserError(f"name one cost{given}: python -m bench examine FILE:NAME [theta=1,0] [grad=jax] [sigma=0.1]")
     settings: dict[str, str] = {}
     for word in words:
@@ -32,8 +35,8 @@ def run(words: Sequence[str]) -> Report:
             if key not in SETTINGS:
                 raise unknown("setting of examine", key, SETTINGS)
             settings[key] = value
-    file = places[0].rpartition(":")[0]
-    cost = imports.load_attribute(places[0])
+    file = costs[0].rpartition(":")[0]
+    cost = imports.load_attribute(costs[0])
     module = imports.load_module(file)
     report = examine(
         cost,
@@ -45,7 +48,7 @@ def run(words: Sequence[str]) -> Report:
         batch=settings.get("batch"),
         scale=_theta(settings["scale"], module, True) if "scale" in settings else None,
         seed=_count(settings, "seed"),
-        name=places[0],
+        name=costs[0],
         progress=QUIET not in words,
     )
     print(report)
@@ -67,13 +70,13 @@ def _numbers(text: str, what: str) -> list[float]:
     try:
         return [float(part) for part in text.strip("[]() ").split(",") if part.strip()]
     except ValueError:
-        raise UserError(f"{what}={text} has to be numbers with commas between, {what}=1,0.5") from None
+        raise UserError(f"{what}={text} is not a list of numbers: write {what}=1,0.5") from None
 
 
 def _count(settings: dict[str, str], key: str) -> int:
     text = settings.get(key, "0")
     if not re.fullmatch(r"\d+", text):
-        raise UserError(f"{key}={text} has to be a whole number")
+        raise UserError(f"{key}={text} is not a whole number")
     return int(text)
 
 
@@ -81,9 +84,9 @@ def _theta(text: str, module: Any, given: bool) -> Any:
     """Return theta from numbers, ``name:number`` pairs, or a name in the file, called if it is a function."""
     if re.fullmatch(r"[A-Za-z_][\w.]*", text):
         if not given and not hasattr(module, text):
-            raise UserError("say where to examine: theta=1,0, or define theta in the file")
-        found = imports.load_attribute(text, module)
-        return found() if callable(found) else found
+            raise UserError("theta is missing: give theta=1,0 or define theta in the file")
+        theta = imports.load_attribute(text, module)
+        return theta() if callable(theta) else theta
     pairs = re.findall(r"([A-Za-z_]\w*):([^,]+)", text)
     if pairs and len(pairs) == text.count(",") + 1:
         return {name: _numbers(value, name)[0] for name, value in pairs}

@@ -1,4 +1,4 @@
-"""The examination itself: what is asked of a cost and its gradient, in which order, within one budget."""
+"""Runs the examination: the checks of a cost and its gradient, in order, within one time budget."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ import numpy as np
 from bench.errors import UserError
 from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
 from bench.examine.report import Report
-from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, smoothed
+from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, measure_smoothed
 from bench.measure.gradcheck import EPS, Check, Options, check
 from bench.model.simulator.clock import Clock, OutOfTime, parse_duration
 from bench.model.simulator.simulator import Simulator
 from bench.model.simulator.tree import ParameterTree
 
 GENERATED_SUFFIX = re.compile(r"_[0-9a-f]{8}$")
-"""What a module's name gets when it is loaded from a file."""
+"""Suffix of the name of a module that is loaded from a file."""
 RELATIVE = 0.01
-"""Sigma of the lines, and of a cost with noise of its own, in units of each input's scale, where none is given."""
+"""Default sigma of the lines, and of a cost with its own noise, in units of each input's scale."""
 SHARES = {"check": 0.75, "again": 0.5, "lines": 0.3}
-"""Most of the time left that a part may take; what it does not use is there for the next one."""
+"""Largest share of the remaining time for each part; unused time goes to the next part."""
 POINTS_EACH = 2 * (2 * EPS.size + 17)
-"""Costs of a direction that is checked, about."""
+"""Approximate number of costs per checked direction."""
 SCAN = 7 * 65
-"""Costs of looking for a staircase along one direction, which a check does where it is not plainly right."""
+"""Costs of the search for a staircase along one direction, for directions that are not clearly right."""
 EFFORTS = (
     Options(),
     Options(draws=2, scanned=1),
@@ -36,19 +36,19 @@ EFFORTS = (
     Options(components=4, draws=2, directions=1, scanned=0),
     Options(components=0, draws=0, directions=1, eps=EPS[::2], scanned=0),
 )
-"""What a check looks at, from the whole to the least, for simulators that are slow."""
+"""Scopes of a check, from the full check to the smallest, for slow simulators."""
 PANELS = (7, 12)
 """Panels of 4 Gauss-Legendre points of the two integrals of the gradient along a line."""
 LEAST_MISSED = 0.002
-"""Share of a cost's change that the integral of its gradient may miss by itself."""
+"""Share of a cost's change that the integral of its gradient may miss through its own error."""
 LINE_EFFORTS = ((PLACES, HALVINGS), (3, 10), (1, 10))
-"""Places looked at on a line and halvings of each, from the whole to the least."""
+"""Places searched on a line and halvings of each, from the full search to the smallest."""
 FEWEST_POINTS = 17
-"""Points without which a line is not scanned."""
+"""Fewest points of a line scan."""
 HELD = 20_000_000
-"""Numbers of theta in the pairs of one sigma, which are held in memory several times over."""
+"""Most numbers of theta in the pairs of one sigma, of which memory holds several copies."""
 OTHER_NOISE = 2
-"""Draws of the simulator's own noise, besides the first, under which the gradient is checked along random directions."""
+"""Further draws of the simulator's own noise under which the gradient is checked along random directions."""
 
 
 def examine(
@@ -64,14 +64,14 @@ def examine(
     name: str = "",
     progress: bool = True,
 ) -> Report:
-    """Say whether a gradient is right, where the cost breaks, what to use under noise, and what that costs.
+    """Report whether a gradient is right, where the cost breaks, which method to use under noise, and its cost.
 
     ``cost(theta)`` returns one number; theta is an array, a number, or nested dicts, lists and dataclasses of them.
-    ``grad`` is ``"jax"``, ``"torch"`` or a function of theta; without it, differences alone. ``sigma`` are standard
-    deviations of noise on theta. ``noise=n`` makes it ``cost(theta, w)`` with ``w (n,)`` standard normal, the
-    simulator's own randomness, which is the same in costs that are compared. ``budget`` is the time for everything
-    (``60``, ``"2m"``); a call that it ends in is interrupted, compiled code when that returns. ``batch`` says how several thetas are taken
-    at once: ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``; by default that is detected.
+    ``grad`` is ``"jax"``, ``"torch"`` or a function of theta; without it, only the cost is examined, by
+    differences. ``sigma`` are standard deviations of noise on theta. ``noise=n`` makes it ``cost(theta, w)`` with ``w (n,)`` standard normal, the
+    simulator's own randomness; costs that are compared have the same w. ``budget`` is the time limit of the whole
+    examination (``60``, ``"2m"``); a call that exceeds it is interrupted, compiled code as soon as it returns.
+    ``batch`` is the way to pass several thetas in one call: ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``; detected by default.
     ``scale`` is the size of each input, with theta's structure; by default its own size, and for 0 that of its array.
 
     Raises :class:`bench.UserError` for a cost that cannot be called.
@@ -83,15 +83,15 @@ def examine(
     clock = Clock(parse_duration(budget), progress)
     levels = _levels(sigma)
     if not isinstance(noise, int | np.integer) or noise < 0:
-        raise UserError(f"noise={noise} is the length of w in cost(theta, w), a whole number")
+        raise UserError(f"noise={noise} is not the length of w in cost(theta, w): give a whole number")
     layout = ParameterTree(theta)
     scales = layout.scales() if scale is None else _scales(layout, scale)
     clock.start_stage("first call")
     try:
         simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
     except OutOfTime:
-        took = f"budget={clock.budget:g} seconds ended in the first call of the cost: give more"
-        raise UserError(f"{took}, or a shorter rollout") from None
+        took = f"the first call of the cost took longer than budget={clock.budget:g} seconds"
+        raise UserError(f"{took}: give a larger budget or a shorter rollout") from None
     try:
         return _Examination(simulator, layout, scales, levels, clock, seed, name or _function_name(cost)).run(
             _function_name(grad)
@@ -106,7 +106,7 @@ def _levels(sigma: float | Sequence[float]) -> list[float]:
     except (TypeError, ValueError):
         levels = [math.nan]
     if not all(one > 0 and math.isfinite(one) for one in levels):
-        raise UserError(f"sigma={sigma} are standard deviations of noise on theta: numbers above 0")
+        raise UserError(f"sigma={sigma} is not valid: sigma has standard deviations of noise on theta, numbers above 0")
     return levels
 
 
@@ -115,22 +115,22 @@ def _scales(layout: ParameterTree, scale: Any) -> np.ndarray:
         np.full(layout.vector.size, float(scale)) if isinstance(scale, int | float) else layout.flatten(scale, "scale")
     ).astype(np.float64)
     if not (np.isfinite(given).all() and (given > 0).all()):
-        raise UserError("scale has the size of each input: numbers above 0")
+        raise UserError("scale is the size of each input: numbers above 0")
     return given
 
 
 def _function_name(function: Any) -> str:
-    """Return a name for a function, ``mysim.cost``, or the library that differentiates."""
+    """Return the name of a function, ``mysim.cost``, or of the library that differentiates."""
     if function is None or isinstance(function, str):
         return function or ""
     module = getattr(function, "__module__", "") or ""
-    own = (
+    name = (
         getattr(function, "__qualname__", type(function).__name__)
         .replace("<locals>.", "")
         .replace("<lambda>", "lambda")
     )
     module = GENERATED_SUFFIX.sub("", module)
-    return own if module in ("__main__", "builtins", "") else f"{module}.{own}"
+    return name if module in ("__main__", "builtins", "") else f"{module}.{name}"
 
 
 class _Examination:
@@ -152,7 +152,7 @@ class _Examination:
         self.w = self.random.standard_normal((simulator.noise, 1)) if simulator.noise else None
 
     def run(self, gradient: str) -> Report:
-        """Ask everything that the time allows, the gradient first."""
+        """Run the checks that the time allows, the gradient first."""
         value, spread = self._repeat_cost()
         simulator, clock = self.simulator, self.clock
         checked, more = None, []
@@ -160,7 +160,7 @@ class _Examination:
             checked = self._check_gradient()
             more = self._check_under_other_noise(checked)
         lines = self._scan_lines(checked) if not simulator.gradient_error else []
-        found = self._measure_noise(checked, spread == 0) if not simulator.gradient_error else []
+        smoothed = self._measure_noise(checked, spread == 0) if not simulator.gradient_error else []
         notes = list(simulator.notes)
         notes += [f"the cost raised {count} times: {text}" for text, count in list(simulator.raised.items())[:3]]
         relative = not self.levels
@@ -185,7 +185,7 @@ class _Examination:
             lines=lines,
             reach=max(self.levels, default=RELATIVE),
             relative=relative,
-            smoothed=found,
+            smoothed=smoothed,
             error=simulator.gradient_error,
             notes=notes,
             left_out=self.left_out,
@@ -199,7 +199,7 @@ class _Examination:
         return self.simulator.costs(thetas, None if w is None else np.repeat(w, thetas.shape[1], axis=1))
 
     def _repeat_cost(self) -> tuple[float, float]:
-        """Return the cost at theta, and by how much equal calls differ; another theta stands between them."""
+        """Return the cost at theta, and the difference between equal calls with a call at another theta between them."""
         self.clock.start_stage("repeating a call")
         other = self.theta + 1e-3 * self.scale
         values: list[float] = []
@@ -215,7 +215,7 @@ class _Examination:
         return values[0], max(0.0 if np.isnan(one).all() else float(np.ptp(one)) for one in pairs)
 
     def _request_gradient(self) -> bool:
-        """Ask for the gradient twice, the second time to see how long it takes; return whether it came."""
+        """Compute the gradient twice, the second time to measure its duration, and return whether it succeeded."""
         if self.simulator.has_gradient:
             self.clock.start_stage("first gradient")
             try:
@@ -226,7 +226,7 @@ class _Examination:
         return not self.simulator.gradient_error
 
     def _seconds_each(self) -> float:
-        """Return the seconds of one cost, as a check asks for them: as many at once as the cost takes."""
+        """Return the seconds per cost in batches of the width that a check uses."""
         width = self.simulator.width
         if width == 1:
             return self.clock.per_cost()
@@ -242,14 +242,14 @@ class _Examination:
         return taken
 
     def _options(self) -> Options:
-        """Return what can be looked at in the time that is left."""
+        """Return the largest scope of a check that fits the remaining time."""
         each, slope = self._seconds_each(), self.clock.per_gradient()
         each = 0.0 if math.isnan(each) else each
         slope = 4 * each if math.isnan(slope) else slope
         for effort in EFFORTS[:-1]:
             chosen = min(effort.components, self.theta.size) + effort.directions
             calls = chosen * POINTS_EACH + effort.draws * effort.directions * POINTS_EACH // 2
-            # what a wrong gradient asks for besides: scans, ratios at other thetas, and a look at thetas farther away
+            # further calls for a wrong gradient: scans, ratios at other thetas, and checks at thetas farther away
             calls += effort.scanned * SCAN + effort.draws * POINTS_EACH
             calls += min(effort.draws, 4) * min(effort.components, self.theta.size) * POINTS_EACH // 2
             if calls * each + (3 * effort.draws + 3) * slope < SHARES["check"] * self.clock.remaining:
@@ -258,7 +258,7 @@ class _Examination:
             effort = EFFORTS[-1]
         if effort is not EFFORTS[0]:
             what = f"{effort.components} components, {effort.directions} directions and {effort.draws} other thetas"
-            self.left_out.append(f"the whole check: it looks at {what} at most")
+            self.left_out.append(f"the full check: it is limited to {what}")
         return replace(effort, scale=self.scale, unit=self.simulator.unit, seed=self.seed)
 
     def _check_gradient(self) -> Check | None:
@@ -287,16 +287,16 @@ class _Examination:
         """Check along random directions under other draws of the simulator's own noise."""
         if self.w is None or checked is None or not checked.trusted:
             return []
-        found = []
+        checks = []
         options = replace(EFFORTS[0], components=0, draws=0, scale=self.scale, unit=self.simulator.unit, seed=self.seed)
         self.clock.limit(SHARES["again"])
         try:
             for _ in range(OTHER_NOISE):
-                found.append(self._check_once(options, self.random.standard_normal((self.simulator.noise, 1))))
+                checks.append(self._check_once(options, self.random.standard_normal((self.simulator.noise, 1))))
         except OutOfTime:
             self.left_out.append("checks under other noise")
         self.clock.limit(1.0)
-        return found
+        return checks
 
     def _scan_lines(self, checked: Check | None) -> list[LineScan]:
         """Scan the cost for jumps and kinks along random directions."""
@@ -313,8 +313,8 @@ class _Examination:
             self.left_out.append("jumps and kinks on lines")
             return []
         if points < POINTS:
-            self.left_out.append(f"fine lines: {points} points instead of {POINTS}, and {most} places looked at")
-        found = []
+            self.left_out.append(f"fine line scans: {points} points instead of {POINTS}, and {most} places searched")
+        lines = []
         measured = checked.noise if checked is not None and math.isfinite(checked.noise) else 0.0
         self.clock.limit(2 * SHARES["lines"])
         try:
@@ -322,17 +322,17 @@ class _Examination:
                 size = float(np.abs(self._costs(self.theta[:, None])).max())
                 rounding = max(measured, self.simulator.unit * (size if math.isfinite(size) else 0.0))
                 line = scan(self._costs, self.theta, direction, rounding, 3.0, points, halvings, most)
-                found.append(replace(line, missed=self._missed_share(line, checked)))
+                lines.append(replace(line, missed=self._missed_share(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
         self.clock.limit(1.0)
-        return found
+        return lines
 
     def _missed_share(self, line: LineScan, checked: Check | None) -> float:
         """Return the share of the cost's change along a line that its gradient does not explain.
 
-        The integral of a right gradient along a line is the difference of the costs at its ends, except for jumps. It needs
-        no step. NaN where the integral itself is not certain to a tenth of what is missed, or without a gradient.
+        Without jumps, the integral of a right gradient along a line is the difference of the costs at its ends. NaN where
+        the integral is not accurate to a tenth of the missed share, or without a gradient.
         """
         if checked is None or not checked.trusted or not self.simulator.has_gradient:
             return math.nan
@@ -353,22 +353,22 @@ class _Examination:
         return float(missed) if doubt < max(0.1 * missed, LEAST_MISSED) else math.nan
 
     def _measure_noise(self, checked: Check | None, repeats: bool) -> list[Smoothed]:
-        """Measure the gradient under noise on theta, an equal share of the time for each sigma."""
+        """Measure the gradient under noise on theta, with an equal share of the time for each sigma."""
         levels, scale = list(self.levels), np.ones(self.theta.size)
         if not levels and self.simulator.noise:
             levels, scale = [RELATIVE], self.scale
         plain = None
         if checked is not None and checked.trusted and repeats and not self.simulator.noise:
             plain = checked.gradient if self.simulator.has_gradient else None
-        found = []
+        results = []
         for index, level in enumerate(levels):
             self.clock.start_stage(f"noise of sigma {level:g}")
             self.clock.limit(1.0 / (len(levels) - index))
             pairs = min(PAIRS, max(FEWEST, HELD // self.theta.size))
-            one = smoothed(self.simulator, self.theta, level, scale, plain, self.clock, self.seed, pairs)
+            one = measure_smoothed(self.simulator, self.theta, level, scale, plain, self.clock, self.seed, pairs)
             self.clock.limit(1.0)
             if one is None:
                 self.left_out.append(f"noise of sigma {level:g}")
             else:
-                found.append(one)
-        return found
+                results.append(one)
+        return results

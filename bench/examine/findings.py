@@ -1,4 +1,4 @@
-"""What an examination found: verdicts, text and tables."""
+"""The findings of an examination: verdicts, text and tables."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ if TYPE_CHECKING:
     import pandas as pd
 
 EXPLANATIONS = {
-    "nan_gradient": "the gradient is not a number where the cost is: a division, log, sqrt or norm at its edge, or a branch that "
-    "'where' takes back only in the value",
-    "nondeterministic": "the same call gives different numbers: noise that is drawn anew, or a state that outlasts a call; "
-    "pass the noise in as w, or fix its seed",
-    "stale_gradient": "the gradient stays that of another theta: a cache that is never emptied, or a copy made too early",
+    "nan_gradient": "the gradient is not a number where the cost is: a division, log, sqrt or norm at the edge of its domain, "
+    "or a branch that 'where' discards only in the value",
+    "nondeterministic": "the same call returns different numbers: new noise in every call, or state that persists between calls; "
+    "pass the noise as w, or fix its seed",
+    "stale_gradient": "the gradient does not change when theta does: a cache that is never cleared, or a copy made too early",
     "staircase": "the cost is constant between steps: a cast to int, rounding, or a comparison inside",
     "precision": "the cost has fewer digits than its type: a shorter float inside, or a solver that stops early",
     "disconnected": "the gradient is exactly 0 where the cost has a slope: detached, or an operation that cuts gradients",
     "wrong_factor": "the ratio is constant: a factor or a sign is wrong",
     "missing_term": "ratio not constant: a term is missing or detached",
-    "wrong_adjoint": "the differences agree with each other, on another number than the gradient",
+    "wrong_adjoint": "the differences agree with each other, but not with the gradient",
     "nonfinite": "the cost is not a number at theta or near it",
-    "unsettled": "the differences agree at no step: nothing is shown; chaotic, or noisier than any step",
-    "jump": "the cost jumps at theta, so that there is no derivative",
-    "kink": "theta is on a kink, so that there are two slopes and no derivative",
-    "saturated": "the gradient is right and exactly 0, though wider steps see a slope: clipped, or out of reach here",
-    "zero": "the gradient and all differences are exactly 0: does this input do anything?",
+    "unsettled": "the differences agree at no step, so the check is inconclusive: the cost is chaotic, or too noisy at every step",
+    "jump": "the cost jumps at theta, so it has no derivative",
+    "kink": "theta is on a kink, with two slopes and no derivative",
+    "saturated": "the gradient is right and exactly 0, though wider steps show a slope: the input is clipped, or has no effect here",
+    "zero": "the gradient and all differences are exactly 0: does this input have any effect?",
 }
-"""What a cause means to the owner of the simulator."""
+"""The meaning of each cause for the owner of the simulator, with likely reasons."""
 SEEN = 0.01
-"""Share of a cost's change that a gradient may miss on a line without a word."""
+"""Share of a cost's change that a gradient may miss on a line without a warning."""
 NOTEWORTHY = ("zero", "saturated")
-"""Right, and yet worth a look."""
+"""Verdicts of right gradients that deserve a warning."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class Findings:
     """The findings about a cost and its gradient at a theta; ``print`` shows them as text."""
 
     name: str
-    """What was examined."""
+    """Name of the cost."""
     gradient: str
-    """How its gradient was had: ``jax``, ``torch``, a function's name, or empty for differences alone."""
+    """Source of the gradient: ``jax``, ``torch``, a function's name, or empty for differences only."""
     names: Sequence[str]
     """A name for each number of theta."""
     theta: np.ndarray
@@ -58,14 +58,14 @@ class Findings:
     cost: float
     precision: str
     repeats: bool
-    """Whether the same call gave the same cost."""
+    """Whether equal calls return equal costs."""
     spread: float
-    """By how much calls differ that should not."""
+    """Largest difference between equal calls."""
     batch: str
     costs: int
-    """Calls of the cost, a theta each."""
+    """Number of costs computed, one per theta."""
     gradients: int
-    """Calls of the gradient, a theta each."""
+    """Number of gradients computed, one per theta."""
     seconds: float
     budget: float
     cost_s: float
@@ -73,30 +73,30 @@ class Findings:
     gradient_s: float
     """Seconds of one gradient; NaN without one."""
     check: Check | None
-    """The gradient check; None where it did not end within the budget."""
+    """The gradient check; None if it did not finish within the budget."""
     more: Sequence[Check]
-    """Checks under other noise of the simulator's own."""
+    """Checks under further draws of the simulator's own noise."""
     lines: Sequence[LineScan]
     reach: float
     """One standard deviation on the lines: a sigma of theta, or a share of the scale of each input."""
     relative: bool
-    """Whether sigma is relative to the scale of each input, as where none was given."""
+    """Whether sigma is relative to the scale of each input, as it is by default."""
     smoothed: Sequence[Smoothed]
     error: str
-    """What the gradient raised; empty if nothing."""
+    """The exception that the gradient raised; empty if none."""
     notes: Sequence[str]
     left_out: Sequence[str]
-    """What the budget did not allow."""
+    """The parts that the budget did not allow."""
 
     # -------------------------------------------------------------------------------------------- verdicts
 
     @property
     def cause(self) -> str:
-        """The cause of what is wrong, or how it is right: a verdict of the gradient check.
+        """The cause of the first problem, or the verdict on a right gradient: a verdict of the gradient check, or one below.
 
-        ``raised`` where the gradient could not be computed, ``undecided`` where the budget ended before the check,
-        ``jumps`` or ``biased`` where the gradient is right at theta and misses jumps around it, ``spread`` where its values
-        around theta vary too widely to say.
+        ``raised``: the gradient could not be computed. ``undecided``: the budget ended before the check. ``jumps`` or
+        ``biased``: the gradient is right at theta and misses jumps around it. ``spread``: its values around theta vary
+        too widely to decide.
         """
         if self.error:
             return "raised"
@@ -119,83 +119,85 @@ class Findings:
 
     @property
     def problems(self) -> list[str]:
-        """Everything that cannot be trusted, in words, most_severe first; empty when all is right."""
-        found = []
+        """The problems as sentences, worst first; empty if there are none."""
+        problems = []
         if self.error:
-            found.append(f"raised: the gradient could not be computed: {self.error}")
+            problems.append(f"raised: the gradient could not be computed: {self.error}")
         elif not self.repeats:
-            found.append(
+            problems.append(
                 f"nondeterministic: {EXPLANATIONS['nondeterministic']} (costs differ by {number(self.spread)})"
             )
         elif self.check is None:
-            found.append("undecided: the budget ended before the gradient was checked")
+            problems.append("undecided: the budget ended before the gradient was checked")
         else:
-            found += [self.sentence(one) for one in (self.check, *self.more) if not one.trusted][:1]
-        if not found and any(line.steps for line in self.lines):
-            found.append(
-                "staircase: the cost is constant between jumps, here and on a line: its derivative is 0 and says nothing, with "
-                "or without a gradient; smooth it, as sigma= does"
+            problems += [self.sentence(one) for one in (self.check, *self.more) if not one.trusted][:1]
+        if not problems and any(line.steps for line in self.lines):
+            problems.append(
+                "staircase: the cost is constant between jumps, here and on a line: its derivative is 0 and carries no "
+                "information; smooth the cost, as sigma= does"
             )
-        elif not found and self.tread:
-            found.append(
+        elif not problems and self.tread:
+            problems.append(
                 f"staircase: jumps of one height, {number(self.tread)}, at even distances on every line: a part of the cost "
-                "is rounded, cast to int or looked up on a grid, and the gradient misses it, "
+                "is rounded, cast to int or looked up on a grid, and the gradient misses this part, "
                 f"{number(100 * self.missed)}% of the cost's change on a line"
             )
-        if not found:
+        if not problems:
             missed = self.missed
             if missed > TARGET_ERROR:
-                found.append(
-                    f"jumps: along a line the integral of the gradient misses {number(100 * missed)}% of the cost's change: "
-                    "jumps, which no gradient sees, make the rest"
+                problems.append(
+                    f"jumps: along a line the integral of the gradient misses {number(100 * missed)}% of the cost's change, "
+                    "which comes from jumps that no gradient sees"
                 )
             for one in self.smoothed:
                 if not one.defined:
-                    found.append(f"nonfinite: at sigma {number(one.sigma)} J is not defined: {one.remark}")
+                    problems.append(f"nonfinite: at sigma {number(one.sigma)} J is not defined: {one.remark}")
                 if one.unshown:
-                    found.append(
+                    problems.append(
                         f"spread: at sigma {number(one.sigma)} the gradients vary so widely that {one.pairs} pairs do not show "
-                        "whether their mean is grad J: take costs, as the table says"
+                        "whether their mean is grad J: use costs, as the table recommends"
                     )
                 if one.biased:
                     low, high = one.bias_low / one.norm, one.bias_high / one.norm
-                    found.append(
+                    problems.append(
                         f"biased: at sigma {number(one.sigma)} the mean of the gradients misses {number(100 * low)} to "
                         f"{number(100 * high)}% of grad J, though each gradient is right: it does not see the jumps"
                     )
-        return found
+        return problems
 
     @property
     def conclusion(self) -> str:
-        """The verdict in one line: what cannot be trusted first, else what was shown, which without a gradient is little."""
+        """One-line verdict: the first problem, otherwise what was verified."""
         if self.problems:
             return f"CANNOT BE TRUSTED: {self.problems[0]}"
         how = MEANING[self.cause].removeprefix("right").lstrip(":; ")
         if self.gradient:
             return f"RIGHT: the gradient is the derivative of its cost ({self.cause}: {how})"
         return (
-            f"NO GRADIENT GIVEN, none was checked: the cost has a derivative here, by differences ({self.cause}: {how})"
+            f"NO GRADIENT GIVEN, none was checked: by differences the cost has a derivative here ({self.cause}: {how})"
         )
 
     @property
     def warnings(self) -> list[str]:
-        """What is right, and yet worth a look."""
-        found = []
+        """The warnings as sentences: findings that are not problems but deserve attention."""
+        warnings = []
         if self.check is not None and self.check.trusted:
             for verdict in NOTEWORTHY:
                 parts = [self.label(part) for part in self.check.components if part.verdict == verdict]
                 if parts:
-                    found.append(
+                    warnings.append(
                         f"{verdict}: {', '.join(parts[:6])}{' ...' if len(parts) > 6 else ''}: {EXPLANATIONS[verdict]}"
                     )
         if self.precision != "float64":
-            found.append(f"{self.precision}: a check in {self.precision} sees errors above about {self.resolution}")
+            warnings.append(
+                f"{self.precision}: a check in {self.precision} detects errors above about {self.resolution}"
+            )
         if not self.status and self.missed > SEEN:
-            found.append(
+            warnings.append(
                 f"jumps: along a line the integral of the gradient misses {number(100 * self.missed)}% of the cost's change"
             )
-        found += [f"not done, for the budget: {what}" for what in self.left_out]
-        return found
+        warnings += [f"not done within the budget: {what}" for what in self.left_out]
+        return warnings
 
     @property
     def missed(self) -> float:
@@ -204,33 +206,33 @@ class Findings:
 
     @property
     def tread(self) -> float:
-        """Height of the jumps where all lines have equal ones, evenly apart, that the gradient is seen to miss; else 0."""
+        """Height of the jumps, if all lines have equal, evenly spaced ones that the gradient misses; else 0."""
         treads = [line.tread for line in self.lines] or [0.0]
         alike = min(treads) > (1 - ALIKE) * max(treads)
         return max(treads) if alike and self.missed > SEEN else 0.0
 
     @property
     def resolution(self) -> str:
-        """The smallest relative error that a check in this precision sees, about u^(2/3) (central differences)."""
+        """The smallest relative error that a check in this precision detects, about u^(2/3) (central differences)."""
         unit = 2.0**-7 if self.precision == "bfloat16" else float(np.finfo(self.precision).eps)
         return f"{100 * unit ** (2 / 3):.1g}%"
 
     @property
     def status(self) -> int:
-        """The exit status: 0, or 1 where something cannot be trusted."""
+        """The exit status: 0 without problems, else 1."""
         return 1 if self.problems else 0
 
     def label(self, part: Part) -> str:
-        """Return a part's name: that of its number in theta, or ``direction 0``."""
+        """Return a part's name: the name of its component of theta, or ``direction 0``."""
         return self.names[part.component] if part.component is not None else part.name
 
     def sentence(self, check: Check) -> str:
-        """Say what a check found wrong, with the numbers of the worst part."""
+        """Return the verdict of a failed check as a sentence, with the numbers of the worst part."""
         text = f"{check.cause}: {EXPLANATIONS.get(check.cause, check.cause)}"
-        guilty = [part for part in check.worst_parts if part.component is not None] or list(check.worst_parts)
-        if not guilty:
+        parts = [part for part in check.worst_parts if part.component is not None] or list(check.worst_parts)
+        if not parts:
             return text
-        part = max(guilty, key=lambda p: np.nan_to_num(p.error, nan=math.inf))
+        part = max(parts, key=lambda p: np.nan_to_num(p.error, nan=math.inf))
         if check.cause == "kink":
             return f"{text} ({self.label(part)}: {number(part.left, 4)} and {number(part.right, 4)})"
         if check.cause not in FAULTS:
@@ -242,7 +244,7 @@ class Findings:
 
     @property
     def frame(self) -> pd.DataFrame:
-        """One row per derivative checked: its number, what the differences give, and the verdict."""
+        """One row per derivative checked: the program's value, the differences, and the verdict."""
         import pandas as pd
 
         parts = [(self.label(part), part) for part in (*self.check.parts, *self.check.draws)] if self.check else []
@@ -264,7 +266,7 @@ class Findings:
 
     @property
     def sigmas(self) -> pd.DataFrame:
-        """One row per sigma and method: its bias, and what a relative error of 10% costs."""
+        """One row per sigma and method: the bias, and the cost of a relative error of 10%."""
         import pandas as pd
 
         rows = []
@@ -291,13 +293,13 @@ class Findings:
 
     @property
     def breaks(self) -> pd.DataFrame:
-        """One row per jump or kink found: its line, its place in standard deviations, and its size."""
+        """One row per jump or kink: line, position in standard deviations, and size."""
         import pandas as pd
 
         rows = [
-            dict(line=index + 1, kind=found.kind, at=found.at, size=found.size)
+            dict(line=index + 1, kind=b.kind, at=b.at, size=b.size)
             for index, line in enumerate(self.lines)
-            for found in line.breaks
+            for b in line.breaks
         ]
         return pd.DataFrame(rows, columns=["line", "kind", "at", "size"])
 
@@ -315,7 +317,7 @@ class Findings:
             repeats += f", rough by {number(self.check.noise)}"
         lines = [
             f"{self.name}: cost {self.cost:.6g} at {shown}",
-            f"{self.precision}, {repeats}; gradient: {self.gradient or 'none, differences alone'}; batch: {self.batch}",
+            f"{self.precision}, {repeats}; gradient: {self.gradient or 'none, only differences'}; batch: {self.batch}",
         ]
         spent = f"spent: {counted(self.costs, 'cost')}"
         if self.gradient:
@@ -364,35 +366,35 @@ class Findings:
         count = counted(len(self.lines), "line")
         lines = [f"Jumps and kinks on {count} through theta, +-3 sigma (sigma = {number(self.reach)} {unit}):"]
         for index, line in enumerate(self.lines):
-            said = []
-            for kind, found in (("jump", line.jumps), ("kink", line.kinks)):
-                if found:
-                    first = ", ".join(f"{b.at:+.3f} ({number(b.size)})" for b in found[:4])
+            remarks = []
+            for kind, breaks in (("jump", line.jumps), ("kink", line.kinks)):
+                if breaks:
+                    first = ", ".join(f"{b.at:+.3f} ({number(b.size)})" for b in breaks[:4])
                     size = "height" if kind == "jump" else "change of slope"
-                    said.append(
-                        f"{counted(len(found), kind)} at t = {first}{' ...' if len(found) > 4 else ''} [{size}]"
+                    remarks.append(
+                        f"{counted(len(breaks), kind)} at t = {first}{' ...' if len(breaks) > 4 else ''} [{size}]"
                     )
             bad = int((~np.isfinite(line.costs)).sum())
             if bad:
-                said.append(f"{bad} of {line.costs.size} costs are no numbers")
+                remarks.append(f"{bad} of {line.costs.size} costs are not numbers")
             if math.isfinite(line.missed):
-                said.append(
+                remarks.append(
                     f"the gradient's integral explains {number(100 * (1 - line.missed), 4)}% of the cost's change"
                 )
             if line.steps:
-                said.append("constant between jumps: a staircase")
+                remarks.append("constant between jumps: a staircase")
             if not line.breaks:
-                said.insert(0, "none found")
-            lines.append(f"  line {index + 1}: {'; '.join(said)}")
+                remarks.insert(0, "none found")
+            lines.append(f"  line {index + 1}: {'; '.join(remarks)}")
         if any(len(line.breaks) > 5 for line in self.lines):
-            lines.append("  at most six places are looked at on a line: there may be more")
+            lines.append("  at most six places are searched on a line, so there may be more")
         return lines
 
     def _sigmas(self) -> list[str]:
         if not self.smoothed:
             return self._without_noise()
         unit = ", relative to each input's scale" if self.relative else ""
-        rows = [["sigma", "|grad J|", "bias of the gradient", "smoothing moves it by", "use", "10% error costs"]]
+        rows = [["sigma", "|grad J|", "bias of the gradient", "smoothing changes it by", "use", "10% error costs"]]
         remarks = []
         for one in self.smoothed:
             rows.append(
@@ -412,10 +414,10 @@ class Findings:
         if not math.isfinite(one.bias):
             return "-"
         if not one.known:
-            return "cannot tell"
+            return "unknown"
         low, high = 100 * one.bias_low / one.norm, 100 * one.bias_high / one.norm
         if one.unshown:
-            return "cannot tell: they spread too widely"
+            return "unknown: the gradients vary too widely"
         if low <= 0:
             return f"none seen, below {number(high)}%"
         return f"{number(100 * one.bias / one.norm)}% [{number(low)}, {number(high)}]"
@@ -423,16 +425,16 @@ class Findings:
     def _use(self, one: Smoothed) -> tuple[str, str]:
         best = one.best
         if best is None:
-            return "cannot tell", "-"
+            return "unknown", "-"
         if self.problems and self.cause in (*FAULTS, "raised") and best.name == "gradient":
             best = next((m for m in one.methods if m.name == "smoothing" and math.isfinite(m.seconds)), None)
             if best is None:
-                return "cannot tell", "-"
+                return "unknown", "-"
         kind = "gradient" if best.name == "gradient" else "cost"
         return f"{best.name}, N = {int(best.samples):,}", f"{counted(int(best.calls), kind)}, {duration(best.seconds)}"
 
     def _without_noise(self) -> list[str]:
-        """Say what to use without noise."""
+        """Return the recommendation without noise."""
         if self.check is None or self.status:
             return []
         dim = self.theta.size
@@ -449,7 +451,7 @@ class Findings:
         return [*lines, self.conclusion, *self._scope()]
 
     def _scope(self) -> list[str]:
-        """Say what was looked at and what was not, where nothing wrong was found."""
+        """Return what was checked and what was not, for a report without problems."""
         check = self.check
         assert check is not None
         dim, seen = self.theta.size, len(check.components)

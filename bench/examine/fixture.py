@@ -1,4 +1,4 @@
-"""A pytest fixture: ``def test_gradient(examine): examine(cost, theta, grad=gradient)`` fails with the whole text.
+"""A pytest fixture: ``def test_gradient(examine): examine(cost, theta, grad=gradient)`` fails with the full report.
 
 In a project's ``conftest.py``: ``pytest_plugins = ["bench.examine.fixture"]``.
 """
@@ -16,7 +16,7 @@ from bench.examine.report import Report
 
 @pytest.fixture
 def examine() -> Callable[..., Report]:
-    """Examine a cost as :func:`bench.examine` does, and fail where something cannot be trusted."""
+    """Return a function like :func:`bench.examine` that fails the test where the report has a problem."""
 
     def examined(cost: Callable[..., Any], theta: Any, **settings: Any) -> Report:
         report = _examine(cost, theta, **{"progress": False, **settings})

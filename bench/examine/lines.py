@@ -1,7 +1,9 @@
-"""Jumps and kinks of a cost on a line, found by halving intervals about the places where its slope changes most.
+"""Finds jumps and kinks of a cost on a line, by halving intervals around the places where its slope changes most.
 
 Where the slope changes by D over a width h, D falls like h for a smooth cost, stays for a kink and grows like 1/h for a
-jump. The order is read over the halvings, so that no threshold on the size of a change is needed.
+jump. The order in h over the halvings gives the kind, so no threshold on the size of a change is needed.
+The search for one jump, :func:`bench.measure.jumps.largest_jump`, cuts all lines together and takes a thousand costs per
+level. This search follows each place separately with two costs per halving, since a user's simulator may be slow.
 """
 
 from __future__ import annotations
@@ -12,19 +14,19 @@ from dataclasses import dataclass
 import numpy as np
 
 POINTS = 97
-"""Points of a scan. No power of 2 and one, so that round numbers seldom fall on them."""
+"""Points of a scan. Not a power of 2 plus one, so that round numbers rarely coincide with points."""
 HALVINGS = 14
 """Halvings of an interval."""
 PLACES = 6
-"""Places that are looked at on a line, those where the slope changes most."""
+"""Most places searched on a line: those where the slope changes most."""
 TREADS = 4
-"""Jumps of one line that make a staircase, where they are alike."""
+"""Fewest equal jumps on one line that count as a staircase."""
 ALIKE = 0.01
-"""Relative difference of heights of jumps that count as equal; a slope between the last two points adds to each."""
+"""Relative difference between heights of jumps that count as equal; the slope of the cost adds to each height."""
 EVEN = 0.02
-"""Share of the distance of treads by which they may be out of place."""
+"""Deviation of a tread from even spacing that is allowed, as a share of the spacing."""
 GUARD = 64.0
-"""Rounding errors of a cost that a change of slope has to exceed."""
+"""Multiple of the cost's rounding error that a change of slope has to exceed."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Break:
     kind: str
     """``jump`` or ``kink``."""
     at: float
-    """Where it is on the line, in units of the line's direction."""
+    """Position on the line, in units of the line's direction."""
     size: float
     """The height of a jump, or the change of slope at a kink, per unit of the line's direction."""
 
@@ -53,24 +55,24 @@ class LineScan:
     steps: bool
     """Whether the cost is constant between jumps everywhere: a staircase."""
     missed: float = float("nan")
-    """Share of the cost's change from end to end that the integral of the gradient misses; NaN where it is not known."""
+    """Share of the cost's change along the line that the integral of the gradient misses; NaN where unknown."""
 
     @property
     def jumps(self) -> tuple[Break, ...]:
         """The jumps."""
-        return tuple(found for found in self.breaks if found.kind == "jump")
+        return tuple(b for b in self.breaks if b.kind == "jump")
 
     @property
     def kinks(self) -> tuple[Break, ...]:
         """The kinks."""
-        return tuple(found for found in self.breaks if found.kind == "kink")
+        return tuple(b for b in self.breaks if b.kind == "kink")
 
     @property
     def tread(self) -> float:
-        """The height that all jumps share, where they are at least four and stand at even distances; else 0.
+        """The common height of all jumps, if there are at least four, equal and evenly spaced; else 0.
 
-        The six places with the largest jumps are known, so that distances are multiples of the smallest. Four jumps
-        would be so by chance less than once in 500 times, of equal height besides.
+        Only the six largest jumps are known, so distances are multiples of the smallest. Four random jumps are evenly
+        spaced by chance less than once in 500 times, and rarely of equal height too.
         """
         heights, at = np.array([b.size for b in self.jumps]), np.array([b.at for b in self.jumps])
         if heights.size < TREADS or np.ptp(heights) > ALIKE * heights.max():
@@ -91,7 +93,7 @@ def scan(
 ) -> LineScan:
     """Scan ``cost((d, B)) -> (B,)`` on a line from -reach to +reach times ``direction (d,)`` about ``theta (d,)``.
 
-    ``noise`` is the size of what the cost's rounding changes; ``most`` places are looked at.
+    ``noise`` is the size of the cost's rounding errors; at most ``most`` places are searched.
     """
 
     def along(t: np.ndarray) -> np.ndarray:
@@ -105,10 +107,10 @@ def scan(
     for index in order:
         if len(places) < most and turns[index] > GUARD * noise and all(abs(index - p) > 1 for p in places):
             places.append(int(index))
-    found = _locate_breaks(along, t, f, places, halvings, noise) if places else []
+    breaks = _locate_breaks(along, t, f, places, halvings, noise) if places else []
     level = np.diff(f)
-    steps = bool(level.any() and (np.abs(level) <= noise).mean() > 0.5 and any(b.kind == "jump" for b in found))
-    return LineScan(direction, t, f, tuple(sorted(found, key=lambda b: b.at)), steps)
+    steps = bool(level.any() and (np.abs(level) <= noise).mean() > 0.5 and any(b.kind == "jump" for b in breaks))
+    return LineScan(direction, t, f, tuple(sorted(breaks, key=lambda b: b.at)), steps)
 
 
 def _locate_breaks(
@@ -119,7 +121,7 @@ def _locate_breaks(
     halvings: int,
     noise: float,
 ) -> list[Break]:
-    """Halve the intervals about each place, all places at once, and return the breaks."""
+    """Halve the intervals around all places together, and return the breaks."""
     count = len(places)
     centre = np.array([t[i + 1] for i in places])
     width = float(t[1] - t[0])
@@ -138,10 +140,9 @@ def _locate_breaks(
         values = np.stack([five[np.arange(count), best + k] for k in range(3)], axis=1)
         turns.append(_second_difference(values))
         widths.append(width)
-    change = np.array(
-        turns
-    )  # (halvings + 1, places): second differences, of order 2 in the width, 1 for a kink, 0 for a jump
-    found = []
+    # (halvings + 1, places): second differences, of order 2 in the width, 1 for a kink, 0 for a jump
+    change = np.array(turns)
+    breaks = []
     for k in range(count):
         clear = np.flatnonzero(change[:, k] > GUARD * noise)
         clear = clear[clear == np.arange(clear.size)]
@@ -151,20 +152,20 @@ def _locate_breaks(
         order = float(np.polyfit(np.log2(np.array(widths)[last]), np.log2(change[last, k]), 1)[0])
         at, end = float(centre[k]), int(last[-1])
         if order < 0.5:
-            found.append(Break("jump", at, float(change[end, k])))
+            breaks.append(Break("jump", at, float(change[end, k])))
         elif order < 1.5:
-            found.append(Break("kink", at, float(bends[end][k])))
-    return _without_duplicates(found, 4 * (t[1] - t[0]) / 2**halvings)
+            breaks.append(Break("kink", at, float(bends[end][k])))
+    return _without_duplicates(breaks, 4 * (t[1] - t[0]) / 2**halvings)
 
 
 def _second_difference(values: np.ndarray) -> np.ndarray:
-    return np.abs(values[:, 0] - 2 * values[:, 1] + values[:, 2])
+    return np.asarray(np.abs(values[:, 0] - 2 * values[:, 1] + values[:, 2]))
 
 
-def _without_duplicates(found: list[Break], near: float) -> list[Break]:
-    """Return breaks without those found twice, jumps before kinks."""
+def _without_duplicates(breaks: list[Break], near: float) -> list[Break]:
+    """Return the breaks without those within ``near`` of another one; jumps take precedence over kinks."""
     kept: list[Break] = []
-    for one in sorted(found, key=lambda b: b.kind):
+    for one in sorted(breaks, key=lambda b: b.kind):
         if all(abs(one.at - other.at) > near for other in kept):
             kept.append(one)
     return kept

@@ -1,4 +1,4 @@
-"""An examination as files: text, tables, charts, and one page that holds them all and needs no network."""
+"""Writes an examination as files: text, tables, charts, and one self-contained page."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from bench.report.text import number
 from bench.run.files import make_directory, write_all, write_whole
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 WIDTH = 7.16
 """Inches of two columns of a paper."""
 SHOWN = 8
-"""Components drawn: those with the largest error."""
+"""Most components drawn: those with the largest errors."""
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -30,7 +31,7 @@ body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem aut
 h1 {{ font-size: 1.4rem; margin-bottom: .3rem; }} h2 {{ font-size: 1.1rem; margin-top: 2rem; }}
 .verdict {{ padding: .6rem .9rem; border-left: 5px solid {colour}; background: #f6f6f6; }}
 pre {{ overflow-x: auto; background: #f6f6f6; padding: .8rem; font-size: 12.5px; }}
-.said {{ white-space: pre-wrap; overflow-wrap: anywhere; }}
+.sentence {{ white-space: pre-wrap; overflow-wrap: anywhere; }}
 img {{ max-width: 100%; }}
 table {{ border-collapse: collapse; font-size: 13px; }} .wide {{ overflow-x: auto; }}
 th, td {{ padding: .2rem .6rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap; }}
@@ -61,7 +62,7 @@ def write(report: Findings, directory: Path) -> list[Path]:
             data = base64.b64encode(saved[0].read_bytes()).decode()
             pictures.append(f'<h2>{escape(title)}</h2><img alt="{escape(title)}" src="data:image/png;base64,{data}">')
     page = PAGE.format(
-        title=escape(f"{report.name}, examined"),
+        title=escape(f"Examination of {report.name}"),
         colour="#D55E00" if report.status else "#009E73",
         verdict=escape(" ".join(report.problems) or report.conclusion),
         charts="\n".join(pictures),
@@ -73,13 +74,13 @@ def write(report: Findings, directory: Path) -> list[Path]:
 
 
 def _wrapping(text: str) -> str:
-    """Return a text as HTML in which sentences wrap and rows of aligned columns keep their shape."""
+    """Return a text as HTML in which sentences wrap and aligned columns do not."""
     lines = [(escape(line), "  " in line.strip()) for line in text.splitlines()]
-    return "\n".join(line if row else f'<span class="said">{line}</span>' for line, row in lines)
+    return "\n".join(line if row else f'<span class="sentence">{line}</span>' for line, row in lines)
 
 
 def charts(report: Findings) -> dict[str, tuple[str, Figure]]:
-    """Return a title and a figure for each chart that the report has numbers for."""
+    """Return a title and a figure for each chart that the report has data for."""
     drawn = {}
     if report.check is not None and report.gradient:
         drawn["steps"] = ("The gradient against differences of the cost", _steps(report))
@@ -90,7 +91,7 @@ def charts(report: Findings) -> dict[str, tuple[str, Figure]]:
     return drawn
 
 
-def _figure(panels: int, height: float = 2.6) -> tuple[Figure, list]:
+def _figure(panels: int, height: float = 2.6) -> tuple[Figure, list[Axes]]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -153,10 +154,8 @@ def _lines(report: Findings) -> Figure:
     for index, (panel, line) in enumerate(zip(panels, report.lines, strict=True)):
         panel.plot(line.at, line.costs, color=PALETTE[0], marker=".", markersize=2.5, linewidth=0.9)
         for kind, colour, style in (("jump", PALETTE[2], "-"), ("kink", PALETTE[3], "--")):
-            for count, found in enumerate(b for b in line.breaks if b.kind == kind):
-                panel.axvline(
-                    found.at, color=colour, linestyle=style, linewidth=0.9, label=kind if count == 0 else None
-                )
+            for count, b in enumerate(b for b in line.breaks if b.kind == kind):
+                panel.axvline(b.at, color=colour, linestyle=style, linewidth=0.9, label=kind if count == 0 else None)
         panel.set_xlabel(f"t, in sigma = {number(report.reach)}{' of the scale' if report.relative else ''}")
         panel.set_title(
             f"line {index + 1}: {'no break found' if not line.breaks else f'{len(line.breaks)} breaks found'}"
@@ -168,7 +167,7 @@ def _lines(report: Findings) -> Figure:
 
 
 def _sigmas(report: Findings) -> Figure:
-    """Draw bias of the gradient and what smoothing moves, against sigma."""
+    """Draw the bias of the gradient, and its change by smoothing, against sigma."""
     figure, (panel,) = _figure(1)
     shown = [one for one in report.smoothed if one.known]
     sigma = np.array([one.sigma for one in shown])
@@ -188,11 +187,11 @@ def _sigmas(report: Findings) -> Figure:
             "v",
             mfc="none",
             color=PALETTE[2],
-            label="none seen: upper end of its interval",
+            label="not detected: upper end of the interval",
         )
     moved = np.array([one.moved / one.norm for one in shown])
     if np.isfinite(moved).any():
-        panel.plot(sigma, moved, "s-", color=PALETTE[0], label="what smoothing moves the gradient by")
+        panel.plot(sigma, moved, "s-", color=PALETTE[0], label="change of the gradient by smoothing")
     panel.axhline(0.1, color=GREY, linewidth=0.8, linestyle=":", label="10%")
     panel.set_xscale("log")
     panel.set_yscale("log")

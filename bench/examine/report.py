@@ -1,4 +1,4 @@
-"""The report of an examination: its findings, as a page and as an assertion too."""
+"""The report of an examination: findings that can be asserted and saved as a page."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from bench.examine.findings import Findings
 class Report(Findings):
     """The findings about a cost and its gradient at a theta; ``print`` shows them as text.
 
-    ``frame``, ``sigmas`` and ``breaks`` are tables of them, ``problems`` and ``warnings`` sentences, ``status`` the exit
-    status.
+    ``frame``, ``sigmas`` and ``breaks`` are tables, ``problems`` and ``warnings`` are sentences, and ``status`` is the
+    exit status.
     """
 
     def assert_right(self) -> None:
-        """Raise AssertionError with the whole text where something cannot be trusted."""
+        """Raise AssertionError with the full report if there is a problem."""
         if self.problems:
             raise AssertionError(f"{'; '.join(self.problems)}\n\n{self}")
 
     def save(self, directory: str | Path) -> list[Path]:
-        """Write the text, the tables, the charts and ``report.html`` into a directory; returns their paths."""
-        # charts and tables take a second to import, which a report without files need not
+        """Write the text, the tables, the charts and ``report.html`` into a directory, and return their paths."""
+        # importing charts and tables takes a second, which a report without files does not need
         from bench.examine import page
 
         return page.write(self, Path(directory).expanduser())

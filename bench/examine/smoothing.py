@@ -1,10 +1,10 @@
-"""What noise of size sigma on theta does to the gradient: bias of the program's gradient, and what each method costs.
+"""Effect of noise of size sigma on theta: the bias of the program's gradient, and the cost of each method.
 
-The truth is grad J, J(theta) = E cost(theta + sigma u) with u ~ N(0, I), from costs alone, so that it is right across
-jumps, which a mean of gradients does not see. Costs are taken in pairs at +u and -u, with the same noise w of the
+The truth is grad J, J(theta) = E cost(theta + sigma u) with u ~ N(0, I), computed only from costs, so it is right
+across jumps, which a mean of gradients misses. Costs are taken in pairs at +u and -u, with the same noise w of the
 simulator's own: d = (cost(theta + sigma u) - cost(theta - sigma u)) / 2 sigma. Then E[d u] = grad J (Nesterov and
 Spokoiny 2017, Found. Comput. Math. 17, section 2), and subtracting a fitted straight line d = b . u, whose mean is known,
-removes most of its variance. The line is fitted to the other half of the pairs, so that the mean stays exact.
+removes most of its variance. The line is fitted to the other half of the pairs, so the mean stays unbiased.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from bench.model.simulator.simulator import Simulator
 PAIRS = 4096
 """Pairs of costs for one sigma, where the time allows."""
 FEWEST = 64
-"""Pairs without which nothing is said."""
+"""Fewest pairs for a result."""
 FIRM = 1024
-"""Pairs before which drawing does not stop early, however small the spread: a jump may be rare."""
+"""Fewest pairs before drawing stops early, however small the spread, since a jump may be rare."""
 GROUPS = 32
 """Independent means that intervals are computed from."""
 ENOUGH = 0.03
-"""Standard error of grad J, relative to it, from which no more pairs are drawn once the bias is decided."""
+"""Relative standard error of grad J at which drawing stops, once the bias is decided."""
 TARGET_ERROR = 0.1
-"""Relative error that the costs are stated for."""
+"""Relative error for which the cost of each method is stated."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way to estimate grad J, and what a relative error of 10% costs with it."""
+    """A method to estimate grad J, and its cost for a relative error of 10%."""
 
     name: str
     """``gradient``: mean of the program's gradients; ``smoothing``: pairs of costs along random directions."""
     bias: float
     """Relative to |grad J|: the upper end of its 95% interval."""
     samples: float
-    """Samples for a relative root-mean-square error of 10%; infinity where its bias alone is more."""
+    """Samples for a relative root-mean-square error of 10%; infinity where its bias exceeds that."""
     calls: float
-    """Calls of cost or gradient that these take."""
+    """Calls of cost or gradient for these samples."""
     seconds: float
 
 
@@ -56,53 +56,53 @@ class Smoothed:
     error: float
     """Standard error of its norm."""
     norm: float
-    """|grad J|, with the share of noise removed."""
+    """|grad J|, with the contribution of noise subtracted."""
     pairs: int
     bias: float
-    """|E program's gradient - grad J|, its size with the share of noise removed; NaN without a gradient."""
+    """|E program's gradient - grad J|, with the contribution of noise subtracted; NaN without a gradient."""
     bias_low: float
     bias_high: float
-    """95% interval of it."""
+    """The 95% interval of the bias."""
     moved: float
-    """|grad J - grad cost| at theta: what smoothing itself changes; NaN without a gradient that is right."""
+    """|grad J - grad cost| at theta: the change by smoothing itself; NaN without a right gradient."""
     remark: str
-    """Why the intervals may be too narrow; empty if there is no reason."""
+    """Why the intervals may be too narrow; empty if there is no such reason."""
     methods: tuple[Method, ...]
 
     @property
     def defined(self) -> bool:
-        """Whether every cost was a number, so that there is a grad J."""
+        """Whether every cost is finite, so grad J exists."""
         return math.isfinite(self.norm)
 
     @property
     def known(self) -> bool:
-        """Whether grad J stands clear of its own error."""
+        """Whether grad J is clearly larger than its own error."""
         return self.norm > 4.0 * self.error
 
     @property
     def decided(self) -> bool:
-        """Whether the bias is surely above or surely below 10% of |grad J|."""
+        """Whether the bias interval is entirely above or entirely below 10% of |grad J|."""
         edge = TARGET_ERROR * self.norm
         return not self.bias_low <= edge <= self.bias_high
 
     @property
     def biased(self) -> bool:
-        """Whether the program's gradient is off by more than 10% at this sigma, beyond doubt."""
+        """Whether the bias interval of the program's gradient is entirely above 10% at this sigma."""
         return self.known and bool(self.bias_low > TARGET_ERROR * self.norm)
 
     @property
     def unshown(self) -> bool:
-        """Whether the bias may be as large as grad J itself, for all that was seen, though it need not be."""
+        """Whether the bias interval is so wide that the bias may, but need not, exceed grad J itself."""
         return self.known and not self.biased and bool(self.bias_high > self.norm)
 
     @property
     def best(self) -> Method | None:
-        """The method that reaches 10% first; None where none does."""
+        """The fastest method to reach an error of 10%; None where no method does."""
         usable = [m for m in self.methods if math.isfinite(m.seconds)]
         return min(usable, key=lambda m: m.seconds) if usable and self.known else None
 
 
-def smoothed(
+def measure_smoothed(
     simulator: Simulator,
     theta: np.ndarray,
     sigma: float,
@@ -112,23 +112,23 @@ def smoothed(
     seed: int = 0,
     pairs: int = PAIRS,
 ) -> Smoothed | None:
-    """Measure the gradient under noise ``sigma * scale * u`` on theta; None where the time allows too few pairs.
+    """Measure the gradient under noise ``sigma * scale * u`` on theta; None where there is time for too few pairs.
 
     ``plain (d,)`` is the gradient at theta without noise, if it is known to be right.
     """
     random = np.random.default_rng([seed, 0x736D6F6F])
     drawn: list[np.ndarray] = []
-    size, found = FEWEST, None
+    size, result = FEWEST, None
     try:
         while size <= pairs:
-            drawn.append(_draw(simulator, theta, sigma * scale, random, size if found is None else size // 2))
-            found = _summary(sigma, scale, np.concatenate(drawn, axis=1), plain, simulator, clock)
-            if size >= FIRM and found.error <= ENOUGH * found.norm and found.decided:
+            drawn.append(_draw(simulator, theta, sigma * scale, random, size if result is None else size // 2))
+            result = _summary(sigma, scale, np.concatenate(drawn, axis=1), plain, simulator, clock)
+            if size >= FIRM and result.error <= ENOUGH * result.norm and result.decided:
                 break
             size *= 2
     except OutOfTime:
         pass
-    return found
+    return result
 
 
 def _draw(
@@ -159,7 +159,7 @@ def _summary(
     spread = sigma * scale
     u, d, up, down = drawn[:dim], drawn[dim], drawn[dim + 1 : 2 * dim + 1], drawn[2 * dim + 1 :]
     if not np.isfinite(d).all():
-        share = f"{int((~np.isfinite(d)).sum())} of {pairs} pairs have a cost that is no number"
+        share = f"{int((~np.isfinite(d)).sum())} of {pairs} pairs have a cost that is not a number"
         nothing = np.full(dim, np.nan)
         return Smoothed(sigma, nothing, math.inf, math.nan, pairs, math.nan, math.nan, math.nan, math.nan, share, ())
     groups = _means(_terms(u, d) / spread[:, None])
@@ -173,7 +173,9 @@ def _summary(
         judged = summarise(_means(slopes) - groups, Truth.exact(np.zeros(dim)), pairs // GROUPS)
         bias, low, high, remark = judged.bias, judged.bias_low, judged.bias_high, judged.note
     elif simulator.has_gradient:
-        remark = f"{int((~np.isfinite(slopes).all(axis=0)).sum())} of {pairs} pairs have a gradient that is no number"
+        remark = (
+            f"{int((~np.isfinite(slopes).all(axis=0)).sum())} of {pairs} pairs have a gradient that is not a number"
+        )
     if plain is not None:
         moved = float(np.linalg.norm(truth - plain))
     methods = _methods(norm, high, d * u / spread[:, None], up, clock) if norm > 4.0 * error else ()
@@ -181,7 +183,7 @@ def _summary(
 
 
 def _terms(u: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Return terms ``(d, n)`` whose mean is E[d u], with a straight line fitted to the other half taken out."""
+    """Return terms ``(d, n)`` whose mean is E[d u], with a straight line fitted to the other half subtracted."""
     dim, count = u.shape
     halves = np.arange(count) % 2 == 0
     out = np.empty_like(u)
@@ -194,16 +196,16 @@ def _terms(u: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 
 def _means(terms: np.ndarray) -> np.ndarray:
-    """Return independent means of ``terms (d, n)``, ``(GROUPS, d)``; each takes as many of both halves as any other."""
-    return terms.reshape(terms.shape[0], GROUPS, -1).mean(axis=2).T
+    """Return independent means of ``terms (d, n)``, ``(GROUPS, d)``; each takes equally many terms of both halves."""
+    return np.asarray(terms.reshape(terms.shape[0], GROUPS, -1).mean(axis=2).T)
 
 
 def _methods(norm: float, bias: float, terms: np.ndarray, slopes: np.ndarray, clock: Clock) -> tuple[Method, ...]:
-    """Return what a relative error of 10% costs with each method, from its single samples ``(d, n)``."""
-    found = [_method("smoothing", 0.0, terms, norm, 2, clock.per_cost())]
+    """Return the cost of a relative error of 10% with each method, from its single samples ``(d, n)``."""
+    methods = [_method("smoothing", 0.0, terms, norm, 2, clock.per_cost())]
     if np.isfinite(slopes).all():
-        found.append(_method("gradient", bias / norm, slopes, norm, 1, clock.per_gradient()))
-    return tuple(sorted(found, key=lambda m: m.seconds))
+        methods.append(_method("gradient", bias / norm, slopes, norm, 1, clock.per_gradient()))
+    return tuple(sorted(methods, key=lambda m: m.seconds))
 
 
 def _method(name: str, bias: float, terms: np.ndarray, norm: float, calls: int, seconds: float) -> Method:

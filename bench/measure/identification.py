@@ -32,7 +32,7 @@ class Information:
     @property
     def fisher(self) -> np.ndarray:
         """The Fisher information of the logarithms, ``(p, p)``."""
-        return self.jacobian.T @ self.jacobian
+        return np.asarray(self.jacobian.T @ self.jacobian)
 
     @property
     def rank(self) -> int:
@@ -100,7 +100,7 @@ class Information:
         values, rows = self._svd
         kept = rows[: self.rank]
         inverse = (kept.T / values[: self.rank] ** 2) @ kept
-        return self.invariants @ inverse @ self.invariants.T
+        return np.asarray(self.invariants @ inverse @ self.invariants.T)
 
 
 def product(names: tuple[str, ...], exponents: np.ndarray) -> str:

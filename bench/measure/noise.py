@@ -49,7 +49,7 @@ def seconds(seed: int, scene: str, samples: int, width: int) -> float:
     """Return the seconds that drawing the noise of one estimate takes, extrapolated from its first part."""
     started = time.perf_counter()
     part = next(parts(seed, scene, 0, samples, width, "cells"))
-    return (time.perf_counter() - started) * samples / part.shape[1]
+    return float((time.perf_counter() - started) * samples / part.shape[1])
 
 
 def _generator(seed: int, scene: str, repeat: int, stream: str) -> np.random.Generator:

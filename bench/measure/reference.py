@@ -60,7 +60,7 @@ class Reference:
     @property
     def gradient(self) -> np.ndarray:
         """grad J_sigma, ``(d,)``."""
-        return self.batches.mean(axis=0)
+        return np.asarray(self.batches.mean(axis=0))
 
     def known(self) -> Truth:
         """Return the reference for the statistics: a mean, its sampling error, and the error that sampling does not show."""

@@ -105,7 +105,7 @@ class Sampling:
             return raw - trace**2
         spread = n * (count - 2) * raw + trace**2 - count * n * float(squares @ squares)
         unbiased = n / (count * (count - 2) * (count - 3)) * spread
-        return raw - min(max(unbiased, trace**2 / self.rows.shape[1]), trace**2)
+        return float(raw - min(max(unbiased, trace**2 / self.rows.shape[1]), trace**2))
 
 
 def _trace_square(rows: np.ndarray) -> float:
@@ -257,7 +257,7 @@ def _noncentral_score(value: float, nu: float, noncentrality: float) -> float:
     p = second / first**2
     m = (h - 1.0) * (1.0 - 3.0 * h)
     centre = 1.0 + h * p * (h - 1.0 - 0.5 * (2.0 - h) * m * p)
-    return ((value / first) ** h - centre) / (h * math.sqrt(2.0 * p) * (1.0 + 0.5 * m * p))
+    return float(((value / first) ** h - centre) / (h * math.sqrt(2.0 * p) * (1.0 + 0.5 * m * p)))
 
 
 def _bisect(target: float, function: Callable[[float], float], low: float, high: float) -> float:

@@ -1,4 +1,4 @@
-"""The adjoints of a rollout: how much its cost depends on each state it passes through."""
+"""The adjoints of a rollout: the derivatives of its cost by each of its states."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ def adjoints(program: Rollout, theta: np.ndarray, w: np.ndarray, path: Jacobians
     p_k = dc_k/du + B_k' l_{k+1} and l_k = A_k' l_{k+1} + dc_k/dx + (dpi/dx)' p_k, from l_T = dc_T/dx; then dL/dtheta =
     (dx_0/dtheta)' l_0 + sum_k (dpi/dtheta)' p_k, and where theta names parameters also sum_k (dF/dtheta)' l_{k+1} and
     the derivatives of the costs at fixed x and u. Costs and policy are differentiated by JAX, with the steps as batch
-    columns, whatever backend gave the steps. Source: Griewank and Walther 2008, ch. 3.
+    columns, whichever backend computed the steps. Source: Griewank and Walther 2008, ch. 3.
     """
     import jax
     import jax.numpy as jnp
 
     if program.decision.names and program.needs_root:
-        raise Unsupported("theta names parameters of steps that solve an equation, which no trace differentiates yet")
+        raise Unsupported(
+            "theta names parameters of steps that solve an equation, which a trace cannot differentiate yet"
+        )
     ops = LoopOps(jnp)
     column = jnp.asarray(theta)[:, None]
     before, end = jnp.asarray(path.states[:-1].T), jnp.asarray(path.states[-1:].T)

@@ -29,7 +29,7 @@ SLIPPING: dict[str, Any] = {"color": "#a6a6a6", "alpha": 0.6, "linewidth": 0}
 SWITCH: dict[str, Any] = {"color": GREY, "linewidth": 0.5}
 SPIKED: dict[str, Any] = {"color": RED, "linewidth": 2.4, "solid_capstyle": "butt"}
 DRAWN = 1e30
-"""Size beyond which a diverging quantity is left out of its panel; the table has it."""
+"""Size beyond which a diverging quantity is omitted from its panel; the table keeps it."""
 LINEAR = 1e4
 """Ratio of the largest to the median size beyond which a panel's scale is not linear."""
 NAMES = {

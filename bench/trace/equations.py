@@ -1,4 +1,4 @@
-"""Solves the equations of the steps again where a trace can watch: the residual left, and the iterations needed."""
+"""Solves the equations of the steps again, to report the remaining residual and the number of iterations."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Newton(LoopOps):
         self.iterations: list[np.ndarray] = []
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Solve for the root by columns, each left as it is once its own Newton step is within tolerance."""
+        """Solve for the root by columns; a column stops once its own Newton step is within tolerance."""
         import jax
         import jax.numpy as jnp
 
@@ -60,7 +60,7 @@ def solved_again(program: Rollout, path: Jacobians) -> tuple[np.ndarray, dict[st
     """Solve for the states after each step again; return them, ``(n, T)``, and the solver columns derived from them.
 
     A backend's own solver runs inside the compiled rollout and reports nothing. So each step is solved again from its
-    state by Newton's method with the law's own first guess: ``solver_residual`` is the largest component left (in the
+    state by Newton's method with the law's own first guess: ``solver_residual`` is the largest remaining component (in the
     unit of the law's equation), ``solver_iterations`` the Newton steps, including the last one, which is within
     tolerance; ``solver_mismatch`` is the largest difference to the state that the backend's solver reached.
     """

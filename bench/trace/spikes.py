@@ -10,11 +10,11 @@ import numpy as np
 MEASURES = {"jacobian_norm": "|dF/dx|", "adjoint_norm": "|dL/dx|"}
 """Columns whose spikes are compared with the contact switches, and how they are printed."""
 SPIKE = 3.0
-"""Factor by which a norm must change over one step for a spike; a first stage cost may double an adjoint harmlessly."""
+"""Least factor by which a norm changes over one step at a spike; a first stage cost alone may double an adjoint."""
 TENTH = 0.1
-"""Share of the steps (those of the largest changes) that can be spikes."""
+"""Largest share of the steps that can be spikes: those with the largest changes."""
 LEVEL = 0.05
-"""p-value up to which spikes are said to line up with switches."""
+"""Largest p-value at which spikes count as aligned with switches."""
 
 
 class Alignment(NamedTuple):
@@ -25,7 +25,7 @@ class Alignment(NamedTuple):
     chance: float
     """Share of the steps that are within one step of a switch."""
     p_value: float
-    """Chance that as many spikes or more, at random on different steps, are near a switch: a permutation test."""
+    """p-value of a permutation test: the chance that at least as many spikes at random steps are near a switch."""
 
 
 def changes(values: Sequence[float] | np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The gradient health of one rollout: contact, step Jacobians and adjoints, step by step.
 
-Exploding gradients come from somewhere. A :class:`Trace` shows where: it has a row for every state of a rollout, and
-says whether the steps over which |dF/dx| or |dL/dx| changes most are those at which a contact is made or lost.
+A :class:`Trace` shows where gradients explode. It has a row for every state of a rollout, and reports whether the steps
+with the largest changes of |dF/dx| or |dL/dx| are those at which a contact is made or lost.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _of_cell(session: Session, cell: Cell, seeded: bool) -> Trace:
     if not isinstance(scene, MechanicalScene):
         raise UserError(f"scene {scene.name} is a plain function: it has no steps to trace")
     if isinstance(scene, EngineScene):
-        raise UserError(f"scene {scene.name} runs only in physics engines, whose contacts cannot be shown")
+        raise UserError(f"scene {scene.name} runs only in physics engines, which do not report their contacts")
     try:
         program = cell.program()
     except Unsupported as error:
@@ -137,13 +137,13 @@ def trace(problem: Problem, w: np.ndarray) -> tuple[pd.DataFrame, float]:
     return table, _gradient_error(gradient, problem.grad(theta, w)[:, 0])
 
 
-def _gradient_error(gradient: np.ndarray, own: np.ndarray) -> float:
-    scale = float(np.linalg.norm(own))
-    return float(np.linalg.norm(gradient - own)) / (scale or 1.0)
+def _gradient_error(gradient: np.ndarray, expected: np.ndarray) -> float:
+    scale = float(np.linalg.norm(expected))
+    return float(np.linalg.norm(gradient - expected)) / (scale or 1.0)
 
 
 def _norms(matrices: np.ndarray) -> np.ndarray:
-    """Return spectral norms of ``(T, n, n)``; inf where an entry is not finite, which LAPACK would refuse."""
+    """Return spectral norms of ``(T, n, n)``; inf where an entry is not finite, which LAPACK rejects."""
     finite = np.isfinite(matrices).all(axis=(1, 2))
     norms = np.full(len(matrices), np.inf)
     norms[finite] = np.linalg.norm(matrices[finite], 2, axis=(1, 2))

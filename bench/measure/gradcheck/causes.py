@@ -38,7 +38,7 @@ def causes_of_ratios(
     - ``wrong_factor``: the ratio of each wrong component is the same at all thetas, within its error. A constant ratio
       next to ratios that vary does not count, since a missing term may act on one input as a factor.
     - ``missing_term``: the ratio varies, and other components are right, or the gradient is right at thetas where the
-      term does not act, or the ratio lies between 0 and 2, so that the gradient has part of the derivative.
+      term does not act, or the ratio lies between 0 and 2, so the gradient has part of the derivative.
     - ``wrong_adjoint``: neither, or too few ratios to decide.
     """
     causes: dict[int | None, str] = {}

@@ -421,7 +421,7 @@ class _Checker:
             parts = self._check_parts(thetas, gradients, vectors, np.ones(len(names)), names, none, doubt, twice=False)
             right = [k for k, part in enumerate(parts) if part.verdict in PLAINLY and part.program != 0.0]
             thetas, gradients = thetas[:, right], gradients[:, right]
-        return thetas.shape[1] > 0
+        return bool(thetas.shape[1] > 0)
 
 
 def _ratio(part: Part) -> Ratio:

@@ -79,7 +79,7 @@ class Sample:
     @property
     def finite(self) -> np.ndarray:
         """Where both costs are numbers, ``(K,)``."""
-        return np.isfinite(self.minus) & np.isfinite(self.plus)
+        return np.asarray(np.isfinite(self.minus) & np.isfinite(self.plus))
 
     def rounding(self, unit: float) -> np.ndarray:
         """Return the error of the differences that rounding at that unit roundoff explains, ``(K,)``."""
@@ -217,7 +217,7 @@ def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
 def _spread(differences: np.ndarray) -> np.ndarray:
     """Return the largest disagreement of each difference with its neighbours, ``(K,)``."""
     apart = np.abs(np.diff(differences))
-    return np.fmax(np.r_[apart[0], apart], np.r_[apart, apart[-1]])
+    return np.asarray(np.fmax(np.r_[apart[0], apart], np.r_[apart, apart[-1]]))
 
 
 def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:

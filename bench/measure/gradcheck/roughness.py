@@ -64,7 +64,7 @@ def scatter(step: np.ndarray, differences: np.ndarray) -> float:
 def staircase_offsets(scale: float, unit: float) -> np.ndarray:
     """Return displacements for :func:`is_staircase` at seven spacings, a decade apart, ``(7, SCAN)``."""
     spacings = np.sqrt(unit) * 10.0 ** np.arange(-2.0, 5.0) * scale
-    return spacings[:, None] * np.arange(SCAN)
+    return np.asarray(spacings[:, None] * np.arange(SCAN))
 
 
 def is_staircase(values: np.ndarray, rounding: float) -> bool:

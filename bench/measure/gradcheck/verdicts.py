@@ -18,7 +18,7 @@ TRUSTED = ("saturated", "rounding", "mode_crossing", "nonlinear", "smooth", "zer
 UNTRUSTED = (*FAULTS, *UNDECIDED, *BROKEN)
 """Verdicts that end a check with exit status 1."""
 VERDICTS = (*UNTRUSTED, *TRUSTED)
-"""All verdicts, most_severe first."""
+"""All verdicts, worst first."""
 MEANING = {
     "nan_gradient": "the gradient is NaN or infinite where the cost is a number",
     "nondeterministic": "the same call returns different numbers",
