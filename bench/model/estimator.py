@@ -110,7 +110,7 @@ class SampleMean(Estimator):
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of the terms over the samples of each repeat."""
-        return per_repeat(self.terms(problem, theta, columns(noise)), noise).mean(axis=1)
+        return np.asarray(per_repeat(self.terms(problem, theta, columns(noise)), noise).mean(axis=1))
 
 
 def columns(noise: np.ndarray) -> np.ndarray:

@@ -57,4 +57,4 @@ def _slope(control: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the regression coefficient of values on the control over samples, one per repeat, 0 without spread."""
     control = control - control.mean(axis=1, keepdims=True)
     both, own = (np.einsum("rnd,rnd->r", control, other) for other in (values, control))
-    return np.divide(both, own, out=np.zeros_like(own), where=own > 0)
+    return np.asarray(np.divide(both, own, out=np.zeros_like(own), where=own > 0))

@@ -40,7 +40,7 @@ class Guided(Estimator):
         shift = s * columns(inside + np.sqrt(self.share) * (w - inside))
         still = problem.centred(columns(fresh))
         change = problem.displaced(shift, theta, still) - problem.displaced(-shift, theta, still)
-        return per_repeat(change * shift / (2.0 * s * s), fresh).mean(axis=1)
+        return np.asarray(per_repeat(change * shift / (2.0 * s * s), fresh).mean(axis=1))
 
     def unsupported_reason(self, program: Program) -> str | None:
         """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""

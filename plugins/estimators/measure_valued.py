@@ -32,7 +32,7 @@ class MeasureValued(SampleMean):
             ahead = problem.value(theta, moved)
             moved[i] = -radius[i]
             rows.append(ahead - problem.value(theta, moved))
-        return np.stack(rows) / (problem.sigma * np.sqrt(2.0 * np.pi))
+        return np.asarray(np.stack(rows) / (problem.sigma * np.sqrt(2.0 * np.pi)))
 
     def unsupported_reason(self, program: Program) -> str | None:
         """Refuse noise that is not on theta: each action would need differences of its own."""

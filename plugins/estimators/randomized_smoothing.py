@@ -36,9 +36,9 @@ class RandomizedSmoothing(SampleMean):
         still = problem.centred(w)
         ahead = problem.displaced(s * direction, theta, still)
         if self.variant == "antithetic":
-            return (ahead - problem.displaced(-s * direction, theta, still)) * direction / (2 * s)
+            return np.asarray((ahead - problem.displaced(-s * direction, theta, still)) * direction / (2 * s))
         centre = still if problem.program.exogenous else still[:, :1]
-        return (ahead - problem.value(theta, centre)) * direction / s
+        return np.asarray((ahead - problem.value(theta, centre)) * direction / s)
 
     def declares_unbiased(self, program: Program) -> bool:
         """Return whether it smoothes as J_sigma does: noise on theta, and no radius of its own."""

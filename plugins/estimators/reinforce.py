@@ -34,7 +34,7 @@ class Reinforce(SampleMean):
         f = problem.value(theta, w)
         if self.baseline == "center":
             f = f - problem.value(theta, np.zeros((w.shape[0], 1)))
-        return f * problem.score(theta, w) + problem.explicit(theta, w)
+        return np.asarray(f * problem.score(theta, w) + problem.explicit(theta, w))
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean over samples of (f - b) * score."""
@@ -47,4 +47,4 @@ class Reinforce(SampleMean):
         f = (f - f.mean(axis=1, keepdims=True)) * f.shape[1] / (f.shape[1] - 1)
         score = per_repeat(problem.score(theta, w), noise)
         explicit = per_repeat(problem.explicit(theta, w), noise)
-        return np.einsum("rn,rnd->rd", f, score) / f.shape[1] + explicit.mean(axis=1)
+        return np.asarray(np.einsum("rn,rnd->rd", f, score) / f.shape[1] + explicit.mean(axis=1))

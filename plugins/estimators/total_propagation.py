@@ -102,7 +102,7 @@ class TotalPropagation(Estimator):
 def _weight(v0: np.ndarray, v1: np.ndarray) -> np.ndarray:
     """Return v0 / (v0 + v1), 1/2 where both are 0 and any weight is right."""
     total = v0 + v1
-    return np.divide(v0, total, out=np.full_like(total, 0.5), where=total > 0)
+    return np.asarray(np.divide(v0, total, out=np.full_like(total, 0.5), where=total > 0))
 
 
 def _controls(program: Program) -> int:

@@ -58,7 +58,7 @@ class Windowed(Estimator):
         """Return the mean over samples of the gradient through windows."""
         program, w = problem.program, columns(noise)
         if not isinstance(program, Rollout) or (self.steps >= program.scene.horizon and self.cut is None):
-            return per_repeat(problem.grad(theta, w), noise).mean(axis=1)
+            return np.asarray(per_repeat(problem.grad(theta, w), noise).mean(axis=1))
         found = slopes(problem, theta, w)
         problem.usage.gradients += w.shape[1]
         ends = self._ends(found)
@@ -69,7 +69,7 @@ class Windowed(Estimator):
                 return adjoint
             return np.where(ends[t], value(t, states), adjoint)
 
-        return per_repeat(adjoint_gradient(problem, found, cut), noise).mean(axis=1)
+        return np.asarray(per_repeat(adjoint_gradient(problem, found, cut), noise).mean(axis=1))
 
     def _ends(self, found: Slopes) -> np.ndarray:
         """Return whether a window ends before step t, ``(T, B)``."""

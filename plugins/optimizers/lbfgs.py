@@ -55,4 +55,4 @@ class Lbfgs(Searching):
         q = q * ((s @ y) / (y @ y))
         for (s, y), share in zip(pairs, reversed(shares), strict=True):
             q = q + s * (share - (y @ q) / (y @ s))
-        return -q
+        return np.asarray(-q)

@@ -80,11 +80,11 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
         """Return the cost of one copy under u = k x: a geometric sum."""
         factor = (1.0 + self.dt * k) ** 2
         powers = factor[None] ** np.arange(self.horizon + 1)[:, None]
-        return (1.0 + self.effort * k * k) * powers[:-1].sum(axis=0) + self.end * powers[-1]
+        return np.asarray((1.0 + self.effort * k * k) * powers[:-1].sum(axis=0) + self.end * powers[-1])
 
     def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:
         """Return p x'x with the p of that step, from the scalar Riccati recursion."""
         p = self.end
         for _ in range(self.horizon - step):
             p = 1.0 + p - (self.dt * p) ** 2 / (self.effort + self.dt**2 * p)
-        return p * (v * v).sum(axis=0)
+        return np.asarray(p * (v * v).sum(axis=0))

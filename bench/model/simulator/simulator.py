@@ -384,7 +384,7 @@ class Simulator:
         if self._grad == "jax":
             if self._single is None:
                 self._jax_values(thetas, w, self.batch)
-            return self._call_compiled(self._slope, self._eager[1], thetas, w, self.batch)
+            return np.asarray(self._call_compiled(self._slope, self._eager[1], thetas, w, self.batch))
         return self._torch_slopes(thetas, w)
 
     def _user_slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
