@@ -20,6 +20,7 @@ from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
 from bench.model.estimator import (
     Auxiliaries,
+    DiagnosticEstimator,
     Estimator,
     SampleMean,
     Smoothing,
@@ -77,6 +78,7 @@ __all__ = [
     "DampedScene",
     "Decision",
     "Descent",
+    "DiagnosticEstimator",
     "DisturbedScene",
     "Dynamics",
     "EngineScene",

@@ -12,7 +12,7 @@ from bench.model import Array, Backend, LoopOps, Problem, Program
 
 from ..fused import emit, kernels, trace
 from ..fused.graph import Refused
-from .jax import Jax, JaxOps, JaxProblem
+from .jax import Jax, JaxOps, JaxProblem, use_double_precision
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Fused(Backend):
 
     def compile(self, program: Program) -> Problem:
         """Return the program as a problem; its kernels are compiled at the first call of each function, for any batch."""
-        _use_double()
+        use_double_precision()
         return FusedProblem(program, JaxOps(), self.dtype, "reverse")
 
     def unsupported_reason(self, program: Program) -> str | None:
@@ -41,19 +41,13 @@ class Fused(Backend):
             return None
         if program.surrogate:
             return f"backend {self.name} differentiates the program itself, not a law's surrogate: use jax"
-        _use_double()
+        use_double_precision()
         try:
             for function in ("value", "grad"):
                 _source(_Structure(program), function, self.dtype)
         except Refused as error:
             return f"backend {self.name} has no scalar code for {error}"
         return None
-
-
-def _use_double() -> None:
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
 
 
 class _PlainOps(LoopOps):

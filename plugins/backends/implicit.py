@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 from bench.model import Array, Ops
 
-from .jax import Jax, JaxOps
+from .jax import Jax, JaxOps, use_double_precision
 
 ROUNDING = 8.0
 """Units in the last place of the unknown below which a residual counts as rounding error."""
@@ -39,9 +39,7 @@ class Implicit(Jax):
         imported Equinox before must set ``EQX_ON_ERROR=off`` itself, or a failed column raises an error for its batch.
         """
         os.environ.setdefault("EQX_ON_ERROR", "off")
-        import jax
-
-        jax.config.update("jax_enable_x64", True)
+        use_double_precision()
         return ImplicitOps()
 
 

@@ -45,10 +45,15 @@ class Jax(Backend):
 
     def ops(self) -> Ops:
         """Return the operations for the model code."""
-        import jax
-
-        jax.config.update("jax_enable_x64", True)
+        use_double_precision()
         return JaxOps()
+
+
+def use_double_precision() -> None:
+    """Let JAX compute in float64 where arrays are float64."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
 
 
 class JaxOps(LoopOps):

@@ -5,11 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Auxiliaries, Estimator, Problem, first_order, halves, param, zeroth_order
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, first_order, halves, param, zeroth_order
 
 
 @dataclass(frozen=True)
-class AlphaOrder(Estimator):
+class AlphaOrder(DiagnosticEstimator):
     """Approximates grad J_sigma with a fobg + (1 - a) zobg, the weight a chosen by a confidence test (Suh et al. 2022).
 
     With v1, v0 the variances of the two means, a = v0 / (v1 + v0) when the zeroth-order mean is known to within
@@ -36,10 +36,6 @@ class AlphaOrder(Estimator):
     sharing: str = param("split", "whether both orders take the same samples", choices=("split", "shared"))
     delta: float = param(0.05, "failure probability of the confidence radius", positive=True, high=1.0)
     bound: float | None = param(None, "L, bound on |zeroth-order term|; null: the largest seen", positive=True)
-
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return estimates with one interpolation weight per repeat."""
-        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray

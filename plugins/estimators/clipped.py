@@ -5,11 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Auxiliaries, Estimator, Problem, first_order, param
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, first_order, param
 
 
 @dataclass(frozen=True)
-class Clipped(Estimator):
+class Clipped(DiagnosticEstimator):
     """Approximates grad J_sigma with the mean of sampled gradients, cut at ``limit`` (Pascanu et al. 2013 cut norms).
 
     ``by``: ``sample``, each sample's norm; ``element``, each coordinate of each sample; ``batch``, the norm of the mean.
@@ -28,10 +28,6 @@ class Clipped(Estimator):
         None, "largest size, in units of the gradient; null: that quantile of the batch", positive=True
     )
     quantile: float = param(0.9, "share of the samples' sizes below the limit where limit is null", low=0.0, high=1.0)
-
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the means of the cut gradients."""
-        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray

@@ -5,11 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Auxiliaries, Estimator, Problem, Program, columns, per_repeat, zeroth_order
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, Program, columns, per_repeat, zeroth_order
 
 
 @dataclass(frozen=True)
-class ControlVariate(Estimator):
+class ControlVariate(DiagnosticEstimator):
     """Approximates grad J_sigma with the zeroth order minus c (g . w) w plus c g, g being df/dtheta at w = 0.
 
     (g . w) w has the known expectation g, so that the result is unbiased for any cost and any c, even where g is wrong.
@@ -23,10 +23,6 @@ class ControlVariate(Estimator):
     needs = frozenset({"value", "grad", "score"})
     unbiased_at_discontinuities = True
     diagnostics: ClassVar[tuple[str, ...]] = ("coefficient",)
-
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean of the controlled terms."""
-        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray

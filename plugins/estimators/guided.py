@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Estimator, Problem, Program, columns, first_order, param, per_repeat
+from bench.model import Estimator, Problem, columns, first_order, param, per_repeat
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,7 @@ class Guided(Estimator):
     """
 
     name = "guided"
+    needs_directions = True
     needs = frozenset({"value", "grad"})
     unbiased = False
 
@@ -41,9 +42,3 @@ class Guided(Estimator):
         still = problem.centred(columns(fresh))
         change = problem.displaced(shift, theta, still) - problem.displaced(-shift, theta, still)
         return np.asarray(per_repeat(change * shift / (2.0 * s * s), fresh).mean(axis=1))
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
-        if program.n_noise >= program.dim:
-            return None
-        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"

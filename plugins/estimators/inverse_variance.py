@@ -5,11 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Auxiliaries, Estimator, Problem, halves
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, halves
 
 
 @dataclass(frozen=True)
-class InverseVariance(Estimator):
+class InverseVariance(DiagnosticEstimator):
     """Approximates grad J_sigma with, per coordinate, the fobg and zobg means weighted by 1 / their variances.
 
     The weights are v0 / (v0 + v1) and v1 / (v0 + v1) on independent halves of the samples (total propagation, Parmas et
@@ -22,10 +22,6 @@ class InverseVariance(Estimator):
     includes_explicit_derivative = True
     unbiased = False
     diagnostics: ClassVar[tuple[str, ...]] = ("weight",)
-
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return estimates with one weight per repeat and coordinate."""
-        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray

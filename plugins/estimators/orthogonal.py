@@ -18,6 +18,7 @@ class Orthogonal(Estimator):
     """
 
     name = "orthogonal"
+    needs_directions = True
     unbiased_at_discontinuities = True
 
     lengths: str = param("drawn", "lengths of the directions", choices=("drawn", "fixed"))
@@ -41,12 +42,6 @@ class Orthogonal(Estimator):
         still = problem.centred(columns(noise))
         change = problem.displaced(shift, theta, still) - problem.displaced(-shift, theta, still)
         return np.asarray(per_repeat(change * shift / (2.0 * s * s), noise).mean(axis=1))
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
-        if program.n_noise >= program.dim:
-            return None
-        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"
 
 
 def _rotated(normal: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ class RandomizedSmoothing(SampleMean):
     """
 
     name = "randomized_smoothing"
+    needs_directions = True
     unbiased_at_discontinuities = True
 
     variant: str = param("antithetic", "which difference", choices=("antithetic", "forward"))
@@ -52,9 +53,3 @@ class RandomizedSmoothing(SampleMean):
         if self.reference == "sigma" or self.radius is None or not program.noise_on_theta:
             return None
         return Smoothing("gaussian", self.radius)
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
-        if program.n_noise >= program.dim:
-            return None
-        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"

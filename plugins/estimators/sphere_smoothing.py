@@ -18,6 +18,7 @@ class SphereSmoothing(SampleMean):
     """
 
     name = "sphere_smoothing"
+    needs_directions = True
     unbiased = False
 
     radius: float | None = param(None, "r, in units of theta; null: sigma sqrt(d + 2)", positive=True)
@@ -47,9 +48,3 @@ class SphereSmoothing(SampleMean):
     def declares_unbiased(self, program: Program) -> bool:
         """Return whether its expectation is the reference: that of the ball is, whatever the cost."""
         return self.reference == "own"
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
-        if program.n_noise >= program.dim:
-            return None
-        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"

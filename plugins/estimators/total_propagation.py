@@ -7,7 +7,7 @@ import numpy as np
 
 from bench.model import (
     Auxiliaries,
-    Estimator,
+    DiagnosticEstimator,
     MechanicalScene,
     Problem,
     Program,
@@ -24,7 +24,7 @@ from bench.model import (
 
 
 @dataclass(frozen=True)
-class TotalPropagation(Estimator):
+class TotalPropagation(DiagnosticEstimator):
     """Approximates grad J_sigma with both orders of the same samples, weighted for each step's controls.
 
     The weights are v0 / (v0 + v1) and v1 / (v0 + v1), v the summed variances of one step's part of theta: where a
@@ -48,10 +48,6 @@ class TotalPropagation(Estimator):
     diagnostics: ClassVar[tuple[str, ...]] = ("weight",)
 
     per: str = param("step", "what is weighted together", choices=("step", "control", "action"))
-
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return estimates with one weight per repeat and part of theta."""
-        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray

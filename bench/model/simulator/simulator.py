@@ -390,9 +390,8 @@ class Simulator:
     def _user_slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
         assert callable(self._grad)
         if self.batch in ("columns", "rows"):
-            transpose = (lambda a: a.T) if self.batch == "rows" else (lambda a: a)
-            arguments = [transpose(self._array(part)) for part in (thetas, w) if part is not None]
-            gradients = as_numpy(self._grad(*arguments))
+            arguments = [self._array(part) for part in (thetas, w) if part is not None]
+            gradients = as_numpy(self._grad(*(part.T if self.batch == "rows" else part for part in arguments)))
             gradients = gradients.T if self.batch == "rows" else gradients
             if gradients.shape != thetas.shape:
                 raise UserError(
