@@ -29,8 +29,8 @@ SURROGATE = "the gradient is a surrogate, not the derivative of the program"
 class Decision:
     """The meaning of theta, and the point at which gradients are taken.
 
-    Without ``names`` theta is the scene's own decision variable. With ``names`` it consists of these float parameters of
-    the scene or its contact law (``mass``, or ``pushing.mass`` and ``penalty.stiffness`` if both have the name), and
+    Without ``names`` theta is the scene's own decision variable. With ``names`` it consists of these float parameters
+    of the scene or its contact law (``mass``, or ``pushing.mass`` and ``penalty.stiffness`` if both have the name), and
     noise is on theta. ``at`` replaces the scene's own value of theta.
     """
 

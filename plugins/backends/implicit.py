@@ -35,8 +35,9 @@ class Implicit(Jax):
         """Return JAX operations with a root finder.
 
         Equinox, on which optimistix and lineax are built, is configured to return the nonfinite result of a failed
-        solve in its own column. Its other options, an exception or NaN, would affect the whole batch. A program that has
-        imported Equinox before must set ``EQX_ON_ERROR=off`` itself, or a failed column raises an error for its batch.
+        solve in its own column. Its other options, an exception or NaN, would affect the whole batch. A program that
+        has imported Equinox before must set ``EQX_ON_ERROR=off`` itself, or a failed column raises an error for its
+        batch.
         """
         os.environ.setdefault("EQX_ON_ERROR", "off")
         use_double_precision()

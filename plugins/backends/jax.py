@@ -219,7 +219,8 @@ class JaxProblem(Problem):
     def _derivative(self, function: Callable[[Array], Array], theta: Array, batch: int) -> Array:
         """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; NaN where b has no value.
 
-        A rollout can fail where the derivative is not looking: a choice between NaN and a number passes on the number's.
+        A rollout can fail where the derivative is not looking: a choice between NaN and a number passes on the
+        number's.
         """
         import jax
         import jax.numpy as jnp
