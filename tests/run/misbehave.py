@@ -101,9 +101,7 @@ KINDS = {
 """By kind: a sound plugin and its class, the rest of a sweep, its own axis, calls of a worker, calls of the plan."""
 # both are ten times what sound plugins take on an idle machine: nothing that is busy is taken for something that hangs
 WORDS = ["samples=8", "repeats=3", "timing=false", "workers=2", "timeout=45s", "memory=700m", "reference.samples=4096", "formats=[png]", "--quiet"]  # fmt: skip
-START = (
-    "import runpy; from bench.model import trial; trial.TIMEOUT_S = 30.0; runpy.run_module('bench', run_name='__main__')"
-)
+START = "import runpy; from bench.model import trial; trial.TIMEOUT_S = 30.0; runpy.run_module('bench', run_name='__main__')"
 SAID = re.compile(r"Traceback|[\x00-\x08\x0b-\x1f]")
 
 
