@@ -11,14 +11,14 @@ from bench.model import EngineTwin, MechanicalScene, Program, Unsupported
 from .contacts.penalty import Penalty
 
 MATCH = {"euler": "semi_implicit_euler", "implicitfast": "semi_implicit_euler", "rk4": "rk4"}
-"""The engine's integrators, and the integrators of the scene's program that each replaces.
+"""The engine's integrators, and the integrator of the scene's program that each one replaces.
 
-``euler`` is the same map. ``implicitfast`` takes joint and tendon damping at the end of the step and is otherwise the
-same.
+``euler`` is the same map. ``implicitfast`` evaluates joint and tendon damping at the end of the step and is otherwise
+the same map.
 """
 
 
-def refusal(backend: Any, program: Program) -> str | None:
+def unsupported_reason(backend: Any, program: Program) -> str | None:
     """Return why an engine cannot run the program, or None."""
     scene, law = program.scene, program.contact
     if not isinstance(scene, EngineTwin):
@@ -27,20 +27,18 @@ def refusal(backend: Any, program: Program) -> str | None:
         return f"{backend.name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
     if program.integrator is None or program.integrator.name != MATCH[backend.integrator]:
         name = program.integrator.name if program.integrator else "none"
-        return f"{backend.name} steps by its own {backend.integrator}, which stands for {MATCH[backend.integrator]}, not {name}"
+        return f"{backend.name} uses its own integrator {backend.integrator}, which replaces {MATCH[backend.integrator]}, not {name}"
     if law is not None and not isinstance(law, Penalty):
-        return f"{backend.name} has its own contact, which stands for penalty, not {law.name}"
+        return f"{backend.name} uses its own contact model, which replaces penalty, not {law.name}"
     if law is not None and law.damping and law.damping_mode != "clipped":
-        return (
-            f"{backend.name}'s contacts never pull: of the dampers it stands for clipped alone, not {law.damping_mode}"
-        )
+        return f"{backend.name}'s contacts never pull: it supports damping_mode=clipped only, not {law.damping_mode}"
     return None
 
 
 def build(backend: Any, program: Program) -> Any:
     """Build the twin as an ``mujoco.MjModel`` with the scene's time step, the law's springs and the backend's solver.
 
-    Raises :class:`Unsupported` for programs that the backend refuses.
+    Raises :class:`Unsupported` for programs that the backend does not support.
     """
     import mujoco
 
@@ -69,21 +67,21 @@ def _set_springs(model: Any, law: Penalty, impedance: float) -> None:
     """Set each contact pair's solref and solimp so that its force is that of ``law``, for an impedance near 0.
 
     The engine gives a contact the acceleration a = (1 - d) a_free - (k r + c r') A, with the impedance d and the
-    inverse mass A that it takes for the pair: a spring of k [N/m] that hides the share d of all other forces.
+    inverse mass A of the pair: a spring of k [N/m] that cancels the share d of all other forces.
     """
     bodies = model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2])]
     inverse_mass = model.body_invweight0[bodies, 0].sum(axis=0)
-    inverse_mass *= _edges(model)
+    inverse_mass *= _cone_factor(model)
     model.pair_solref[:] = -np.array([law.stiffness, law.damping]) * inverse_mass[:, None]
     model.pair_solimp[:, :2] = impedance
 
 
-def _edges(model: Any) -> Any:
-    """Return by how much less each pair's spring has to be, as its force is made of several, ``(n_pairs,)``.
+def _cone_factor(model: Any) -> Any:
+    """Return the factor on each pair's spring that accounts for the edges of its friction cone, ``(n_pairs,)``.
 
     With a pyramidal cone a contact with friction is the sum of four edges (two with one direction of friction), each a
-    spring with the inverse mass A (1 + mu^2) instead of A. The engine takes 2 mu^2 of that for the regularisation of an
-    edge at small impedances, so that the normal force of all is 2 / (mu^2 (1 + mu^2)) times that of one spring
+    spring with the inverse mass A (1 + mu^2) instead of A. The engine uses 2 mu^2 of that for the regularisation of an
+    edge at small impedances, so that the total normal force is 2 / (mu^2 (1 + mu^2)) times that of one spring
     (MuJoCo, Computation, "Pyramidal cones": R of all edges is one value, derived from the friction coefficients).
     """
     import mujoco
@@ -95,10 +93,10 @@ def _edges(model: Any) -> Any:
 
 
 def _disabled(bit: Any, model: Any, lean: bool) -> int:
-    """Return flags for features that no twin may use and, with ``lean``, for those that this one does not use.
+    """Return flags for features that no twin may use and, with ``lean``, for features that this twin does not use.
 
-    Steps must depend only on the state (no warm start), damp as the scene does (not implicitly), diverge where they
-    diverge (no reset) and take any spring (no refsafe).
+    Steps must depend on the state only (no warm start), damp like the scene (not implicitly), keep diverging states
+    (no reset) and accept any spring (no refsafe).
     """
     off = bit.mjDSBL_WARMSTART | bit.mjDSBL_EULERDAMP | bit.mjDSBL_AUTORESET | bit.mjDSBL_REFSAFE | bit.mjDSBL_CLAMPCTRL
     if not lean:

@@ -59,10 +59,10 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
     repeated = np.tile(noisy, (1, horizon))
 
     def stage(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return 0.0 * x[0] + scene.stage_cost(np, *_split(program, x), u)
+        return np.asarray(0.0 * x[0] + scene.stage_cost(np, *_split(program, x), u))
 
     def end(x: np.ndarray) -> np.ndarray:
-        return scene.terminal_cost(np, *_split(program, x))
+        return np.asarray(scene.terminal_cost(np, *_split(program, x)))
 
     def back(x: np.ndarray) -> np.ndarray | None:
         return scene.feedback(np, repeated, *_split(program, x))
@@ -123,7 +123,7 @@ def by_theta(problem: Problem, path: Slopes, by_control: np.ndarray, adjoint: np
     if path.feedback_x is not None:
         result = result + _theta_differences(back, path.theta, flat)
     start = _theta_differences(lambda theta: np.concatenate(scene.initial_state(np, theta)), path.theta, adjoint)
-    return result + start
+    return np.asarray(result + start)
 
 
 # ---------------------------------------------------------------------------------------------------- differences

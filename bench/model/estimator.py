@@ -46,6 +46,8 @@ class Estimator(Plugin):
     Without this term, cost times score is biased where theta sets the initial state and noise is on the actions, so the
     estimator is not supported there.
     """
+    needs_directions: ClassVar[bool] = False
+    """Whether it takes a direction in theta space from each sample, which needs at least d normal numbers per sample."""
     gives_gradient: ClassVar[bool] = True
     """Whether it estimates a gradient, along which an optimizer can descend."""
 
@@ -61,7 +63,7 @@ class Estimator(Plugin):
     ) -> tuple[np.ndarray, Auxiliaries]:
         """Return the estimates, and by name one array ``(R,)`` or ``(R, d)`` for each of :attr:`diagnostics`.
 
-        An estimator with diagnostics defines this method, and returns its first part in :meth:`estimate`.
+        An estimator with diagnostics derives from :class:`DiagnosticEstimator` and defines this method.
         """
         return self.estimate(problem, theta, noise), {}
 
@@ -92,7 +94,26 @@ class Estimator(Plugin):
                 return f"{condition}cost times score lacks a term, which {self.name} does not add"
             if "explicit" not in provides:
                 return f"{condition}{self.name} needs explicit, which {backend} lacks"
+        if self.needs_directions and program.n_noise < program.dim:
+            return (
+                f"{self.name} needs {program.dim} normal numbers per sample, and the noise model has {program.n_noise}"
+            )
         return self.unsupported_reason(program)
+
+
+@dataclass(frozen=True)
+class DiagnosticEstimator(Estimator):
+    """An estimator with diagnostics, whose :meth:`estimate` is the first part of :meth:`estimate_with_diagnostics`."""
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the estimates without diagnostics."""
+        return self.estimate_with_diagnostics(problem, theta, noise)[0]
+
+    @abstractmethod
+    def estimate_with_diagnostics(
+        self, problem: Problem, theta: np.ndarray, noise: np.ndarray
+    ) -> tuple[np.ndarray, Auxiliaries]:
+        """Return the estimates, and by name one array ``(R,)`` or ``(R, d)`` for each of :attr:`diagnostics`."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +131,7 @@ class SampleMean(Estimator):
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of the terms over the samples of each repeat."""
-        return per_repeat(self.terms(problem, theta, columns(noise)), noise).mean(axis=1)
+        return np.asarray(per_repeat(self.terms(problem, theta, columns(noise)), noise).mean(axis=1))
 
 
 def columns(noise: np.ndarray) -> np.ndarray:

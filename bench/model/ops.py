@@ -26,7 +26,8 @@ class Ops(Protocol):
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
         """Return ``z (n, B)`` with ``residual(z, args) = 0``; column b of the residual depends only on column b of z.
 
-        The derivative follows from the implicit-function theorem. Raises :class:`Unsupported` on backends without ``root``.
+        The derivative follows from the implicit-function theorem. Raises :class:`Unsupported` on backends without
+        ``root``.
         """
 
 

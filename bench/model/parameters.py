@@ -103,7 +103,8 @@ def traced(plugin: Plugin) -> list[str]:
 def build(plugin: type[Plugin], values: Mapping[str, Any]) -> Plugin:
     """Build an instance with validated parameter values.
 
-    Raises :class:`UserError` for an unknown name or an invalid type or value, and if the plugin's own code fails or exits.
+    Raises :class:`UserError` for an unknown name or an invalid type or value, and if the plugin's own code fails or
+    exits.
     """
     declared = parameters(plugin)
     checked = {}

@@ -29,8 +29,8 @@ SURROGATE = "the gradient is a surrogate, not the derivative of the program"
 class Decision:
     """The meaning of theta, and the point at which gradients are taken.
 
-    Without ``names`` theta is the scene's own decision variable. With ``names`` it consists of these float parameters of
-    the scene or its contact law (``mass``, or ``pushing.mass`` and ``penalty.stiffness`` if both have the name), and
+    Without ``names`` theta is the scene's own decision variable. With ``names`` it consists of these float parameters
+    of the scene or its contact law (``mass``, or ``pushing.mass`` and ``penalty.stiffness`` if both have the name), and
     noise is on theta. ``at`` replaces the scene's own value of theta.
     """
 
@@ -251,12 +251,12 @@ class Program(ABC):
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
         """Return f(theta, w) for ``theta (d, 1)`` or ``(d, B)`` and ``w (n_w, B)``: ``(B,)``."""
 
-    @abstractmethod
     def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
         """Return ``(B,)`` whose gradient by ``theta_scored`` at ``theta_scored = theta`` is the score.
 
-        Needed only for noise on the actions of a policy; otherwise the score is w / sigma.
+        By default this is w . theta_scored / sigma, for noise on theta.
         """
+        return ops.xp.sum(w[: self.dim] * theta_scored, axis=0) / self.scene.sigma
 
     def explicit_cost(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> Array:
         """Return the cost at ``theta_moved`` under the actions that theta and w determine, ``(B,)``.
@@ -297,10 +297,6 @@ class FunctionProgram(Program):
         """Number of the scene's own normal numbers."""
         return self.scene.exogenous if isinstance(self.scene, DisturbedScene) else 0
 
-    def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
-        """Return w . theta_scored / sigma, ``(B,)``, since noise is on theta."""
-        return ops.xp.sum((w[: self.dim] if self.exogenous else w) * theta_scored, axis=0) / self.scene.sigma
-
 
 class CallableProgram(Program):
     """The program of a scene whose cost is a user's own simulator, which no array namespace can run."""
@@ -317,10 +313,6 @@ class CallableProgram(Program):
         raise Unsupported(
             f"scene {self.scene.name} is a user's own simulator: it runs on {' and '.join(self.scene.backends)} only"
         )
-
-    def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
-        """Return w . theta_scored / sigma, ``(B,)``, since noise is on theta."""
-        return ops.xp.sum(w[: self.dim] * theta_scored, axis=0) / self.scene.sigma
 
 
 class Rollout(Program):

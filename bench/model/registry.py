@@ -1,8 +1,9 @@
 """Finds plugins and reports whether they are available.
 
 Built-in plugins are the files under ``plugins/<kind>/`` and the folders under ``bench/studies/``; others come from
-folders passed to :func:`add_folder` and from the entry-point group ``bench.plugins``, in which each entry names a plugin
-class. Importing a plugin must stay cheap: it names heavy libraries in ``requires`` and imports them when it is used.
+folders passed to :func:`add_folder` and from the entry-point group ``bench.plugins``, in which each entry names a
+plugin class. Importing a plugin must stay cheap: it names heavy libraries in ``requires`` and imports them when it is
+used.
 """
 
 from __future__ import annotations

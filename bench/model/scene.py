@@ -69,8 +69,8 @@ class FunctionScene(Scene):
 class DisturbedScene(FunctionScene):
     """A role: a plain function with its own noise in addition to the noise on theta.
 
-    ``J_sigma(theta) = E f(theta + sigma u, e)`` over both: d normal numbers u, then ``exogenous`` numbers e of the scene.
-    No estimator shifts e for smoothing, and no score depends on it.
+    ``J_sigma(theta) = E f(theta + sigma u, e)`` over both: d normal numbers u, then ``exogenous`` numbers e of the
+    scene. No estimator shifts e for smoothing, and no score depends on it.
     """
 
     exogenous: ClassVar[int]
@@ -175,9 +175,9 @@ class DampedScene(MechanicalScene):
 class ProcessNoiseScene(MechanicalScene):
     """A role: process noise on every control of every step, in addition to the noise on theta.
 
-    ``u_t = plan + feedback + gust e_t`` with ``horizon * n_u`` normal numbers e, which follow the d numbers on theta, so
-    that J averages over both. No estimator shifts e for smoothing, and no score depends on it. The scene decides what u
-    does: a channel may be a wind force, or the relative error of a mass or stiffness in that step.
+    ``u_t = plan + feedback + gust e_t`` with ``horizon * n_u`` normal numbers e, which follow the d numbers on theta,
+    so that J averages over both. No estimator shifts e for smoothing, and no score depends on it. The scene decides
+    what u does: a channel may be a wind force, or the relative error of a mass or stiffness in that step.
     """
 
     noise: str = param("parameter", "sigma is the noise on theta; gusts are added to it", choices=("parameter",))

@@ -1,1 +1,1 @@
-"""Backends: they execute a program and differentiate it."""
+"""Backends execute and differentiate programs."""

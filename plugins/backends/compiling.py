@@ -1,4 +1,4 @@
-"""Compiled JAX functions: each is compiled once per process, counted, and kept between runs in a folder."""
+"""Compiles JAX functions once per process, counts the compilations, and stores executables in a folder between runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _busy = threading.Lock()
 
 @dataclass(frozen=True)
 class Compiled:
-    """An executable, and the seconds of tracing, lowering and compiling it; ``loaded`` if it came from the folder."""
+    """An executable and the seconds of tracing, lowering and compiling; ``loaded`` if it was read from the folder."""
 
     name: str
     call: Callable[..., Any]
@@ -34,31 +34,31 @@ def compiled(
 ) -> Compiled:
     """Return the executable of ``function`` for arguments of these shapes; ``key`` identifies program and shapes.
 
-    With ``fresh`` its seconds are those of a compilation: the folder of ``count`` is bypassed, and an executable that
-    was loaded from it is compiled again. Compilations and requests are added to ``count``.
+    With ``fresh`` the seconds are those of a real compilation: the folder of ``count`` is bypassed, and an executable
+    loaded from it is compiled again. Compilations and requests are added to ``count``.
     """
-    # one at a time: JAX's cache folder is a setting of the whole process
+    # one at a time, since JAX's cache folder is a global setting
     with _busy:
-        found = _known.get(key)
-        if found is None or (fresh and found.loaded):
-            name = found.name if found else hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+        executable = _known.get(key)
+        if executable is None or (fresh and executable.loaded):
+            name = executable.name if executable else hashlib.sha256(repr(key).encode()).hexdigest()[:16]
             folder = None if fresh or count.folder is None else str(count.folder)
-            found = _known[key] = _compile(name, function, arguments, folder)
-            count.made += not found.loaded
-        count.shapes.add(found.name)
-        return found
+            executable = _known[key] = _compile(name, function, arguments, folder)
+            count.made += not executable.loaded
+        count.shapes.add(executable.name)
+        return executable
 
 
 def _compile(name: str, function: Callable[..., Any], arguments: tuple[Any, ...], folder: str | None) -> Compiled:
-    """Compile a function and take the time.
+    """Compile a function and measure the time.
 
-    Single operations on constants, which libraries make JAX compile on the way, add to the seconds but are not counted.
+    Single operations on constants that libraries compile meanwhile add to the seconds but are not counted.
     """
     import jax
 
     _use(folder)
     _listen()
-    # blocks run beside each other, one thread each
+    # blocks run in parallel, each on one thread
     options: dict[str, str | bool] | None = None
     if jax.default_backend() == "cpu":
         options = {"xla_cpu_multi_thread_eigen": False}
@@ -74,7 +74,7 @@ def _compile(name: str, function: Callable[..., Any], arguments: tuple[Any, ...]
 
 
 def _use(folder: str | None) -> None:
-    """Keep compiled programs in a folder and load them from there; with None, do neither."""
+    """Store compiled programs in a folder and load them from it; with None, do neither."""
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
@@ -87,19 +87,19 @@ def _use(folder: str | None) -> None:
 
 _listening = False
 _loaded = 0
-"""Number of programs that JAX loaded from the folder."""
+"""Number of programs that JAX has loaded from the folder."""
 
 
 def _listen() -> None:
-    """Have JAX report each program that it loads from the folder."""
+    """Register a listener for programs that JAX loads from the folder."""
     global _listening
     if _listening:
         return
     _listening = True
     from jax import monitoring
 
-    def happened(event: str, **facts: Any) -> None:
+    def record(event: str, **facts: Any) -> None:
         global _loaded
         _loaded += event == "/jax/compilation_cache/cache_hits"
 
-    monitoring.register_event_listener(happened)
+    monitoring.register_event_listener(record)

@@ -12,36 +12,36 @@ from bench.model import Array, Backend, LoopOps, Problem, Program
 
 from ..fused import emit, kernels, trace
 from ..fused.graph import Refused
-from .jax import Jax, JaxOps, JaxProblem
+from .jax import Jax, JaxOps, JaxProblem, use_double_precision
 
 
 @dataclass(frozen=True)
 class Fused(Backend):
     """Gradients: exact derivative of the program by JAX's rules for single operations; float64 or float32; no roots.
 
-    JAX traces the program once for one rollout. Its step and the step's adjoint become scalar code, the loop over time
-    lies inside, and rollouts are the lanes of vector instructions, so that states stay near the core. Equal to ``jax``
-    up to rounding, ties included; trajectories, step Jacobians and explicit derivatives come from ``jax`` itself. A
-    program with an operation that has no scalar form is refused by the operation's name.
+    JAX traces the program once for one rollout. The step and its adjoint become scalar code with the loop over time
+    inside, and rollouts are the lanes of vector instructions, so that states stay in registers and cache. Results equal
+    those of ``jax`` up to rounding, ties included. Trajectories, step Jacobians and explicit derivatives come from
+    ``jax`` itself. Programs with an operation that has no scalar form are not supported.
     """
 
     name = "fused"
     requires: ClassVar[tuple[str, ...]] = ("jax", "numba")
-    # surrogate gradients are refused
+    # surrogate gradients are not supported
     provides = Jax.provides - {"surrogate"}
 
     def compile(self, program: Program) -> Problem:
-        """Return the program, whose kernels are compiled at the first call of each function, for any batch."""
-        _use_double()
+        """Return the program as a problem; its kernels are compiled at the first call of each function, for any batch."""
+        use_double_precision()
         return FusedProblem(program, JaxOps(), self.dtype, "reverse")
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return the operation that has no form as scalar code, or None."""
+        """Return why the program cannot run, for example an operation without scalar form, or None."""
         if program.needs - self.provides:
             return None
         if program.surrogate:
             return f"backend {self.name} differentiates the program itself, not a law's surrogate: use jax"
-        _use_double()
+        use_double_precision()
         try:
             for function in ("value", "grad"):
                 _source(_Structure(program), function, self.dtype)
@@ -50,14 +50,8 @@ class Fused(Backend):
         return None
 
 
-def _use_double() -> None:
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-
-
 class _PlainOps(LoopOps):
-    """jax.numpy and lax.scan as it is."""
+    """Operations of jax.numpy with a plain lax.scan."""
 
     def __init__(self) -> None:
         import jax.numpy
@@ -72,7 +66,7 @@ class _PlainOps(LoopOps):
 
 
 class _Structure:
-    """A program, equal to others of the same structure."""
+    """A program that equals other programs of the same structure, as a key of caches."""
 
     def __init__(self, program: Program) -> None:
         self.program, self.key = program, program.structure
@@ -86,7 +80,7 @@ class _Structure:
 
 @dataclass(frozen=True)
 class _Source:
-    """The source of a kernel and the tables that it reads."""
+    """The source of a kernel and its tables of constants."""
 
     text: str
     length: int
@@ -117,36 +111,36 @@ def _source(structure: _Structure, function: str, dtype: str) -> _Source:
 
 
 class FusedProblem(JaxProblem):
-    """A program as compiled kernels; they take any batch and horizon, and float parameters as arguments."""
+    """A program as compiled kernels for any batch and horizon; float parameters are arguments."""
 
     grain = emit.LANES
-    # fewer are done before another thread has woken up
+    # fewer columns are finished before another thread has started
     least = 4096
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._kernel("value", theta, w, 1)[0][0]
+        return np.asarray(self._kernel("value", theta, w, 1)[0][0])
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        gradient, tame = self._kernel("grad", theta, w, self.dim)
-        # a cost that overflows has no gradient, finite as its slope may be
-        return gradient if tame else np.where(np.isfinite(self._value(theta, w)), gradient, np.nan)
+        gradient, is_bounded = self._kernel("grad", theta, w, self.dim)
+        # a cost that overflows has no gradient, even if its slope is finite
+        return gradient if is_bounded else np.where(np.isfinite(self._value(theta, w)), gradient, np.nan)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._kernel("score", theta, w, self.dim)[0]
 
     def _kernel(self, function: str, theta: np.ndarray, w: np.ndarray, rows: int) -> tuple[np.ndarray, bool]:
-        """Return ``(rows, B)`` of a kernel, and whether all slopes are so small that their cost is surely finite."""
+        """Return a kernel's result ``(rows, B)``, and whether all slopes are so small that all costs must be finite."""
         batch = w.shape[1]
         if batch % self.grain:
-            # a batch below one block comes as it is
-            short = -batch % self.grain
-            wide = [np.pad(x, ((0, 0), (0, short)), mode="edge") if x.shape[1] == batch else x for x in (theta, w)]
-            found, tame = self._kernel(function, wide[0], wide[1], rows)
-            return found[:, :batch], tame
+            # a batch below one block is not padded yet
+            missing = -batch % self.grain
+            padded = [np.pad(x, ((0, 0), (0, missing)), mode="edge") if x.shape[1] == batch else x for x in (theta, w)]
+            result, is_bounded = self._kernel(function, padded[0], padded[1], rows)
+            return result[:, :batch], is_bounded
         if not batch:
             return np.empty((rows, 0)), True
         source = _source(_Structure(self.program), function, self._dtype.name)
-        # in one piece: rows that lie far apart in a large batch would each need a page of their own
+        # contiguous: the distant rows of a large batch would each need their own memory page
         w, noise_row = self._flat(np.ascontiguousarray(w))
         if theta.shape[1] == 1:
             theta = np.repeat(theta, self.grain, axis=1)
@@ -159,13 +153,13 @@ class FusedProblem(JaxProblem):
             self._parameters, source.constants, source.indices, source.length, flat, row, column, flat, row, column,
             w, noise_row, out.reshape(-1), batch, rows, 0, batch,
         )  # fmt: skip
-        small, tame = self._compiled(source.text)(*arguments)
-        if not small:
-            _, tame = self._compiled(kernels.exact(source.text))(*arguments)
-        return out.astype(np.float64, copy=False), tame
+        is_small, is_bounded = self._compiled(source.text)(*arguments)
+        if not is_small:
+            _, is_bounded = self._compiled(kernels.exact(source.text))(*arguments)
+        return out.astype(np.float64, copy=False), is_bounded
 
     def _flat(self, array: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return a view that begins at the first entry, and the distance of its rows."""
+        """Return a flat view from the first entry, and the stride of its rows in entries."""
         array = np.asarray(array, dtype=self._dtype)
         size = array.itemsize
         if array.strides[1] != size or array.strides[0] % size or array.strides[0] < 0:

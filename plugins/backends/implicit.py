@@ -1,4 +1,4 @@
-"""Implicit contact: equations solved each step, differentiated by the implicit-function theorem."""
+"""Implicit steps: equations solved in each step and differentiated by the implicit-function theorem."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any, ClassVar
 
 from bench.model import Array, Ops
 
-from .jax import Jax, JaxOps
+from .jax import Jax, JaxOps, use_double_precision
 
-ROUNDED = 8.0
-"""Units in the last place of the unknown within which a residual is rounding."""
-PATIENCE = 8
-"""Iterations before rounding is taken for an answer: Newton's method ends within fewer wherever it can."""
+ROUNDING = 8.0
+"""Units in the last place of the unknown below which a residual counts as rounding error."""
+MIN_ITERATIONS = 8
+"""Iterations before a residual may count as rounding error. Newton's method needs fewer where it converges."""
 
 
 @dataclass(frozen=True)
 class Implicit(Jax):
     """Gradients: reverse mode through the rollout, implicit-function theorem at each solve, never through the solver.
 
-    optimistix finds the root (Newton), lineax solves the linear systems. Programs without an equation to solve run
-    as on ``jax``. Float64 or float32; forward mode is not the solver's adjoint and is available all the same.
+    optimistix finds the root by Newton's method and lineax solves the linear systems. Programs without an equation run
+    as on ``jax``. Float64 or float32. Forward mode is available too, although it is not the solver's adjoint.
     """
 
     name = "implicit"
@@ -34,14 +34,13 @@ class Implicit(Jax):
     def ops(self) -> Ops:
         """Return JAX operations with a root finder.
 
-        Equinox, on which optimistix and lineax are built, is set to leave a failed solve in the adjoint as it is, not
-        finite in its own column: its other choices, an exception or NaN, would spoil the whole batch. A program that
-        imports Equinox before sets ``EQX_ON_ERROR=off`` itself, or a column that cannot be solved is an error of its batch.
+        Equinox, on which optimistix and lineax are built, is configured to return the nonfinite result of a failed
+        solve in its own column. Its other options, an exception or NaN, would affect the whole batch. A program that
+        has imported Equinox before must set ``EQX_ON_ERROR=off`` itself, or a failed column raises an error for its
+        batch.
         """
         os.environ.setdefault("EQX_ON_ERROR", "off")
-        import jax
-
-        jax.config.update("jax_enable_x64", True)
+        use_double_precision()
         return ImplicitOps()
 
 
@@ -49,12 +48,12 @@ class ImplicitOps(JaxOps):
     """JAX operations, and ``root`` through optimistix."""
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Solve by Newton's method, each column on its own: a failed one spoils no values or gradients of the others.
+        """Return the root by Newton's method, ``(n, B)``. Columns are independent, so a failure does not affect others.
 
-        Residuals are met to 1e-12 (1e-6 in float32), and the unknown to that plus as much of its own size; or the
-        residual is down to the rounding of the unknown, as no residual of a stiff equation gets as small as 1e-12.
-        Columns that do not converge in 64 iterations come back as NaN, values and gradients, which makes their rollouts
-        ``nonfinite`` instead of wrong.
+        Converged means a residual below 1e-12 (1e-6 in float32) and the unknown to the same absolute and relative
+        tolerance, or a residual at the rounding error of the unknown, since stiff equations do not reach 1e-12. Columns
+        that do not converge in 64 iterations have NaN values and gradients, so that their rollouts are ``nonfinite``
+        instead of wrong.
         """
         import jax
         import jax.numpy as jnp
@@ -78,49 +77,49 @@ class ImplicitOps(JaxOps):
                 tags=frozenset({lineax.diagonal_tag} if scalar else ()),
             )  # fmt: skip
             solved = solution.result == optimistix.RESULTS.successful
-            # a factor, since a choice between value and NaN would give the gradient of the value
+            # a factor, since jnp.where(solved, value, NaN) would keep the gradient of the value
             return solution.value * jnp.where(solved, 1.0, jnp.nan).astype(guess.dtype)
 
         axes = jax.tree.map(lambda a: -1 if jnp.ndim(a) else None, args)
-        # the root does not depend on where the search for it starts
+        # the root does not depend on the initial guess
         return jax.vmap(column, in_axes=(-1, axes), out_axes=-1)(jax.lax.stop_gradient(guess), args)
 
 
 @cache
 def _newton() -> Any:
-    """Return optimistix's Newton with an end that does not depend on the units of the residual."""
+    """Return optimistix's Newton with a termination test that does not depend on the units of the residual."""
     import equinox
     import jax.numpy as jnp
     import optimistix
 
-    class Newton(optimistix.Newton):  # type: ignore[type-arg,misc]
-        """Newton's method that also ends where the residual is what rounding the unknown makes of it.
+    class Newton(optimistix.Newton):  # type: ignore[type-arg]
+        """Newton's method that also terminates when the residual is at the rounding error of the unknown.
 
-        A residual that multiplies a gap by dt^2 k / m = 1e11 rounds to 1e-5 at the root itself, and may step to and fro
-        between touching and not, which are one number apart. The steepest slope met is kept in a field of the state
-        that this end of the iteration leaves unused.
+        A residual that multiplies a gap by dt^2 k / m = 1e11 has rounding errors of 1e-5 at the root, and Newton's
+        method may alternate between two adjacent numbers with and without contact. The steepest slope so far is stored
+        in a field of the state that is not used otherwise.
         """
 
         def step(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> Any:
-            """Take a step, and keep the steepest slope."""
-            after, found, aux = super().step(fn, y, args, options, state, tags)
-            slope = jnp.abs(found.f).max() / jnp.maximum(jnp.abs(found.diff).max(), jnp.finfo(y.dtype).tiny)
+            """Take a step and store the steepest slope."""
+            after, new_state, aux = super().step(fn, y, args, options, state, tags)
+            slope = jnp.abs(new_state.f).max() / jnp.maximum(jnp.abs(new_state.diff).max(), jnp.finfo(y.dtype).tiny)
             steepest = jnp.maximum(state.diffsize_prev, jnp.where(jnp.isfinite(slope), slope, 0.0))
-            return after, equinox.tree_at(lambda s: s.diffsize_prev, found, steepest.astype(y.dtype)), aux
+            return after, equinox.tree_at(lambda s: s.diffsize_prev, new_state, steepest.astype(y.dtype)), aux
 
         def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> Any:
-            """Return whether to end, and with which result."""
+            """Return whether to terminate, and the result."""
             done, result = super().terminate(fn, y, args, options, state, tags)
-            return done | self._rounded(y, state), result
+            return done | self._is_rounding(y, state), result
 
         def postprocess(
             self, fn: Any, y: Any, aux: Any, args: Any, options: Any, state: Any, tags: Any, result: Any
         ) -> Any:
-            """Return the unknown whose residual was looked at, where that was rounding; else the one after it."""
-            return jnp.where(self._rounded(y, state), y + state.diff, y), aux, {}
+            """Return the unknown before the last step if its residual was rounding error, else the unknown after it."""
+            return jnp.where(self._is_rounding(y, state), y + state.diff, y), aux, {}
 
-        def _rounded(self, y: Any, state: Any) -> Any:
-            allowed = ROUNDED * jnp.finfo(y.dtype).eps * (1.0 + jnp.abs(y).max()) * state.diffsize_prev
-            return (state.step >= PATIENCE) & jnp.isfinite(state.f).all() & (jnp.abs(state.f).max() <= allowed)
+        def _is_rounding(self, y: Any, state: Any) -> Any:
+            allowed = ROUNDING * jnp.finfo(y.dtype).eps * (1.0 + jnp.abs(y).max()) * state.diffsize_prev
+            return (state.step >= MIN_ITERATIONS) & jnp.isfinite(state.f).all() & (jnp.abs(state.f).max() <= allowed)
 
     return Newton

@@ -44,15 +44,20 @@ class Jax(Backend):
         return JaxProblem(program, self.ops(), self.dtype, self.mode)
 
     def ops(self) -> Ops:
-        """Return the array operations lent to the model code."""
-        import jax
-
-        jax.config.update("jax_enable_x64", True)
+        """Return the operations for the model code."""
+        use_double_precision()
         return JaxOps()
 
 
+def use_double_precision() -> None:
+    """Let JAX compute in float64 where arrays are float64."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+
+
 class JaxOps(LoopOps):
-    """jax.numpy, lax.scan, and no root."""
+    """Operations of jax.numpy with lax.scan and without ``root``."""
 
     def __init__(self) -> None:
         import jax.numpy
@@ -60,7 +65,7 @@ class JaxOps(LoopOps):
         super().__init__(jax.numpy)
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Run lax.scan over rows; the backward pass stores only the carries and computes each step again."""
+        """Run lax.scan over rows. The backward pass stores only the carries and recomputes each step."""
         import jax
 
         leaves, tree = jax.tree.flatten(carry)
@@ -76,8 +81,10 @@ class JaxOps(LoopOps):
             return rows.evaluate(traced.jaxpr, traced.consts, [*state, *x]), None
 
         # inside a scan XLA cannot merge the two evaluations, so CSE need not be prevented
-        kept = jax.checkpoint(body, prevent_cse=False)
-        last, _ = jax.lax.scan(kept, [rows.split(x) for x in leaves], [rows.split(x, axis=1) for x in slices], length)
+        recomputed = jax.checkpoint(body, prevent_cse=False)
+        last, _ = jax.lax.scan(
+            recomputed, [rows.split(x) for x in leaves], [rows.split(x, axis=1) for x in slices], length
+        )
         return jax.tree.unflatten(tree, [rows.join(x) for x in last])
 
 
@@ -88,19 +95,19 @@ def _platform() -> str:
 
 
 def _numbers(program: Program) -> int:
-    """Estimate how many numbers one rollout's gradient keeps: carries, controls, their gradients, theta, noise."""
-    kept = 2 * program.dim + program.n_noise
+    """Estimate the count of numbers stored for one rollout's gradient: carries, controls, gradients, theta, noise."""
+    stored = 2 * program.dim + program.n_noise
     if isinstance(program, Rollout):
         scene = program.scene
-        kept += scene.horizon * (2 * scene.n_q + 2 + 2 * scene.n_u)
-    return kept
+        stored += scene.horizon * (2 * scene.n_q + 2 + 2 * scene.n_u)
+    return stored
 
 
 class JaxProblem(Problem):
-    """A program compiled once per batch shape; float parameters are traced, so sweeping them compiles nothing.
+    """A program compiled once per batch shape; float parameters are traced, so that sweeping them compiles nothing.
 
-    Each block runs on one thread of XLA, and blocks run side by side, which shares the cores without a wait at every
-    step.
+    Each block runs on one thread of XLA and blocks run in parallel, which uses all cores without synchronisation at
+    every step.
     """
 
     grain = 128
@@ -126,14 +133,14 @@ class JaxProblem(Problem):
         return self._call(self._explicit_function, theta, w)
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """Return states and controls, from a scan that keeps them."""
-        return Trajectory(*self._parts(self._followed, theta, w))
+        """Return states and controls from a scan that stores them."""
+        return Trajectory(*self._parts(self._trajectory, theta, w))
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """Return states, controls and step Jacobians, by forward mode through each step."""
         return Jacobians(*self._parts(self._linearised, theta, w))
 
-    def _followed(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array]:
+    def _trajectory(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array]:
         import jax
         import jax.numpy as jnp
 
@@ -151,7 +158,7 @@ class JaxProblem(Problem):
         import jax
         import jax.numpy as jnp
 
-        states, controls = self._followed(parameters, theta, w)
+        states, controls = self._trajectory(parameters, theta, w)
         program, *_ = rollout(self.program.bind(parameters)).resolved(self._ops, theta, w)
         n_q = program.scene.n_q
 
@@ -212,7 +219,8 @@ class JaxProblem(Problem):
     def _derivative(self, function: Callable[[Array], Array], theta: Array, batch: int) -> Array:
         """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; NaN where b has no value.
 
-        A rollout can fail where the derivative is not looking: a choice between NaN and a number passes on the number's.
+        A rollout can fail where the derivative is not looking: a choice between NaN and a number passes on the
+        number's.
         """
         import jax
         import jax.numpy as jnp

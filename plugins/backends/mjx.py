@@ -15,9 +15,9 @@ from .. import mjcf
 from .jax import Jax, JaxProblem
 
 FORWARD_UP_TO = 8
-"""Length of theta up to which forward mode is cheaper: reverse mode costs as much as that many directions."""
+"""Length of theta up to which forward mode is cheaper, since reverse mode costs as much as this many directions."""
 LARGEST = 1e10
-"""Largest number of a state; MuJoCo calls what is beyond it bad and gives up (``mjMAXVAL``)."""
+"""Largest valid number of a state; MuJoCo stops a rollout at larger ones (``mjMAXVAL``)."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Mjx(Jax):
     """Gradients: exact derivative of MJX's steps, forward or reverse mode; float64 or float32.
 
     Steps the scene's MJCF twin with MJX's own integrator and contact solver, compiled by XLA. The whole model is
-    traced: stiffness, damping, masses, sizes and time step change without compiling anew. Costs, policy and noise are
+    traced: stiffness, damping, masses, sizes and time step change without recompilation. Costs, policy and noise are
     the scene's.
     """
 
@@ -34,16 +34,16 @@ class Mjx(Jax):
     provides = Backend.provides | {"physics"}
     reference_rank: ClassVar[int | None] = None
 
-    mode: str = param(
-        "auto", "direction of differentiation; auto: the cheaper one", choices=("auto", "reverse", "forward")
+    mode: str = param("auto", "mode of differentiation; auto: the cheaper mode", choices=("auto", "reverse", "forward"))
+    impedance: float = param(
+        1e-4, "share of other forces that a contact cancels; at 0 it is a spring", low=1e-4, high=0.9999
     )
-    impedance: float = param(1e-4, "share of other forces that a contact hides; 0 is a spring", low=1e-4, high=0.9999)
     integrator: str = param("euler", "MJX's integrator", choices=("euler", "implicitfast", "rk4"))
     solver: str = param("newton", "MJX's constraint solver", choices=("newton", "cg"))
     cone: str = param("pyramidal", "friction cone", choices=("pyramidal", "elliptic"))
-    iterations: int = param(1, "most iterations of the constraint solver; 1 is exact for springs", positive=True)
-    ls_iterations: int = param(4, "most iterations of its line search", positive=True)
-    lean: bool = param(True, "switch off every feature of the engine that the scene does not use")
+    iterations: int = param(1, "maximum iterations of the constraint solver; 1 is exact for springs", positive=True)
+    ls_iterations: int = param(4, "maximum iterations of the solver's line search", positive=True)
+    lean: bool = param(True, "switch off all engine features that the scene does not use")
 
     def compile(self, program: Program) -> Problem:
         """Return the twin's steps as jitted functions, compiled at the first call with each batch shape."""
@@ -52,7 +52,7 @@ class Mjx(Jax):
 
     def unsupported_reason(self, program: Program) -> str | None:
         """Return why the program cannot run: it has no twin, or MJX cannot differentiate it; or None."""
-        reason = mjcf.refusal(self, program)
+        reason = mjcf.unsupported_reason(self, program)
         if reason is None and self.mode == "reverse" and self.iterations > 1:
             return (
                 f"MJX's solver has no reverse mode with iterations={self.iterations}: use mode=forward or iterations=1"
@@ -68,13 +68,13 @@ class Mjx(Jax):
 
 
 class MjxProblem(JaxProblem):
-    """A program stepped by MJX, in smaller blocks, since a step of a column that is thrown away is dear."""
+    """A program stepped by MJX, in smaller blocks, since padding columns are expensive."""
 
     grain = 16
 
 
 class MjxProgram(Rollout):
-    """A program stepped by MJX: its parameters are the scene's, followed by all numbers of the MJX model."""
+    """A program stepped by MJX. Its parameters are the scene's, followed by all numbers of the MJX model."""
 
     def __init__(self, program: Rollout, backend: Mjx) -> None:
         import jax
@@ -90,7 +90,7 @@ class MjxProgram(Rollout):
         self._settings = (*options, backend.iterations, backend.ls_iterations, int(model.opt.disableflags))
 
     @property
-    def structure(self) -> tuple[Any, ...]:  # type: ignore[override]
+    def structure(self) -> tuple[Any, ...]:
         """The program's structure, the engine's settings, and the parts of the model that are not traceable numbers."""
         # only floats are traced: any other leaf is compiled in and must be part of the key
         fixed = tuple(leaf.tobytes() for leaf in self._leaves if leaf.dtype.kind != "f")
@@ -103,7 +103,7 @@ class MjxProgram(Rollout):
         )
 
     def bind(self, parameters: Any) -> Program:
-        """Return this program, model included, with other values."""
+        """Return a copy of this program, model included, with other values for :meth:`parameters`."""
         import jax
         import jax.numpy as jnp
 
@@ -121,7 +121,7 @@ class MjxProgram(Rollout):
         return bound
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
-        """Take one step of MJX in each column; a state beyond MuJoCo's own limit becomes NaN, as MuJoCo would give up there."""
+        """Return the state after one step of MJX per column; NaN beyond MuJoCo's limit, where MuJoCo would stop."""
         import jax
         import jax.numpy as jnp
 
@@ -132,16 +132,16 @@ class MjxProgram(Rollout):
             after = mjx.step(self._model, data.replace(qpos=q, qvel=v, ctrl=u))
             return State(after.qpos, after.qvel)
 
-        # numbers that MJX makes itself are of JAX's default precision
+        # MJX creates numbers in JAX's default precision
         with jax.enable_x64(kind == np.float64):
             after = jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)
             largest = jnp.maximum(jnp.abs(after.q).max(axis=0), jnp.abs(after.v).max(axis=0))
-            factor = jnp.where(largest <= LARGEST, 1.0, jnp.nan).astype(kind)  # as a factor it reaches the gradient too
+            factor = jnp.where(largest <= LARGEST, 1.0, jnp.nan).astype(kind)  # a factor makes the gradient NaN too
             return State(after.q * factor, after.v * factor)
 
 
 def _library() -> Any:
-    """Return ``mujoco.mjx``, without the messages it prints when optional parts of it are missing."""
+    """Return ``mujoco.mjx`` without printing its messages about missing optional parts."""
     with contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
     return mjx

@@ -43,27 +43,29 @@ class Mujoco(Backend):
     provides = Backend.provides | {"physics"}
 
     gradient: str = param(
-        "chain", "chained Jacobians of single steps, or differences of whole rollouts", choices=("chain", "rollouts")
+        "chain", "chain Jacobians of single steps, or take differences of whole rollouts", choices=("chain", "rollouts")
     )
     differences: str = param("central", "finite differences of a step", choices=("central", "forward"))
     step: float = param(1e-6, "step of the finite differences, in units of the state, or of theta", positive=True)
-    impedance: float = param(1e-4, "share of other forces that a contact hides; 0 is a spring", low=1e-4, high=0.9999)
+    impedance: float = param(
+        1e-4, "share of other forces that a contact cancels; at 0 it is a spring", low=1e-4, high=0.9999
+    )
     integrator: str = param("euler", "MuJoCo's integrator", choices=("euler", "implicitfast"))
     solver: str = param("newton", "MuJoCo's constraint solver", choices=("newton", "cg", "pgs"))
     cone: str = param("pyramidal", "friction cone", choices=("pyramidal", "elliptic"))
-    iterations: int = param(100, "most iterations of the constraint solver", positive=True)
-    ls_iterations: int = param(50, "most iterations of its line search", positive=True)
-    lean: bool = param(True, "switch off every feature of the engine that the scene does not use")
+    iterations: int = param(100, "maximum iterations of the constraint solver", positive=True)
+    ls_iterations: int = param(50, "maximum iterations of the solver's line search", positive=True)
+    lean: bool = param(True, "switch off all engine features that the scene does not use")
 
     def compile(self, program: Program) -> Problem:
-        """Build the twin's model; nothing is compiled."""
+        """Return the twin's model as a problem; nothing is compiled."""
         return MujocoProblem(program, self)
 
     def unsupported_reason(self, program: Program) -> str | None:
         """Return why the program cannot run: single precision, or a program without a twin; or None."""
         if self.dtype != "float64":
             return "MuJoCo computes in double precision"
-        return mjcf.refusal(self, program)
+        return mjcf.unsupported_reason(self, program)
 
 
 class MujocoProblem(NumpyProblem):
@@ -103,13 +105,13 @@ class MujocoProblem(NumpyProblem):
         return Jacobians(states, controls, *self._engine.jacobians(states, controls, self._backend.step, central))
 
     def _rollout(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return states ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)``; NaN once the engine gives up."""
+        """Return states ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)``; NaN after the engine has stopped."""
         ops = NumpyOps()
         moved, state, scanned = self._rolled.start(ops, theta, w)
         horizon = self._rolled.scene.horizon
 
         def control(t: int) -> np.ndarray:
-            return self._rolled.control(ops, moved, state, tuple(x[t] for x in scanned))
+            return np.asarray(self._rolled.control(ops, moved, state, tuple(x[t] for x in scanned)))
 
         if self._open_loop:
             controls = np.stack([control(t) for t in range(horizon)])
@@ -123,13 +125,13 @@ class MujocoProblem(NumpyProblem):
 
 
 class Engine:
-    """A MuJoCo model, with a thread and simulation data for each core."""
+    """A MuJoCo model with one thread and one set of simulation data per core."""
 
     def __init__(self, model: Any) -> None:
         import mujoco
         from mujoco.rollout import Rollout
 
-        # a diverging rollout ends in NaN, which is report enough; by default MuJoCo also writes a log file
+        # by default MuJoCo writes a log file about a diverging rollout, which NaN reports already
         mujoco.set_mju_user_warning(lambda message: None)
         self._mujoco, self._model = mujoco, model
         self._data = [mujoco.MjData(model) for _ in range(cores())]
@@ -138,7 +140,7 @@ class Engine:
     def rollout(self, first: np.ndarray, controls: np.ndarray) -> np.ndarray:
         """Return states ``(T + 1, n, B)`` from ``first (n, B)`` under controls ``(T, n_u, B)``.
 
-        MuJoCo stops a rollout, and its clock, at the first bad number (beyond 1e10); the states after it are NaN.
+        MuJoCo stops a rollout and its time at the first number beyond 1e10. The states after it are NaN.
         """
         start = np.concatenate([np.zeros((1, first.shape[1])), first]).T
         controls = np.ascontiguousarray(np.moveaxis(controls, -1, 0))
@@ -164,7 +166,7 @@ class Engine:
             nq = self._model.nq
             for c in columns:
                 for t in range(horizon):
-                    # all later states are bad too, and their Jacobians stay NaN
+                    # all later states are nonfinite too, and their Jacobians stay NaN
                     if not np.isfinite(points[c, t]).all():
                         break
                     data.qpos, data.qvel, data.ctrl = points[c, t, :nq], points[c, t, nq:], inputs[c, t]
@@ -177,10 +179,10 @@ class Engine:
 
 
 class Recorded(Rollout):
-    """A program along recorded states of an engine; with Jacobians, its linearisation about them.
+    """A program along recorded states of an engine; with Jacobians, its linearisation about these states.
 
-    Its cost has the value of the engine's rollouts and, however the rest is differentiated, their gradient: reverse
-    mode through it is the adjoint pass lambda_t = A_t^T lambda_{t+1} + ..., feedback and stage costs included.
+    Its cost and gradient are those of the engine's rollouts: reverse mode through it is the adjoint pass
+    lambda_t = A_t^T lambda_{t+1} + ..., feedback and stage costs included.
     """
 
     def __init__(
@@ -196,7 +198,7 @@ class Recorded(Rollout):
         self._times: Iterator[int] = iter(range(len(states) - 1))
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
-        """Step from each recorded state to the next; the rollout can be taken only once."""
+        """Return the next recorded state, linearised if there are Jacobians. A rollout can run only once."""
         t, xp = next(self._times), ops.xp
         after = xp.asarray(self._states[t + 1])
         if self._a is not None and self._b is not None and self._controls is not None:
@@ -217,11 +219,11 @@ def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -
     ops = TorchOps()
     result = program.log_probability(ops, fixed, free, noise) if scored else program.cost(ops, free, noise)
     (gradient,) = torch.autograd.grad(result.sum(), free, materialize_grads=True)
-    # a choice between NaN and a number passes on the number's derivative
+    # torch.where between NaN and a number would keep the number's derivative
     return np.asarray(gradient.masked_fill(~torch.isfinite(result.detach()), float("nan")))
 
 
 def _is_open_loop(scene: MechanicalScene, dim: int) -> bool:
-    """Return whether the control law ignores the state."""
+    """Return whether the control law does not depend on the state."""
     zero = np.zeros((scene.n_q, 1))
     return scene.feedback(np, np.zeros((dim, 1)), zero, zero) is None

@@ -1,4 +1,4 @@
-"""NumPy: costs natively, derivatives by batched central differences."""
+"""NumPy: costs from the program itself, derivatives by batched central differences."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ class Numpy(Backend):
     )
 
     def compile(self, program: Program) -> Problem:
-        """Return the program ready to run; there is nothing to compile."""
-        # about the cube root of the rounding error, which balances rounding and truncation
+        """Return the program as a problem; nothing is compiled."""
+        # about the cube root of the rounding error, which balances rounding and truncation errors
         step = self.step or {"float64": 1e-6, "float32": 5e-3}[self.dtype]
         return NumpyProblem(program, self.dtype, step)
 
 
 class NumpyOps(LoopOps):
-    """NumPy, a Python loop, and no root."""
+    """Operations of NumPy with a Python loop and without ``root``."""
 
     def __init__(self) -> None:
         import array_api_compat.numpy
@@ -55,7 +55,7 @@ class NumpyProblem(Problem):
         return np.asarray(cost, dtype=np.float64)
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """Return states and controls, step by step."""
+        """Return states and controls of all steps."""
         bound = rollout(self._bound)
         theta = np.reshape(theta, (self.dim, -1)).astype(self._dtype)
         with np.errstate(all="ignore"):
@@ -64,16 +64,18 @@ class NumpyProblem(Problem):
         return Trajectory(np.stack(states).astype(np.float64), np.stack(controls).astype(np.float64))
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        # they are counted as gradients; what a gradient costs in rollouts is measured
+        # counted as gradients, since the cost of a gradient in rollouts is measured separately
         return self._differences(lambda moved, w: self._value(moved, w), theta, w)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._moving(self._bound.log_probability, theta, w)
+        return self._differences_by_moved(self._bound.log_probability, theta, w)
 
     def _explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._moving(self._bound.explicit_cost, theta, w)
+        return self._differences_by_moved(self._bound.explicit_cost, theta, w)
 
-    def _moving(self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def _differences_by_moved(
+        self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray
+    ) -> np.ndarray:
         """Return the derivative of ``function(ops, theta, moved, w)`` by ``moved`` at theta, ``(d, B)``."""
         self.usage.rollouts += 2 * self.dim * w.shape[1]
 

@@ -1,8 +1,8 @@
-"""Row-wise evaluation of JAX code: a ``(n, B)`` array of few rows as a tuple of n arrays ``(B,)``.
+"""Evaluates JAX code row by row: an array ``(n, B)`` of few rows becomes a tuple of n arrays ``(B,)``.
 
-Model code stacks and slices rows, and XLA compiles a stack to a loop that checks for each element which row it is in.
-The same operations applied row by row are long loops without a branch, which vectorise. The numbers stay the same:
-each element is computed by the operations that the code names, in their order.
+Model code stacks and slices rows, and XLA compiles a stack to a loop that checks the row of each element. The same
+operations row by row are long loops without branches, which vectorise. Results do not change, since each element is
+computed by the same operations in the same order.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 
 from bench.model import Array
 
-MOST_ROWS = 16
-"""Arrays with more rows are left whole."""
+MAX_ROWS = 16
+"""Arrays with more rows are not split."""
 ELEMENTWISE = {
     "abs", "acos", "acosh", "add", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
     "convert_element_type", "cos", "cosh", "div", "eq", "erf", "exp", "exp2", "expm1", "floor", "ge", "gt",
@@ -21,18 +21,18 @@ ELEMENTWISE = {
     "or", "pow", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan",
     "tanh", "xor",
 }  # fmt: skip
-"""Primitives that compute each element only from the elements at the same place."""
+"""Primitives that compute each element only from the elements at the same position."""
 
 
 def split(array: Array, axis: int = 0) -> Any:
     """Return the rows of a ``(n, B)`` array, or of ``(T, n, B)`` with axis 1; return any other array unchanged."""
-    if array.ndim != axis + 2 or not 0 < array.shape[axis] <= MOST_ROWS:
+    if array.ndim != axis + 2 or not 0 < array.shape[axis] <= MAX_ROWS:
         return array
     return tuple(array[(slice(None),) * axis + (i,)] for i in range(array.shape[axis]))
 
 
 def join(value: Any) -> Array:
-    """Return the array that a tuple of rows stands for; return an array unchanged."""
+    """Stack a tuple of rows to an array; return an array unchanged."""
     import jax.numpy as jnp
 
     return jnp.stack(value) if isinstance(value, tuple) else value
@@ -67,10 +67,10 @@ def _apply(equation: Any, values: list[Any]) -> list[Any]:
 
 
 def _rows(name: str, parameters: Any, primitive: Any, values: list[Any], out: Any) -> Any:
-    """Return the output as rows, or as one row ``(B,)``; None where the operation has no row-wise form."""
+    """Return the output as rows, or as one row ``(B,)``; None if the operation has no row-wise form."""
     if name == "squeeze" and parameters["dimensions"] == (0,):
         return values[0][0]
-    if out.ndim != 2 or not 0 < out.shape[0] <= MOST_ROWS:
+    if out.ndim != 2 or not 0 < out.shape[0] <= MAX_ROWS:
         return None
     if name in ELEMENTWISE:
         columns = [_repeated(value, out.shape[0]) for value in values]
@@ -85,7 +85,7 @@ def _rows(name: str, parameters: Any, primitive: Any, values: list[Any], out: An
 
 
 def _repeated(value: Any, count: int) -> tuple[Any, ...]:
-    """Return the part of an operand that each of ``count`` rows uses: its own row, the only row, or the same number."""
+    """Return the operand of each of ``count`` rows: its own row, the only row, or the same number."""
     if getattr(value, "ndim", 0) == 2:
         value = split(value)
     rows = value if isinstance(value, tuple) else (value,)

@@ -21,12 +21,12 @@ class Torch(Backend):
     reference_rank: ClassVar[int | None] = 2
 
     def compile(self, program: Program) -> Problem:
-        """Return the program ready to run eagerly; nothing is compiled."""
+        """Return the program as a problem that runs eagerly; nothing is compiled."""
         return TorchProblem(program, self.dtype)
 
 
 class TorchOps(LoopOps):
-    """torch through array-api-compat, a Python loop, and no root."""
+    """Operations of torch through array-api-compat with a Python loop and without ``root``."""
 
     def __init__(self) -> None:
         import array_api_compat.torch
@@ -35,7 +35,7 @@ class TorchOps(LoopOps):
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
         """Loop over the leading axis."""
-        # one node of the graph for all steps, where indexing would make one per step
+        # one graph node for all steps, while indexing would create one per step
         slices = [x.unbind(0) for x in xs]
         for t in range(length):
             carry = step(carry, tuple(x[t] for x in slices))
@@ -60,10 +60,10 @@ class TorchProblem(Problem):
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         with self._torch.no_grad():
             cost = self.program.cost(self._ops, self._tensor(theta), self._tensor(w))
-        return cost.to(self._torch.float64).numpy()
+        return np.asarray(cost.to(self._torch.float64).numpy())
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """Return states and controls, step by step."""
+        """Return states and controls of all steps."""
         theta = np.reshape(theta, (self.dim, -1))
         with self._torch.no_grad():
             steps = list(rollout(self.program).steps(self._ops, self._tensor(theta), self._tensor(w)))
@@ -85,13 +85,13 @@ class TorchProblem(Problem):
     def _derivative(self, function: Callable[[Array, Array], Array], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; zero if disconnected.
 
-        It is NaN where b has no value, as a choice between NaN and a number passes on the number's derivative.
+        It is NaN where the value of b is not finite, since torch.where between NaN and a number keeps the derivative.
         """
         full = self._tensor(np.broadcast_to(theta, (self.dim, w.shape[1]))).requires_grad_()
         result = function(full, self._tensor(w))
-        lost = ~self._torch.isfinite(result.detach())
+        invalid = ~self._torch.isfinite(result.detach())
         if not result.requires_grad:
             gradient = self._torch.zeros_like(full)
         else:
             (gradient,) = self._torch.autograd.grad(result.sum(), full, allow_unused=True, materialize_grads=True)
-        return gradient.masked_fill(lost, float("nan")).detach().to(self._torch.float64).numpy()
+        return gradient.masked_fill(invalid, float("nan")).detach().to(self._torch.float64).numpy()

@@ -1,1 +1,1 @@
-"""Contact laws: how touching bodies push on each other."""
+"""Contact laws compute forces or impulses between bodies in contact."""

@@ -11,7 +11,7 @@ class Complementarity(ImpulseLaw):
     """0 <= lambda, y >= 0, lambda y = kappa at the end of the step, with y = gap + lambda / stiffness.
 
     kappa -> 0 is hard contact, and infinite stiffness rigid: inelastic impacts, whatever the scene's restitution.
-    A finite stiffness is the penalty spring of that stiffness taken at the end of the step instead of its start.
+    A finite stiffness is the penalty spring of that stiffness evaluated at the end of the step instead of its start.
     Solved through the Fischer-Burmeister function p + y - sqrt(p^2 + y^2 + 2 c kappa), whose root lies on the
     central path, with p = c lambda the gap that the force opens in a step (c = dt^2 J M^-1 J^T).
     """
@@ -40,7 +40,7 @@ class Complementarity(ImpulseLaw):
 
         system = (before.q, dt, opened)
         compliance = 1.0 / self.stiffness
-        # exact for one contact with a linear gap, so that Newton starts close to the root
+        # exact for one contact with a linear gap, so that Newton's method starts close to the root
         guess = opened * _central_path_force(xp, contact.gap(free.q), opened + compliance, self.kappa)
         p = ops.root(residual, guess, (system, free.q, self.kappa, compliance))
         dv = effect(p, system)
@@ -50,7 +50,7 @@ class Complementarity(ImpulseLaw):
 def _central_path_force(xp: Any, a: Array, c: Array, kappa: Any) -> Array:
     """Return lambda >= 0 with (a + c lambda) lambda = kappa: exact for one contact whose gap is linear in position."""
     root = xp.sqrt(a * a + 4.0 * c * kappa)
-    # two forms of the same root, each without a difference of nearly equal numbers on its side
-    apart = 2.0 * kappa / (xp.abs(a) + root)
+    # two forms of the same root, each without cancellation on its side
+    separated = 2.0 * kappa / (xp.abs(a) + root)
     pressed = (xp.abs(a) + root) / (2.0 * c)
-    return xp.where(a > 0, apart, pressed)
+    return xp.where(a > 0, separated, pressed)

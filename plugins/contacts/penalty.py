@@ -10,20 +10,20 @@ from bench.model import Array, ForceLaw, param
 class Penalty(ForceLaw):
     """lambda = k d + c d' while the penetration d = max(0, -gap) is positive.
 
-    ``damping_mode`` says where the damper acts, since sources differ and so do their gradients:
+    ``damping_mode`` selects where the damper acts, since sources and their gradients differ:
     ``clipped`` max(0, k d + c d'), never adhesive; ``approach`` k d + c max(0, d'); ``linear`` k d + c d', which
-    pulls at the end of a separation.
+    pulls at the end of a contact.
     """
 
     name = "penalty"
 
     stiffness: float = param(1e3, "k, force per penetration", "N/m", positive=True)
     damping: float = param(0.0, "c, force per penetration rate", "N s/m", low=0.0)
-    damping_mode: str = param("clipped", "where the damper acts", choices=("clipped", "approach", "linear"))
+    damping_mode: str = param("clipped", "when the damper acts", choices=("clipped", "approach", "linear"))
 
     @property
     def continuous(self) -> bool:
-        """True only without damping: at touch a damper sets in at once."""
+        """True only without damping: a damper acts immediately at touch, so the force jumps."""
         return self.damping == 0.0
 
     def spring(self) -> tuple[float, float]:

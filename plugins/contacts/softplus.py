@@ -11,7 +11,7 @@ class Softplus(ForceLaw):
     """The penalty law with max(0, z) replaced by softplus_beta(z) = log(1 + exp(beta z)) / beta.
 
     ``smooths="clip"``: only the outer clip, force = softplus_beta(k d + c d') with d = max(0, -gap), so that it still
-    has a kink at touch and pushes with log(2)/beta from afar; beta then is per newton.
+    has a kink at touch and a force of log(2)/beta at any distance; beta is then per newton.
     ``smooths="gap"``: the gap as well, force = softplus of (k softplus_beta(-gap) + c d' weighted by the smoothed
     contact indicator); without damping this is k softplus_beta(-gap), and beta is per metre.
     As beta grows both tend to ``penalty[damping_mode=clipped]``.
@@ -23,11 +23,11 @@ class Softplus(ForceLaw):
     stiffness: float = param(1e3, "k, force per penetration", "N/m", positive=True)
     damping: float = param(0.0, "c, force per penetration rate", "N s/m", low=0.0)
     beta: float = param(1e2, "sharpness of the softplus, per newton with smooths=clip", "1/m", positive=True)
-    smooths: str = param("gap", "what is smoothed", choices=("gap", "clip"))
+    smooths: str = param("gap", "whether gap and clip or only the clip is smoothed", choices=("gap", "clip"))
 
     @property
     def continuous(self) -> bool:
-        """True with the gap smoothed, or without damping: at touch an unsmoothed damper sets in at once."""
+        """True with a smoothed gap or without damping: an unsmoothed damper acts immediately at touch."""
         return self.smooths == "gap" or self.damping == 0.0
 
     def spring(self) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""One law in the forward pass, another in the backward one."""
+"""One law in the forward pass, another in the backward pass."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -11,11 +11,11 @@ from bench.model import Array, ForceLaw, param, stopped
 
 @dataclass(frozen=True)
 class StraightThrough(ForceLaw):
-    """The forces of ``forward``; automatic differentiation sees those of ``backward`` at the same states.
+    """The forces of ``forward``, which automatic differentiation replaces by those of ``backward`` at the same states.
 
     Its gradient is a surrogate, not the derivative of the program: each step is differentiated as if ``backward`` had
-    acted there. With a hard forward law and a softplus behind it, bodies that miss each other still feel in the
-    gradient where they would have met (contacts from distance), and the motion is not smoothed. ``none`` differentiates
+    acted there. With a hard forward law and a softplus in the backward pass, the gradient includes contacts from a
+    distance between bodies that miss each other, and the motion is not smoothed. ``none`` differentiates
     contact forces as constants. Source: Paulus et al. 2025; straight-through estimators, Bengio et al. 2013.
     """
 
@@ -28,7 +28,7 @@ class StraightThrough(ForceLaw):
     stiffness: float = param(1e3, "k, force per penetration, of both laws", "N/m", positive=True)
     damping: float = param(0.0, "c, force per penetration rate, of both laws", "N s/m", low=0.0)
     beta: float = param(
-        1e2, "sharpness of a softplus, which smooths the gap: its reach is some 1/beta", "1/m", positive=True
+        1e2, "sharpness of a softplus, which smooths the gap over a distance of about 1/beta", "1/m", positive=True
     )
 
     @property

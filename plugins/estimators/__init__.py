@@ -1,1 +1,1 @@
-"""Estimators: how sampled costs, gradients and scores become an estimate of grad J."""
+"""Estimators of grad J from sampled costs, gradients and scores."""

@@ -1,25 +1,24 @@
-"""Interpolation of first and zeroth order with a confidence test."""
+"""Interpolation between first and zeroth order with a confidence test."""
 
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Auxiliaries, Estimator, Problem, first_order, halves, param, zeroth_order
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, first_order, halves, param, zeroth_order
 
 
 @dataclass(frozen=True)
-class AlphaOrder(Estimator):
+class AlphaOrder(DiagnosticEstimator):
     """Approximates grad J_sigma with a fobg + (1 - a) zobg, the weight a chosen by a confidence test (Suh et al. 2022).
 
     With v1, v0 the variances of the two means, a = v0 / (v1 + v0) when the zeroth-order mean is known to within
     gamma, capped so that |a (fobg - zobg)| <= gamma - eps; a = 0 when it is not. Confidence radius
     eps = sqrt(2 V ln((d+1)/delta) / N) + (2 L / 3 N) ln((d+1)/delta), V the per-sample zeroth-order variance.
-    gamma is ``ratio`` eps unless it is given: a fixed gamma far below eps switches the method off, so that it is the
-    zeroth order on fewer samples. A ratio of 1.25 caps a in many estimates of a smooth cost of one variable, at 4 to 20
-    times the variance; a larger one lets more of a jump's bias through, up to (ratio - 1) eps. Both orders take
-    independent halves of the samples, or the same ones (``sharing=shared``, as in the source). Reports a as ``alpha``,
-    and ``eps``.
+    By default gamma is ``ratio`` eps: a fixed gamma far below eps reduces the method to the zeroth order on fewer
+    samples. A ratio of 1.25 caps a in many estimates of a smooth cost of one variable, at 4 to 20 times the variance. A
+    larger ratio admits more of a jump's bias, up to (ratio - 1) eps. The two orders use independent halves of the
+    samples, or the same samples (``sharing=shared``, as in the source). Reports a as ``alpha``, and ``eps``.
     Requires costs, gradients and scores. Biased by at most about gamma - eps, since a depends on the samples.
     """
 
@@ -30,21 +29,19 @@ class AlphaOrder(Estimator):
     diagnostics: ClassVar[tuple[str, ...]] = ("alpha", "eps")
 
     gamma: float | None = param(
-        None, "accuracy asked of the zeroth-order mean, in units of the gradient; null: ratio times eps", positive=True
+        None,
+        "required accuracy of the zeroth-order mean, in units of the gradient; null: ratio times eps",
+        positive=True,
     )
-    ratio: float = param(1.5, "gamma / eps where gamma is null", low=1.0)
-    sharing: str = param("split", "whether both orders take the same samples", choices=("split", "shared"))
+    ratio: float = param(1.5, "gamma / eps if gamma is null", low=1.0)
+    sharing: str = param("split", "whether both orders use the same samples", choices=("split", "shared"))
     delta: float = param(0.05, "failure probability of the confidence radius", positive=True, high=1.0)
-    bound: float | None = param(None, "L, bound on |zeroth-order term|; null: the largest seen", positive=True)
-
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return estimates with one interpolation weight per repeat."""
-        return self.estimate_with_diagnostics(problem, theta, noise)[0]
+    bound: float | None = param(None, "L, bound on |zeroth-order term|; null: the largest in the batch", positive=True)
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates with alpha and eps, each ``(R,)``. Raises ValueError below 4 samples, or 2 shared."""
+        """Return the estimates with alpha and eps, each ``(R,)``. Raises ValueError for fewer than 4 samples, or 2 shared ones."""
         if self.sharing == "split":
             first, zeroth = halves(problem, theta, noise)
         elif noise.shape[1] < 2:
@@ -61,11 +58,11 @@ class AlphaOrder(Estimator):
         eps = np.sqrt(2 * per_sample * log_term / n) + 2 * largest / (3 * n) * log_term
         gamma = self.ratio * eps if self.gamma is None else self.gamma
         total = v0 + v1
-        # with both variances 0 any weight is right
+        # if both variances are 0, any weight is right
         alpha = np.divide(v0, total, out=np.ones_like(total), where=total > 0)
         distance = np.linalg.norm(fobg - zobg, axis=-1)
-        room = np.maximum(gamma - eps, 0.0)  # none where the zeroth order is not known to within gamma
-        cap = np.divide(room, distance, out=np.full_like(distance, np.inf), where=distance > 0)
+        margin = np.maximum(gamma - eps, 0.0)  # 0 if the zeroth order is not known to within gamma
+        cap = np.divide(margin, distance, out=np.full_like(distance, np.inf), where=distance > 0)
         alpha = np.minimum(alpha, cap)
         weight = alpha[:, None]
         return weight * fobg + (1 - weight) * zobg, {"alpha": alpha, "eps": eps}

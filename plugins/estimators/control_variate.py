@@ -5,28 +5,24 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Auxiliaries, Estimator, Problem, Program, columns, per_repeat, zeroth_order
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, Program, columns, per_repeat, zeroth_order
 
 
 @dataclass(frozen=True)
-class ControlVariate(Estimator):
+class ControlVariate(DiagnosticEstimator):
     """Approximates grad J_sigma with the zeroth order minus c (g . w) w plus c g, g being df/dtheta at w = 0.
 
-    (g . w) w has the known expectation g, so that the result is unbiased for any cost and any c, even where g is wrong.
-    c is the regression coefficient of the other half of the samples: independent, hence no bias. It removes the
+    (g . w) w has the known expectation g, so the result is unbiased for any cost and any c, even if g is wrong. c is
+    the regression coefficient from the other half of the samples, which is independent and adds no bias. It removes the
     variance of the cost's linear part, as a Taylor control variate does (Glasserman 2003, ch. 4; Mohamed et al. 2020,
-    section 7), and it goes to 0 where g has nothing to do with the cost. Requires costs, gradients and scores, with
-    noise on theta, at least 4 samples. Reports c as ``coefficient``, the mean of both halves.
+    section 7), and tends to 0 where g is unrelated to the cost. Requires costs, gradients and scores, with noise on
+    theta, and at least 4 samples. Reports c as ``coefficient``, the mean of both halves.
     """
 
     name = "control_variate"
     needs = frozenset({"value", "grad", "score"})
     unbiased_at_discontinuities = True
     diagnostics: ClassVar[tuple[str, ...]] = ("coefficient",)
-
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean of the controlled terms."""
-        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
@@ -49,12 +45,12 @@ class ControlVariate(Estimator):
         return np.concatenate(corrected, axis=1).mean(axis=1), {"coefficient": np.mean(coefficients, axis=0)}
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Refuse noise that is not on theta, where (g . w) w has another expectation."""
-        return None if program.noise_on_theta else f"{self.name} needs the noise on theta, not on a policy's actions"
+        """Return a reason for noise that is not on theta, where the expectation of (g . w) w is not g; else None."""
+        return None if program.noise_on_theta else f"{self.name} needs noise on theta, not on a policy's actions"
 
 
 def _slope(control: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the regression coefficient of values on the control over samples, one per repeat, 0 without spread."""
     control = control - control.mean(axis=1, keepdims=True)
-    both, own = (np.einsum("rnd,rnd->r", control, other) for other in (values, control))
-    return np.divide(both, own, out=np.zeros_like(own), where=own > 0)
+    covariance, variance = (np.einsum("rnd,rnd->r", control, other) for other in (values, control))
+    return np.asarray(np.divide(covariance, variance, out=np.zeros_like(variance), where=variance > 0))

@@ -11,8 +11,8 @@ from bench.model import Problem, SampleMean, param
 class FiniteDifference(SampleMean):
     """Approximates grad J_sigma by central differences of the mean cost under common random numbers.
 
-    It takes 2 d rollouts per sample and has a bias of order step^2. Across a jump of the cost it is unbiased for
-    J_sigma smoothed over one step, with a variance that grows as 1/step (Glasserman 2003, ch. 7). Requires only costs.
+    It needs 2 d rollouts per sample and has a bias of order step^2. Across a jump of the cost it is unbiased for
+    J_sigma averaged over one step, with a variance that grows as 1/step (Glasserman 2003, ch. 7). Requires only costs.
     """
 
     name = "finite_difference"

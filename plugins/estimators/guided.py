@@ -4,46 +4,41 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Estimator, Problem, Program, columns, first_order, param, per_repeat
+from bench.model import Estimator, Problem, columns, first_order, param, per_repeat
 
 
 @dataclass(frozen=True)
 class Guided(Estimator):
     """Approximates grad J_sigma with central differences along v = P w + sqrt(share) (1 - P) w.
 
-    P projects on the span of the gradients of the first ``subspace`` samples; the differences use the others. The
-    expectation is the gradient itself inside the subspace and ``share`` times it outside, on a linear cost, while the
-    variance falls from d + 1 to about ``subspace`` + share d squared gradients: useful where gradients point into the
-    right subspace with wrong lengths and signs, useless where they vanish (Maheswaranathan et al. 2019, guided
+    P projects on the span of the gradients of the first ``subspace`` samples. The differences use the other samples.
+    The expectation is the gradient itself inside the subspace and ``share`` times it outside, on a linear cost, while
+    the variance falls from d + 1 to about ``subspace`` + share d squared gradients: useful if gradients lie in the
+    right subspace with wrong lengths and signs, useless if they vanish (Maheswaranathan et al. 2019, guided
     evolutionary strategies). Requires costs and gradients, and more samples than ``subspace``. Biased.
     """
 
     name = "guided"
+    needs_directions = True
     needs = frozenset({"value", "grad"})
     unbiased = False
 
     subspace: int = param(4, "samples whose gradients span the subspace", positive=True)
-    share: float = param(0.1, "part of the gradient outside the subspace that is kept", low=0.0, high=1.0)
+    share: float = param(0.1, "share of the gradient outside the subspace in the expectation", low=0.0, high=1.0)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of the differences along guided directions."""
         if noise.shape[1] <= self.subspace:
             raise ValueError(f"{self.name} needs more than {self.subspace} samples, got {noise.shape[1]}")
-        past, fresh = noise[:, : self.subspace], noise[:, self.subspace :]
-        gradients = first_order(problem, theta, past)
+        first, rest = noise[:, : self.subspace], noise[:, self.subspace :]
+        gradients = first_order(problem, theta, first)
         _, sizes, basis = np.linalg.svd(gradients, full_matrices=False)
-        # directions that rounding alone has made are none; a gradient of 0 spans nothing
+        # directions that are rounding errors do not count, and a gradient of 0 spans nothing
         basis = basis * (sizes > 1e-9 * sizes.max(axis=1, keepdims=True))[..., None]
-        w = fresh[..., : problem.dim]
+        w = rest[..., : problem.dim]
         inside = np.einsum("rkd,rke,rne->rnd", basis, basis, w)
         s = problem.sigma
         shift = s * columns(inside + np.sqrt(self.share) * (w - inside))
-        still = problem.centred(columns(fresh))
-        change = problem.displaced(shift, theta, still) - problem.displaced(-shift, theta, still)
-        return per_repeat(change * shift / (2.0 * s * s), fresh).mean(axis=1)
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
-        if program.n_noise >= program.dim:
-            return None
-        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"
+        centred = problem.centred(columns(rest))
+        change = problem.displaced(shift, theta, centred) - problem.displaced(-shift, theta, centred)
+        return np.asarray(per_repeat(change * shift / (2.0 * s * s), rest).mean(axis=1))

@@ -5,16 +5,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Auxiliaries, Estimator, Problem, halves
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, halves
 
 
 @dataclass(frozen=True)
-class InverseVariance(Estimator):
-    """Approximates grad J_sigma with, per coordinate, the fobg and zobg means weighted by 1 / their variances.
+class InverseVariance(DiagnosticEstimator):
+    """Approximates grad J_sigma with the fobg and zobg means weighted by their inverse variances, per coordinate.
 
     The weights are v0 / (v0 + v1) and v1 / (v0 + v1) on independent halves of the samples (total propagation, Parmas et
-    al. 2018). Requires costs, gradients and scores. Follows whichever mean has the lower variance, right or
-    wrong; the weights depend on the samples, so it is biased at finite N too. Reports the first-order ``weight``.
+    al. 2018). Requires costs, gradients and scores. It favours the mean with the lower variance, even if that mean is
+    wrong. Biased at finite N, since the weights depend on the samples. Reports the first-order ``weight``.
     """
 
     name = "inverse_variance"
@@ -22,10 +22,6 @@ class InverseVariance(Estimator):
     includes_explicit_derivative = True
     unbiased = False
     diagnostics: ClassVar[tuple[str, ...]] = ("weight",)
-
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return estimates with one weight per repeat and coordinate."""
-        return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
@@ -35,6 +31,6 @@ class InverseVariance(Estimator):
         v1 = first.var(axis=1, ddof=1) / first.shape[1]
         v0 = zeroth.var(axis=1, ddof=1) / zeroth.shape[1]
         total = v0 + v1
-        # with both variances 0 any weight is right
+        # if both variances are 0, any weight is right
         weight = np.divide(v0, total, out=np.full_like(total, 0.5), where=total > 0)
         return weight * first.mean(axis=1) + (1 - weight) * zeroth.mean(axis=1), {"weight": weight}

@@ -11,9 +11,9 @@ from bench.model import Problem, Program, SampleMean
 class MeasureValued(SampleMean):
     """Approximates grad J_sigma with (f(w_i = r) - f(w_i = -r)) / (sigma sqrt(2 pi)) for every coordinate i.
 
-    The derivative of a normal density by its mean is a difference of two Rayleigh densities; r, Rayleigh distributed, is
-    the same for both terms (coupled), and the other coordinates keep their noise. Takes 2 d rollouts per sample.
-    Requires only costs, with noise on theta. Unbiased for any cost, and without variance at a symmetric one
+    The derivative of a normal density by its mean is a difference of two Rayleigh densities. Both terms use the same
+    Rayleigh-distributed r (coupled), and the other coordinates keep their noise. Needs 2 d rollouts per sample.
+    Requires only costs, with noise on theta. Unbiased for any cost, and of variance 0 for a symmetric cost
     (Mohamed et al. 2020, section 6).
     """
 
@@ -32,8 +32,8 @@ class MeasureValued(SampleMean):
             ahead = problem.value(theta, moved)
             moved[i] = -radius[i]
             rows.append(ahead - problem.value(theta, moved))
-        return np.stack(rows) / (problem.sigma * np.sqrt(2.0 * np.pi))
+        return np.asarray(np.stack(rows) / (problem.sigma * np.sqrt(2.0 * np.pi)))
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Refuse noise that is not on theta: each action would need differences of its own."""
-        return None if program.noise_on_theta else f"{self.name} needs the noise on theta, not on a policy's actions"
+        """Return a reason for noise that is not on theta, where each action would need its own differences; else None."""
+        return None if program.noise_on_theta else f"{self.name} needs noise on theta, not on a policy's actions"

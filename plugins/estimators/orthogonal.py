@@ -1,4 +1,4 @@
-"""Zeroth order along directions that are orthogonal to each other."""
+"""Zeroth order along orthogonal directions."""
 
 from dataclasses import dataclass
 
@@ -9,15 +9,16 @@ from bench.model import Estimator, Problem, Program, columns, param, per_repeat
 
 @dataclass(frozen=True)
 class Orthogonal(Estimator):
-    """Approximates grad J_s with (f(theta + s v) - f(theta - s v)) v / 2s, the v of up to d samples orthogonal.
+    """Approximates grad J_s with (f(theta + s v) - f(theta - s v)) v / 2s, where the v of up to d samples are orthogonal.
 
-    Each block of d samples is a random rotation, so that together they see every direction. With ``lengths=drawn`` each
-    v has the length of its own normal vector and is normal by itself: unbiased, like ``randomized_smoothing``. With
-    ``lengths=fixed`` all have the length sqrt(d): the target is then another smoothing, and d samples are exact on a
+    Each block of d samples is a random rotation and covers all directions. With ``lengths=drawn`` each v has the length
+    of its own normal vector and is normally distributed: unbiased, like ``randomized_smoothing``. With
+    ``lengths=fixed`` all v have the length sqrt(d): the target is then another smoothing, and d samples are exact for a
     linear cost (Choromanski et al. 2018). Requires only costs.
     """
 
     name = "orthogonal"
+    needs_directions = True
     unbiased_at_discontinuities = True
 
     lengths: str = param("drawn", "lengths of the directions", choices=("drawn", "fixed"))
@@ -28,7 +29,7 @@ class Orthogonal(Estimator):
         return self.lengths == "drawn"
 
     def declares_unbiased(self, program: Program) -> bool:
-        """Return whether it smoothes as J_sigma does: noise on theta."""
+        """Return whether its smoothing is that of J_sigma, which needs noise on theta."""
         return program.noise_on_theta and super().declares_unbiased(program)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -38,20 +39,14 @@ class Orthogonal(Estimator):
         v = np.concatenate([_rotated(normal[:, i : i + d]) for i in range(0, noise.shape[1], d)], axis=1)
         lengths = np.linalg.norm(normal, axis=2, keepdims=True) if self.lengths == "drawn" else np.sqrt(d)
         shift = s * columns(lengths * v)
-        still = problem.centred(columns(noise))
-        change = problem.displaced(shift, theta, still) - problem.displaced(-shift, theta, still)
-        return per_repeat(change * shift / (2.0 * s * s), noise).mean(axis=1)
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
-        if program.n_noise >= program.dim:
-            return None
-        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"
+        centred = problem.centred(columns(noise))
+        change = problem.displaced(shift, theta, centred) - problem.displaced(-shift, theta, centred)
+        return np.asarray(per_repeat(change * shift / (2.0 * s * s), noise).mean(axis=1))
 
 
 def _rotated(normal: np.ndarray) -> np.ndarray:
-    """Return orthonormal vectors, uniform over rotations but for their signs, from normal ones ``(R, m, d)``, m <= d.
+    """Return orthonormal vectors, uniform over rotations except for their signs, from normal ones ``(R, m, d)``, m <= d.
 
-    The signs are the factorisation's own choice, and a central difference times its direction does not see them.
+    The factorisation chooses the signs, on which a central difference times its direction does not depend.
     """
     return np.moveaxis(np.linalg.qr(np.moveaxis(normal, 1, 2))[0], 2, 1)

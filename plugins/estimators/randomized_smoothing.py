@@ -11,21 +11,23 @@ from bench.model import Problem, Program, SampleMean, Smoothing, param
 class RandomizedSmoothing(SampleMean):
     """Approximates grad J_s with (f(theta + s w) - f(theta - s w)) w / 2s, or (f(theta + s w) - f(theta)) w / s.
 
-    ``variant``: ``antithetic`` (2 rollouts per sample) or ``forward`` (1 per sample, and one for the centre). The
-    radius s is sigma by default; noise is on theta, never on actions: under a feedback policy with action noise, or
-    with another radius, the target is not J_sigma (``reference=own`` measures against its own, where noise is on theta). Requires only costs (Nesterov, Spokoiny 2017).
+    ``variant``: ``antithetic`` (2 rollouts per sample) or ``forward`` (1 per sample and 1 for the centre). The radius s
+    is sigma by default. The smoothing is over theta, never over actions: under a feedback policy with action noise, or
+    with another radius, the target is not J_sigma. With ``reference=own`` and noise on theta, the reference is the
+    gradient of the estimator's own smoothing. Requires only costs (Nesterov, Spokoiny 2017).
     """
 
     name = "randomized_smoothing"
+    needs_directions = True
     unbiased_at_discontinuities = True
 
-    variant: str = param("antithetic", "which difference", choices=("antithetic", "forward"))
+    variant: str = param("antithetic", "central or forward difference", choices=("antithetic", "forward"))
     radius: float | None = param(
         None, "s, standard deviation of the smoothing, in units of theta; null: sigma", positive=True
     )
     reference: str = param(
         "sigma",
-        "what its rows are measured against: J_sigma, or the smoothing it does itself",
+        "reference of its rows: J_sigma, or the estimator's own smoothing",
         choices=("sigma", "own"),
     )
 
@@ -33,28 +35,22 @@ class RandomizedSmoothing(SampleMean):
         """Return one directional difference per sample, along its own direction."""
         s = problem.sigma if self.radius is None else self.radius
         direction = problem.directions(w)
-        still = problem.centred(w)
-        ahead = problem.displaced(s * direction, theta, still)
+        centred = problem.centred(w)
+        ahead = problem.displaced(s * direction, theta, centred)
         if self.variant == "antithetic":
-            return (ahead - problem.displaced(-s * direction, theta, still)) * direction / (2 * s)
-        centre = still if problem.program.exogenous else still[:, :1]
-        return (ahead - problem.value(theta, centre)) * direction / s
+            return np.asarray((ahead - problem.displaced(-s * direction, theta, centred)) * direction / (2 * s))
+        centre = centred if problem.program.exogenous else centred[:, :1]
+        return np.asarray((ahead - problem.value(theta, centre)) * direction / s)
 
     def declares_unbiased(self, program: Program) -> bool:
-        """Return whether it smoothes as J_sigma does: noise on theta, and no radius of its own."""
+        """Return whether its smoothing is that of its reference: noise on theta, and J_sigma's radius or its own."""
         if self.smoothing(program) is not None:
             return True
-        other = self.radius is not None and self.radius != program.scene.sigma
-        return program.noise_on_theta and not other and super().declares_unbiased(program)
+        is_other = self.radius is not None and self.radius != program.scene.sigma
+        return program.noise_on_theta and not is_other and super().declares_unbiased(program)
 
     def smoothing(self, program: Program) -> Smoothing | None:
-        """Return the Gaussian of its own radius, where its rows are measured against it and noise is on theta."""
+        """Return the Gaussian of its own radius if that is the reference and noise is on theta; else None."""
         if self.reference == "sigma" or self.radius is None or not program.noise_on_theta:
             return None
         return Smoothing("gaussian", self.radius)
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
-        if program.n_noise >= program.dim:
-            return None
-        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"

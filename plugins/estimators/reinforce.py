@@ -11,10 +11,10 @@ from bench.model import Problem, SampleMean, columns, param, per_repeat
 class Reinforce(SampleMean):
     """Approximates grad J_sigma with the mean of (f - b) d log p(actions)/dtheta (Williams 1992).
 
-    Where theta also sets the initial state, the derivative of f along that path, at given actions, is added.
+    If theta also sets the initial state, the derivative of f along that path, at given actions, is added.
 
     Baseline b: ``none``; ``center``, f at w = 0; ``leave_one_out``, the mean cost of the other samples of the batch.
-    Requires costs and scores. Unbiased for any cost, even one with jumps.
+    Requires costs and scores. Unbiased for any cost, even with jumps.
     """
 
     name = "reinforce"
@@ -22,11 +22,11 @@ class Reinforce(SampleMean):
     includes_explicit_derivative = True
     unbiased_at_discontinuities = True
 
-    baseline: str = param("center", "what is subtracted from f", choices=("none", "center", "leave_one_out"))
+    baseline: str = param("center", "baseline subtracted from f", choices=("none", "center", "leave_one_out"))
 
     @property
     def separable(self) -> bool:
-        """Whether no cost is compared with those of other samples."""
+        """Whether the term of a sample depends on this sample only."""
         return self.baseline != "leave_one_out"
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -34,7 +34,7 @@ class Reinforce(SampleMean):
         f = problem.value(theta, w)
         if self.baseline == "center":
             f = f - problem.value(theta, np.zeros((w.shape[0], 1)))
-        return f * problem.score(theta, w) + problem.explicit(theta, w)
+        return np.asarray(f * problem.score(theta, w) + problem.explicit(theta, w))
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean over samples of (f - b) * score."""
@@ -47,4 +47,4 @@ class Reinforce(SampleMean):
         f = (f - f.mean(axis=1, keepdims=True)) * f.shape[1] / (f.shape[1] - 1)
         score = per_repeat(problem.score(theta, w), noise)
         explicit = per_repeat(problem.explicit(theta, w), noise)
-        return np.einsum("rn,rnd->rd", f, score) / f.shape[1] + explicit.mean(axis=1)
+        return np.asarray(np.einsum("rn,rnd->rd", f, score) / f.shape[1] + explicit.mean(axis=1))

@@ -1,4 +1,4 @@
-"""Zeroth order along directions of one length."""
+"""Zeroth order along directions of equal length."""
 
 from dataclasses import dataclass
 
@@ -12,18 +12,20 @@ class SphereSmoothing(SampleMean):
     """Approximates grad J_sigma with d (f(theta + r u) - f(theta - r u)) u / 2r, u uniform on the unit sphere.
 
     Its expectation is the gradient of the cost averaged over a *ball* of radius r. By default r = sigma sqrt(d + 2),
-    at which ball and Gaussian have the same covariance, so that both agree for cubic costs; others differ, hence it is
-    declared biased, unless ``reference=own`` measures it against the ball itself. On a linear cost its relative squared error is (d - 1) / N, Gaussian directions give (d + 1) / N
-    (Flaxman et al. 2005; Berahas et al. 2022). Requires only costs.
+    for which ball and Gaussian have the same covariance and agree for cubic costs. For other costs they differ, so it
+    is declared biased, unless the reference is the ball itself (``reference=own``). On a linear cost its relative
+    squared error is (d - 1) / N, while Gaussian directions give (d + 1) / N (Flaxman et al. 2005; Berahas et al. 2022).
+    Requires only costs.
     """
 
     name = "sphere_smoothing"
+    needs_directions = True
     unbiased = False
 
     radius: float | None = param(None, "r, in units of theta; null: sigma sqrt(d + 2)", positive=True)
     reference: str = param(
         "sigma",
-        "what its rows are measured against: J_sigma, or the smoothing it does itself",
+        "reference of its rows: J_sigma, or the estimator's own smoothing",
         choices=("sigma", "own"),
     )
 
@@ -33,23 +35,17 @@ class SphereSmoothing(SampleMean):
         r = self._radius(problem.program)
         normal = problem.directions(w)
         u = normal / np.linalg.norm(normal, axis=0)
-        still = problem.centred(w)
-        change = problem.displaced(r * u, theta, still) - problem.displaced(-r * u, theta, still)
-        return d * change * u / (2.0 * r)
+        centred = problem.centred(w)
+        change = problem.displaced(r * u, theta, centred) - problem.displaced(-r * u, theta, centred)
+        return np.asarray(d * change * u / (2.0 * r))
 
     def _radius(self, program: Program) -> float:
         return float(program.scene.sigma * np.sqrt(program.dim + 2.0)) if self.radius is None else self.radius
 
     def smoothing(self, program: Program) -> Smoothing | None:
-        """Return the ball, where its rows are measured against it."""
+        """Return the ball if it is the reference, else None."""
         return Smoothing("ball", self._radius(program)) if self.reference == "own" else None
 
     def declares_unbiased(self, program: Program) -> bool:
-        """Return whether its expectation is the reference: that of the ball is, whatever the cost."""
+        """Return whether the reference is the ball, for which it is unbiased with any cost."""
         return self.reference == "own"
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Refuse noise of fewer than d normal numbers per sample, since a direction is made of them."""
-        if program.n_noise >= program.dim:
-            return None
-        return f"{self.name} needs {program.dim} normal numbers a sample, the noise model has {program.n_noise}"

@@ -1,8 +1,8 @@
 """Source code of a kernel: loops over time around loops over lanes, one rollout in each lane.
 
-A number is computed in the outermost place where it is known: once per call if it depends on parameters alone, once
-per step if it is the same in all lanes, once per lane before or after the loop over time, else in each step of each
-lane. A forward pass keeps the carries that the backward pass reads; the backward pass computes the rest of a step again.
+A number is computed in the outermost place where it is known: once per call if it depends on parameters alone, once per
+step if it is the same in all lanes, once per lane before or after the loop over time, else in each step of each lane. A
+forward pass keeps the carries that the backward pass reads; the backward pass computes the rest of a step again.
 """
 
 from __future__ import annotations

@@ -139,7 +139,7 @@ class _Tracer:
     def _reduce(self, op: str, value: np.ndarray, axes: Sequence[int]) -> np.ndarray:
         moved = np.moveaxis(value, axes, range(len(axes)))
         rows = moved.reshape(-1, *moved.shape[len(axes) :])
-        total = rows[0]
+        total: np.ndarray = rows[0]
         for row in rows[1:]:
             pairs = zip(self.nodes(total), self.nodes(row), strict=True)
             total = _objects([self.loop.graph.apply(op, a, b) for a, b in pairs], row.shape)

@@ -1,4 +1,4 @@
-"""Second-order steps that are split where an impact falls."""
+"""Second-order steps that are split at impacts."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +8,7 @@ from bench.model import Array, Contact, Dynamics, State
 from .stormer_verlet import StormerVerlet, flight
 
 LATE = 1e-3
-"""Fraction of a step by which an impact may lie in the past and still be located, in case rounding delayed it."""
+"""Fraction of a step by which an impact may lie in the past, since rounding may delay its detection."""
 
 
 @dataclass(frozen=True)
@@ -17,12 +17,13 @@ class EventDriven(StormerVerlet):
 
     The time of impact is a root of gap + rate t + acceleration t^2 / 2, differentiated in closed form, so that speed
     and time of the impact depend on theta as in the physics: gradients of rigid bounces are right to discretisation
-    error, and exact under constant acceleration, which no correction within a step from boundary to boundary achieves.
-    The law turns the velocity at the impact and the rest of the step follows from it.
+    error, and exact under constant acceleration, which no correction of a whole step achieves.
+    The law reverses the velocity at the impact, and the rest of the step starts from the new velocity.
 
-    Each contact has at most one impact per step: a body that returns sooner (coming to rest) sinks slowly, by less than
-    dt^2 g / 2 per step. The gap's acceleration leaves out the gap's curvature in q. Further contacts in the rest of a
-    step, and steps without an impact, are left to the law. Made for rigid laws; without one it is Stormer-Verlet.
+    Each contact has at most one impact per step: a body that returns earlier (coming to rest) sinks slowly, by less
+    than dt^2 g / 2 per step. The gap's acceleration neglects the gap's curvature in q. The law alone handles further
+    contacts in the rest of a step and steps without an impact. Intended for rigid laws; without one it is
+    Stormer-Verlet.
     """
 
     name = "event_driven"

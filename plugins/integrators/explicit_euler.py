@@ -18,7 +18,7 @@ class ExplicitEuler(Integrator):
     order = 1
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """Take one step, evaluating everything at its start."""
+        """Take one step, evaluating all terms at its start."""
         v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)
         return State(state.q + dt * state.v, v)
 
@@ -27,5 +27,5 @@ class ExplicitEuler(Integrator):
         return 1 + z
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """Return the matrix whose rows are both taken at the old state."""
+        """Return the matrix with both rows evaluated at the old state."""
         return np.array([[1.0, dt], [-dt * stiffness, factor - dt * damping]])

@@ -12,11 +12,11 @@ from bench.model import Array, Dynamics, Integrator, State
 class ImplicitEuler(Integrator):
     """v+ = d v + dt a(q + dt v+, v+, u) with velocity factor d; then q+ = q + dt v+.
 
-    Stable at every dt where the motion is, contact springs of a force law included, at the price of losing energy.
-    Differentiated through the implicit-function theorem; the unknown is the displacement dt v+, in which rounding in a
-    stiff force stays below the solver's tolerance. Impulses of an impulse law act on the solved step and move the
-    position along, as in semi-implicit Euler; they are not part of the equation. A force that jumps, such as a damper
-    that sets in at touch, can leave the equation without a root: such a rollout is not finite.
+    Stable at every dt if the motion is stable, contact springs of a force law included, but it loses energy.
+    Differentiated through the implicit-function theorem; the unknown is the displacement dt v+, for which rounding
+    errors of a stiff force stay below the solver's tolerance. Impulses of an impulse law act after the solved step and
+    change the position as in semi-implicit Euler; they are not part of the equation. With a force that jumps, such as a
+    damper at touch, the equation may have no root: such a rollout is not finite.
     """
 
     name = "implicit_euler"

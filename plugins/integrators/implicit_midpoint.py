@@ -12,11 +12,11 @@ from bench.model import Array, Dynamics, Integrator, State
 class ImplicitMidpoint(Integrator):
     """v+ = v + dt a(q + dt m / 2, m, u) with m = (v + v+) / 2; then q+ = q + dt m.
 
-    Symplectic, and stable at every dt where the motion is; it keeps the energy of linear oscillators exactly, so that
-    stiff modes ring on where implicit Euler damps them. Differentiated through the implicit-function theorem; the
-    unknown is the displacement dt m, in which rounding in a stiff force stays below the solver's tolerance. The
-    velocity factor multiplies the velocity at the start of the step.
-    Source: Hairer, Lubich, Wanner 2006.
+    Symplectic, and stable at every dt if the motion is stable. It conserves the energy of linear oscillators exactly,
+    so that stiff modes keep oscillating where implicit Euler damps them. Differentiated through the implicit-function
+    theorem; the unknown is the displacement dt m, for which rounding errors of a stiff force stay below the solver's
+    tolerance. The velocity factor multiplies the velocity at the start of the step. Source: Hairer, Lubich, Wanner
+    2006.
     """
 
     name = "implicit_midpoint"

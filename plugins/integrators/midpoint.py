@@ -9,7 +9,7 @@ from bench.model import Array, Dynamics, Integrator, State
 
 @dataclass(frozen=True)
 class Midpoint(Integrator):
-    """Half an explicit Euler step, then a whole one with the derivatives found there: second-order Runge-Kutta.
+    """Half an explicit Euler step, then a full step with the derivatives at the midpoint: second-order Runge-Kutta.
 
     The velocity factor multiplies the velocity at the start of the step, before all stages. On an undamped oscillator
     of frequency w it gains energy at every dt, by a factor 1 + (w dt)^4 / 4 per step.

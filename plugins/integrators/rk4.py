@@ -12,7 +12,7 @@ class Rk4(Integrator):
     """Four explicit stages, weighted 1, 2, 2, 1.
 
     The velocity factor multiplies the velocity at the start of the step, before all stages. Stable on an undamped
-    oscillator of frequency w while w dt <= 2 sqrt(2). A contact that begins within a step costs the method its order.
+    oscillator of frequency w while w dt <= 2 sqrt(2). A contact that begins within a step reduces the order.
     """
 
     name = "rk4"

@@ -1,1 +1,1 @@
-"""Optimizers: how costs and gradient estimates become the next theta."""
+"""Optimizers compute the next theta from costs and gradient estimates."""

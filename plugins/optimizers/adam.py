@@ -13,14 +13,14 @@ from .clipped import Clipped
 class Adam(Clipped):
     """Adam (Kingma, Ba 2015): theta - rate m / (sqrt(v) + eps) with bias-corrected means m of g and v of g^2.
 
-    Its steps are about ``rate`` per element whatever the gradient's size, so that rates suit scenes of any scale.
+    Its steps are about ``rate`` per element for gradients of any size, so that a rate suits scenes of any scale.
     """
 
     name = "adam"
 
-    beta1: float = param(0.9, "memory of the mean gradient", low=0.0, high=0.999999)
-    beta2: float = param(0.999, "memory of the mean square", low=0.0, high=0.999999)
-    eps: float = param(1e-8, "added to the root", positive=True)
+    beta1: float = param(0.9, "decay of the mean gradient", low=0.0, high=0.999999)
+    beta2: float = param(0.999, "decay of the mean square", low=0.0, high=0.999999)
+    eps: float = param(1e-8, "added to the square root", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
         """Start with both means at 0."""

@@ -9,23 +9,23 @@ from bench.model import Answer, OptimizerState, Population, param
 
 @dataclass(frozen=True)
 class Cem(Population):
-    """The cross-entropy method (Rubinstein 1999): fit a diagonal normal to the best of the population, again and again.
+    """The cross-entropy method (Rubinstein 1999): repeatedly fit a diagonal normal to the best points.
 
-    On a linear cost with elite share rho and z the normal quantile of rho, the mean moves by -sigma phi(z) / rho and the
-    variance falls by 1 - z phi(z) / rho - (phi(z) / rho)^2. ``spread`` is where the elites' squares are taken about:
-    the ``new`` mean, or the ``old`` one, which adds the squared step to the variance and keeps the search wide.
+    On a linear cost with elite share rho and z the normal quantile of rho, the mean moves by -sigma phi(z) / rho and
+    the variance falls by 1 - z phi(z) / rho - (phi(z) / rho)^2. The variance of the elites is about the ``new`` mean,
+    or about the ``old`` one, which adds the squared step and keeps the search wide (``spread``).
     """
 
     name = "cem"
 
     population: int = param(100, "points per iteration", low=2)
-    elites: int = param(20, "points that the next normal is fitted to", low=1)
-    width: float = param(1.0, "first standard deviation, in units of theta", positive=True)
+    elites: int = param(20, "best points, to which the next normal is fitted", low=1)
+    width: float = param(1.0, "initial standard deviation, in units of theta", positive=True)
     least: float = param(1e-6, "smallest standard deviation", low=0.0)
-    spread: str = param("new", "mean that the variance is taken about", choices=("new", "old"))
+    spread: str = param("new", "mean about which the variance is computed", choices=("new", "old"))
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start at theta with the first width."""
+        """Start at theta with the initial width."""
         return super().start(theta) | {"deviation": np.full(len(theta), self.width)}
 
     def draws(self, dim: int) -> int:
@@ -37,7 +37,7 @@ class Cem(Population):
         return np.asarray(state["theta"][:, None] + state["deviation"][:, None] * noise)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Fit mean and variance to the elites; points without a finite cost come last."""
+        """Fit mean and variance to the elites; points without a finite cost are ranked last."""
         assert answer.value is not None
         cost = np.where(np.isfinite(answer.value), answer.value, np.inf)
         elite = theta[:, np.argsort(cost, kind="stable")[: min(self.elites, theta.shape[1])]]

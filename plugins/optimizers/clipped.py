@@ -1,4 +1,4 @@
-"""What the gradient methods share: clipping, and a rate that falls."""
+"""The base of the gradient methods: clipping, and a decreasing rate."""
 
 from dataclasses import dataclass
 
@@ -9,26 +9,26 @@ from bench.model import Descent, OptimizerState, param
 
 @dataclass(frozen=True)
 class Clipped(Descent):
-    """A gradient method whose gradients may be clipped and whose rate may fall as 1 / iteration^decay."""
+    """A gradient method with optional clipping and an optional rate decay of 1 / iteration^decay."""
 
     rate: float = param(0.01, "step per unit of gradient", positive=True)
     decay: float = param(0.0, "the rate at iteration i is rate / i^decay", low=0.0)
     clip: float | None = param(None, "largest gradient; null: no limit", positive=True)
-    clip_by: str = param("norm", "what the limit is on: the norm, or each element", choices=("norm", "element"))
+    clip_by: str = param("norm", "whether the norm or each element is limited", choices=("norm", "element"))
 
     def start(self, theta: np.ndarray) -> OptimizerState:
         """Start at iteration 0."""
         return super().start(theta) | {"iteration": 0}
 
     def clipped(self, gradient: np.ndarray) -> np.ndarray:
-        """Return the gradient, shortened to a norm of ``clip`` or cut to it element by element."""
+        """Return the gradient with its norm or its elements limited to ``clip``."""
         if self.clip is None:
             return gradient
         if self.clip_by == "element":
-            return np.clip(gradient, -self.clip, self.clip)
+            return np.asarray(np.clip(gradient, -self.clip, self.clip))
         norm = float(np.linalg.norm(gradient))
         return gradient if norm <= self.clip else gradient * (self.clip / norm)
 
     def rate_at(self, iteration: int) -> float:
-        """Return the rate of an iteration, the first being 1."""
+        """Return the rate of an iteration; the first iteration is 1."""
         return float(self.rate / iteration**self.decay)

@@ -12,8 +12,8 @@ from bench.model import Answer, OptimizerState, Population, param
 class Constants(NamedTuple):
     """The strategy's constants for a dimension and a population (Hansen 2016, arXiv 1604.00772, table 1).
 
-    ``c_sigma`` has d + mu_eff + 3 below the line, as in the author's own program, where the table has 5, and is
-    at most 1/2.
+    ``c_sigma`` has the denominator d + mu_eff + 3, as in the author's own program, while the table has 5, and is at
+    most 1/2.
     """
 
     weights: np.ndarray
@@ -45,13 +45,13 @@ def constants(dim: int, population: int) -> Constants:
 class CmaEs(Population):
     """CMA-ES (Hansen 2016): adapts the mean, the step size and the whole covariance of a normal to the better half.
 
-    Keeps d^2 numbers and takes d^3 operations per iteration. Points without a finite cost come last.
+    Stores d^2 numbers and needs d^3 operations per iteration. Points without a finite cost are ranked last.
     """
 
     name = "cma_es"
 
     population: int | None = param(None, "points per iteration; null: 4 + 3 ln d", low=4)
-    width: float = param(0.3, "first step size, in units of theta", positive=True)
+    width: float = param(0.3, "initial step size, in units of theta", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
         """Start with the unit covariance."""
@@ -82,9 +82,9 @@ class CmaEs(Population):
         white = axes @ ((axes.T @ step) / lengths)
         path_sigma = (1 - k.c_sigma) * state["path_sigma"] + math.sqrt(k.c_sigma * (2 - k.c_sigma) * k.mu_eff) * white
         norm = float(np.linalg.norm(path_sigma))
-        settled = norm / math.sqrt(1 - (1 - k.c_sigma) ** (2 * i)) < (1.4 + 2 / (d + 1)) * k.chi
-        path_c = (1 - k.c_c) * state["path_c"] + settled * math.sqrt(k.c_c * (2 - k.c_c) * k.mu_eff) * step
-        lost = (1 - settled) * k.c_1 * k.c_c * (2 - k.c_c)
+        is_settled = norm / math.sqrt(1 - (1 - k.c_sigma) ** (2 * i)) < (1.4 + 2 / (d + 1)) * k.chi
+        path_c = (1 - k.c_c) * state["path_c"] + is_settled * math.sqrt(k.c_c * (2 - k.c_c) * k.mu_eff) * step
+        lost = (1 - is_settled) * k.c_1 * k.c_c * (2 - k.c_c)
         covariance = (
             (1 - k.c_1 - k.c_mu + lost) * state["covariance"]
             + k.c_1 * np.outer(path_c, path_c)

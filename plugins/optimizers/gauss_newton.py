@@ -12,17 +12,17 @@ from bench.model import Answer, Optimizer, OptimizerState, param
 class GaussNewton(Optimizer):
     """Minimises |r|^2 / 2 by steps of (J'J + damping diag(J'J))^-1 J'r (Levenberg 1944, Marquardt 1963).
 
-    Requires residuals and their Jacobian. A step that raises the cost is taken back and the damping grows tenfold; one
-    that lowers it divides the damping by ten. Where J'J is singular the least-squares step of least length is taken.
+    Requires residuals and their Jacobian. A step that increases the cost is rejected and the damping multiplied by ten.
+    A step that decreases it divides the damping by ten. If J'J is singular, the shortest least-squares step is taken.
     """
 
     name = "gauss_newton"
     needs: ClassVar[frozenset[str]] = frozenset({"residual", "jacobian"})
 
-    damping: float = param(1e-3, "first damping, relative to the diagonal of J'J", positive=True)
+    damping: float = param(1e-3, "initial damping, relative to the diagonal of J'J", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start with the first damping, no point known yet."""
+        """Start with the initial damping and no known point."""
         return super().start(theta) | {"damping": self.damping, "known": None, "next": np.array(theta, dtype=float)}
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
@@ -30,7 +30,7 @@ class GaussNewton(Optimizer):
         return np.array(state["next"][:, None])
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Take the point if it is better, and step from the best one."""
+        """Accept the point if it is better, and step from the best point."""
         assert answer.residual is not None
         assert answer.jacobian is not None
         residual, jacobian = answer.residual[:, 0], answer.jacobian[..., 0]

@@ -13,25 +13,25 @@ from .searching import Searching
 class Lbfgs(Searching):
     """L-BFGS by the two-loop recursion (Nocedal, Wright 2006, algorithm 7.4) with Armijo backtracking from step 1.
 
-    Made for gradients without noise: pairs with y.s <= 1e-10 |y||s| are left out, and before the first pair the
-    direction is the gradient scaled to ``first_move``.
+    For gradients without noise. Pairs with y.s <= 1e-10 |y||s| are skipped, and before the first pair the direction is
+    the negative gradient scaled to ``first_move``.
     """
 
     name = "lbfgs"
 
-    first: float = param(1.0, "longest step that is tried", positive=True)
-    shrink: float = param(0.5, "factor between two steps that are tried", positive=True, high=0.99)
-    slope: float = param(1e-4, "share of the promised descent that a step has to keep", positive=True, high=1.0)
-    tries: int = param(16, "steps that are tried", positive=True)
-    memory: int = param(10, "pairs of steps and gradient differences that are kept", positive=True)
-    first_move: float = param(0.1, "length of the first direction", positive=True)
+    first: float = param(1.0, "longest trial step", positive=True)
+    shrink: float = param(0.5, "factor between two trial steps", positive=True, high=0.99)
+    slope: float = param(1e-4, "required share of the predicted descent (Armijo)", positive=True, high=1.0)
+    tries: int = param(16, "number of trial steps", positive=True)
+    memory: int = param(10, "stored pairs of steps and gradient differences", positive=True)
+    first_move: float = param(0.1, "length of the first step", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
         """Start without pairs."""
         return super().start(theta) | {"steps": [], "changes": [], "last": None}
 
     def with_gradient(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
-        """Return the state with a new gradient and the pair that it completes."""
+        """Return the state with a new gradient and the pair that it completes, if any."""
         steps, changes = list(state["steps"]), list(state["changes"])
         if state["last"] is not None:
             s, y = state["theta"] - state["last"][0], gradient - state["last"][1]
@@ -55,4 +55,4 @@ class Lbfgs(Searching):
         q = q * ((s @ y) / (y @ y))
         for (s, y), share in zip(pairs, reversed(shares), strict=True):
             q = q + s * (share - (y @ q) / (y @ s))
-        return -q
+        return np.asarray(-q)

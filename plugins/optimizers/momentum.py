@@ -15,11 +15,11 @@ class Momentum(Clipped):
 
     name = "momentum"
 
-    momentum: float = param(0.9, "share of the last step that is kept", low=0.0, high=1.0)
-    nesterov: bool = param(False, "look ahead (Nesterov 1983)")
+    momentum: float = param(0.9, "share of the last step in the next one", low=0.0, high=1.0)
+    nesterov: bool = param(False, "Nesterov momentum (Nesterov 1983)")
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start without speed."""
+        """Start with speed 0."""
         return super().start(theta) | {"speed": np.zeros(len(theta))}
 
     def step(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:

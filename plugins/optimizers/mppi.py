@@ -20,7 +20,7 @@ class Mppi(Population):
 
     population: int = param(100, "points per iteration", low=2)
     width: float = param(0.3, "standard deviation of the samples, in units of theta", positive=True)
-    temperature: float = param(1.0, "cost by which a weight falls to 1/e", positive=True)
+    temperature: float = param(1.0, "increase of the cost at which a weight falls to 1/e", positive=True)
     relative: bool = param(True, "whether the temperature is in units of the standard deviation of the costs")
 
     def draws(self, dim: int) -> int:
@@ -34,10 +34,10 @@ class Mppi(Population):
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
         """Move to the weighted mean; points without a finite cost have no weight."""
         assert answer.value is not None
-        known = np.isfinite(answer.value)
-        if not known.any():
+        is_finite = np.isfinite(answer.value)
+        if not is_finite.any():
             return state
-        cost = answer.value[known]
+        cost = answer.value[is_finite]
         unit = float(cost.std()) if self.relative else 1.0
         weight = np.exp(-(cost - cost.min()) / (self.temperature * (unit or 1.0)))
-        return {"theta": theta[:, known] @ (weight / weight.sum())}
+        return {"theta": theta[:, is_finite] @ (weight / weight.sum())}

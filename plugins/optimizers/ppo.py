@@ -1,4 +1,4 @@
-"""Proximal policy optimisation, of a plan without states."""
+"""Proximal policy optimisation of an open-loop plan."""
 
 from dataclasses import dataclass
 
@@ -11,24 +11,24 @@ from bench.model import Answer, OptimizerState, Population, param
 class Ppo(Population):
     """PPO (Schulman et al. 2017, arXiv 1707.06347, equation 7) whose policy is a normal per coordinate of theta.
 
-    Each coordinate of a sample is an action x_i ~ N(mean_i, deviation_i^2) with a ratio r_i of its own to the policy that
-    drew it, and the advantage A of its rollout, its cost below the population's mean in standard deviations. ``epochs`` steps
-    of Adam ascend the mean of min(r_i A, clip(r_i, 1 - clip, 1 + clip) A) by means and logarithms of the deviations. It
-    sees costs only: without states there is no value function, and no credit for single steps: it is context
-    for other methods, and no measure of implementations that have both.
+    Each coordinate of a sample is an action x_i ~ N(mean_i, deviation_i^2) with a ratio r_i of its own to the policy
+    that drew it, and the advantage A of its rollout, its cost below the population's mean in standard deviations.
+    ``epochs`` steps of Adam ascend the mean of min(r_i A, clip(r_i, 1 - clip, 1 + clip) A) by means and logarithms of
+    the deviations. It uses costs only: without states there is neither a value function nor credit assignment to single
+    steps. It is a point of comparison for other methods, not a benchmark of full PPO implementations.
     """
 
     name = "ppo"
 
     population: int = param(100, "rollouts per iteration", low=2)
-    width: float = param(0.3, "first standard deviation, in units of theta", positive=True)
+    width: float = param(0.3, "initial standard deviation, in units of theta", positive=True)
     rate: float = param(0.01, "step of Adam, in units of theta for means", positive=True)
-    clip: float = param(0.2, "distance from 1 at which a ratio has nothing more to gain", positive=True, high=1.0)
+    clip: float = param(0.2, "distance of a ratio from 1 at which the objective is clipped", positive=True, high=1.0)
     epochs: int = param(10, "steps of Adam per population", positive=True)
     least: float = param(1e-6, "smallest standard deviation", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start at theta with the first width, Adam's means at 0."""
+        """Start at theta with the initial width, and with Adam's means at 0."""
         policy = np.stack([np.array(theta, dtype=np.float64), np.full(len(theta), np.log(self.width))])
         return {
             "theta": policy[0], "policy": policy, "mean": 0.0 * policy, "square": 0.0 * policy, "step": 0,
@@ -44,16 +44,16 @@ class Ppo(Population):
         return np.asarray(mean[:, None] + np.exp(log_deviation)[:, None] * noise)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Ascend the surrogate; points without a finite cost are left out, costs that are all the same say nothing."""
+        """Ascend the surrogate. Points without a finite cost are ignored, and equal costs change nothing."""
         assert answer.value is not None
-        known = np.isfinite(answer.value)
-        cost = answer.value[known]
+        is_finite = np.isfinite(answer.value)
+        cost = answer.value[is_finite]
         if not cost.size or not cost.std() > 0:
             return state
         advantage = (cost.mean() - cost) / cost.std()
         policy, mean, square, step = state["policy"], state["mean"], state["square"], state["step"]
         for _ in range(self.epochs):
-            slope, step = self.slope(policy, state["policy"], theta[:, known], advantage), step + 1
+            slope, step = self.slope(policy, state["policy"], theta[:, is_finite], advantage), step + 1
             mean, square = 0.9 * mean + 0.1 * slope, 0.999 * square + 0.001 * slope**2
             move = mean / (1 - 0.9**step) / (np.sqrt(square / (1 - 0.999**step)) + 1e-8)
             policy = policy + self.rate * move
@@ -68,7 +68,7 @@ class Ppo(Population):
         away, before = (
             (points - mean[:, None]) / np.exp(log_deviation)[:, None] for mean, log_deviation in (policy, old)
         )
-        # a ratio beyond e^20 is clipped anyway, or has next to no weight
+        # a ratio beyond e^20 is clipped anyway or has a negligible weight
         ratio = np.exp(np.clip((before**2 - away**2) / 2 + (old[1] - policy[1])[:, None], -20.0, 20.0))
         moving = np.where(advantage > 0, ratio < 1 + self.clip, ratio > 1 - self.clip)
         weight = moving * ratio * advantage / advantage.size

@@ -1,4 +1,4 @@
-"""One ball is pushed at another: where it misses, the gradient is exactly zero."""
+"""One ball is pushed at another. If it misses, the gradient is exactly zero."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Billiard(ContactScene):
     mass: float = param(0.17, "mass of each ball", "kg", positive=True)
     radius: float = param(0.042, "radius of each ball", "m", positive=True)
     push: float = param(4.0, "force along x in the first step", "N")
-    start: float = param(1.0, "u0 at theta, the force across in the first step", "N")
+    start: float = param(1.0, "u0 at theta, the force along y in the first step", "N")
 
     def theta0(self) -> np.ndarray:
         """Return (u0,)."""
@@ -43,7 +43,7 @@ class Billiard(ContactScene):
         return State(xp.stack([zero - 0.375, zero, zero - 0.2, zero]), xp.stack([zero, zero, zero, zero]))
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """Return (push, u0) in the first step, nothing after it."""
+        """Return (push, u0) in the first step and 0 afterwards."""
         first = xp.stack([0.0 * theta[0] + self.push, theta[0]])[None]
         later = xp.zeros((self.horizon - 1, 2, theta.shape[1]), dtype=theta.dtype)
         return xp.concat([first, later], axis=0)

@@ -16,8 +16,8 @@ class BounceOnce(EngineTwin, ContactScene):
 
     State (q, v); theta = (y0, vy0, u0), initial height and velocity and a vertical force during the first step only,
     with parameter noise; f = q_T. A rigid bounce ends at radius + restitution |z| with
-    z = y0 - radius + T (vy0 + dt u0 / mass). The default height starts the contact in the middle of a step. Height 1,
-    the source's, starts it on the boundary between two steps, a kink of the penalty program.
+    z = y0 - radius + T (vy0 + dt u0 / mass). With the default height, contact begins in the middle of a step. With
+    the source's height of 1 it begins on the boundary between two steps, a kink of the penalty program.
     Source: Zhong, Han, Brikis 2022, task 1.
     """
 
@@ -42,11 +42,11 @@ class BounceOnce(EngineTwin, ContactScene):
         return np.array([self.height, self.velocity, self.force])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at that height and velocity."""
+        """Start at the height and velocity of theta."""
         return State(theta[0:1], theta[1:2])
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """Return the force in the first step, none after it."""
+        """Return the force in the first step and 0 afterwards."""
         first = theta[None, 2:3, :]
         later = xp.zeros((self.horizon - 1, 1, theta.shape[1]), dtype=theta.dtype)
         return xp.concat([first, later], axis=0)
@@ -108,7 +108,7 @@ class BounceOnce(EngineTwin, ContactScene):
         return self.radius + (end if end > 0 else -self.restitution * end)
 
     def _free_end(self) -> float:
-        """Return z, the final gap if there were no ground."""
+        """Return z, the final gap without a ground."""
         return self.height - self.radius + self.horizon * self.dt * (self.velocity + self.dt * self.force / self.mass)
 
     def _free_slope(self) -> np.ndarray:

@@ -17,9 +17,9 @@ class BouncingBall(EngineTwin, ContactScene):
     State (q, v); theta = (initial height, initial velocity), with parameter noise; f = (q_T - target)^2.
     The default lands at 0.45 s and is on its way down again at T = 1 s.
 
-    Under gravity an impulse that takes the velocity of a step boundary has a wrong derivative at every dt, with or
-    without time of impact: the speed of impact then depends on theta only through the step the impact falls in, in
-    jumps. Differences over a span of theta that moves the impact by many steps are right.
+    Under gravity, an impulse that uses the velocity at a step boundary has a wrong derivative at every dt, with or
+    without time of impact: the impact speed then depends on theta only in jumps, through the step of the impact.
+    Differences over a range of theta that moves the impact by many steps are right.
     """
 
     name = "bouncing_ball"
@@ -36,7 +36,7 @@ class BouncingBall(EngineTwin, ContactScene):
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2", positive=True)
     height: float = param(1.0, "initial height at theta", "m", positive=True)
     velocity: float = param(0.0, "initial velocity at theta, upwards", "m/s")
-    target: float = param(0.5, "height wanted at the end", "m")
+    target: float = param(0.5, "target height at the end", "m")
     restitution: float = param(1.0, "restitution of impulse laws and of the physical gradient", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
@@ -44,7 +44,7 @@ class BouncingBall(EngineTwin, ContactScene):
         return np.array([self.height, self.velocity])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at theta itself."""
+        """Start at theta."""
         return State(theta[0:1], theta[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
@@ -93,9 +93,9 @@ class BouncingBall(EngineTwin, ContactScene):
     def _rigid_end(self) -> tuple[float, np.ndarray] | None:
         """Return the height at T and its slope by theta, ``(2,)``."""
         g, end, e = self.gravity, self.horizon * self.dt, self.restitution
-        start = np.array([0.0, self.velocity, self.height])  # time, velocity and height at the last take-off
-        slopes = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])  # by theta
-        # a ball with more bounces than this counts as come to rest
+        start = np.array([0.0, self.velocity, self.height])  # time, velocity and height after the last impact
+        slopes = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])  # derivatives by theta
+        # a ball with more bounces than this counts as at rest
         for _ in range(1000):
             time, v, q = start
             impact = math.sqrt(v * v + 2 * g * q)

@@ -1,4 +1,4 @@
-"""A simulator of the user's own, named by its file."""
+"""A user's own simulator, named by its file."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -12,18 +12,18 @@ from bench.model import CallableScene, load_simulator, param, simulator_files
 class Callable(CallableScene):
     """f(theta, w) = cost(theta + sigma u, v), with a function of a file as the cost; w = (u, v).
 
-    theta is that of the file, or ``theta0=[..]``. Without ``grad`` its gradients are central differences.
+    theta comes from the file or from ``theta0=[..]``. Without ``grad``, gradients are central differences.
     """
 
     name = "callable"
-    neglected_effects = "whatever the simulator leaves out"
+    neglected_effects = "those that the simulator neglects"
     backends: ClassVar[tuple[str, ...]] = ("callable",)
 
     cost: str = param("bench.model.simulator.example:cost", "the cost, as FILE:NAME or MODULE:NAME")
-    theta: str = param("theta", "where it starts: a name in the file")
+    theta: str = param("theta", "theta: a name in the file")
     grad: str = param("gradient", "jax, torch, or a function of theta in the file; empty for differences")
-    batch: str = param("", "how several thetas are taken at once; by default detected")
-    own_noise: int = param(0, "length of the noise that the cost itself takes", low=0)
+    batch: str = param("", "how the cost evaluates several thetas: loop, vmap, columns or rows; detected by default")
+    own_noise: int = param(0, "length of the cost's own noise", low=0)
 
     def simulator(self) -> Any:
         """Return the user's functions, loaded once."""

@@ -1,4 +1,4 @@
-"""Balancing a pole on a cart: a feedback policy, where noise on actions and noise on theta differ."""
+"""Balancing a pole on a cart: a feedback policy, for which noise on actions and noise on theta differ."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -27,7 +27,7 @@ class Cartpole(EngineTwin, MechanicalScene):
     sigma: float = param(0.1, "standard deviation of the noise on each force, or on each gain", "N", positive=True)
     horizon: int = param(50, "number of time steps", "steps", positive=True)
     dt: float = param(0.02, "length of a time step", "s", positive=True)
-    noise: str = param("action", "what the noise perturbs", choices=("action", "parameter"))
+    noise: str = param("action", "whether noise is on the actions or on theta", choices=("action", "parameter"))
     cart_mass: float = param(1.0, "M", "kg", positive=True)
     pole_mass: float = param(0.1, "m", "kg", positive=True)
     length: float = param(0.5, "l, length of the pole", "m", positive=True)

@@ -1,4 +1,4 @@
-"""A flat cost: anything that an estimator reports beyond zero is its own noise."""
+"""A constant cost: every nonzero estimate is noise of the estimator."""
 
 from dataclasses import dataclass
 from typing import Any

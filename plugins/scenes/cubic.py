@@ -1,4 +1,4 @@
-"""A cubic: the simplest cost whose smoothed gradient differs from its own."""
+"""A cubic: the simplest cost whose smoothed gradient differs from its gradient."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
 class Cubic(FunctionScene):
     """f = sum_i x_i^3 / 3, with x = theta + sigma w.
 
-    grad J = theta^2 + sigma^2, where the gradient of f itself is theta^2. theta runs evenly from 0.5 to 1.5.
+    grad J = theta^2 + sigma^2, where the gradient of f itself is theta^2. theta is spaced evenly from 0.5 to 1.5.
     """
 
     name = "cubic"

@@ -1,4 +1,4 @@
-"""A mass pushed along a line: dynamics with everything in closed form."""
+"""A mass pushed along a line: dynamics with a closed form of all results."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -13,7 +13,7 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
     """q'' = u from rest at q = 0; state (q, v), theta the controls u_0 .. u_{N-1}; f = (q_N - 1)^2 / 2.
 
     q_N = c . u with c_i = dt^2 (N - i) for semi-implicit and dt^2 (N - i - 1) for explicit Euler. Hence grad J =
-    (c . theta - 1) c whatever sigma, and a sample's gradient has covariance sigma^2 |c|^2 c c^T: trace sigma^2 |c|^4.
+    (c . theta - 1) c for any sigma, and a sample's gradient has covariance sigma^2 |c|^2 c c^T: trace sigma^2 |c|^4.
     """
 
     name = "double_integrator"
@@ -23,7 +23,7 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
     n_u: ClassVar[int] = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each control", "m/s^2", positive=True)
-    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = param(20, "number of time steps", "steps", positive=True)
     dt: float = param(0.05, "length of a time step", "s", positive=True)
     control: float = param(1.0, "control of every step at theta", "m/s^2")

@@ -13,7 +13,7 @@ class DoublePendulum(MechanicalScene):
     """Two equal point masses on two equal rods; q are the absolute angles from hanging down.
 
     State (q1, q2, v1, v2); theta = its initial value, with parameter noise; f = 1 - cos q1 at the end. Equal masses
-    drop out of the motion; their 0.1 kg each only scale the :meth:`energy`. Sample gradients grow exponentially with
+    cancel in the motion and only scale the :meth:`energy`. Sample gradients grow exponentially with
     the horizon, while costs, and with them the zeroth-order variance, stay bounded.
     """
 
@@ -29,11 +29,11 @@ class DoublePendulum(MechanicalScene):
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2")
 
     def theta0(self) -> np.ndarray:
-        """Start with the first rod level, swinging up at 5 rad/s, and the second hanging, swinging the other way."""
+        """Return the first rod horizontal, swinging up at 5 rad/s, and the second one hanging, swinging the other way."""
         return np.array([0.5 * np.pi, 0.0, 5.0, -5.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at theta itself."""
+        """Start at theta."""
         return State(theta[:2], theta[2:])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:

@@ -13,14 +13,14 @@ from bench.model import Array, FrictionScene, State, param
 class FrictionBlock(FrictionScene):
     """A block lies on the ground by gravity and is dragged by a spring whose other end is pulled in jerks; q = (x, z).
 
-    The end is at p(t) = V (t - a sin(w t) / w): pulled at speed V on average, and for a = 1 standing still once a
-    period 2 pi / w. theta = (V, a), with parameter noise; f = half the squared distance of the end position from (goal,
-    0). The normal force comes from the contact law, the block starting at the depth that balances its weight under the
-    scene's stiffness; friction is regularised Coulomb, mu lambda tanh(slip / slip_speed), so that a sticking block
-    creeps. At a = 0 the end moves evenly. With one coefficient for stick and slip, the block then holds until the
-    spring pulls with mu m g and moves at V (1 - cos(sqrt(k/m) t)) after that, at rest only for moments: lasting sticks
-    would need a coefficient that falls with speed. Explicit steps are stable up to dt mu g < 2 slip_speed. Impulse laws
-    have no friction: the block glides.
+    The end is at p(t) = V (t - a sin(w t) / w): pulled at speed V on average, and for a = 1 at rest once per period 2
+    pi / w. theta = (V, a), with parameter noise; f = half the squared distance of the end position from (goal, 0). The
+    normal force comes from the contact law, the block starting at the depth that balances its weight under the scene's
+    stiffness; friction is regularised Coulomb, mu lambda tanh(slip / slip_speed), so that a sticking block creeps. At a
+    = 0 the end moves at constant speed. With one coefficient for stick and slip, the block sticks until the spring
+    pulls with mu m g and then moves at V (1 - cos(sqrt(k/m) t)), at rest only for moments: longer sticking would need a
+    coefficient that decreases with speed. Explicit steps are stable up to dt mu g < 2 slip_speed. Impulse laws have no
+    friction, so the block slides freely.
     """
 
     name = "friction_block"
@@ -38,13 +38,13 @@ class FrictionBlock(FrictionScene):
     mass: float = param(1.0, "m", "kg", positive=True)
     gravity: float = param(9.81, "g", "m/s^2", positive=True)
     friction: float = param(0.5, "mu, Coulomb coefficient", low=0.0)
-    slip_speed: float = param(0.005, "speed at which friction has grown to tanh(1) of its bound", "m/s", positive=True)
+    slip_speed: float = param(0.005, "slip speed at which friction reaches tanh(1) of its limit", "m/s", positive=True)
     spring: float = param(400.0, "k, stiffness of the spring", "N/m", positive=True)
     depth: float = param(9.81e-5, "penetration at the start", "m", low=0.0)
     pull: float = param(0.3, "V at theta", "m/s")
     jerk: float = param(1.0, "a at theta: amplitude of the end's speed over its mean")
     frequency: float = param(8.0, "w", "rad/s", positive=True)
-    goal: float = param(1.0, "x wanted at the end", "m")
+    goal: float = param(1.0, "target x at the end", "m")
     restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:

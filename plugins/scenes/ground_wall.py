@@ -17,8 +17,8 @@ class GroundWall(ContactScene):
     State (q, v); theta = initial velocity (d = 2), with parameter noise; f = squared distance to the target at T.
     Contacts are (ground, wall), both frictionless, so that x and y do not interact. Under gravity the impulse law has a
     wrong derivative by vy at every dt (see ``bouncing_ball``), while its derivative by vx is right with the time of
-    impact and has the wrong sign without it. The penalty's damper sets in at once at touch, so that the program jumps
-    by O(dt) wherever contact begins on a step boundary, and the mean of its gradients is not the gradient of its mean.
+    impact and has the wrong sign without it. The penalty's damper acts immediately at touch, so that the program jumps
+    by O(dt) where contact begins on a step boundary, and the mean of its gradients is not the gradient of its mean.
     Source: Zhong, Han, Brikis 2022, task 2.
     """
 
@@ -101,17 +101,21 @@ def _bounced(gap: float, velocity: float, gravity: float, e: float, end: float) 
     A fall from gap s at velocity v lasts t with s + v t = g t^2 / 2 and ends at speed w = sqrt(v^2 + 2 g s), with
     dt = t dv / w and dw = v dv / w.
     """
-    left, slope, delay = end, 1.0, 0.0  # time left; derivatives of velocity and of the time of the last impact
+    remaining, slope, delay = (
+        end,
+        1.0,
+        0.0,
+    )  # remaining time; derivatives of velocity and of the time of the last impact
     for _ in range(1000):
         impact = math.sqrt(velocity**2 + 2 * gravity * gap)
         fall = _fall_time(gap, velocity, gravity, impact)
-        if fall > left:
-            reached = gap + velocity * left - 0.5 * gravity * left**2
-            return reached, slope * left - (velocity - gravity * left) * delay
+        if fall > remaining:
+            reached = gap + velocity * remaining - 0.5 * gravity * remaining**2
+            return reached, slope * remaining - (velocity - gravity * remaining) * delay
         if e * impact == 0.0:
             return None
         delay += fall * slope / impact
-        gap, velocity, slope, left = 0.0, e * impact, e * slope * velocity / impact, left - fall
+        gap, velocity, slope, remaining = 0.0, e * impact, e * slope * velocity / impact, remaining - fall
     return None
 
 

@@ -1,4 +1,4 @@
-"""A cart pushed against the wind: noise from outside, wider than theta."""
+"""A cart pushed in gusts of wind: process noise in addition to the noise on theta."""
 
 import math
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ class GustyCart(ProcessNoiseScene):
 
     q_N = c (theta + sigma u) + b . gust e, with b_i = dt^2 (N - i) / mass for semi-implicit and dt^2 (N - i - 1) / mass
     for explicit Euler, and c the sum of b. So q_N is normal with mean m = c theta and variance s^2 = c^2 sigma^2 + gust^2
-    |b|^2, and grad J = 2 c s (z Phi(z) + phi(z)) at z = (m - edge) / s. Without gusts the cart hardly ever passes the edge
-    and the gradient is near 0: the reference has to average over them.
+    |b|^2, and grad J = 2 c s (z Phi(z) + phi(z)) at z = (m - edge) / s. Without gusts the cart rarely passes the edge
+    and the gradient is near 0, so the reference must average over the gusts.
     """
 
     name = "gusty_cart"
@@ -30,7 +30,7 @@ class GustyCart(ProcessNoiseScene):
     dt: float = param(0.05, "length of a time step", "s", positive=True)
     mass: float = param(1.0, "mass of the cart", "kg", positive=True)
     force: float = param(1.0, "force at theta", "N")
-    edge: float = param(0.75, "position beyond which the cart should not come", "m")
+    edge: float = param(0.75, "position that the cart should not pass", "m")
 
     def theta0(self) -> np.ndarray:
         """Return the force."""
@@ -59,7 +59,7 @@ class GustyCart(ProcessNoiseScene):
             return None
         b = self.dt**2 * (self.horizon - steps[integrator.name] - np.arange(self.horizon)) / self.mass
         c = float(b.sum())
-        if c == 0.0:  # one explicit step moves by the velocity before it, which is 0
+        if c == 0.0:  # one explicit step moves by the initial velocity, which is 0
             return np.zeros(1)
         s = math.hypot(c * self.sigma, self.gust * float(np.linalg.norm(b)))
         z = (c * self.force - self.edge) / s

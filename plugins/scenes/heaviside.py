@@ -17,7 +17,7 @@ class Heaviside(FunctionScene):
     """
 
     name = "heaviside"
-    neglected_effects = "dynamics; stands for a contact that is made or missed"
+    neglected_effects = "dynamics; represents a contact that occurs or not"
     continuous: ClassVar[bool] = False
 
     theta: float = param(0.0, "where the gradient is estimated; the jump is at 0")
@@ -32,7 +32,7 @@ class Heaviside(FunctionScene):
         return xp.where(x[0] >= 0, zero + 1.0, zero)
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return the place of the jump."""
+        """Return the position of the jump."""
         return ((0.0,),)
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:

@@ -15,13 +15,13 @@ class Hopper(EngineTwin, ContactScene):
 
     With the compression c = rest length - (z - y) the leg pushes body and foot apart with k c + b c' + u. The policy
     u = c z' (theta_0 + theta_1 (target - h)) makes the leg stiffer while the body rises than while it falls, more so
-    where the energy height h = z + z'^2 / 2g + k c^2 / (2 M g), the apex to come, is below target. theta holds the two
+    if the energy height h = z + z'^2 / 2g + k c^2 / (2 M g), the next apex, is below target. theta holds the two
     gains; f = mean of (h - target)^2 over the steps, plus ``effort`` times the mean of u^2, plus (h - target)^2 at
     the end.
 
     The default lands and lifts off four times. Under a penalty the light foot rebounds within a stance, under
-    ``complementarity`` it stays down; the hops are the same. The ``impulse`` law is not a ground to hop on: it uses
-    the velocity before the step, so that a pressed foot sinks at dt times the acceleration that presses it.
+    ``complementarity`` it stays down; the hops are the same. The ``impulse`` law does not support hopping: it uses
+    the velocity before the step, so that a loaded foot sinks at dt times the acceleration of the load.
     """
 
     name = "hopper"
@@ -33,7 +33,7 @@ class Hopper(EngineTwin, ContactScene):
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
 
     sigma: float = param(1.0, "standard deviation of the noise on the force of each step", "N", positive=True)
-    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = param(1000, "number of time steps", "steps", positive=True)
     dt: float = param(0.002, "length of a time step", "s", positive=True)
     body_mass: float = param(1.0, "M, mass of the body", "kg", positive=True)
@@ -43,7 +43,7 @@ class Hopper(EngineTwin, ContactScene):
     leg_damping: float = param(6.0, "b, damping of the leg", "N s/m", low=0.0)
     gravity: float = param(9.81, "g", "m/s^2", positive=True)
     drop: float = param(0.15, "initial height of the foot", "m", positive=True)
-    target: float = param(0.7, "energy height wanted", "m", positive=True)
+    target: float = param(0.7, "target energy height", "m", positive=True)
     effort: float = param(1e-5, "weight of the mean squared force", "m^2/N^2", low=0.0)
     restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
 

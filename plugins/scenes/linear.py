@@ -1,4 +1,4 @@
-"""A plane: every gradient estimator without bias of its own is exact on average."""
+"""A plane: every unbiased gradient estimator is exact on average."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
 class Linear(FunctionScene):
     """f = sum_i a_i x_i, with x = theta + sigma w and a_i = slope (i + 1) / d for i = 0 .. d - 1.
 
-    grad J = a, whatever sigma and theta; first-order gradients have variance 0.
+    grad J = a for any sigma and theta; first-order gradients have variance 0.
     """
 
     name = "linear"

@@ -11,11 +11,11 @@ from bench.model import Array, ContactLaw, KnownOptimum, KnownValue, MechanicalS
 
 @dataclass(frozen=True)
 class Lqr(KnownOptimum, KnownValue, MechanicalScene):
-    """q'' = u from (q, v) = (``start``, 0); f = sum of position q^2 + speed v^2 + effort u^2, plus the end state's.
+    """q'' = u from (q, v) = (``start``, 0); f = sum of position q^2 + speed v^2 + effort u^2, plus terminal terms.
 
     theta is the control of each step (d = horizon). Made for semi-implicit Euler, whose step is x' = A x + B u with
     A = [[1, h], [0, 1]] and B = [h^2, h]. J* = x0'P x0 with P from the Riccati recursion: 10.988683643 at the default.
-    Noise of sigma on the controls adds sigma^2 (tr R + tr B'P B) per step to the best that feedback reaches.
+    Noise of sigma on the controls adds sigma^2 (tr R + tr B'P B) per step to the optimal cost of feedback.
     """
 
     name = "lqr"
@@ -25,7 +25,7 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
     n_u: ClassVar[int] = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each control", "m/s^2", positive=True)
-    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = param(100, "number of time steps", "steps", positive=True)
     dt: float = param(0.05, "length of a time step", "s", positive=True)
     start: float = param(1.0, "q at the start", "m")
@@ -66,12 +66,12 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
     def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:
         """Return x'P x with the P of that step."""
         x = np.concatenate([q, v])
-        return np.einsum("ib,ij,jb->b", x, _values(self)[step], x)
+        return np.asarray(np.einsum("ib,ij,jb->b", x, _values(self)[step], x))
 
 
 @cache
 def _values(scene: Lqr) -> list[np.ndarray]:
-    """Return P of every step, the last being the end's weights, for semi-implicit Euler."""
+    """Return P of every step, the last being the terminal weights, for semi-implicit Euler."""
     h = scene.dt
     a, b = np.array([[1.0, h], [0.0, 1.0]]), np.array([[h * h], [h]])
     p = np.diag([scene.end_position, scene.end_speed])

@@ -15,9 +15,9 @@ class MassSpring(Oscillator, DampedScene):
     """Two equal masses joined by a spring and damper, reduced to the spring's stretch: m q'' = -2 k q - 2 c q'.
 
     State (q, v), stretch and its rate; theta = their initial values, with parameter noise; f = q_N^2. With r the first
-    row of the N-th power of the integrator's transition matrix, q_N = r . theta and grad J = 2 (r . theta) r whatever
+    row of the N-th power of the integrator's transition matrix, q_N = r . theta and grad J = 2 (r . theta) r for any
     sigma. Semi-implicit Euler with velocity factor d is unstable when dt^2 2 k / m > 2 (1 + d), explicit Euler
-    without damping always is; the gradient then grows with the horizon as the trajectory does.
+    without damping is always unstable. The gradient then grows with the horizon as the trajectory does.
     """
 
     name = "mass_spring"
@@ -38,7 +38,7 @@ class MassSpring(Oscillator, DampedScene):
         return np.array([self.stretch, self.rate])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at theta itself."""
+        """Start at theta."""
         return State(theta[0:1], theta[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
@@ -70,7 +70,7 @@ class MassSpring(Oscillator, DampedScene):
             return None
         stiffness, damping, _ = self.oscillator()
         half, end = 0.5 * damping, self.horizon * self.dt
-        rate = cmath.sqrt(half * half - stiffness)  # imaginary where it swings
+        rate = cmath.sqrt(half * half - stiffness)  # imaginary if it oscillates
         even = 0.5 * (cmath.exp((rate - half) * end) + cmath.exp((-rate - half) * end))
         odd = 0.5 * (cmath.exp((rate - half) * end) - cmath.exp((-rate - half) * end))
         odd = odd / rate if rate else end * math.exp(-half * end)

@@ -1,4 +1,4 @@
-"""A mass on a spring and a damper, let go from rest: what its motion can and cannot say about its parameters."""
+"""A mass on a spring and a damper, released from rest: identifiable and unidentifiable parameters."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -12,13 +12,13 @@ from bench.model import Array, Identified, MechanicalScene, State, param
 class MassSpringDamper(Identified, MechanicalScene):
     """m x'' = -k x - c x' + ``force`` sin t from rest at ``start``; f = mean of (x - hold)^2 over the steps.
 
-    theta is the position at the start, with parameter noise. Without a force the motion is x = e^(-at) (cos wt + (a/w) sin
-    wt) with a = c / 2m and w^2 = k/m - a^2: it depends on k/m and c/m only, so that no record of it tells m, k and c
-    apart. A known force lifts that.
+    theta is the position at the start, with parameter noise. Without a force the motion is x = e^(-at) (cos wt + (a/w)
+    sin wt) with a = c / 2m and w^2 = k/m - a^2: it depends on k/m and c/m only, so that m, k and c are not identifiable
+    separately. With a known force they are.
     """
 
     name = "mass_spring_damper"
-    neglected_effects = "friction that does not grow with speed, a spring that stiffens"
+    neglected_effects = "dry friction, nonlinear stiffness"
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1
     unknowns: ClassVar[tuple[str, ...]] = ("mass", "stiffness", "damping")
@@ -31,7 +31,7 @@ class MassSpringDamper(Identified, MechanicalScene):
     damping: float = param(0.4, "c", "N s/m", low=0.0)
     force: float = param(0.0, "amplitude of the force sin t", "N")
     start: float = param(1.0, "x at the start, at theta", "m")
-    hold: float = param(0.0, "x wanted", "m")
+    hold: float = param(0.0, "target x", "m")
 
     def theta0(self) -> np.ndarray:
         """Return the position at the start."""
@@ -42,7 +42,7 @@ class MassSpringDamper(Identified, MechanicalScene):
         return State(theta[:1], 0.0 * theta[:1])
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """Return sin t at the middle of each step, whatever theta."""
+        """Return sin t at the middle of each step, independent of theta."""
         time = self.dt * (xp.astype(xp.arange(self.horizon), theta.dtype)[:, None] + 0.5)
         return (xp.sin(time) + 0.0 * theta[0])[:, None, :]
 
@@ -55,5 +55,5 @@ class MassSpringDamper(Identified, MechanicalScene):
         return (q[0] - self.hold) ** 2 / self.horizon
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return nothing."""
+        """Return 0."""
         return 0.0 * q[0]

@@ -23,7 +23,7 @@ class Pendulum(EngineTwin, MechanicalScene):
     n_u: ClassVar[int] = 1
 
     sigma: float = param(0.3, "standard deviation of the noise on each torque", "N m", positive=True)
-    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = param(50, "number of time steps", "steps", positive=True)
     dt: float = param(0.02, "length of a time step", "s", positive=True)
     mass: float = param(1.0, "mass at the tip", "kg", positive=True)

@@ -1,4 +1,4 @@
-"""Swinging up a pendulum against a running cost: an optimum that is known to ten digits."""
+"""Swinging up a pendulum with a running cost: an optimum that is known to ten digits."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -13,10 +13,9 @@ class PendulumSwing(MechanicalScene):
     """A pendulum of unit constants, q'' = -sin q + u, is swung from rest at q = 0 to rest at q = pi.
 
     State (q, q'); theta is the torque of each step (d = horizon). f = sum over the steps of (q - pi)^2 + q'^2 + u^2,
-    taken before each step, plus ``terminal`` times (q - pi)^2 + q'^2 at the end. Smooth, not convex, of one minimum as
-    far as anyone has looked: J* = 349.490460 at the default, reached by Newton's method with |gradient| < 1e-9.
-    Source: Suh et al. 2021, *Bundled gradients*, whose curve ends 2.2% above it since it minimises other weights than
-    those it reports.
+    evaluated before each step, plus ``terminal`` times (q - pi)^2 + q'^2 at the end. Smooth and not convex, with one
+    known minimum: J* = 349.490460 at the default, reached by Newton's method with |gradient| < 1e-9. Source: Suh et al.
+    2021, *Bundled gradients*, whose curve ends 2.2% above it, since it minimises other weights than the reported ones.
     """
 
     name = "pendulum_swing"
@@ -26,7 +25,7 @@ class PendulumSwing(MechanicalScene):
     n_u: ClassVar[int] = 1
 
     sigma: float = param(0.3, "standard deviation of the noise on each torque", positive=True)
-    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = param(200, "number of time steps", "steps", positive=True)
     dt: float = param(0.05, "length of a time step", "s", positive=True)
     torque: float = param(0.1, "torque of every step at theta")

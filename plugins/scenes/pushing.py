@@ -13,9 +13,9 @@ from bench.model import Array, ContactScene, DampedScene, EngineTwin, State, Zer
 class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
     """Two bodies on a line, the first pushed by an open-loop force; they touch when closer than 1 m.
 
-    State (x1, x2, v1, v2); theta is the force sequence (d = horizon / hold). f = sum over steps of the Q-weighted squared
-    distance to the goal before the step plus u^2, divided by ``hold``, plus the same distance of the last state. Source:
-    Suh et al. 2022.
+    State (x1, x2, v1, v2); theta is the force sequence (d = horizon / hold). f = sum over steps of the Q-weighted
+    squared distance to the goal before the step plus u^2, divided by ``hold``, plus the same distance of the last
+    state. Source: Suh et al. 2022.
     """
 
     name = "pushing"
@@ -30,7 +30,7 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e3}
 
     sigma: float = param(0.3, "standard deviation of the noise on each force", "N", positive=True)
-    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = param(30, "number of time steps", "steps", positive=True)
     dt: float = param(0.005, "length of a time step", "s", positive=True)
     mass: float = param(0.1, "mass of each body", "kg", positive=True)
@@ -82,7 +82,7 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
             <actuator><motor joint="first"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the distance to the goal before the step, plus effort, weighted by the step's share of a control."""
+        """Return the distance to the goal before the step, plus effort, divided by ``hold``."""
         return (self.terminal_cost(xp, q, v) + u[0] * u[0]) / self.hold
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:

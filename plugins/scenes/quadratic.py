@@ -12,8 +12,8 @@ from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
 class Quadratic(FunctionScene):
     """f = sum_i c_i x_i^2 / 2, with x = theta + sigma w.
 
-    The curvatures c_i are spaced geometrically from 1 to ``condition``; theta runs evenly from 0.5 to 1.5.
-    grad J = c theta, whatever sigma.
+    The curvatures c_i are spaced geometrically from 1 to ``condition``; theta is spaced evenly from 0.5 to 1.5.
+    grad J = c theta for any sigma.
     """
 
     name = "quadratic"

@@ -1,4 +1,4 @@
-"""A block that slides to rest: what its distance says about friction depends on the time step."""
+"""A block that slides to rest: the friction identified from its distance depends on the time step."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -10,11 +10,12 @@ from bench.model import Array, Identified, MechanicalScene, State, param
 
 @dataclass(frozen=True)
 class SlidingBlock(Identified, MechanicalScene):
-    """x'' = -friction g until the block stands; f = (x_T - goal)^2. theta is the first speed, with parameter noise.
+    """x'' = -friction g until the block stops; f = (x_T - goal)^2. theta is the initial speed, with parameter noise.
 
-    It slides d = v0^2 / (2 friction g) = 1.529052 m at the default, with dd/dfriction = -5.096840. A step ends at speed 0
-    where it would turn back, which shortens d by dt v0 / 2: a friction fitted to the true d comes out as 1 - dt friction
-    g / v0 of it, and holds for its time step only. Once the block stands, further time makes no difference, rightly.
+    It slides d = v0^2 / (2 friction g) = 1.529052 m at the default, with dd/dfriction = -5.096840. A step ends at speed
+    0 if the block would turn back, which shortens d by dt v0 / 2: a friction fitted to the true d is too low by the
+    factor 1 - dt friction g / v0 and valid for its time step only. After the block has stopped, further time changes
+    nothing.
     """
 
     name = "sliding_block"
@@ -29,10 +30,10 @@ class SlidingBlock(Identified, MechanicalScene):
     friction: float = param(0.3, "Coulomb coefficient", positive=True)
     gravity: float = param(9.81, "g", "m/s^2", positive=True)
     speed: float = param(3.0, "v0, at theta", "m/s", positive=True)
-    goal: float = param(2.0, "x wanted at the end", "m")
+    goal: float = param(2.0, "target x at the end", "m")
 
     def theta0(self) -> np.ndarray:
-        """Return the first speed."""
+        """Return the initial speed."""
         return np.array([self.speed])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
@@ -40,7 +41,7 @@ class SlidingBlock(Identified, MechanicalScene):
         return State(0.0 * theta[:1], theta[:1])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the deceleration that friction can give, at most the one that stops the block within the step."""
+        """Return the deceleration by friction, at most the one that stops the block within the step."""
         most, stop = self.friction * self.gravity, v / self.dt
         return -xp.where(stop < most, stop, most + 0.0 * v)
 

@@ -13,12 +13,12 @@ from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
 class SoftHeaviside(FunctionScene):
     """f = clip(2 x / nu, -1, 1), with x = theta + sigma w (d = 1).
 
-    With p the chance that |x| < nu / 2: grad J = 2 p / nu, and a sample's derivative has variance (2 / nu)^2 p (1 - p),
-    so that first-order gradients are unbiased and, at small nu, useless. Source: Suh et al. 2022.
+    With p the probability that |x| < nu / 2: grad J = 2 p / nu, and a sample's derivative has variance (2 / nu)^2 p (1
+    - p), so that first-order gradients are unbiased and, at small nu, useless. Source: Suh et al. 2022.
     """
 
     name = "soft_heaviside"
-    neglected_effects = "dynamics; stands for a stiff contact that is made or missed"
+    neglected_effects = "dynamics; represents a stiff contact that occurs or not"
 
     theta: float = param(0.0, "where the gradient is estimated; the ramp is around 0")
     nu: float = param(0.1, "width of the ramp", positive=True)
@@ -38,7 +38,7 @@ class SoftHeaviside(FunctionScene):
         return ((-self.nu / 2, self.nu / 2),)
 
     def probability(self) -> float:
-        """Return p, the chance that a sample falls on the ramp."""
+        """Return p, the probability that a sample lies on the ramp."""
         scale = math.sqrt(2) * self.sigma
         upper, lower = (self.nu / 2 - self.theta) / scale, (-self.nu / 2 - self.theta) / scale
         return 0.5 * (math.erf(upper) - math.erf(lower))

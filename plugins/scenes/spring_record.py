@@ -1,4 +1,4 @@
-"""A spring and a damper fitted to a record of their motion: a cost with many valleys, more of them in longer records."""
+"""A spring and a damper fitted to a record of their motion: a cost with more local minima in longer records."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -10,16 +10,16 @@ from bench.model import Array, ContactLaw, KnownOptimum, MechanicalScene, Plugin
 
 @dataclass(frozen=True)
 class SpringRecord(KnownOptimum, MechanicalScene):
-    """x'' = -k x - c x' from rest at 1; theta = (k, c) is to be found; f = mean of (x - record)^2 over the steps.
+    """x'' = -k x - c x' from rest at 1; theta = (k, c) is to be identified; f = mean of (x - record)^2 over the steps.
 
-    The record is the same motion with ``stiffness`` and ``damping`` in the same steps, so that J* = 0: it is q[1], beside x
-    in q[0]. theta starts with ``guess`` times the stiffness and no damping. Without damping two frequencies D apart differ
-    by 1 - sin(DT) / (DT) on average over a record of length T: from further apart than D = 4.4934 / T a descent ends in a
-    false valley.
+    The record is the same motion with ``stiffness`` and ``damping`` in the same steps, so that J* = 0. It is q[1], and
+    x is q[0]. theta starts with ``guess`` times the stiffness and no damping. Without damping two frequencies D apart
+    differ by 1 - sin(DT) / (DT) on average over a record of length T: from further away than D = 4.4934 / T, descent
+    ends in a wrong local minimum.
     """
 
     name = "spring_record"
-    neglected_effects = "noise in the record, an unknown mass or start (a record tells k/m and c/m only)"
+    neglected_effects = "noise in the record, an unknown mass or start (only k/m and c/m are identifiable)"
     identifies: ClassVar[bool] = True
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 2
@@ -53,9 +53,9 @@ class SpringRecord(KnownOptimum, MechanicalScene):
         return (q[0] - q[1]) ** 2 / self.horizon
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return nothing: the end is no more than the steps before it."""
+        """Return 0: the final state has no extra cost."""
         return 0.0 * q[0]
 
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str]:
-        """Return 0, whatever the integrator."""
+        """Return 0, for any integrator."""
         return 0.0, "the record's own parameters"

@@ -1,4 +1,4 @@
-"""Copies of x' = x + u under one matrix of gains: a policy of which most directions make no difference."""
+"""Copies of x' = x + u under one matrix of gains: a policy with many gauge directions, which do not change the cost."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,19 +10,19 @@ from bench.model import Array, ContactLaw, KnownOptimum, KnownValue, MechanicalS
 
 @dataclass(frozen=True)
 class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
-    """``copies`` of x' = x + u under the policy u = K x from x = (1, .., 1), with K any matrix (d = copies^2), at first 0.
+    """``copies`` of x' = x + u under the policy u = K x from x = (1, .., 1), for any matrix K (d = copies^2), initially 0.
 
-    f = sum over the steps of x'x + effort u'u, plus ``end`` x'x. All copies move alike, so that only K 1 matters: the
-    other copies (copies - 1) of copies^2 directions are gauge. With 100 copies over 10 steps, effort .1 and end 10, J goes
-    from 2000 at K = 0 to 109.1607978 at every K with K 1 = -.9160798. The step length is 1, under explicit or
-    semi-implicit Euler alike: x is the velocity, and positions make no difference.
+    f = sum over the steps of x'x + effort u'u, plus ``end`` x'x. All copies move in the same way, so that only K 1
+    matters: the other copies (copies - 1) of the copies^2 directions are gauge directions. With 100 copies over 10
+    steps, effort .1 and end 10, J goes from 2000 at K = 0 to 109.1607978 at every K with K 1 = -.9160798. The step
+    length is 1. x is the velocity and positions do not matter, so explicit and semi-implicit Euler agree.
     """
 
     name = "static_gain"
     neglected_effects = "positions, coupling of the copies"
 
     sigma: float = param(0.1, "standard deviation of the noise on the gains, or on each control", positive=True)
-    noise: str = param("parameter", "what the noise perturbs", choices=("parameter", "action"))
+    noise: str = param("parameter", "whether noise is on theta or on the actions", choices=("parameter", "action"))
     horizon: int = param(10, "number of time steps", "steps", positive=True)
     dt: float = param(1.0, "length of a time step", "s", positive=True)
     copies: int = param(2, "length of x", low=1)
@@ -32,7 +32,7 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
 
     @property
     def n_q(self) -> int:  # type: ignore[override]
-        """The number of copies: their sums, which nothing depends on, stand where a scene has positions."""
+        """The number of copies. The positions are sums of x, on which nothing depends."""
         return self.copies
 
     @property
@@ -80,11 +80,11 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
         """Return the cost of one copy under u = k x: a geometric sum."""
         factor = (1.0 + self.dt * k) ** 2
         powers = factor[None] ** np.arange(self.horizon + 1)[:, None]
-        return (1.0 + self.effort * k * k) * powers[:-1].sum(axis=0) + self.end * powers[-1]
+        return np.asarray((1.0 + self.effort * k * k) * powers[:-1].sum(axis=0) + self.end * powers[-1])
 
     def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:
         """Return p x'x with the p of that step, from the scalar Riccati recursion."""
         p = self.end
         for _ in range(self.horizon - step):
             p = 1.0 + p - (self.dt * p) ** 2 / (self.effort + self.dt**2 * p)
-        return p * (v * v).sum(axis=0)
+        return np.asarray(p * (v * v).sum(axis=0))

@@ -13,13 +13,13 @@ from bench.model import Array, ContactLaw, Integrator, MechanicalScene, Plugin, 
 class StiffDecay(MechanicalScene):
     """x' = rate x, a first-order scene whose state is the velocity; theta = x_0, with parameter noise; f = x_N.
 
-    One step multiplies x by the integrator's stability function R(rate dt), so that grad J = R^N whatever sigma. At
+    One step multiplies x by the integrator's stability function R(rate dt), so that grad J = R^N for any sigma. At
     the default, rate dt = -2.5, it is -1.5 for explicit Euler and 1 / 3.5 for implicit Euler; the physics has
     e^-2.5 per step. Outside the stability region the derivative is exact for its program and useless.
     """
 
     name = "stiff_decay"
-    neglected_effects = "positions, any second time scale"
+    neglected_effects = "positions, a second time scale"
     n_q: ClassVar[int] = 0
     n_v: ClassVar[int | None] = 1
 
@@ -34,7 +34,7 @@ class StiffDecay(MechanicalScene):
         return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start without a position, with x_0 as velocity."""
+        """Return no position and x_0 as velocity."""
         return State(theta[:0], theta)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:

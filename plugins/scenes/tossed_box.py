@@ -1,4 +1,4 @@
-"""A box tossed on the ground, only for physics engines: four corners that slide, stick and bounce."""
+"""A box thrown on the ground, for physics engines only: four corners that slide, stick and bounce."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from bench.model import Array, EngineScene, State, param
 class TossedBox(EngineScene):
     """A square box in a vertical plane lands on its corners, tumbles and slides; q = (x, height, pitch) of its centre.
 
-    State (q, v); theta is the first velocity (m/s, m/s, rad/s), with parameter noise; f = (x_T - target)^2. Four
-    contacts with friction are coupled through one body: only a physics engine runs it, from the MJCF twin.
+    State (q, v); theta is the initial velocity (m/s, m/s, rad/s), with parameter noise; f = (x_T - target)^2. Four
+    contacts with friction are coupled through one body, so only physics engines can run it, from the MJCF twin.
     """
 
     name = "tossed_box"
@@ -23,7 +23,7 @@ class TossedBox(EngineScene):
     n_contacts: ClassVar[int] = 4
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 50.0, "damping_mode": "clipped"}
 
-    sigma: float = param(0.1, "standard deviation of the noise on the first velocity", "m/s and rad/s", positive=True)
+    sigma: float = param(0.1, "standard deviation of the noise on the initial velocity", "m/s and rad/s", positive=True)
     horizon: int = param(250, "number of time steps", "steps", positive=True)
     dt: float = param(0.002, "length of a time step", "s", positive=True)
     mass: float = param(1.0, "mass of the box", "kg", positive=True)
@@ -33,10 +33,10 @@ class TossedBox(EngineScene):
     height: float = param(0.3, "initial height of the centre", "m", positive=True)
     speed: float = param(1.5, "initial horizontal velocity at theta", "m/s")
     spin: float = param(2.0, "initial angular velocity at theta", "rad/s")
-    target: float = param(0.5, "horizontal position wanted at the end", "m")
+    target: float = param(0.5, "target horizontal position at the end", "m")
 
     def theta0(self) -> np.ndarray:
-        """Throw forwards, spinning."""
+        """Return a forward velocity with spin."""
         return np.array([self.speed, 0.0, self.spin])
 
     def initial_state(self, xp: Any, theta: Array) -> State:

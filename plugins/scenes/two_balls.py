@@ -17,11 +17,11 @@ class TwoBalls(KnownOptimum, ContactScene):
     second ball from (0, 0) at the end plus ``effort`` dt sum |u|^2. The balls start at (-2, -2) and (-1, -1) on the
     goal's diagonal and collide elastically.
 
-    By symmetry the optimum is one blow along the diagonal: with the impact at time s and speed v per coordinate, and d
-    the gap per coordinate, f(s, v) = (8 effort / s + 2 (T - s)^2) v^2 - (4 (T - s) + 24 effort d / s^2) v + 2 + 24 effort
-    d^2 / s^3, so s* = .68322, J* = 1.396542 at the default effort for dt -> 0. Doing nothing costs 2. Without the time
-    of impact the gradient of the collision has the wrong sign, and descent learns to do nothing.
-    Source: Zhong, Han, Brikis 2022, task 3, which has 480 steps.
+    By symmetry the optimum is a push along the diagonal: with the impact at time s and speed v per coordinate, and d
+    the gap per coordinate, f(s, v) = (8 effort / s + 2 (T - s)^2) v^2 - (4 (T - s) + 24 effort d / s^2) v + 2 + 24
+    effort d^2 / s^3, so s* = .68322, J* = 1.396542 at the default effort for dt -> 0. Doing nothing costs 2. Without
+    the time of impact the gradient of the collision has the wrong sign, and descent learns to do nothing. Source:
+    Zhong, Han, Brikis 2022, task 3, which has 480 steps.
     """
 
     name = "two_balls"
@@ -32,7 +32,7 @@ class TwoBalls(KnownOptimum, ContactScene):
     n_contacts: ClassVar[int] = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each force", "N", positive=True)
-    noise: str = param("action", "what the noise perturbs", choices=("action",))
+    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = param(120, "number of time steps", "steps", positive=True)
     dt: float = param(1 / 120, "length of a time step", "s", positive=True)
     radius: float = param(0.2, "radius of both balls", "m", positive=True)

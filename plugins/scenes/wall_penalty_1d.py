@@ -1,4 +1,4 @@
-"""A point running into a soft wall: how the step size by itself ruins a penalty gradient."""
+"""A point that hits a soft wall: the step size alone makes a penalty gradient wrong."""
 
 import math
 from collections.abc import Mapping
@@ -15,10 +15,10 @@ class WallPenalty1d(EngineTwin, ContactScene):
     """A point of mass 1 at q0 > 0 moves at velocity -1 into a wall at q = 0, which pushes with -v - 50 q, unclipped.
 
     State (q, v); theta = q0 (d = 1), with parameter noise; f = |q_T - 1| with T = horizon dt = 2 s. The wall is a
-    penalty law with the values of ``contact_values``; unlike elsewhere the softness is part of the physics, which the
-    physical gradient takes at dt -> 0. Its damper acts from first touch, so that the program jumps by O(dt) each time
-    q0 grows by one step's travel: its derivative tends to the physical one where the wall is left again, not for
-    rollouts that end in it. Source: Paulus et al. 2025, toy example.
+    penalty law with the values of ``contact_values``; unlike in other scenes the softness is part of the physics, whose
+    gradient is that of dt -> 0. The damper acts from first touch, so that the program jumps by O(dt) each time
+    q0 grows by one step's travel: its derivative tends to the physical one for rollouts that leave the wall again, not
+    for those that end in it. Source: Paulus et al. 2025, toy example.
     """
 
     name = "wall_penalty_1d"

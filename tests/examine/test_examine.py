@@ -88,7 +88,7 @@ def test_gradients_are_matched_by_name_whatever_their_order():
 def test_list_of_numbers_of_any_library_is_a_vector():
     layout = ParameterTree([1.0, 2.0])
     np.testing.assert_array_equal(layout.flatten([np.float32(3), np.array(4.0)]), [3.0, 4.0])
-    with pytest.raises(UserError, match="theta is theta"):
+    with pytest.raises(UserError, match="theta has theta"):
         layout.flatten([np.float32(3)])
 
 
@@ -99,7 +99,7 @@ def test_cost_that_takes_its_argument_apart_is_given_another_each_time():
 
 
 def test_theta_that_would_fill_the_memory_is_bad_input():
-    with pytest.raises(UserError, match="up to 100,000"):
+    with pytest.raises(UserError, match="at most 100,000"):
         ParameterTree(np.zeros(100_001))
 
 

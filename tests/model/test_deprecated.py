@@ -10,7 +10,7 @@ import pytest
 
 import bench
 from bench import deprecated
-from bench.model import Estimator, FunctionScene, SampleMean, sources
+from bench.model import Descent, Estimator, FunctionScene, SampleMean, sources
 
 ESTIMATOR = '''
 """First order with a weight that it reports."""
@@ -222,6 +222,24 @@ def test_members_are_read_by_their_old_names_from_classes_and_instances():
         assert Now().across_jumps == "a property"
 
 
+def test_an_old_optimizer_names_the_fields_of_the_next_step():
+    with pytest.warns(DeprecationWarning, match="Old.wants is now called required_fields"):
+
+        class Old(Descent):
+            def step(self, state, gradient):
+                return state
+
+            def wants(self, state):
+                return frozenset()
+
+    assert Old().required_fields({}) == frozenset()
+
+
+def test_a_renamed_function_is_found_by_its_old_name():
+    with pytest.warns(DeprecationWarning, match="bench.simulator_of is now called load_simulator"):
+        assert bench.simulator_of is bench.load_simulator
+
+
 def test_an_old_name_that_the_kind_never_had_is_the_authors_own():
     class Bowl(FunctionScene):
         reports = "its own"
@@ -241,6 +259,7 @@ def test_an_old_name_that_the_kind_never_had_is_the_authors_own():
     [
         ("bench.face", "bench.api"),
         ("bench.model.known", "bench.model.known_solutions"),
+        ("bench.model.loaded", "bench.model.simulator.imports"),
         ("bench.simulator.mjcf", "bench.model.simulator.mjcf"),
         ("bench.simulator.layout", "bench.model.simulator.tree"),
         ("bench.sweep.grid", "bench.experiment.grid"),

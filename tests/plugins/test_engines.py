@@ -171,7 +171,7 @@ def test_stiffness_and_mass_compile_nothing_anew(mode):
 @pytest.mark.parametrize(
     ("engine", "of", "reason"),
     [
-        (Mujoco(), compose(Pushing(), Complementarity(), SemiImplicitEuler()), "stands for penalty, not complementarity"),
+        (Mujoco(), compose(Pushing(), Complementarity(), SemiImplicitEuler()), "replaces penalty, not complementarity"),
         (Mujoco(), compose(Pendulum(), None, Rk4()), "not rk4"),
         (Mujoco(), compose(DoublePendulum(), None, SemiImplicitEuler()), "no MJCF twin"),
         (Mujoco(), compose(WallPenalty1d(), law_for(WallPenalty1d(), Penalty), SemiImplicitEuler()), "never pull"),

@@ -177,7 +177,7 @@ def test_stiff_steps_end_a_window():
 
 
 def test_refusals():
-    assert "knows its cost to go" in Windowed(terminal="exact").unsupported_reason(
+    assert "knows its cost-to-go" in Windowed(terminal="exact").unsupported_reason(
         bench.problem("pendulum", backend="numpy").program
     )
     named = bench.problem("pushing", backend="numpy", theta=("mass",)).program

@@ -309,7 +309,7 @@ FAULTS = [
     Fault(X + "randomized_smoothing.py", "* direction / (2 * s)", "* direction / s", OF_ESTIMATORS),
     Fault(X + "randomized_smoothing.py", "centre)) * direction / s", "centre)) * direction / (2 * s)", OF_ESTIMATORS),
     Fault(X + "randomized_smoothing.py", "self.radius != program.scene.sigma", "False", "tests/measure/test_unexplained.py"),
-    Fault(X + "sphere_smoothing.py", "return d * change * u / (2.0 * r)", "return change * u / (2.0 * r)", OF_ESTIMATORS),
+    Fault(X + "sphere_smoothing.py", "d * change * u / (2.0 * r)", "change * u / (2.0 * r)", OF_ESTIMATORS),
     Fault(X + "sphere_smoothing.py", "np.sqrt(program.dim + 2.0)", "np.sqrt(program.dim)", OF_ESTIMATORS),
     Fault(X + "total_propagation.py", "part = 1 if self.per == \"control\"", "part = 1 if self.per == \"step\"", OF_ESTIMATORS),
     Fault(X + "total_propagation.py", "variances.reshape(len(variances), -1, part).sum(axis=2)", "variances.reshape(len(variances), part, -1).sum(axis=1)", OF_ESTIMATORS),

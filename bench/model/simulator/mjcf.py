@@ -88,7 +88,7 @@ class Mjcf:
             slopes = a @ slopes + b @ control
             self._mujoco.mj_step(self.model, data)
         last = [self._final_cost(self._displaced(data, i, h)) for i in range(size) for h in (STEP, -STEP)]
-        return (np.array(last[::2]) - np.array(last[1::2])) / (2 * STEP) @ slopes
+        return np.asarray((np.array(last[::2]) - np.array(last[1::2])) / (2 * STEP) @ slopes)
 
     # ------------------------------------------------------------------------------------------- the C engine
 
@@ -162,7 +162,7 @@ class Mjcf:
         direct = [control(data, theta + h * row) for row in np.eye(theta.size) for h in (STEP, -STEP)]
         indirect = [control(self._displaced(data, i, h), theta) for i in range(len(slopes)) for h in (STEP, -STEP)]
         by_theta = (np.array(direct[::2]) - np.array(direct[1::2])).T / (2 * STEP)
-        return by_theta + (np.array(indirect[::2]) - np.array(indirect[1::2])).T / (2 * STEP) @ slopes
+        return np.asarray(by_theta + (np.array(indirect[::2]) - np.array(indirect[1::2])).T / (2 * STEP) @ slopes)
 
 
 class _Mjx:

@@ -384,15 +384,14 @@ class Simulator:
         if self._grad == "jax":
             if self._single is None:
                 self._jax_values(thetas, w, self.batch)
-            return self._call_compiled(self._slope, self._eager[1], thetas, w, self.batch)
+            return np.asarray(self._call_compiled(self._slope, self._eager[1], thetas, w, self.batch))
         return self._torch_slopes(thetas, w)
 
     def _user_slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
         assert callable(self._grad)
         if self.batch in ("columns", "rows"):
-            transpose = (lambda a: a.T) if self.batch == "rows" else (lambda a: a)
-            arguments = [transpose(self._array(part)) for part in (thetas, w) if part is not None]
-            gradients = as_numpy(self._grad(*arguments))
+            arguments = [self._array(part) for part in (thetas, w) if part is not None]
+            gradients = as_numpy(self._grad(*(part.T if self.batch == "rows" else part for part in arguments)))
             gradients = gradients.T if self.batch == "rows" else gradients
             if gradients.shape != thetas.shape:
                 raise UserError(
