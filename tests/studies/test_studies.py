@@ -393,7 +393,7 @@ def test_reports_name_no_plugin():
 def test_findings_count_in_plain_english():
     given, rows = erring("scenes=[bounce_once]", "contacts=[penalty]", "estimators=[fobg]")
     text = three_errors_page.finding(rows.assign(program_error_rel=1e-9))
-    assert text.startswith("1 of 1 gradient that matches differences of its program misses")
+    assert text.startswith("Of 1 gradient confirmed by differences of the program's cost, 1 is off by over 10%")
     given, rows = checked("scenes=[pendulum]", "backends=[jax]")
     assert web.content(given, rows).finding.startswith("No wrong gradient at 1 checked point")
     here = Path(bench.report.__file__).parent
