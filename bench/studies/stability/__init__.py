@@ -27,7 +27,7 @@ class Stability(Study):
     columns: ClassVar[Columns] = Columns.of(
         Column("first_bad_step", "first step at which the state diverged or was not finite"),
         Column("growth_factor", "measured growth of the state per step, where the motion is linear"),
-        Column("spectral_radius", "of one step on the cell's oscillator, in theory"),
+        Column("spectral_radius", "theoretical spectral radius of one step on the cell's oscillator"),
         Column("stiffness_limit", "stiffness at which that radius leaves 1", "N/m"),
         Column(
             "relative_error",
@@ -40,7 +40,7 @@ class Stability(Study):
         Column("truth_error", "relative change of the truth on its last refinement"),
         text("verdict", "ok, or what is wrong", comparison=ComparisonRule("verdict", "verdict", order=WORST_FIRST)),
         text("truth", "how the truth was computed: physical or refined"),
-        text("cause", "of a finite but wrong gradient: step (or how it is differentiated), law, both or unknown"),
+        text("cause", "why a finite gradient is wrong: step (or its derivative), law, both or unknown"),
         Column(
             "step_error",
             "distance from the law's own gradient, which is differences of its cost at a far finer step, / norm of the truth",
@@ -65,9 +65,8 @@ class Stability(Study):
         """Return the verdict on one cell."""
         from bench.studies.stability.measure import StabilityLimits, measure
 
-        return measure(
-            cell, session, StabilityLimits(self.diverged, self.grown, self.inaccurate, self.fine_steps, self.finer)
-        )
+        limits = StabilityLimits(self.diverged, self.grown, self.inaccurate, self.fine_steps, self.finer)
+        return measure(cell, session, limits)
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         """Write the tables, the maps and their summary."""
@@ -76,7 +75,7 @@ class Stability(Study):
         return [*report.write(experiment, rows), *summary.write(experiment, rows)]
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the shares of the verdicts, and the boundaries of the oscillators without contact."""
+        """Print the shares of the verdicts, and the stability limits of the oscillators without contact."""
         from bench.studies.stability import report
 
         report.show(experiment, rows)
