@@ -87,7 +87,7 @@ def test_semi_implicit_euler_diverges_within_a_cell_of_its_limit(tmp_path, facto
     assert lost[first:].all()
     assert 0 < first < len(STIFFNESS) - 1
     assert STIFFNESS[first - 2] < limit < STIFFNESS[first + 1]
-    (panel,) = report.panels(report.placed(given, rows))
+    (panel,) = report.panels(report.arrange_maps(given, rows))
     assert panel.boundary["agrees"].all()
 
 
@@ -106,7 +106,7 @@ def test_implicit_steps_never_diverge(tmp_path, integrator):
 def test_measured_boundary_is_within_a_cell_of_the_theoretical_one(tmp_path, integrator, damping):
     """For every integrator, those too that grow too slowly to diverge within the rollout."""
     given, rows = swept(tmp_path, integrator, f"scene.mass_spring.damping={damping}")
-    (panel,) = report.panels(report.placed(given, rows))
+    (panel,) = report.panels(report.arrange_maps(given, rows))
     assert panel.boundary["agrees"].all()
     assert rows["growth_factor"].to_numpy() == pytest.approx(rows["spectral_radius"].to_numpy(), rel=1e-6)
 
@@ -271,7 +271,7 @@ def test_files_and_the_printed_table(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "semi_implicit_euler" in printed
     assert "1 of 2" in printed  # the verdicts at twice the dt are copies, and its limit is a quarter
-    (panel,) = report.panels(report.placed(given, both))
+    (panel,) = report.panels(report.arrange_maps(given, both))
     (axes,) = report.heat_map("semi_implicit_euler", [panel]).axes
     (line,) = axes.get_lines()
     drawn = dict(zip(np.round(line.get_xdata(), 9), line.get_ydata(), strict=True))

@@ -235,30 +235,34 @@ def test_maps_are_apart_by_parameters_and_their_titles_say_defaults():
         "scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]",
         "sweep.mass_spring.damping=[0,1,10]",
     )  # fmt: skip
-    panels = stability.panels(stability.placed(given, rows))
+    panels = stability.panels(stability.arrange_maps(given, rows))
     assert [panel.title for panel in panels] == [f"mass_spring, damping={d}" for d in (0, 1, 10)]
     assert [len(panel.rows) for panel in panels] == [4, 4, 4]
     assert panels[0].kind == ("semi_implicit_euler", "mass_spring", "none")
-    assert list(table_of(stability.markdown(stability.placed(given, rows), panels))["damping"]) == ["0", "1", "10"]
+    assert list(table_of(stability.markdown(stability.arrange_maps(given, rows), panels))["damping"]) == [
+        "0",
+        "1",
+        "10",
+    ]
 
 
 def test_maps_of_scenes_that_no_label_tells_apart_are_apart():
     """sigma has a column of its own, and so is in no identity string."""
     given, rows = mapped("scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']", "sweep.stiffness=[10,100]")
     assert rows["scene"].nunique() == 1
-    panels = stability.panels(stability.placed(given, rows))
+    panels = stability.panels(stability.arrange_maps(given, rows))
     assert [panel.title for panel in panels] == ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]
 
 
 def test_a_stiffness_that_equals_another_swept_number_stays_on_its_map():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[10,100]")
-    for panel in stability.panels(stability.placed(given, rows)):
+    for panel in stability.panels(stability.arrange_maps(given, rows)):
         assert list(panel.rows["stiffness"]) == [10.0, 100.0]
 
 
 def test_limits_in_texts_are_those_of_the_rows():
     given, rows = mapped("study=stability[inaccurate=0.25]", "scenes=[mass_spring]", "sweep.stiffness=[10,100]")
-    shown = stability.placed(given, rows)
+    shown = stability.arrange_maps(given, rows)
     panels = stability.panels(shown)
     assert "off by more than 25%" in stability.markdown(shown, panels)
     legend = stability.heat_map("semi_implicit_euler", panels).legends[0]
@@ -270,7 +274,7 @@ def test_limits_in_texts_are_those_of_the_rows():
 
 def test_a_share_is_not_named_after_a_parameter_that_varies_in_it():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[0,1]")
-    (line,) = stability_page.shares(stability.placed(given, rows)).to_dict("records")
+    (line,) = stability_page.shares(stability.arrange_maps(given, rows)).to_dict("records")
     assert (line["scene"], line["step"]) == ("mass_spring", "semi_implicit_euler")
 
 
@@ -329,7 +333,7 @@ def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     assert axis.unit == "N/m"
     assert rows["stiffness"].nunique() == 1  # that of the law
     given, rows = mapped(*words, "sweep.sprung.stiffness=[1,10,100]", "sweep.penalty.stiffness=[1,10]")
-    panels = stability.panels(stability.placed(given, rows))
+    panels = stability.panels(stability.arrange_maps(given, rows))
     assert [list(panel.rows["stiffness"]) for panel in panels] == [[1.0, 10.0]] * 3
     assert len({panel.title for panel in panels}) == 3
 
@@ -394,7 +398,7 @@ def test_reports_name_no_plugin():
 def test_findings_count_in_plain_english():
     given, rows = erring("scenes=[bounce_once]", "contacts=[penalty]", "estimators=[fobg]")
     text = three_errors_page.finding(rows.assign(program_error_rel=1e-9))
-    assert text.startswith("1 of 1 gradient that matches differences of its program misses")
+    assert text.startswith("Of 1 gradient confirmed by differences of the program's cost, 1 is off by over 10%")
     given, rows = checked("scenes=[pendulum]", "backends=[jax]")
     assert web.content(given, rows).finding.startswith("No wrong gradient at 1 checked point")
     here = Path(bench.report.__file__).parent

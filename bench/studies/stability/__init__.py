@@ -69,9 +69,8 @@ class Stability(Study):
         """Return the verdict on one cell."""
         from bench.studies.stability.measure import StabilityLimits, measure
 
-        return measure(
-            cell, session, StabilityLimits(self.diverged, self.grown, self.inaccurate, self.fine_steps, self.finer)
-        )
+        limits = StabilityLimits(self.diverged, self.grown, self.inaccurate, self.fine_steps, self.finer)
+        return measure(cell, session, limits)
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         """Write the tables, the maps and their summary."""
@@ -80,7 +79,7 @@ class Stability(Study):
         return [*report.write(experiment, rows), *summary.write(experiment, rows)]
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the shares of the verdicts, and the boundaries of the oscillators without contact."""
+        """Print the shares of the verdicts, and the stability limits of the oscillators without contact."""
         from bench.studies.stability import report
 
         report.show(experiment, rows)

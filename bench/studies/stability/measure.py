@@ -43,7 +43,7 @@ REACH = np.logspace(-3, 4, 141)
 
 @dataclass(frozen=True)
 class StabilityLimits:
-    """When a rollout counts as diverged and a gradient as wrong, and how fine the truth is; see the parameters."""
+    """Limits at which a rollout counts as diverged and a gradient as wrong, and steps of the truth: see the parameters."""
 
     diverged: float
     grown: float
@@ -63,19 +63,19 @@ def _measured(cell: Cell, program: Rollout, session: Session, limits: StabilityL
     problem, scene = session.problem(cell), program.scene
     theta, still = program.theta0, np.zeros((problem.program.n_noise, 1))
     gradient = problem.grad(theta, still)[:, 0]
-    found = problem.trajectory(theta, still)
-    states, largest = found.states[:, :, 0], bounds(program, found, limits.diverged)
+    trajectory = problem.trajectory(theta, still)
+    states, largest = trajectory.states[:, :, 0], bounds(program, trajectory, limits.diverged)
     growth = growth_factor(states) if isinstance(scene, Oscillator) else math.nan
     result = {"status": "ok", "grad_norm": float(np.linalg.norm(gradient)), "growth_factor": growth, **theory(cell)}
-    bad = first_bad_step(states, largest, growth, limits)
-    if bad is not None:
-        step, verdict, what = bad
-        reason = f"state at step {step} of {scene.horizon} {what}"
+    failure = first_bad_step(states, largest, growth, limits)
+    if failure is not None:
+        step, verdict, description = failure
+        reason = f"state at step {step} of {scene.horizon} {description}"
         result |= {"status": verdict, "verdict": verdict, "first_bad_step": step, "reason": reason}
         return result | {"state_at_first_bad_step": states[step].tolist()}
     if not np.isfinite(gradient).all():
         return result | {"status": "nonfinite", "verdict": "nonfinite", "reason": "the gradient of a finite rollout"}
-    kind, truth, error = truth_of(cell, limits)
+    kind, truth, error = compute_truth(cell, limits)
     result |= {"truth": kind, "truth_norm": float(np.linalg.norm(truth)), "truth_error": error}
     resolved = limits.inaccurate / 2
     if not error <= resolved:
@@ -91,10 +91,10 @@ def _measured(cell: Cell, program: Rollout, session: Session, limits: StabilityL
 def first_bad_step(
     states: np.ndarray, largest: np.ndarray, growth: float, limits: StabilityLimits
 ) -> tuple[int, str, str] | None:
-    """Find the first bad step of ``states (T + 1, n)``, whether it ``diverged`` or is ``nonfinite``, and why; or None.
+    """Return the first bad step of ``states (T + 1, n)``, ``diverged`` or ``nonfinite``, and a description, or None.
 
-    A step is bad when a component exceeds its ``largest`` value ``(n,)``, or when growing by the factor ``growth`` at
-    every step has come to ``limits.grown``, whichever is first.
+    A step is bad when a component exceeds its ``largest`` value ``(n,)``, or when growth by the factor ``growth`` per
+    step has reached ``limits.grown``, whichever is first.
     """
     steps = len(states)
     outside = ~(np.abs(states) <= largest).all(axis=1)
@@ -125,20 +125,19 @@ def growth_factor(states: np.ndarray) -> float:
     size = np.linalg.norm(scaled[:-1], axis=1, keepdims=True)
     moving = size[:, 0] > 0
     before, after = (part[moving] / size[moving] for part in (scaled[:-1], scaled[1:]))
-    fitted = np.linalg.lstsq(before, after, rcond=None)[0]
-    return float(np.abs(np.linalg.eigvals(fitted)).max())
+    linear_map = np.linalg.lstsq(before, after, rcond=None)[0]
+    return float(np.abs(np.linalg.eigvals(linear_map)).max())
 
 
-def bounds(program: Rollout, found: Trajectory, factor: float) -> np.ndarray:
+def bounds(program: Rollout, trajectory: Trajectory, factor: float) -> np.ndarray:
     """Return ``factor`` times the initial scale of each component, ``(n,)``.
 
-    Positions: |q_0| + T |v_0|, the distance that the start reaches. Velocities: |v_0| + sqrt(|a_0| times that
-    distance), the speed that the first acceleration gives over it; largest components of each. A scale of 0 counts as
-    1.
+    The scale of positions is the distance |q_0| + T |v_0|. The scale of velocities is |v_0| + sqrt(|a_0| distance), the
+    speed after accelerating over that distance. Norms are largest components, and a scale of 0 counts as 1.
     """
     scene = program.scene
-    q, v = np.split(found.states[0], [scene.n_q])
-    u = found.controls[0]
+    q, v = np.split(trajectory.states[0], [scene.n_q])
+    u = trajectory.controls[0]
     a = Dynamics(LoopOps(), scene, program.contact).acceleration(q, v, u)
     speed = float(np.abs(v).max(initial=0.0))
     length = float(np.abs(q).max(initial=0.0)) + scene.horizon * scene.dt * speed
@@ -149,8 +148,8 @@ def bounds(program: Rollout, found: Trajectory, factor: float) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------------- truth
 
 
-def truth_of(cell: Cell, limits: StabilityLimits) -> tuple[str, np.ndarray, float]:
-    """Return how the truth was obtained, the gradient ``(d,)``, and its relative error as far as known."""
+def compute_truth(cell: Cell, limits: StabilityLimits) -> tuple[str, np.ndarray, float]:
+    """Return the kind of truth (``physical`` or ``refined``), the true gradient ``(d,)``, and its known relative error."""
     program = rollout(cell.program())
     physical = program.physical_gradient()
     if physical is not None:
@@ -162,7 +161,7 @@ def truth_of(cell: Cell, limits: StabilityLimits) -> tuple[str, np.ndarray, floa
 
 
 def _refined(cell: Cell, steps: int) -> Cell:
-    """Return the cell with its duration cut into ``steps`` steps, keeping numerical damping per second."""
+    """Return the cell with its duration divided into ``steps`` steps and the same numerical damping per second."""
     program = rollout(cell.program())
     scene = program.scene
     dt = scene.horizon * scene.dt / steps
@@ -171,26 +170,28 @@ def _refined(cell: Cell, steps: int) -> Cell:
         values["velocity_factor"] = scene.velocity_factor ** (dt / scene.dt)
     fine = cell.with_part("scene", replace(scene, **values))
     if fine.program().dim != program.dim:
-        raise Unsupported(f"theta of scene {scene.name} changes with the horizon, so that no finer step has the truth")
+        raise Unsupported(
+            f"theta of scene {scene.name} depends on the horizon, so a finer step has no comparable gradient"
+        )
     return fine
 
 
 def _gradient_at(cell: Cell, steps: int) -> np.ndarray:
-    """Return the cell's gradient with its duration cut into ``steps`` steps."""
+    """Return the cell's gradient ``(d,)`` with its duration divided into ``steps`` steps."""
     fine = _refined(cell, steps)
-    return _kept(fine.program_key, lambda: _gradient(fine.reference_backends[0], fine.program()))
+    return _cached(fine.program_key, lambda: _gradient(fine.reference_backends[0], fine.program()))
 
 
-def _kept(key: str, make: Callable[[], np.ndarray]) -> np.ndarray:
-    """Return the gradient kept under a key, made where there is none."""
+def _cached(key: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
+    """Return the cached gradient of a key, computed at first use. The oldest entry is dropped when the cache is full."""
     if key not in _fine_gradients:
-        if len(_fine_gradients) >= KEPT:
+        if len(_fine_gradients) >= CACHE_SIZE:
             del _fine_gradients[next(iter(_fine_gradients))]
-        _fine_gradients[key] = make()
+        _fine_gradients[key] = compute()
     return _fine_gradients[key]
 
 
-KEPT = 4096
+CACHE_SIZE = 4096
 _fine_gradients: dict[str, np.ndarray] = {}
 """Gradients at fine steps by program, shared by all cells whose fine program is the same."""
 
@@ -200,14 +201,15 @@ def _gradient(backend: Backend, program: Program) -> np.ndarray:
 
 
 def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[str, Any]:
-    """Return verdict, relative error and cosine of a finite gradient; the verdict is the first that holds.
+    """Return verdict, relative error and cosine of a finite gradient.
 
-    ``zero``: a component is exactly 0 where the truth's is not. ``wrong_sign``: the directional derivative along the
-    truth is negative. ``inaccurate``: off by more than that share of the truth. Otherwise ``ok``.
+    The verdict is the first that applies. ``zero``: a component is exactly 0 where the truth's is not. ``wrong_sign``:
+    the directional derivative along the truth is negative. ``inaccurate``: the relative error exceeds that limit.
+    ``ok``: otherwise.
     """
     norm, size = float(np.linalg.norm(truth)), float(np.linalg.norm(gradient))
-    away = float(np.linalg.norm(gradient - truth))
-    error = away / norm if norm else math.inf if away else 0.0
+    distance = float(np.linalg.norm(gradient - truth))
+    error = distance / norm if norm else math.inf if distance else 0.0
     cosine = float(gradient / size @ (truth / norm)) if norm and size else math.nan
     if ((gradient == 0) & (np.abs(truth) > NEGLIGIBLE * norm)).any():
         verdict = "zero"
@@ -223,7 +225,7 @@ def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[
 SPAN = 0.01
 """Half the span of theta for differences of the law's own cost, in units of theta's largest component (1 if that is 0).
 
-It moves an impact by many of the fine steps, so that the place of the impact within its step averages out.
+It moves an impact by many fine steps, so that the effect of the impact's time within its step averages out.
 """
 
 
@@ -232,37 +234,37 @@ def cause_of(
 ) -> dict[str, Any]:
     """Return why a gradient is wrong: ``cause``, ``step_error`` and ``law_error``, both in units of the truth's norm.
 
-    The law's own gradient is between the two: that of the same law and integrator at a far smaller step. What the cell
-    differs from it is the step's, what it differs from the physics is the law's. Their sum is at least the cell's
-    error, so that one of them is always there to blame. Without a law all is the step's.
+    The law's own gradient is that of the same law and integrator at a far smaller step. The step error is the cell's
+    difference from it, the law error its difference from the physics. Their sum is at least the cell's error, so at
+    least one of them is a cause. Without a law the whole error is the step's.
     """
     norm = float(np.linalg.norm(truth))
-    away = float(np.linalg.norm(gradient - truth)) / norm if norm else math.inf
+    error = float(np.linalg.norm(gradient - truth)) / norm if norm else math.inf
     if truth_kind != "physical" or cell.contact is None:
-        return {"cause": "step", "step_error": away, "law_error": 0.0}
+        return {"cause": "step", "step_error": error, "law_error": 0.0}
     if not norm:
         return {"cause": "unknown"}
-    own, coarse = law_gradient(cell, limits)
-    step, law, change = (float(np.linalg.norm(part)) / norm for part in (gradient - own, own - truth, own - coarse))
+    fine, coarse = law_gradient(cell, limits)
+    step, law, change = (float(np.linalg.norm(part)) / norm for part in (gradient - fine, fine - truth, fine - coarse))
     errors = {"step_error": step, "law_error": law}
     if not change <= limits.inaccurate / 2:
         return {"cause": "unknown"} | errors
-    blamed = [name for name, error in (("step", step), ("law", law)) if error > limits.inaccurate]
-    return {"cause": "both" if len(blamed) == 2 else blamed[0] if blamed else "step" if step >= law else "law"} | errors
+    causes = [name for name, error in (("step", step), ("law", law)) if error > limits.inaccurate]
+    return {"cause": "both" if len(causes) == 2 else causes[0] if causes else "step" if step >= law else "law"} | errors
 
 
 def law_gradient(cell: Cell, limits: StabilityLimits) -> tuple[np.ndarray, np.ndarray]:
     """Return the gradient ``(d,)`` of the cell's law at a far smaller step, and one at half its resolution.
 
-    Both are central differences of the cost over a span of theta (:data:`SPAN`): a derivative through a contact jumps
-    with the place of the impact within its step, however small that is.
+    Both are central differences of the cost over a span of theta (:data:`SPAN`), since a derivative through a contact
+    jumps with the time of the impact within its step, however small the step is.
     """
     steps = max(limits.fine_steps, limits.finer * rollout(cell.program()).scene.horizon)
     return _differences(cell, steps, SPAN), _differences(cell, steps // 2, 2 * SPAN)
 
 
 def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
-    """Return central differences ``(d,)`` of the cell's cost with its duration cut into ``steps`` steps."""
+    """Return central differences ``(d,)`` of the cell's cost with its duration divided into ``steps`` steps."""
     fine = _refined(cell, steps)
 
     def differences() -> np.ndarray:
@@ -275,7 +277,7 @@ def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
         ]
         return np.array([(after - before) / (2 * h) for after, before in ends])
 
-    return _kept(f"{fine.program_key} {span}", differences)
+    return _cached(f"{fine.program_key} {span}", differences)
 
 
 # --------------------------------------------------------------------------------------------------- theory
@@ -286,11 +288,11 @@ def theory(cell: Cell) -> dict[str, float]:
 
     The limit is 0 for a step that is never stable and infinite for one that always is. Empty without an oscillator.
     """
-    found = oscillator(cell)
-    if found is None:
+    parameters = oscillator(cell)
+    if parameters is None:
         return {}
     assert cell.integrator is not None
-    stiffness, damping, factor = found
+    stiffness, damping, factor = parameters
     dt = float(rollout(cell.program()).scene.dt)
     limit = stiffness_limit(cell.integrator, dt, damping, factor)
     radius = spectral_radius(cell.integrator, dt, stiffness, damping, factor)
@@ -322,7 +324,7 @@ def spectral_radius(integrator: Integrator, dt: float, stiffness: float, damping
 
 
 def stiffness_limit(integrator: Integrator, dt: float, damping: float, factor: float) -> float:
-    """Return the stiffness [1/s^2] at which the step becomes unstable: 0 if it always is, inf if never within REACH."""
+    """Return the stiffness [1/s^2] at which the step becomes unstable, 0 if it always is, inf if it never is within REACH."""
 
     def unstable(reach: float) -> bool:
         return spectral_radius(integrator, dt, reach / dt**2, damping, factor) > NEUTRAL

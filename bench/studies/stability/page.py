@@ -1,4 +1,4 @@
-"""The page of the stability map: the share of right gradients of each step, and the maps."""
+"""The page of the stability map: the share of right gradients by integrator, and the maps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,17 @@ from bench.report.web.content import (
     problems,
     together,
 )
-from bench.studies.stability.report import LOST, PLACES, STEP, VERDICTS, meaning, name_of, placed
+from bench.studies.stability.report import (
+    LOST,
+    PLACES,
+    STEP,
+    VERDICTS,
+    WRONG,
+    arrange_maps,
+    meaning,
+    name_of,
+    with_verdict,
+)
 
 RESULTS = [
     TableColumn("verdict", "verdict", "text"),
@@ -33,10 +43,10 @@ RESULTS = [
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the integrator that is right most often, shares, and maps over step size and stiffness."""
-    shown = placed(experiment, rows)
+    """Return the finding, the shares of right gradients, and the maps over step size and stiffness."""
+    shown = arrange_maps(experiment, rows)
     over = together(shown, *PLACES)
-    judged = (rows["verdict"] != "").any()
+    has_verdict = (rows["verdict"] != "").any()
     table = shown.rows.assign(
         problem=problems(shown, ["scene", "contact"], over, always=("scene", "contact")),
         panel=problems(shown, STEP, over, always=STEP),
@@ -59,11 +69,11 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         level="verdict",
     )
     return Content(
-        finding=finding(shown) if judged else "No cell has a verdict: the table has the reason of each.",
+        finding=finding(shown) if has_verdict else "No cell has a verdict: the table has the reason of each.",
         rows=table,
         columns=[*identity_columns(table, [axis.column for axis in shown.axes]), *RESULTS, *STATUS],
         charts=[share, maps],
-        answers=answers(shown) if judged else pd.DataFrame(),
+        answers=answers(shown) if has_verdict else pd.DataFrame(),
         answers_title="How often each contact law and step gives the right gradient",
         looks={
             name: look(colour, letter=letter, meaning=f"{name}: {meaning(name, rows)}")
@@ -74,36 +84,36 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
 
 
 def shares(shown: Arranged) -> pd.DataFrame:
-    """Return each verdict's share of the cells that ran, by scene, contact law and integrator, a scene's best first.
+    """Return each verdict's share of the cells by scene, contact law and integrator, the best of each scene first.
 
-    Scenes are grouped by name; laws and integrators keep the parameters that distinguish them.
+    Scenes are grouped by name. Laws and integrators keep the parameters that distinguish them.
     """
-    judged = attempted(shown.rows)
-    judged = judged[judged["verdict"] != ""]
-    step = problems(shown, ["contact", "integrator"], together(shown, *PLACES), ("contact", "integrator"), judged)
-    scene = [name_of(given.get("scene")) for given in parsed(judged)]
-    table = pd.crosstab([scene, step], judged["verdict"], normalize="index")
+    cells = with_verdict(shown.rows)
+    step = problems(shown, ["contact", "integrator"], together(shown, *PLACES), ("contact", "integrator"), cells)
+    scene = [name_of(given.get("scene")) for given in parsed(cells)]
+    table = pd.crosstab([scene, step], cells["verdict"], normalize="index")
     table = table.reindex(columns=[name for name in VERDICTS if name], fill_value=0.0).rename_axis(["scene", "step"])
     return table.reset_index().sort_values(["scene", "ok"], ascending=[True, False], kind="stable")
 
 
 def finding(shown: Arranged) -> str:
-    """Write, per scene, the step that is right most often, and how often a gradient is wrong without a sign of it."""
+    """Write how many gradients are finite but wrong, and the most and the least reliable step on each scene."""
     table = shares(shown)
     parts = []
     for scene, part in table.groupby("scene", sort=False):
         first, last = part.iloc[0], part.iloc[-1]
-        least = f", least with {last['step']} ({last['ok']:.0%})" if len(part) > 1 else ""
+        least = f", least often with {last['step']} ({last['ok']:.0%})" if len(part) > 1 else ""
         parts.append(f"{scene}: right most often with {first['step']} ({first['ok']:.0%} of its cells){least}")
-    judged = attempted(shown.rows)
-    silent = int(judged["verdict"].isin(("inaccurate", "wrong_sign", "zero")).sum())
-    lost = int(judged["verdict"].isin(LOST).sum())
-    head = f"{silent} of {counted(len(judged), 'cell')} have a finite but wrong gradient, {lost} a state that diverges"
-    return "; ".join([head, *parts]) + "."
+    cells = attempted(shown.rows)
+    n_wrong, n_lost = int(cells["verdict"].isin(WRONG).sum()), int(cells["verdict"].isin(LOST).sum())
+    return (
+        f"The gradient is finite but wrong in {n_wrong} of {counted(len(cells), 'cell')}, and the state diverges in "
+        f"{n_lost}. {'; '.join(parts)}."
+    )
 
 
 def answers(shown: Arranged) -> pd.DataFrame:
-    """Return the shares as texts."""
+    """Return the shares as a table of texts."""
     table = shares(shown)
     texts = {name: [f"{share:.0%}" if share else "-" for share in table[name]] for name in VERDICTS if name}
     return table.assign(**texts)

@@ -1,6 +1,6 @@
-"""Writes the stability map: a heat map per integrator, tables, and the short table that is printed.
+"""Writes the stability map: a heat map per integrator, tables, and a short table on the terminal.
 
-It does not depend on any plugin: the theoretical boundary is the column ``stiffness_limit`` of the rows.
+It depends on no plugin: the theoretical boundary is the column ``stiffness_limit`` of the rows.
 """
 
 from __future__ import annotations
@@ -16,26 +16,23 @@ import numpy as np
 import pandas as pd
 from matplotlib import patheffects
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import FixedLocator, NullLocator
-from rich.console import Console
-from rich.table import Table
 
-from bench.experiment.axes import Axis, parsed, table
+from bench.experiment.axes import Axis, parsed
 from bench.experiment.columns import COMMON
 from bench.experiment.experiment import Experiment
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH, columns
+from bench.report.study_tables import open_console, print_table, titled_figure, write_tables
 from bench.report.style import PALETTE, axis_name, plain
-from bench.report.tables import escape_markdown
-from bench.report.text import axis_value, counted
+from bench.report.tables import escape_markdown, plain_markdown
+from bench.report.text import axis_value
 from bench.report.views import Arranged, arranged, attempted
 from bench.report.web.content import columns_of, distinguishing_columns, grouped, problems, shown_as, together
-from bench.run.files import write_all
 
 BLUE, BLACK, RED, GREEN, PINK, ORANGE, SKY, _ = PALETTE
 VERDICTS = {
@@ -48,15 +45,15 @@ VERDICTS = {
     "unresolved": ("?", "#d9d9d9", "truth not resolved"),
     "": ("", "#ffffff", "not run"),
 }
-"""Per verdict: the letter in its cells, their colour, and its meaning, where the study's limits are filled in."""
+"""Per verdict: the character in its cells, their colour, and the meaning, a template for the study's limits."""
 DARK = ("nonfinite", "diverged")
-"""Verdicts whose cells take white letters."""
+"""Verdicts whose cells have white characters."""
 WRONG = ("inaccurate", "wrong_sign", "zero")
-"""Verdicts of finite but wrong gradients, which the maps colour by their cause."""
+"""Verdicts of finite but wrong gradients, which are coloured by cause."""
 CAUSES = {
-    "step": (ORANGE, "wrong by the step or its derivative, the law is right"),
-    "law": (SKY, "wrong by the law, however fine the step"),
-    "both": (PINK, "wrong by step and law"),
+    "step": (ORANGE, "wrong because of the step or its derivative, the law is right"),
+    "law": (SKY, "wrong because of the law, at any step"),
+    "both": (PINK, "wrong because of step and law"),
     "unknown": ("#a39bc8", "?: wrong, the cause is not resolved"),
     "": ("#c9b458", "wrong, the cause was not recorded"),
 }
@@ -68,7 +65,7 @@ FILLS = {
 }
 """Colours of cells and bars, by :func:`looks`."""
 LOST = ("diverged", "nonfinite")
-"""Verdicts on the far side of the measured stability boundary."""
+"""Verdicts of cells beyond the measured stability boundary."""
 GROWING = 1 + 1e-9
 """Measured growth per step above which a state counts as growing: 1 plus rounding."""
 ACROSS = 3
@@ -82,14 +79,14 @@ STEP = ("scene", "contact", "integrator")
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """The map of one integrator and problem, on the backends that agree on every verdict."""
+    """The map of one integrator and problem, on the backends that agree in every verdict."""
 
     integrator: str
     """Identity string of the integrator, as are the scene's and the contact law's."""
     scene: str
     contact: str
     values: Mapping[str, str]
-    """Values, as texts, of the :func:`more` columns that distinguish it from other maps."""
+    """Values, as texts, of the columns that distinguish it from other maps: :func:`label_columns_of`."""
     kind: tuple[str, ...]
     """Names of integrator, scene and law, whatever their parameters."""
     backends: tuple[str, ...]
@@ -97,23 +94,23 @@ class Panel:
 
     @property
     def title(self) -> str:
-        """The map in words: ``bouncing_ball, penalty, damping=0``; without the contact law where there is none."""
+        """The problem: ``bouncing_ball, penalty, damping=0``."""
         values = (f"{name}={value}" for name, value in self.values.items() if value != "-")
         return ", ".join([self.scene, *([] if self.contact == "none" else [self.contact]), *values])
 
     @property
     def measured(self) -> str:
-        """How it was measured: ``jax, torch; truth: physical``."""
+        """The backends and the kind of truth: ``jax, torch; truth: physical``."""
         truth = ", ".join(text for text in self.rows["truth"].unique() if text)
         return ", ".join(self.backends) + (f"; truth: {truth}" if truth else "")
 
     @cached_property
     def boundary(self) -> pd.DataFrame:
-        """By dt: the theoretical ``limit``, the largest stiffness below the first unstable one, and that one.
+        """The theoretical ``limit`` and the measured interval of the stability limit by dt: ``low``, ``high``, ``agrees``.
 
-        A cell is unstable if it diverged or was measured to grow. ``low`` is 0 where even the softest is unstable, and
-        ``high`` is infinite where none is. ``agrees`` is true where the limit lies between them, widened by one cell of
-        the grid.
+        ``high`` is the first unstable stiffness, infinite where none is, and ``low`` the largest below it, or 0. A cell
+        is unstable if it diverged or was measured to grow. ``agrees`` is true where the limit lies in the interval,
+        widened by one cell of the grid.
         """
         limits = {}
         for dt, part in self.rows.dropna(subset=["stiffness", "stiffness_limit"]).groupby("dt"):
@@ -129,24 +126,24 @@ class Panel:
 
 
 def unstable(rows: pd.DataFrame) -> pd.Series:
-    """Return a mask of the cells that diverged, or whose state grows however slowly where that was measured."""
+    """Return a mask of the cells that diverged or were measured to grow."""
     return rows["verdict"].isin(LOST) | (rows["growth_factor"] > GROWING)
 
 
-def judged(rows: pd.DataFrame) -> pd.DataFrame:
+def with_verdict(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of cells that have a verdict."""
     rows = attempted(rows)
     return rows[rows["verdict"] != ""]
 
 
 def looks(rows: pd.DataFrame) -> pd.Series:
-    """Return what colours each cell: its verdict, and of a finite but wrong gradient the cause."""
+    """Return the key of each cell's colour in :data:`FILLS`: its verdict, or the cause of a finite but wrong gradient."""
     verdict = rows["verdict"].where(rows["verdict"].isin(list(VERDICTS)), "")
     return verdict.where(~verdict.isin(WRONG), "by " + rows["cause"].where(rows["cause"].isin(list(CAUSES)), ""))
 
 
-def swatches(rows: pd.DataFrame) -> list[Patch]:
-    """Return the legend of the cells' colours and letters."""
+def colour_legend(rows: pd.DataFrame) -> list[Patch]:
+    """Return the legend of the cells' colours and characters."""
     present = set(looks(rows))
     named = {name: f"{VERDICTS[name][0]}: {meaning(name, rows)}" for name in VERDICTS if name not in (*WRONG, "", "ok")}
     named |= {"ok": meaning("ok", rows), "": VERDICTS[""][2]}
@@ -158,17 +155,18 @@ def swatches(rows: pd.DataFrame) -> list[Patch]:
     ]
 
 
-def placed(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
-    """Arrange rows for reading, with every cell's step size and stiffness as stored, whatever else was swept."""
+def arrange_maps(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
+    """Arrange rows for reading, with each cell's stored step size and stiffness, and a cause for older rows without."""
     shown = arranged(experiment, rows)
     cause = rows["cause"].fillna("") if "cause" in rows else ""
     return replace(shown, rows=shown.rows.assign(**{name: rows[name] for name in PLACES}, cause=cause))
 
 
 def panels(shown: Arranged) -> list[Panel]:
-    """Return the maps, grouped by scene and law; backends that refused a whole problem are left out, equal ones merged.
+    """Return the maps, grouped by scene and law.
 
     A map has all rows with equal parameters of scene, contact law and integrator, except step size and stiffness.
+    Backends with equal maps share one, and backends that support no cell of a map are left out.
     """
     over = together(shown, *PLACES)
     rows = shown.rows.assign(
@@ -179,22 +177,22 @@ def panels(shown: Arranged) -> list[Panel]:
         ],
         machine=problems(shown, ["backend"], always=["backend"]),
     )
-    added = more(shown, over)
+    labels = label_columns_of(shown, over)
     maps: list[Panel] = []
     for _, part in rows.groupby("map", sort=False):
         groups: list[tuple[pd.DataFrame, list[str]]] = []
-        for backend, mine in part.groupby("machine", sort=False):
-            mine = mine.drop_duplicates(list(PLACES), keep="last").sort_values(list(PLACES))
-            if attempted(mine).empty:
+        for backend, cells in part.groupby("machine", sort=False):
+            cells = cells.drop_duplicates(list(PLACES), keep="last").sort_values(list(PLACES))
+            if attempted(cells).empty:
                 continue
-            alike = next((g for g in groups if _same(g[0], mine)), None)
-            if alike is None:
-                groups.append((mine, [str(backend)]))
+            equal = next((group for group in groups if _have_equal_verdicts(group[0], cells)), None)
+            if equal is None:
+                groups.append((cells, [str(backend)]))
             else:
-                alike[1].append(str(backend))
+                equal[1].append(str(backend))
         first = part.iloc[0]
         integrator, scene, contact = (str(first[name]) for name in ("integrator", "scene", "contact"))
-        values = {name: shown_as(first[name]) for name in added}
+        values = {name: shown_as(first[name]) for name in labels}
         maps += [
             Panel(integrator, scene, contact, values, first["kind"], tuple(names), table) for table, names in groups
         ]
@@ -202,8 +200,8 @@ def panels(shown: Arranged) -> list[Panel]:
     return sorted(maps, key=lambda panel: kinds.index(panel.kind))
 
 
-def more(shown: Arranged, over: Sequence[Axis]) -> list[str]:
-    """Return the columns, besides integrator, scene and law, that two maps need to have different names."""
+def label_columns_of(shown: Arranged, over: Sequence[Axis]) -> list[str]:
+    """Return the columns, besides integrator, scene and law, that distinguish the maps."""
     basic = ("integrator", "scene", "contact")
     names = [*basic, *(name for name in columns_of(shown, STEP, over) if name not in (*basic, *PLACES, "horizon"))]
     return [
@@ -219,7 +217,7 @@ def name_of(part: Any) -> str:
 
 
 def limits(rows: pd.DataFrame) -> dict[str, str]:
-    """Return the limits that judged the rows, as texts: ``{"inaccurate": "10%"}``; several if studies differ."""
+    """Return the limits of the rows' studies as texts: ``{"inaccurate": "10%"}``, or ``10% or 20%`` where they differ."""
     texts = dict.fromkeys(given["study"]["inaccurate"] for given in parsed(rows) if given)
     return {"inaccurate": " or ".join(f"{100 * limit:g}%" for limit in texts)}
 
@@ -229,10 +227,10 @@ def meaning(verdict: str, rows: pd.DataFrame) -> str:
     return VERDICTS[verdict][2].format(**limits(rows))
 
 
-def _same(a: pd.DataFrame, b: pd.DataFrame) -> bool:
+def _have_equal_verdicts(a: pd.DataFrame, b: pd.DataFrame) -> bool:
     """Return whether two maps have the same cells and verdicts."""
-    named = ["dt", "stiffness", "verdict", "cause", "status"]
-    return a[named].reset_index(drop=True).equals(b[named].reset_index(drop=True))
+    names = ["dt", "stiffness", "verdict", "cause", "status"]
+    return bool(a[names].reset_index(drop=True).equals(b[names].reset_index(drop=True)))
 
 
 # ---------------------------------------------------------------------------------------------------- files
@@ -240,19 +238,14 @@ def _same(a: pd.DataFrame, b: pd.DataFrame) -> bool:
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``stability_map`` (.csv, .md) and a heat map per integrator."""
-    directory = experiment.directory
-    shown = placed(experiment, rows)
+    shown = arrange_maps(experiment, rows)
     maps = panels(shown)
-    contents = {
-        "stability_map.csv": table(experiment, rows).to_csv(index=False, lineterminator="\n"),
-        "stability_map.md": markdown(shown, maps),
-    }
-    paths = write_all(directory, contents)
+    paths = write_tables(experiment, rows, "stability_map", [markdown(shown, maps)])
     with styled():
         for integrator in dict.fromkeys(panel.integrator for panel in maps):
             figure = heat_map(integrator, [panel for panel in maps if panel.integrator == integrator], shown.axes)
-            name = "".join(letter if letter.isalnum() else "_" for letter in integrator).strip("_")
-            paths += save(figure, directory / f"stability_map_{name}", experiment.formats)
+            name = "".join(character if character.isalnum() else "_" for character in integrator).strip("_")
+            paths += save(figure, experiment.directory / f"stability_map_{name}", experiment.formats)
     return paths
 
 
@@ -264,33 +257,28 @@ def shares(maps: Sequence[Panel]) -> dict[str, float]:
 
 
 def markdown(shown: Arranged, maps: Sequence[Panel]) -> str:
-    """Write a line per map: shares of the verdicts, and the measured beside the theoretical boundary."""
-    names = [*(name for name in VERDICTS if name), "unstable"]
-    labels = ["integrator", "scene", "contact", *more(shown, together(shown, *PLACES)), "backends"]
-    heads = [*labels, "cells", *names, "dt", "theory", "measured", "agree"]
-    out = [f"# {escape_markdown(shown.experiment.name)}: shares of verdicts and stability limits", ""]
-    rule = "|" + "---|" * len(labels) + "--:|" * (len(heads) - len(labels))
-    out += ["| " + " | ".join(map(escape_markdown, heads)) + " |", rule]
+    """Return the report as Markdown: a line per map with shares of the verdicts and both stability limits, and notes."""
+    labels = ["integrator", "scene", "contact", *label_columns_of(shown, together(shown, *PLACES)), "backends"]
+    results = ["cells", *(name for name in VERDICTS if name), "unstable", "dt", "theory", "measured", "agree"]
+    lines = []
     for panel in maps:
-        cells = [panel.integrator, panel.scene, panel.contact, *panel.values.values(), ", ".join(panel.backends)]
-        cells += [
-            str(len(attempted(panel.rows))),
-            *(_percent(share) for share in shares([panel]).values()),
-            *_limits(panel),
-        ]
-        out.append("| " + " | ".join(map(escape_markdown, cells)) + " |")
-    out += ["", *(f"- {escape_markdown(note)}" for note in notes(shown.rows))]
-    return "\n".join(out) + "\n"
+        names = [panel.integrator, panel.scene, panel.contact, *panel.values.values(), ", ".join(panel.backends)]
+        percentages = map(_percent, shares([panel]).values())
+        lines.append([*names, str(len(attempted(panel.rows))), *percentages, *_limits(panel)])
+    heads = list(map(escape_markdown, [*labels, *results]))
+    out = [f"# {escape_markdown(shown.experiment.name)}: shares of verdicts and stability limits", ""]
+    out += [plain_markdown(pd.DataFrame(lines, columns=heads)), ""]
+    return "\n".join([*out, *(f"- {escape_markdown(note)}" for note in notes(shown.rows))])
 
 
 def notes(rows: pd.DataFrame) -> list[str]:
-    """Explain the columns of the table, with the limits that its rows were judged by."""
+    """Return explanations of the table's columns, with the limits of the rows' studies."""
     return [
         "ok: " + ", ".join(f"{n}: {meaning(n, rows)}" for n in VERDICTS if n).removeprefix("ok: ") + ".",
-        "unstable: diverged, or, without contact, a state measured to grow by more than 1e-9 per step: it diverges at a longer "
+        "unstable: diverged, or, without contact, a state that grows by more than 1e-9 per step and would diverge at a longer "
         "horizon, whatever the verdict on the gradient at this one.",
-        "theory: stiffness at which the step's spectral radius on the oscillator exceeds 1, at that dt; for a contact, while "
-        "it lasts. measured: the largest stiffness before the first that is unstable, and that one.",
+        "theory: stiffness at which the step's spectral radius on the oscillator exceeds 1, at that dt. A contact is an "
+        "oscillator while it lasts. measured: the largest stiffness below the first unstable one, and that one.",
         "agree: step sizes at which theory and measurement are within one cell of the grid.",
     ]
 
@@ -326,41 +314,27 @@ def _between(low: float, high: float) -> str:
 
 
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
-    """Print the shares of the verdicts, and the boundaries of the oscillators without contact."""
-    maps = panels(placed(experiment, rows))
-    console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal:
-        console.width = max(console.width, 120)
-    console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
-    counts = rows["status"].value_counts()
-    console.print(f"{counted(len(rows), 'cell')}: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
-    table = _table(["integrator", "scene"], ["cells", *(name for name in VERDICTS if name), "unstable"])
+    """Print the shares of the verdicts, and the stability limits of the oscillators without contact."""
+    maps = panels(arrange_maps(experiment, rows))
+    console = open_console(experiment, rows)
+    lines = []
     for kind in dict.fromkeys(panel.kind[:2] for panel in maps):
-        mine = [panel for panel in maps if panel.kind[:2] == kind]
-        cells = [str(sum(len(attempted(panel.rows)) for panel in mine)), *map(_percent, shares(mine).values())]
-        table.add_row(*kind, *cells)
-    console.print(table)
-    boundaries = _table(["integrator", "oscillator"], ["dt", "theory", "measured", "dt that agree"])
-    for panel in maps:
-        if panel.contact == "none" and not panel.boundary.empty:
-            boundaries.add_row(panel.integrator, panel.title, *_limits(panel))
-    if boundaries.row_count:
+        members = [panel for panel in maps if panel.kind[:2] == kind]
+        n_cells = sum(len(attempted(panel.rows)) for panel in members)
+        lines.append([*kind, str(n_cells), *map(_percent, shares(members).values())])
+    results = ["cells", *(name for name in VERDICTS if name), "unstable"]
+    print_table(console, pd.DataFrame(lines, columns=["integrator", "scene", *results]), right=results)
+    oscillators = [panel for panel in maps if panel.contact == "none" and not panel.boundary.empty]
+    if oscillators:
+        results = ["dt", "theory", "measured", "dt that agree"]
+        lines = [[panel.integrator, panel.title, *_limits(panel)] for panel in oscillators]
         console.print(
-            "\nStability limit as a stiffness: where the spectral radius leaves 1, and where states grow or diverge."
+            "\nStability limit as a stiffness: spectral radius 1 in theory, growth or divergence as measured."
         )
-        console.print(boundaries)
+        print_table(console, pd.DataFrame(lines, columns=["integrator", "oscillator", *results]), right=results)
     reasons = rows[rows["status"].isin(("unsupported", "unavailable", "error"))].groupby(["status", "reason"]).size()
     for (status, reason), count in reasons.items():
         console.print(f"{count} {status}: {reason}")
-
-
-def _table(left: Sequence[str], right: Sequence[str]) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="underline")
-    for name in left:
-        table.add_column(name, overflow="fold")
-    for name in right:
-        table.add_column(name, justify="right")
-    return table
 
 
 # --------------------------------------------------------------------------------------------------- charts
@@ -373,33 +347,31 @@ def heat_map(integrator: str, maps: Sequence[Panel], axes: Sequence[Axis] = ()) 
     rows = pd.concat([panel.rows for panel in maps])
     steps, levels = (np.sort(rows[name].dropna().unique()) for name in ("dt", "stiffness"))
     width = WIDTH if across > 2 else 0.5 * WIDTH * across
-    figure = Figure(figsize=(width, 0.75 + down * (0.75 + 0.22 * max(len(levels), 4)) + 0.3), layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(down, across, squeeze=False)
     measured = {panel.measured for panel in maps}
     common = len(measured) == 1
     where = "".join(f" ({text})" for text in measured if common)
-    cells = judged(rows)
+    cells = with_verdict(rows)
     share = f"right in {(looks(cells) == 'ok').mean():.0%} of the cells" if len(cells) else "not known in any cell"
-    head = f"{plain(integrator)}: the gradient is {share}{where}"
-    figure.suptitle(head, fontsize=9, fontweight="bold")
+    title = f"{plain(integrator)}: the gradient is {share}{where}"
+    figure = titled_figure(width, 0.75 + down * (0.75 + 0.22 * max(len(levels), 4)) + 0.3, title)
+    grid = figure.subplots(down, across, squeeze=False)
     for area, panel in zip(grid.flat, maps, strict=False):
         _draw(area, panel, steps, levels, common)
     for spare in grid.flat[len(maps) :]:
         spare.remove()
-    named = {column: _axis_name(column, axes) for column in PLACES}
+    axis_names = {column: _axis_name(column, axes) for column in PLACES}
     for i, area in enumerate(grid.flat[: len(maps)]):
         if i % across:
             area.set_yticklabels([])
         else:
-            area.set_ylabel(named["stiffness"])
+            area.set_ylabel(axis_names["stiffness"])
         if i + across >= len(maps):
-            area.set_xlabel(named["dt"])
+            area.set_xlabel(axis_names["dt"])
         else:
             area.set_xticklabels([])
-    legend: list[Any] = swatches(rows)
-    letters = [f"{VERDICTS[name][0]}: {meaning(name, rows)}" for name in WRONG if name in set(rows["verdict"])]
-    legend += [Patch(facecolor="none", label=text) for text in letters]
+    legend: list[Any] = colour_legend(rows)
+    meanings = [f"{VERDICTS[name][0]}: {meaning(name, rows)}" for name in WRONG if name in set(rows["verdict"])]
+    legend += [Patch(facecolor="none", label=text) for text in meanings]
     if (unstable(rows) & ~rows["verdict"].isin(LOST)).any():
         legend.append(Patch(label="striped: state grows, slowly", facecolor="white", **STRIPES))
     if any(area.lines for area in grid.flat[: len(maps)]):
@@ -414,13 +386,13 @@ BOUNDARY: dict[str, Any] = {"color": BLUE, "linewidth": 1.3, "linestyle": (0, (4
 
 
 def _axis_name(column: str, axes: Sequence[Axis]) -> str:
-    """Return what a map is drawn over, with its unit; axes that step with it are left out if the label has no room."""
+    """Return the name and unit of an axis of the maps, without the axes that step with it."""
     axis = next((axis for axis in axes if axis.column == column), Axis(column, (), COMMON[column].unit))
     return axis_name(replace(axis, moves=()))
 
 
 def _draw(axes: Axes, panel: Panel, steps: np.ndarray, levels: np.ndarray, common: bool) -> None:
-    """Draw the cells with their letters, and the boundary."""
+    """Draw the cells with their characters, and the boundary."""
     x, y = _edges(steps), _edges(levels)
     whole = panel.rows["stiffness"].isna().all()
     heights = np.array([y[0], y[-1]]) if whole else y
@@ -455,7 +427,7 @@ LETTER: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6.5, "zord
 
 
 def _title(panel: Panel, whole: bool, common: bool) -> list[str]:
-    """Write the problem, how it was measured (unless common to all panels), and the boundary where it is not a line."""
+    """Write the problem, how it was measured unless common to all panels, and the boundary where it is not a line."""
     lines = list(map(plain, panel.title.split(", ")))
     lines[1:1] = ["no contact"] if panel.contact == "none" else []
     limits = set(panel.boundary["limit"])

@@ -1,45 +1,57 @@
-"""One figure over all stability maps: what became of the cells of each integrator with each law."""
+"""One figure over all stability maps: shares of the verdicts of each integrator with each law."""
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from bench.experiment.experiment import Experiment
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
+from bench.report.study_tables import titled_figure
 from bench.report.style import plain
 from bench.run.files import write_whole
-from bench.studies.stability.report import DARK, FILLS, LOST, VERDICTS, Panel, judged, looks, panels, placed, swatches
+from bench.studies.stability.report import (
+    DARK,
+    FILLS,
+    LOST,
+    VERDICTS,
+    Panel,
+    arrange_maps,
+    colour_legend,
+    looks,
+    panels,
+    with_verdict,
+)
 
 SHORT = {"by step": "step", "by law": "law", "by both": "both", "by unknown": "?"} | {
     name: VERDICTS[name][0] for name in LOST
 }
-"""What is written into a bar, where it has the room."""
-LETTER = 0.055
-"""Share of the cells that is as wide as a letter."""
+"""Labels of the bars' parts that are wide enough."""
+CHARACTER = 0.055
+"""Share of the cells that is as wide as a character."""
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Draw the summary as ``stability_summary``, where some cell has a verdict."""
-    maps = panels(placed(experiment, rows))
-    if not any(len(judged(panel.rows)) for panel in maps):
+    """Draw the summary as ``stability_summary``, unless no cell has a verdict."""
+    maps = panels(arrange_maps(experiment, rows))
+    if not any(len(with_verdict(panel.rows)) for panel in maps):
         return []
     with styled():
         paths = save(figure(maps), experiment.directory / "stability_summary", experiment.formats)
-    # bars are no points: the plotted numbers are the counts behind them
-    write_whole(paths[-1], counted(maps).to_csv(index=False, lineterminator="\n").encode())
+    # bars have no points to read back: the plotted numbers are the counts behind them
+    write_whole(paths[-1], count_cells(maps).to_csv(index=False, lineterminator="\n").encode())
     return paths
 
 
-def counted(maps: Sequence[Panel]) -> pd.DataFrame:
-    """Return the number of cells by integrator, problem (scene and law, without parameters) and what colours them."""
-    parts = [judged(panel.rows).assign(integrator=panel.kind[0], problem=_problem(*panel.kind[1:])) for panel in maps]
+def count_cells(maps: Sequence[Panel]) -> pd.DataFrame:
+    """Return the number of cells by problem (scene and law, without parameters), integrator and colour."""
+    parts = [
+        with_verdict(panel.rows).assign(integrator=panel.kind[0], problem=_problem(*panel.kind[1:])) for panel in maps
+    ]
     cells = pd.concat(parts).assign(look=looks)
     return cells.groupby(["problem", "integrator", "look"], sort=False).size().rename("cells").reset_index()
 
@@ -49,7 +61,7 @@ def _problem(scene: str, contact: str) -> str:
 
 
 def headline(table: pd.DataFrame) -> str:
-    """Write what share of all cells is right, and the integrator and problem with the largest and the smallest share."""
+    """Write the share of right gradients over all cells, and the integrator and problem with the largest share."""
     totals = table.groupby(["problem", "integrator"], sort=False)["cells"].sum()
     right = table[table["look"] == "ok"].groupby(["problem", "integrator"])["cells"].sum()
     shares = (right.reindex(totals.index).fillna(0) / totals).sort_values(ascending=False)
@@ -65,33 +77,23 @@ def headline(table: pd.DataFrame) -> str:
 
 
 def figure(maps: Sequence[Panel]) -> Figure:
-    """Draw, for each problem, a bar per integrator: shares of its cells by verdict and cause, right ones at the left."""
-    table = counted(maps)
+    """Draw, for each problem, a bar per integrator: shares of its cells by verdict and cause, right ones first."""
+    table = count_cells(maps)
     names = [name for name in FILLS if name in set(table["look"])]
     problems, integrators = (list(dict.fromkeys(table[column])) for column in ("problem", "integrator"))
-    drawn = Figure(figsize=(WIDTH, 1.35 + 0.21 * len(integrators)), layout="constrained")
-    FigureCanvasAgg(drawn)
+    drawn = titled_figure(WIDTH, 1.35 + 0.21 * len(integrators), plain(headline(table)))
     grid = drawn.subplots(1, len(problems), squeeze=False, sharey=True)[0]
     for panel, problem in zip(grid, problems, strict=True):
-        mine = table[table["problem"] == problem].pivot(index="integrator", columns="look", values="cells").fillna(0)
-        mine = mine.div(mine.sum(axis=1), axis=0)
-        for integrator, shares in mine.iterrows():
+        cells = table[table["problem"] == problem].pivot(index="integrator", columns="look", values="cells").fillna(0)
+        for integrator, shares in cells.div(cells.sum(axis=1), axis=0).iterrows():
             height, left = len(integrators) - 1 - integrators.index(str(integrator)), 0.0
             for name in names:
                 share = float(shares.get(name, 0.0))
                 panel.barh(height, share, left=left, color=FILLS[name], edgecolor="white", linewidth=0.4)
-                said = SHORT.get(name, name)
-                if share >= LETTER * (len(said) + 1):
+                label = SHORT.get(name, name)
+                if share >= CHARACTER * (len(label) + 1):
                     colour = "white" if name in DARK else "black"
-                    panel.text(
-                        left + share / 2,
-                        height,
-                        said,
-                        ha="center",
-                        va="center",
-                        fontsize=6.5,
-                        color=colour,
-                    )
+                    panel.text(left + share / 2, height, label, ha="center", va="center", fontsize=6.5, color=colour)
                 left += share
         panel.set(xlim=(0, 1), ylim=(-0.6, len(integrators) - 0.4))
         panel.set_xticks([0, 0.5, 1], ["0", "50%", "100%"])
@@ -99,6 +101,5 @@ def figure(maps: Sequence[Panel]) -> Figure:
         panel.tick_params(axis="y", length=0)
         panel.set_title("\n".join(plain(problem).split(", ")), pad=4)
     rows = pd.concat([panel.rows for panel in maps])
-    drawn.legend(handles=swatches(rows), loc="outside lower center", ncols=2, columnspacing=1.2)
-    drawn.suptitle("\n".join(textwrap.wrap(plain(headline(table)), 95)), fontsize=9, fontweight="bold")
+    drawn.legend(handles=colour_legend(rows), loc="outside lower center", ncols=2, columnspacing=1.2)
     return drawn

@@ -1,4 +1,4 @@
-"""Three errors of one gradient, measured separately, and the forward error beside them."""
+"""Three errors of one gradient, measured separately, and the forward error."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ThreeErrors(Study):
-    """Measures program, model and estimator error of a gradient, and the forward error beside them."""
+    """Measures program, model and estimator error of a gradient, and the forward error."""
 
     name = "three_errors"
     columns: ClassVar[Columns] = COLUMNS

@@ -1,8 +1,8 @@
-"""Three errors of one gradient, measured separately, and the forward error beside them.
+"""Measures three errors of one gradient separately, and the forward error.
 
 Program error: the program's gradient against central differences of the same program. Model error: against the
 gradient of the physics. Estimator error: the bias of an estimator against grad J_sigma of the program. A gradient can
-have any one of them without the others, and a small forward error says nothing about any.
+have any of them without the others, and a small forward error says nothing about any of them.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ SUMMARY = (
     "reference_norm", "reference_se", "bias", "bias_low", "bias_high", "bias_rel", "variance", "rmse_rel", "cosine",
     "sign_agreement",
 )  # fmt: skip
-"""The statistics of an estimator that are kept."""
+"""Columns that are statistics of the estimator."""
 ROUNDING = 1e-9
-"""Share of a gradient's norm up to which a coordinate is rounding, with no sign."""
+"""Share of a gradient's norm up to which a coordinate counts as rounding error, without a sign."""
 STEPS = 10.0 ** -np.arange(1.0, 9.5, 0.5)
 """Step sizes of the central differences, in the units of theta."""
 
 
 def measure(cell: Cell, session: Session) -> dict[str, Any]:
-    """Measure the forward error, the errors of program and model at w = 0, and the bias of the cell's estimator."""
+    """Return the forward error, the errors of program and model at w = 0, and the bias of the cell's estimator."""
     problem = session.problem(cell)
     check = difference_check(problem)
     result = {"status": "ok", "reason": ""} | check.columns() | _against_physics(problem.program, check)
@@ -59,7 +59,7 @@ class DifferenceCheck:
     step: float
 
     def columns(self) -> dict[str, Any]:
-        """Return the program error and the numbers it is made of."""
+        """Return the columns of the program error."""
         norm, error = _norm(self.difference), _norm(self.gradient - self.difference)
         return {
             "cost": self.cost,
@@ -74,7 +74,8 @@ class DifferenceCheck:
 def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceCheck:
     """Compare the program's gradient with its best central difference over a sweep of step sizes, at w = 0.
 
-    Truncation and jumps spoil large steps, rounding small ones. All differences are one batch of 2 d len(steps) costs.
+    Truncation errors and jumps dominate at large steps, rounding at small ones. All differences are one batch of
+    2 d len(steps) costs.
     """
     theta = problem.program.theta0
     shifts = (np.eye(theta.size)[:, None, :] * steps[:, None]).reshape(-1, theta.size).T
@@ -84,16 +85,16 @@ def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceC
     differences = (ahead - behind) / (2 * steps)
     gradient = problem.grad(theta, np.zeros((problem.program.n_noise, 1)))[:, 0]
     errors = np.linalg.norm(differences - gradient[:, None], axis=0)
-    # argmin takes a NaN for the smallest number
+    # np.argmin would return the index of a NaN
     best = int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
     return DifferenceCheck(float(costs[0]), gradient, differences[:, best], float(steps[best]))
 
 
 def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]:
-    """Return forward and model error, where the scene knows its physics.
+    """Return the columns of forward and model error that the scene's physical cost and gradient allow.
 
-    ``model_cosine`` is the cosine between the two gradients, ``model_signs`` the share of coordinates whose sign is
-    the physics', of those that have one.
+    ``model_cosine`` is the cosine between the two gradients. ``model_signs`` is the share of coordinates with the sign
+    of the physical gradient, among the coordinates where that has a sign.
     """
     result: dict[str, Any] = {}
     cost, physical = program.physical_cost(), program.physical_gradient()
@@ -102,20 +103,22 @@ def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]
         result |= {"physical_cost": cost, "forward_error": error, "forward_error_rel": _ratio(error, abs(cost))}
     if physical is not None:
         norm, error = _norm(physical), _norm(check.gradient - physical)
-        signs, told = _signs(check.gradient), _signs(physical)
+        signs, physical_signs = _signs(check.gradient), _signs(physical)
         result |= {
             "physical_gradient": physical.tolist(),
             "physical_norm": norm,
             "model_error": error,
             "model_error_rel": _ratio(error, norm),
             "model_cosine": _ratio(float(check.gradient @ physical), norm * _norm(check.gradient)),
-            "model_signs": float((signs == told)[told != 0].mean()) if told.any() else math.nan,
+            "model_signs": (
+                float((signs == physical_signs)[physical_signs != 0].mean()) if physical_signs.any() else math.nan
+            ),
         }
     return result
 
 
 def _signs(gradient: np.ndarray) -> np.ndarray:
-    """Return the signs of a gradient's coordinates, 0 for those that are rounding beside the others."""
+    """Return the signs of a gradient's coordinates, 0 where a coordinate is rounding error."""
     return np.where(np.abs(gradient) > ROUNDING * _norm(gradient), np.sign(gradient), 0.0)
 
 

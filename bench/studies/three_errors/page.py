@@ -1,4 +1,4 @@
-"""The page of the three errors: each against the swept numbers, and which gradients pass one test and fail another."""
+"""The page of the three errors: each along the swept parameters, and gradients with a small and a large error."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ ERRORS = {
 }
 PROBLEM = ("scene", "contact", "integrator")
 AGREES, WRONG = 1e-3, 0.1
-"""Largest program error of a gradient that passes for its program's, and smallest model error of one that is wrong."""
+"""Largest program error of a gradient that is right for its program, and smallest model error of a wrong gradient."""
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the gradients that match their program but not the physics, and every error."""
+    """Return the finding, charts of the errors, and the table of gradients that are right for the program only."""
     shown = arranged(experiment, rows)
     laws = problems(shown, ["contact", "integrator"], shown.axes, ("contact", "integrator"))
     table = shown.rows.assign(series=laws, problem=problems(shown, ["scene"], shown.axes))
@@ -41,7 +41,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     charts = [
         Chart(
             "The errors against each other",
-            "High and to the left is the trap: right for the program, wrong for the physics.",
+            "Traps are at the upper left: right for the program, wrong for the physics.",
             [PlotAxis(name, text) for name, text in ERRORS.items() if name != "model_error_rel"],
             [PlotAxis("model_error_rel", ERRORS["model_error_rel"], above_one="larger than the gradient")],
             facet="problem",
@@ -49,8 +49,8 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     ]
     if swept:
         along = Chart(
-            "Errors along what was swept",
-            "A model error that stays as the step shrinks is the contact model's, not the step's.",
+            "Errors along the swept parameters",
+            "A model error that does not shrink with the step is due to the contact model.",
             swept,
             [PlotAxis(name, text, above_one="larger than the gradient") for name, text in ERRORS.items()],
             facet="problem",
@@ -71,29 +71,30 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     )
 
 
-def trapped(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows whose gradient is that of the program but not that of the physics, worst first."""
+def misleading(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows whose gradient is right for the program but wrong for the physics, the worst first."""
     misses = rows[(rows["program_error_rel"] <= AGREES) & (rows["model_error_rel"] >= WRONG)]
     return misses.sort_values("model_error_rel", ascending=False)
 
 
 def finding(rows: pd.DataFrame) -> str:
-    """Write how many gradients match differences of their program but miss the physics, and the worst of them."""
+    """Write how many gradients are right for their program but wrong for the physics, and the worst of them."""
     exact = rows[rows["model_error_rel"].notna() & (rows["program_error_rel"] <= AGREES)]
-    wrong = trapped(rows)
-    one = len(exact) == 1
-    match, their, miss = ("matches", "its", "misses") if one else ("match", "their", "miss")
-    text = f"{len(wrong)} of {counted(len(exact), 'gradient')} that {match} differences of {their} program {miss} the physics' by over {WRONG:.0%}"
+    wrong = misleading(rows)
+    text = (
+        f"Of {counted(len(exact), 'gradient')} confirmed by differences of the program's cost, {len(wrong)} "
+        f"{'is' if len(wrong) == 1 else 'are'} off by over {WRONG:.0%} from the gradient of the physics"
+    )
     if wrong.empty:
         return text + "."
     worst = wrong.iloc[0]
-    name = ", ".join(filter(lambda part: part != "none", (worst["scene"], worst["contact"], worst["integrator"])))
-    return f"{text}; the worst: {name}, off by {number(worst['model_error_rel'])} times it."
+    name = ", ".join(part for part in (worst["scene"], worst["contact"], worst["integrator"]) if part != "none")
+    return f"{text}. Worst: {name}, with a relative error of {number(worst['model_error_rel'])}."
 
 
 def answers(shown: Arranged) -> pd.DataFrame:
-    """Return the problems with such gradients: the range of each error over everything that was swept."""
-    wrong = trapped(shown.rows)
+    """Return the problems with misleading gradients, and the range of each error over the swept parameters."""
+    wrong = misleading(shown.rows)
     lines = []
     for problem, part in wrong.groupby(problems(shown, PROBLEM, shown.axes, PROBLEM, wrong), sort=False):
         errors = {

@@ -10,36 +10,35 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from bench.experiment.axes import Axis, table
+from bench.experiment.axes import Axis
 from bench.experiment.experiment import Experiment
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
 from bench.report.scales import log_axis
+from bench.report.study_tables import label_columns, open_console, print_table, titled_figure, write_tables
 from bench.report.style import GREY, MARKERS, SHADE, axis_name, colour, plain, symbol
 from bench.report.tables import plain_markdown
-from bench.report.text import axis_value, counted, number
+from bench.report.text import axis_value, number
 from bench.report.views import Arranged, along, arranged, attempted, merge_seeds
-from bench.report.web.content import columns_of, distinguishing_columns, grouped, problems, shown_as
-from bench.run.files import write_all
+from bench.report.web.content import grouped, problems, shown_as
 
 FLOOR, CEILING = 1e-14, 1e3
-"""Relative errors outside this range are drawn at the edge."""
+"""Relative errors outside this range are drawn at its ends."""
 ERRORS = {
     "forward_error_rel": "forward error\n(cost, to physics)",
     "program_error_rel": "program error\n(to differences)",
     "model_error_rel": "model error\n(to physics)",
 }
-"""The errors of the program itself, each drawn in a column."""
+"""The errors that do not depend on the estimator, each a column of panels."""
 EXACT = 1e-6
 """Program error up to which a gradient counts as exact."""
 CONVERGED = 0.5
-"""Forward error at the smallest step over that at the largest, up to which a cost counts as converging; for a gradient likewise."""
+"""Largest ratio of the errors at the smallest and the largest step at which a cost, or a gradient, counts as converging."""
 WRONG = 0.1
 """Model error at the smallest step above which a gradient that does not converge is a trap."""
 AWAY: dict[str, Any] = {"marker": "x", "markersize": 6, "markeredgewidth": 1.6, "color": "#000000", "linestyle": "none"}
@@ -52,7 +51,7 @@ HEADERS = {
 }  # fmt: skip
 RESULTS = tuple(name for name in HEADERS if name != "contact")
 PROGRAM = ("scene", "contact", "integrator", "backend")
-"""What the errors belong to; a line of a table has one bias per estimator."""
+"""Parts of the grid that make a program, which has one bias per estimator."""
 STEP = "dt"
 """The column of the time step, along which a cost may converge."""
 NOTES = (
@@ -64,16 +63,12 @@ NOTES = (
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``three_errors`` (.csv, .md) and its chart along the time step, or else the first swept axis."""
+    """Write ``three_errors`` (.csv, .md) and the chart along the time step, or else the first swept axis."""
     shown = arranged(experiment, rows)
     parts = sections(shown)
     texts = [f"## {part.heading}\n\n{plain_markdown(readable(shown, part), HEADERS)}" for part in parts]
     title = f"# {experiment.name}: program, model and estimator error"
-    contents = {
-        "three_errors.csv": table(experiment, rows).to_csv(index=False, lineterminator="\n"),
-        "three_errors.md": "\n\n".join([title, *map(str, traps(shown)), *texts, *NOTES]) + "\n",
-    }
-    paths = write_all(experiment.directory, contents)
+    paths = write_tables(experiment, rows, "three_errors", [title, *map(str, traps(shown)), *texts, *NOTES])
     drawn = figure(shown)
     if drawn is not None:
         paths += save(drawn, experiment.directory / "three_errors", experiment.formats)
@@ -82,7 +77,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """The rows of one table: those along an axis, with its values in a column ``x``, or those on no axis, ``x`` 0."""
+    """The rows of one table: along an axis, whose values are in the column ``x``, or on no axis, with ``x`` 0."""
 
     axis: Axis | None
     rows: pd.DataFrame
@@ -94,30 +89,31 @@ class Section:
 
 
 def sections(shown: Arranged) -> list[Section]:
-    """Return, per swept axis, the programs that move along it at one value of all others; then the other programs.
+    """Return, per swept axis, the programs that vary along it with all other axes fixed, then the other programs.
 
-    Axes that step together are one: the time step where it is among them, else the first.
+    Axes that step together have one section: that of the time step if it is among them, else of the first.
     """
     parts: list[Section] = []
-    for axis in leading(shown):
+    for axis in independent_axes(shown):
+        joint = joint_axes(shown, axis)
         part = attempted(along(shown, axis))
         for other in shown.axes:
-            if other not in (axis, *_with(shown, axis)) and other.column != "seed" and not part.empty:
-                part = part[_at_commonest(part, other, shown)]
+            if other not in joint and other.column != "seed" and not part.empty:
+                part = part[_is_most_common(part, other, shown)]
         if part.empty:
             continue
-        moving = part.groupby(grouped(part, PROGRAM, [axis, *_with(shown, axis)]))["x"].transform("nunique") > 1
-        if moving.any():
-            parts.append(Section(axis, part[moving].sort_values("x", kind="stable")))
+        varies = part.groupby(grouped(part, PROGRAM, joint))["x"].transform("nunique") > 1
+        if varies.any():
+            parts.append(Section(axis, part[varies].sort_values("x", kind="stable")))
     rest = attempted(merge_seeds(shown.rows)).assign(x=0.0)
-    still = grouped(rest, PROGRAM, shown.axes)
+    programs = grouped(rest, PROGRAM, shown.axes)
     listed = {key for part in parts for key in part.rows["key"]}
-    rest = rest[~still.isin(still[rest["key"].isin(listed)])]
+    rest = rest[~programs.isin(programs[rest["key"].isin(listed)])]
     return parts + ([] if rest.empty else [Section(None, rest)])
 
 
-def leading(shown: Arranged) -> list[Axis]:
-    """Return the axes that get a table: one of those that step together."""
+def independent_axes(shown: Arranged) -> list[Axis]:
+    """Return the axes that get a section: one of each set that steps together."""
     axes: list[Axis] = []
     for axis in sorted(shown.axes, key=lambda axis: axis.column != STEP):
         if axis.column != "seed" and not any(axis.column in other.moves for other in axes):
@@ -125,26 +121,27 @@ def leading(shown: Arranged) -> list[Axis]:
     return [axis for axis in shown.axes if axis in axes]
 
 
-def _with(shown: Arranged, axis: Axis) -> list[Axis]:
-    return [other for other in shown.axes if other.column in axis.moves]
+def joint_axes(shown: Arranged, axis: Axis | None) -> list[Axis]:
+    """Return an axis and those that step with it."""
+    return [] if axis is None else [axis, *(other for other in shown.axes if other.column in axis.moves)]
 
 
-def _at_commonest(rows: pd.DataFrame, axis: Axis, shown: Arranged) -> pd.Series:
-    """Return a mask of the rows whose value of an axis is the commonest for their scene and law, or that have none."""
+def _is_most_common(rows: pd.DataFrame, axis: Axis, shown: Arranged) -> pd.Series:
+    """Return a mask of the rows without a value of an axis, or with the most common one for their scene and law."""
     laws = grouped(rows, ("scene", "contact"), shown.axes)
-    middle = rows.groupby(laws)[axis.column].transform(lambda v: v.mode().iloc[0] if v.notna().any() else np.nan)
-    return (rows[axis.column] == middle) | rows[axis.column].isna()
+    mode = rows.groupby(laws)[axis.column].transform(lambda v: v.mode().iloc[0] if v.notna().any() else np.nan)
+    return (rows[axis.column] == mode) | rows[axis.column].isna()
 
 
 # ------------------------------------------------------------------------------------------------------- tables
 
 
 def readable(shown: Arranged, part: Section) -> pd.DataFrame:
-    """Return a table of texts: a line per program and value of the axis, the errors, and a bias per estimator."""
+    """Return a table of texts with a line per program and value of the axis: the errors, and a bias per estimator."""
     rows, axis = part.rows, part.axis
-    without = [] if axis is None else [axis, *_with(shown, axis)]
+    without = joint_axes(shown, axis)
     programs = grouped(rows, PROGRAM, without)
-    names = distinguishing_columns(rows, programs, columns_of(shown, PROGRAM, without), ("scene", "contact"))
+    names = label_columns(shown, PROGRAM, without, rows=rows)
     labels = rows["estimator"].where(
         rows["estimator_params"] == "", rows["estimator"] + "[" + rows["estimator_params"] + "]"
     )
@@ -152,12 +149,12 @@ def readable(shown: Arranged, part: Section) -> pd.DataFrame:
     place = {law: i for i, law in enumerate(laws.unique())}
     rows = rows.assign(program=programs, label=labels, place=laws.map(place))
     lines = []
-    for _, own in rows.groupby(["place", "program", "x"], sort=False):
-        row = own.iloc[0]
+    for _, group in rows.groupby(["place", "program", "x"], sort=False):
+        row = group.iloc[0]
         line = {name: shown_as(row[name]) for name in names}
         line |= {} if axis is None else {replace(axis, moves=()).title: axis_value(row["x"])}
         line |= {name: number(row[name]) for name in RESULTS}
-        line |= {f"bias {name}": _bias(mine.iloc[0]) for name, mine in own.groupby("label", sort=False)}
+        line |= {f"bias {name}": _bias(estimates.iloc[0]) for name, estimates in group.groupby("label", sort=False)}
         lines.append((row["place"], line))
     return pd.DataFrame([line for _, line in sorted(lines, key=lambda pair: pair[0])])
 
@@ -172,23 +169,11 @@ def _bias(row: Any) -> str:
 
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     """Print the tables and the traps."""
-    from rich.console import Console
-    from rich.table import Table
-
     shown = arranged(experiment, rows)
-    console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal:
-        console.width = max(console.width, 140)
-    counts = ", ".join(f"{n} {status}" for status, n in rows["status"].value_counts().items())
-    console.print(f"\n{experiment.name}: {experiment.question}\n{counted(len(rows), 'cell')}: {counts}")
+    console = open_console(experiment, rows)
     for part in sections(shown):
         texts = readable(shown, part)
-        grid = Table(title=f"\n{part.heading}", title_justify="left", box=None, padding=(0, 2, 0, 0))
-        for name in texts:
-            grid.add_column(HEADERS.get(name, name), justify="left" if name in PROGRAM else "right")
-        for row in texts.fillna("").to_numpy():
-            grid.add_row(*map(str, row))
-        console.print(grid)
+        print_table(console, texts, HEADERS, set(texts) - set(PROGRAM), title=f"\n{part.heading}")
     console.print(*map(str, traps(shown)), *NOTES, sep="\n")
 
 
@@ -197,13 +182,13 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
 
 @dataclass(frozen=True)
 class Trap:
-    """A scene and law whose gradient passes every test except the physics': exact, of a converging cost, and wrong.
+    """A program with a converging cost and an exact derivative that is nevertheless wrong for the physics.
 
-    It points away from the physics at every step, or its error does not fall with the step.
+    Its gradient points away from the physical one at every step, or its model error does not fall with the step.
     """
 
     name: str
-    """Name of the scene and the law, with whatever else distinguishes it."""
+    """Name of the scene, the law and further distinguishing parameters."""
     program: float
     """Largest relative program error."""
     forward: tuple[float, float]
@@ -214,17 +199,17 @@ class Trap:
     """Relative model error at the largest and the smallest value of the axis."""
 
     def __str__(self) -> str:
-        """Write one sentence."""
+        """Write the trap in two sentences."""
+        cosines = f"{number(self.cosine[0])} to {number(self.cosine[1])}"
         against = (
-            f"and the gradient's cosine to the physics is {number(self.cosine[0])} to {number(self.cosine[1])}, negative "
-            f"at every time step."
+            f"but the cosine to the physical gradient is negative at every time step ({cosines})."
             if self.cosine[1] < 0
-            else f"and yet the gradient's error to the physics stays: {number(self.model[0])} at the largest time step, "
-            f"{number(self.model[1])} at the smallest, at a cosine of {number(self.cosine[0])} to {number(self.cosine[1])}."
+            else f"but the error to the physical gradient does not converge: it is {number(self.model[0])} at the largest time "
+            f"step and {number(self.model[1])} at the smallest (cosine {cosines})."
         )
         return (
-            f"Trap: {self.name}: the gradient agrees with differences to {number(self.program)}, the "
-            f"cost's error falls from {number(self.forward[0])} to {number(self.forward[1])}, {against}"
+            f"Trap: {self.name}: the gradient agrees with differences to {number(self.program)}. The cost's error falls "
+            f"from {number(self.forward[0])} to {number(self.forward[1])} with the time step, {against}"
         )
 
 
@@ -235,12 +220,12 @@ def traps(shown: Arranged) -> list[Trap]:
         return []
     result = []
     for name, rows in part.rows.groupby(programs_of(shown, part), sort=False):
-        own = rows.drop_duplicates("x").sort_values("x")
-        forward, cosine, program = own["forward_error_rel"], own["model_cosine"], own["program_error_rel"].max()
+        steps = rows.drop_duplicates("x").sort_values("x")
+        forward, cosine, program = steps["forward_error_rel"], steps["model_cosine"], steps["program_error_rel"].max()
         converges = forward.is_monotonic_increasing and forward.iloc[0] <= CONVERGED * forward.iloc[-1]
-        model = own["model_error_rel"]
-        stays = model.iloc[0] > max(CONVERGED * model.iloc[-1], WRONG)
-        if ((cosine < 0).all() or stays) and program <= EXACT and converges:
+        model = steps["model_error_rel"]
+        stays_wrong = model.iloc[0] > max(CONVERGED * model.iloc[-1], WRONG)
+        if ((cosine < 0).all() or stays_wrong) and program <= EXACT and converges:
             ends, errors = ((float(v.iloc[-1]), float(v.iloc[0])) for v in (forward, model))
             result.append(Trap(str(name), float(program), ends, (float(cosine.min()), float(cosine.max())), errors))
     return result
@@ -248,8 +233,8 @@ def traps(shown: Arranged) -> list[Trap]:
 
 def programs_of(shown: Arranged, part: Section, parts: Sequence[str] = PROGRAM) -> pd.Series:
     """Return, per row of a section, the name of its program, the same along the axis: ``bounce_once, penalty``."""
-    without = [] if part.axis is None else [part.axis, *_with(shown, part.axis)]
-    return problems(shown, parts, without, [name for name in ("scene", "contact") if name in parts], part.rows)
+    always = [name for name in ("scene", "contact") if name in parts]
+    return problems(shown, parts, joint_axes(shown, part.axis), always, part.rows)
 
 
 # ------------------------------------------------------------------------------------------------------- charts
@@ -265,20 +250,18 @@ def figure(shown: Arranged) -> Figure | None:
         return _figure(shown, part, {trap.name for trap in traps(shown)})
 
 
-def _figure(shown: Arranged, part: Section, trapped: Set[str]) -> Figure:
+def _figure(shown: Arranged, part: Section, trap_names: Set[str]) -> Figure:
     assert part.axis is not None
     panels = programs_of(shown, part, ["scene"])
     rows = part.rows.assign(
         panel=panels,
         law=_laws(shown, part, panels),
-        trap=programs_of(shown, part).isin(trapped if part.axis.column == STEP else ()),
+        trap=programs_of(shown, part).isin(trap_names if part.axis.column == STEP else ()),
         label=problems(shown, ["estimator"], shown.axes, ["estimator"], part.rows),
     )
     scenes, laws, estimators = (list(dict.fromkeys(rows[name])) for name in ("panel", "law", "label"))
     looks = {law: {"color": _colour(i), "marker": MARKERS[i % len(MARKERS)]} for i, law in enumerate(laws)}
-    drawn = Figure(figsize=(WIDTH, 1.45 * len(scenes) + 1.75), layout="constrained")
-    FigureCanvasAgg(drawn)
-    drawn.suptitle(_title(part.axis, bool(rows["trap"].any())), fontsize=9, fontweight="bold")
+    drawn = titled_figure(WIDTH, 1.45 * len(scenes) + 1.75, _title(part.axis, bool(rows["trap"].any())))
     grid = drawn.subplots(len(scenes), len(ERRORS) + len(estimators), squeeze=False, sharey=True)
     titles = [*ERRORS.values(), *(f"estimator error\n(bias of {plain(name)})" for name in estimators)]
     for panel, title in zip(grid[0], titles, strict=True):
@@ -290,7 +273,7 @@ def _figure(shown: Arranged, part: Section, trapped: Set[str]) -> Figure:
         for law, program in own.groupby("law", sort=False):
             _draw(line, program, estimators, looks[law] | (BOLD if program["trap"].any() else THIN))
         if own["trap"].any():
-            for panel, (height, text) in zip(line, SAID, strict=False):
+            for panel, (height, text) in zip(line, TRAP_LABELS, strict=False):
                 panel.text(0.5, height, text, transform=panel.transAxes, ha="center", va="center", fontweight="bold")
         line[0].set_ylabel(plain(scene).replace("[", "\n[", 1))
     for panel in grid[-1]:
@@ -300,7 +283,7 @@ def _figure(shown: Arranged, part: Section, trapped: Set[str]) -> Figure:
 
 
 def _laws(shown: Arranged, part: Section, panels: pd.Series) -> pd.Series:
-    """Name the law of each row by what distinguishes it from the others in its panel: one law has one look in all scenes."""
+    """Name the law of each row by the columns that distinguish it within its panel, so that a law has one style overall."""
     axes = ["contact", "integrator", "backend"]
     return pd.concat(
         [programs_of(shown, Section(part.axis, own), axes) for _, own in part.rows.groupby(panels, sort=False)]
@@ -312,7 +295,7 @@ def _colour(place: int) -> str:
 
 
 BOLD: dict[str, Any] = {"linewidth": 2.6, "markersize": 5.0, "zorder": 4}
-SAID = (
+TRAP_LABELS = (
     (0.3, "looks right:\nfalls with $\\Delta t$"),
     (0.68, "looks right:\nexact"),
     (0.42, "wrong\nat every $\\Delta t$"),
@@ -321,10 +304,14 @@ SAID = (
 THIN: dict[str, Any] = {"linewidth": 0.9, "markersize": 3.0, "zorder": 3}
 
 
-def _title(axis: Axis, trapped: bool) -> str:
-    """Write what is drawn, and what to look at first."""
+def _title(axis: Axis, has_trap: bool) -> str:
+    """Write the title of the chart, which explains traps if there are any."""
     text = f"Three errors of a gradient along {axis_name(axis)}, all relative"
-    return text + ("\nBold is a trap: right cost, exact derivative, and not that of the physics" if trapped else "")
+    return text + (
+        "\nBold: traps, with a converging cost and an exact derivative that the physics does not have"
+        if has_trap
+        else ""
+    )
 
 
 def _short_name(axis: Axis) -> str:

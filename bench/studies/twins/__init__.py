@@ -1,4 +1,4 @@
-"""A physics engine's twin of a scene beside the scene's own program: one rollout, its cost and its gradient."""
+"""A physics engine's twin of a scene compared with the scene's own program: one rollout, its cost and its gradient."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Twins(Study):
-    """Measures how far a physics engine's twin is from the scene's own program, and what its gradient costs."""
+    """Measures the difference between a physics engine's twin and the scene's own program, and the time of gradients."""
 
     name = "twins"
     columns: ClassVar[Columns] = Columns.of(

@@ -1,7 +1,7 @@
-"""A physics engine's twin of a scene beside the scene's own program: one rollout, its cost and its gradient.
+"""Compares a physics engine's twin of a scene with the scene's own program: one rollout, its cost and its gradient.
 
-A difference here is the model error of the engine's program against the scene's, for the same masses, springs and step:
-neither is wrong about its own program. Seconds are those of a batch of ``samples`` rollouts.
+A difference is the model error between the two programs for the same masses, springs and step; each may be exact for
+itself. Seconds are those of a batch of ``samples`` rollouts.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from bench.model import Problem, Unsupported, rollout
 
 
 def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
-    """Measure the differences at w = 0, and the seconds of costs and gradients.
+    """Return the differences at w = 0, and the seconds of costs and gradients.
 
-    ``state_difference`` is the largest over time and coordinates, positions in their units and velocities in theirs;
-    ``_rel`` is in units of the largest value that coordinate takes.
+    ``state_difference`` is the largest over time and coordinates, in the units of each coordinate. With ``_rel`` it is
+    in units of the coordinate's largest value.
     """
     scene = rollout(cell.program()).scene
     if "physics" not in cell.backend.provides:
         raise Unsupported(f"backend {cell.backend.name} has no twin to compare: its steps are the scene's own")
-    able = cell.ranked_backends
-    if not able:
+    backends = cell.ranked_backends
+    if not backends:
         raise Unsupported(
             f"scene {scene.name} exists only as an engine's model: it has no program of its own to compare with"
         )
-    twin, own = session.problem(cell), session.problems.of(able[0], cell)
+    twin, own = session.problem(cell), session.problems.of(backends[0], cell)
     theta, still = twin.program.theta0, np.zeros((twin.program.n_noise, 1))
     path, own_path = (problem.trajectory(theta, still).states[:, :, 0] for problem in (twin, own))
     gradient, own_gradient = (problem.grad(theta, still)[:, 0] for problem in (twin, own))
     cost, own_cost = (float(problem.value(theta, still)[0]) for problem in (twin, own))
-    off = np.abs(path - own_path).max(axis=0)
+    difference = np.abs(path - own_path).max(axis=0)
     result = {
         "status": "ok",
         "reason": "",
-        "own_backend": able[0].name,
-        "state_difference": float(off.max()),
-        "state_difference_rel": float((off / np.maximum(np.abs(own_path).max(axis=0), 1e-300)).max()),
+        "own_backend": backends[0].name,
+        "state_difference": float(difference.max()),
+        "state_difference_rel": float((difference / np.maximum(np.abs(own_path).max(axis=0), 1e-300)).max()),
         "cost": cost,
         "own_cost": own_cost,
         "cost_difference_rel": abs(cost - own_cost) / abs(own_cost),
@@ -61,7 +61,7 @@ def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
 
 
 def _seconds(cell: Cell, problem: Problem, timed_calls: int) -> dict[str, float]:
-    """Return medians over calls with ``samples`` columns, and the time to compile the gradient."""
+    """Return median times of calls with ``samples`` columns, and the time to compile the gradient."""
     theta = problem.program.theta0
     w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, problem.program.n_noise)[0].T
     _, value = timing.timed(lambda _: problem.value(theta, w), timed_calls)

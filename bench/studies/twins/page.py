@@ -1,4 +1,4 @@
-"""The page of the twins: how far engines and scenes are apart, and what an engine's gradient costs."""
+"""The page of the twins: differences between engines and own programs, and the time of an engine's gradient."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from bench.report.web.content import Content, nothing_ran
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the largest differences and longest compilation in a sentence, a chart of any two numbers, the table."""
+    """Return the finding, a chart of any two numbers, and the table."""
     return replace(generic.content(experiment, rows), finding=nothing_ran(rows) or finding(rows))
 
 
 def finding(rows: pd.DataFrame) -> str:
-    """Write where trajectory and gradient differ most, and the time of compiling and of one batch."""
+    """Write the largest differences of trajectory and gradient, and the times of compilation and of one batch."""
     good = rows[rows["status"] == "ok"]
     parts = []
-    for column, what in (("state_difference", "Trajectories"), ("gradient_difference_rel", "gradients, relatively,")):
+    for column, quantity in (("state_difference", "states"), ("gradient_difference_rel", "gradients (relative)")):
         finite = good[np.isfinite(good[column])]
         if len(finite):
             worst = finite.loc[finite[column].idxmax()]
-            parts.append(f"{what} differ by {number(worst[column])} at most ({worst['scene']} in {worst['backend']})")
+            where = f"{worst['scene']} in {worst['backend']}"
+            parts.append(f"Largest difference of {quantity}: {number(worst[column])} ({where})")
     for backend, part in good.groupby("backend", sort=False):
         times = f"{duration(part['gradient_s'].min())} to {duration(part['gradient_s'].max())}"
         compiled = part["compile_s"].max()
-        after = f", after compiling for up to {duration(compiled)}" if compiled > 0 else ""
+        compilation = f", after at most {duration(compiled)} of compilation" if compiled > 0 else ""
         counts = " or ".join(f"{count:g}" for count in part["samples"].unique())
-        parts.append(f"{backend} takes {times} for {counts} gradients{after}")
-    return "; ".join(parts) + "."
+        parts.append(f"{backend} computes {counts} gradients in {times}{compilation}")
+    return ". ".join(parts) + "."
