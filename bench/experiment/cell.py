@@ -62,7 +62,7 @@ class Cell:
     """One point of a sweep: a plugin on each axis, counts, a seed, and the study that measures it."""
 
     parts: Mapping[str, Plugin | None]
-    """Plugins by axis; None where the scene has no such part."""
+    """Plugins by axis; None if the scene has no such part."""
     samples: int
     repeats: int
     seed: int
@@ -71,7 +71,7 @@ class Cell:
     timing: bool = True
     """Whether the row records timings."""
     budget: Budget | None = None
-    """Budget of its reference gradient; None where the study needs none."""
+    """Budget of its reference gradient; None if the study needs none."""
 
     @property
     def scene(self) -> Scene:

@@ -168,7 +168,7 @@ def coerce_finite(values: Any, name: str) -> tuple[float, ...]:
     if not all(map(math.isfinite, numbers)):
         raise UserError(f"{name}={list(numbers)} must be finite")
     if "." in name and len(numbers) != 1:
-        raise UserError(f"{name} takes one number, given {list(numbers)}")
+        raise UserError(f"{name} takes one number at a time, given {list(numbers)}")
     return numbers
 
 

@@ -20,7 +20,7 @@ from bench.measure import noise
 from bench.measure.contacts import split
 from bench.model import EngineScene, Jacobians, LoopOps, MechanicalScene, Problem, Program, Unsupported, rollout
 from bench.model.identity import label
-from bench.run.reference_backends import linearising
+from bench.run.reference_backends import backends_with_jacobians
 from bench.run.session import Session
 from bench.trace import sentences
 from bench.trace.adjoints import adjoints
@@ -107,7 +107,7 @@ def _of_cell(session: Session, cell: Cell, seeded: bool) -> Trace:
 
 def _cannot(cell: Cell, program: Program, reason: str) -> UserError:
     """Return why a cell cannot be traced, and the backends that can trace its program."""
-    able = sorted(name for name in linearising(program) if name != cell.backend.name)
+    able = sorted(name for name in backends_with_jacobians(program) if name != cell.backend.name)
     hint = f"; use backends=[{'] or backends=['.join(able)}]" if able else ""
     return UserError(f"{cell.scene.name} on backend {cell.backend.name} cannot be traced: {reason}{hint}")
 
