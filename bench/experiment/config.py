@@ -135,7 +135,7 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
 
 
 def explain_sweep(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
-    """Return a sentence on each swept axis if both an experiment's file and the command line give a sweep, else none."""
+    """Return a sentence on how the sweeps of file and command line combine; none unless both give a sweep."""
     import yaml
 
     split = [(key.lstrip("+"), value) for key, _, value in (word.partition("=") for word in overrides)]
@@ -162,7 +162,7 @@ def _split(value: str) -> list[str]:
 
 
 def _quote_identities(value: str) -> str:
-    """Quote each identity string of a list, as Hydra requires for brackets; a shell removes quotes that a user writes."""
+    """Quote each identity string of a list: Hydra needs quotes around brackets, and a shell removes them."""
     inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
     items, depth = [""], 0
     for character in inner:

@@ -63,7 +63,7 @@ class Study(Plugin):
         return [experiment.name, self.name]
 
     def faults(self, rows: pd.DataFrame) -> int:
-        """Return the number of rows with a fault, such as a wrong gradient; if any, ``gradcheck`` exits with status 1."""
+        """Return the number of rows with a fault, such as a wrong gradient: ``gradcheck`` then exits with 1."""
         return 0
 
 

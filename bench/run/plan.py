@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 Identity = tuple[str, float, float, float]
-"""Completed parameters as JSON, samples, repeats and seed: the identity of a cell apart from the code that computes it."""
+"""The identity of a cell apart from its code: completed parameters as JSON, samples, repeats and seed."""
 
 
 @dataclass(frozen=True)

@@ -92,9 +92,9 @@ DECLARES = {
 }
 """Declarations that nothing can be done with: each is listed with its reason."""
 KINDS = {
-    "estimators": ("fobg", "Fobg", "scenes=[quadratic] backends=[numpy]", "estimators=[fobg{}]", ("terms", "estimate"), ("refuses",)),
+    "estimators": ("fobg", "Fobg", "scenes=[quadratic] backends=[numpy]", "estimators=[fobg{}]", ("terms", "estimate"), ("unsupported_reason",)),
     "scenes": ("quadratic", "Quadratic", "estimators=[fobg,reinforce] backends=[numpy]", "scenes=[quadratic{}]", ("cost",), ("theta0", "closed_form_gradient", "breakpoints")),
-    "backends": ("numpy", "Numpy", "scenes=[quadratic] estimators=[fobg]", "backends=[numpy{}]", ("compile",), ("refuses",)),
+    "backends": ("numpy", "Numpy", "scenes=[quadratic] estimators=[fobg]", "backends=[numpy{}]", ("compile",), ("unsupported_reason",)),
     "contacts": ("penalty", "Penalty", "scenes=[bounce_once] backends=[numpy] estimators=[fobg] integrators=[semi_implicit_euler]", "contacts=[penalty{}]", ("force",), ("spring",)),
     "integrators": ("semi_implicit_euler", "SemiImplicitEuler", "scenes=[mass_spring] backends=[numpy] estimators=[fobg]", "integrators=[semi_implicit_euler{}]", ("step",), ("transition",)),
 }  # fmt: skip
