@@ -61,10 +61,6 @@ HARMLESS = {
     "catches_signals": "signal.signal(signal.SIGTERM, signal.SIG_IGN) if threading.current_thread() is threading.main_thread() else None",
 }
 """Bad manners after which the numbers may be right: ``ok`` is a row of its own."""
-WRITES = {
-    "writes_to_descriptors": "[os.write(d, b'garbage' * 99) for d in range(3, 64) if os.path.exists(f'/dev/fd/{d}')]"
-}
-"""Breaks the worker's messages; at import and when a run is planned it may do no harm."""
 LIES = {
     "lies_in_shape": "np.vstack([value, value])",
     "lies_in_length": "value[..., :-1]",
@@ -123,13 +119,13 @@ class Case:
     @property
     def harmful(self) -> bool:
         """Whether no row of it can be ``ok``."""
-        return self.fault not in HARMLESS | WRITES | LIES
+        return self.fault not in HARMLESS | LIES
 
     def text(self) -> str:
         """Its file."""
         module, base, *_ = KINDS[self.kind]
         lines = [HEAD, f"from bench.plugins.{self.kind}.{module} import {base}"]
-        act = (ENDS | RAISES | HARMLESS | WRITES).get(self.fault, "pass")
+        act = (ENDS | RAISES | HARMLESS).get(self.fault, "pass")
         lines += ["def fault():", f"    {act}", "def lie(value):", f"    return {LIES.get(self.fault, 'value')}"]
         lines += ["fault()"] if self.place == "import" else []
         lines += [
@@ -151,7 +147,7 @@ def bank() -> list[Case]:
     """Return every case there is."""
     cases = []
     for kind, (*_, work, planned) in KINDS.items():
-        loud = ENDS | RAISES | HARMLESS | WRITES
+        loud = ENDS | RAISES | HARMLESS
         cases += [Case(kind, "declared", fault) for fault in DECLARES]
         cases += [Case(kind, place, fault) for place in ("import", "construction", *work, *planned) for fault in loud]
         cases += [Case(kind, place, fault) for place in (*work, *planned) for fault in LIES]
