@@ -182,7 +182,7 @@ def _loaded(words: Sequence[str], notes: bool = True) -> Experiment:
         else:
             overrides.append(word)
     experiment = config.load(overrides, folders)
-    for note in config.notes(overrides, folders) if notes else ():
+    for note in config.explain_sweep(overrides, folders) if notes else ():
         print(f"bench: {printable(note)}", file=sys.stderr)
     return experiment
 

@@ -1,10 +1,11 @@
-"""Errors that a user can cause, and the statuses in which a cell can end."""
+"""Errors that a user can cause, and the statuses of cells."""
 
 from __future__ import annotations
 
 import os
 import sys
 import threading
+import traceback
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Literal, get_args
@@ -17,7 +18,7 @@ if sys.platform == "win32":
 Status = Literal["ok", "nonfinite", "diverged", "timeout", "crashed", "unsupported", "unavailable", "error"]
 STATUSES: tuple[str, ...] = get_args(Status)
 INTERRUPTED = threading.Event()
-"""Set from the moment the command is told to stop until its KeyboardInterrupt has arrived: code in between may swallow it."""
+"""Set from an interrupt until its KeyboardInterrupt is handled, since code in between may swallow the exception."""
 
 
 class UserError(Exception):
@@ -25,30 +26,30 @@ class UserError(Exception):
 
 
 class StorageError(UserError):
-    """Raised when results cannot be written or read; what was stored before stays."""
+    """Raised when results cannot be written or read. Rows that were stored before are kept."""
 
 
 class Unsupported(Exception):
-    """Raised for a combination of plugins that cannot work, with the reason; becomes a row of that status."""
+    """Raised for a combination of plugins that does not fit together; its cell gets the status ``unsupported``."""
 
 
 def printable(text: object) -> str:
-    """Return text on one line without control characters, fit for a terminal or a message.
+    """Return text on one line without control characters, for a terminal or a message.
 
     >>> printable("a\\nb\\x1b[31m")
     'a b [31m'
     """
     try:
-        said = str(text)
+        line = str(text)
     except KeyboardInterrupt:
         raise
-    except BaseException:  # the message of a plugin's own kind of error is code of the plugin
-        said = "(a message that cannot be printed)"
-    return " ".join("".join(c if c.isprintable() else " " for c in said).split())
+    except BaseException:  # str() of a plugin's own exception class is code of the plugin
+        line = "(a message that cannot be printed)"
+    return " ".join("".join(c if c.isprintable() else " " for c in line).split())
 
 
 def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:
-    """Make the error for a name that does not exist, with the nearest one that does."""
+    """Return the error for an unknown name, with the nearest valid name and all valid names."""
     names = sorted(allowed)
     text = str(given)
     near = get_close_matches(text.lower(), [n.lower() for n in names], n=1, cutoff=0.4)
@@ -57,13 +58,9 @@ def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:
 
 
 def failure(error: BaseException) -> dict[str, str]:
-    """Return status and reason of a plugin's exception: its message and the last lines of its traceback."""
+    """Return status and reason of a plugin's exception. The reason has its message and the last lines of its traceback."""
     if isinstance(error, Unsupported):
         return {"status": "unsupported", "reason": printable(error)}
-    lines, step = [], error.__traceback__
-    while step is not None:
-        code = step.tb_frame.f_code
-        lines.append(f"{os.path.basename(code.co_filename)}:{step.tb_lineno} in {code.co_name}")
-        step = step.tb_next
-    said = printable(error)[:1000]
-    return {"status": "error", "reason": f"{type(error).__name__}: {said} ({' < '.join(reversed(lines[-3:]))})"}
+    frames = traceback.extract_tb(error.__traceback__, limit=-3)
+    lines = [f"{os.path.basename(frame.filename)}:{frame.lineno} in {frame.name}" for frame in reversed(frames)]
+    return {"status": "error", "reason": f"{type(error).__name__}: {printable(error)[:1000]} ({' < '.join(lines)})"}

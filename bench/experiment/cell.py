@@ -14,7 +14,7 @@ from typing import Any, cast
 from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
 from bench.experiment.keys import PROGRAM, REFERENCE, fingerprint, hashed, module_hash
-from bench.experiment.reference_backends import able_backends
+from bench.experiment.reference_backends import capable_backends
 from bench.model import (
     Backend,
     ContactLaw,
@@ -69,7 +69,7 @@ class Cell:
     """One point of a sweep: a plugin on each axis, counts, a seed, and the study that measures it."""
 
     parts: Mapping[str, Plugin | None]
-    """Plugins by axis; None where the scene has no such part."""
+    """Plugins by axis; None if the scene has no such part."""
     samples: int
     repeats: int
     seed: int
@@ -78,7 +78,7 @@ class Cell:
     timing: bool = True
     """Whether the row records timings."""
     budget: Budget | None = None
-    """Budget of its reference gradient; None where the study needs none."""
+    """Budget of its reference gradient; None if the study needs none."""
 
     @property
     def scene(self) -> Scene:
@@ -154,7 +154,7 @@ class Cell:
         if self.program_key not in _ranked:
             _ranked[self.program_key] = ()
             with suppress(Unsupported, UserError):
-                _ranked[self.program_key] = tuple(able_backends(self.program(), ranked=True))
+                _ranked[self.program_key] = tuple(capable_backends(self.program(), for_references=True))
         return _ranked[self.program_key]
 
     def smoothing(self) -> Smoothing | None:

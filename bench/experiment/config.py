@@ -1,4 +1,4 @@
-"""Turns Hydra configuration into a checked :class:`~bench.experiment.experiment.Experiment`."""
+"""Turns Hydra configuration into a validated :class:`~bench.experiment.experiment.Experiment`."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def experiments(config_dirs: Sequence[Path] = ()) -> list[str]:
 
 
 def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experiment:
-    """Load the experiment that Hydra composes from overrides; raises :class:`UserError` for anything wrong in them.
+    """Load the experiment that Hydra composes from overrides; raises :class:`UserError` if one of them is invalid.
 
-    ``config_dirs`` are folders with experiments of the user's own, as ``experiment/NAME.yaml``.
+    ``config_dirs`` are folders with the user's own experiments, as ``experiment/NAME.yaml``.
     """
     from hydra import compose, initialize_config_dir
     from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -50,25 +50,27 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
     for override in overrides:
         key, _, value = override.lstrip("+").partition("=")
         if key == "plugins":
-            for folder in _split(value):
-                registry.add_folder(Path(folder))
-    for place in config_dirs:
-        if not (place / "experiment").is_dir():
-            raise UserError(f"'{place}' has no folder 'experiment' with experiments in it, as experiment/NAME.yaml")
+            for path in _split(value):
+                registry.add_folder(Path(path))
+    for folder in config_dirs:
+        if not (folder / "experiment").is_dir():
+            raise UserError(
+                f"'{folder}' has no experiments: put them into its folder experiment, as experiment/NAME.yaml"
+            )
     parser = OverridesParser.create()
     prepared = []
     for override in overrides:
-        word = _prepared(override, config_dirs)
+        hydra_override = _to_hydra(override, config_dirs)
         try:
-            parser.parse_override(word)
+            parser.parse_override(hydra_override)
         except (HydraException, ValueError, RecursionError):  # ValueError: a number of 5000 digits
             raise UserError(
                 f"'{override[:200]}' cannot be read: write key=value with lists as [a,b] and strings in quotes"
             ) from None
-        prepared.append(word)
+        prepared.append(hydra_override)
     if config_dirs:
-        places = ",".join(f"'file://{folder.expanduser().absolute()}'" for folder in config_dirs)
-        prepared.insert(0, f"hydra.searchpath=[{places}]")
+        search_path = ",".join(f"'file://{folder.expanduser().absolute()}'" for folder in config_dirs)
+        prepared.insert(0, f"hydra.searchpath=[{search_path}]")
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
             config = compose("config", overrides=prepared)
@@ -85,7 +87,7 @@ def _known_keys() -> frozenset[str]:
 
 
 LAYOUT = ("columns", "rows")
-"""Settings of ``table`` that may be given by their own names."""
+"""Settings of ``table`` that may be given without ``table.``."""
 
 
 @remember
@@ -95,12 +97,12 @@ def _settings() -> frozenset[str]:
     return frozenset(yaml.safe_load((config_dir() / "config.yaml").read_text())) - {"defaults"}
 
 
-def _prepared(override: str, config_dirs: Sequence[Path]) -> str:
-    """Return the override as Hydra wants it, with experiments and plugin parameters reachable without ``+``."""
+def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
+    """Return an override in Hydra's syntax; experiments and plugin parameters need no ``+``."""
     if "=" not in override:
         raise UserError(f"'{override}' is not an override: write key=value (commands come first: see --help)")
     if "${" in override:
-        raise UserError(f"'{override}': interpolations are not resolved here, give the value itself")
+        raise UserError(f"'{override}': interpolations are not supported, give the value itself")
     key, _, value = override.partition("=")
     bare = key.lstrip("+~")
     if bare in LAYOUT:
@@ -109,66 +111,66 @@ def _prepared(override: str, config_dirs: Sequence[Path]) -> str:
     if head == "experiment":
         if "," in value:
             raise UserError(
-                f"'{override}': one command runs one experiment, with its own sweep; give a command to each"
+                f"'{override}': one command runs one experiment with its sweep; run one command for each experiment"
             )
         names = experiments(config_dirs)
         if value not in names:
             raise unknown("experiment", value, names)
         return f"+experiment={value}"
     if head.partition("/")[0] == "hydra" or key.startswith("~"):
-        raise UserError(f"'{override}': Hydra's own settings cannot be changed here")
+        raise UserError(f"'{override}': Hydra's own settings cannot be changed")
     if head not in _known_keys():
         raise unknown("setting", bare, {*_known_keys(), *LAYOUT, "experiment"})
     kinds = registry.kinds()
     if bare in kinds:
-        return f"++{bare}={_quoted(value)}"
+        return f"++{bare}={_quote_identities(value)}"
     if bare == "study":
-        return f"study={_quoted(value)[1:-1]}"
+        return f"study={_quote_identities(value)[1:-1]}"
     if head in map(singular, kinds) or head in ("sweep", "marks", "ray", "slurm"):
         return f"++{bare}={value}"
     if bare != head and (head not in ("reference", "table") or bare.count(".") > 1):
         whole = bare.rpartition(".")[0]
-        raise UserError(f"'{bare}' is not a setting: '{whole}' has no parts")
+        raise UserError(f"'{bare}' is not a setting: '{whole}' has no settings of its own")
     return f"{bare}={value}"
 
 
-def notes(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
-    """Return sentences on what wins where both an experiment's file and the command line give a sweep."""
+def explain_sweep(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
+    """Return a sentence on how the sweeps of file and command line combine; none unless both give a sweep."""
     import yaml
 
     split = [(key.lstrip("+"), value) for key, _, value in (word.partition("=") for word in overrides)]
     chosen = [value for key, value in split if key == "experiment"]
-    given: list[str] = []
+    axes: list[str] = []
     for key, value in split:
         head, _, axis = key.partition(".")
         if head == "sweep":
-            given.extend([axis] if axis else (yaml.safe_load(value.replace(":", ": ")) or {}))
-    if not chosen or not given:
+            axes.extend([axis] if axis else (yaml.safe_load(value.replace(":", ": ")) or {}))
+    if not chosen or not axes:
         return []
-    places = (folder / "experiment" / f"{chosen[-1]}.yaml" for folder in (*config_dirs, config_dir()))
-    own = yaml.safe_load(next(place for place in places if place.exists()).read_text()).get("sweep") or {}
-    wins = [f"{axis} of the command line replaces that of {chosen[-1]}" for axis in given if axis in own]
-    adds = [f"{axis} of the command line is multiplied with it" for axis in given if axis not in own]
-    kept = [f"{axis} of {chosen[-1]} stays" for axis in own if axis not in given]
-    return [f"sweep: {'; '.join(wins + kept + adds)}"] if own else []
+    paths = (folder / "experiment" / f"{chosen[-1]}.yaml" for folder in (*config_dirs, config_dir()))
+    own = yaml.safe_load(next(path for path in paths if path.exists()).read_text()).get("sweep") or {}
+    replaced = [f"{axis} of the command line replaces that of {chosen[-1]}" for axis in axes if axis in own]
+    kept = [f"{axis} of {chosen[-1]} stays" for axis in own if axis not in axes]
+    added = [f"{axis} of the command line is multiplied with it" for axis in axes if axis not in own]
+    return [f"sweep: {'; '.join(replaced + kept + added)}"] if own else []
 
 
 def _split(value: str) -> list[str]:
-    """Return the items of a value that may be one or a list: ``a``, ``[a,b]``."""
+    """Return the items of a value that is one item or a list: ``a`` or ``[a,b]``."""
     inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
     return [item.strip().strip("'\"") for item in inner.split(",") if item.strip()]
 
 
-def _quoted(value: str) -> str:
-    """Quote each identity string of a list, since a shell eats the quotes that Hydra needs around brackets."""
+def _quote_identities(value: str) -> str:
+    """Quote each identity string of a list: Hydra needs quotes around brackets, and a shell removes them."""
     inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
     items, depth = [""], 0
-    for letter in inner:
-        depth += (letter == "[") - (letter == "]")
-        if letter == "," and depth == 0:
+    for character in inner:
+        depth += (character == "[") - (character == "]")
+        if character == "," and depth == 0:
             items.append("")
         else:
-            items[-1] += letter
+            items[-1] += character
     if depth != 0:
         return value
     names = [item.strip().strip("'\"") for item in items]
@@ -179,28 +181,28 @@ FORMATS = ("png", "svg", "pdf")
 
 
 def experiment(config: Mapping[str, Any]) -> Experiment:
-    """Check a resolved configuration against the registry."""
+    """Return the experiment of a composed configuration; raises :class:`UserError` if a setting is invalid."""
     extra = set(config) - _known_keys()
     if extra:
         raise unknown("setting", sorted(extra)[0], _known_keys())
     name = "" if config["name"] is None else str(config["name"])
     if not SAFE_NAME.fullmatch(name) or ".." in name:
-        raise UserError(f"name={name!r} must be letters, digits, '.', '_' and '-', since it names a folder")
-    for folder in _listed_or_none(config["plugins"]):
+        raise UserError(f"name={name!r} must consist of letters, digits, '.', '_' and '-', since it names a folder")
+    for folder in _as_list(config["plugins"]):
         registry.add_folder(Path(str(folder)))
     study = _study(config["study"])
     axes = {axis: registry.kind_of(axis) for axis in study.axes}
-    choices = {axis: [_choice(kind, item) for item in _listed(config, kind)] for axis, kind in axes.items()}
-    values = {axis: _table(config, axis) for axis in axes}
+    choices = {axis: [_choice(kind, item) for item in _at_least_one(config, kind)] for axis, kind in axes.items()}
+    values = {axis: _mapping(config, axis) for axis in axes}
     for axis, kind in axes.items():
         for plugin, given in values[axis].items():
             entry = registry.find(kind, plugin)
             if not isinstance(given, Mapping):
-                raise UserError(f"{axis}.{plugin}={given!r} must name a parameter: {axis}.{plugin}.parameter=value")
+                raise UserError(f"{axis}.{plugin}={given!r} names no parameter: write {axis}.{plugin}.parameter=value")
             if entry.plugin is not None:
                 build(entry.plugin, given)
     timing = config["timing"]
-    refuse_too_many(_table(config, "sweep"))
+    refuse_too_many(_mapping(config, "sweep"))
     return Experiment(
         name=name,
         study=study,
@@ -209,16 +211,16 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         execution=_execution(config),
         choices=choices,
         values=values,
-        sweep=_table(config, "sweep"),
+        sweep=_mapping(config, "sweep"),
         decision=_decision(config),
         results_dir=_folder(config["results_dir"]),
         question=str(config["question"] or ""),
-        marks=_table(config, "marks"),
+        marks=_mapping(config, "marks"),
         compile_time=coerce(bool, config["compile_time"], "compile_time"),
-        formats=tuple(_one_of("formats", item, FORMATS) for item in _listed_or_none(config["formats"])),
-        table=_layout(_table(config, "table"), _table(config, "sweep")),
-        average=_average(config["average"], _table(config, "sweep")),
-        reference=_budget(_table(config, "reference")),
+        formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
+        table=_table_layout(_mapping(config, "table"), _mapping(config, "sweep")),
+        average=_average(config["average"], _mapping(config, "sweep")),
+        reference=_budget(_mapping(config, "reference")),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
         **{key: coerce(int, config[key], key) for key in ("samples", "repeats", "seed")},
@@ -245,7 +247,7 @@ def _budget(settings: Mapping[str, Any]) -> Budget:
             raise unknown("setting of reference", key, ("samples", "tolerance"))
     for key in ("samples", "tolerance"):
         if key not in settings:
-            raise UserError(f"reference has no {key}: write reference.{key}=... and leave the other as it is")
+            raise UserError(f"reference has no {key}: write reference.{key}=... to change only one of its settings")
     samples = coerce(int, settings["samples"], "reference.samples")
     tolerance = coerce(float, settings["tolerance"], "reference.tolerance")
     if samples < 256 or not tolerance > 0:
@@ -256,7 +258,7 @@ def _budget(settings: Mapping[str, Any]) -> Budget:
 ROWS = ("estimator", "backend")
 
 
-def _layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> TableLayout:
+def _table_layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> TableLayout:
     for key in settings:
         if key not in LAYOUT:
             raise unknown("setting of table", key, LAYOUT)
@@ -264,34 +266,34 @@ def _layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> TableLayou
     names = {part for name in swept(sweep) for part in (name, name.rpartition(".")[2])}
     if columns and columns not in names:
         raise unknown("axis for table.columns:", columns, names)
-    rows = tuple(_one_of("table.rows", row, ROWS) for row in _listed_or_none(settings["rows"]))
+    rows = tuple(_one_of("table.rows", row, ROWS) for row in _as_list(settings["rows"]))
     if "estimator" not in rows:
-        raise UserError(f"table.rows={list(rows)} must hold estimator; [estimator,backend] gives each backend a row")
+        raise UserError(f"table.rows={list(rows)} must contain estimator; [estimator,backend] gives each backend a row")
     return TableLayout(columns, rows)
 
 
 def _average(names: Any, sweep: Mapping[str, Any]) -> tuple[str, ...]:
     known = {part for name in swept(sweep) for part in (name, parameter_name(name), name.partition(".")[0])}
-    for name in _listed_or_none(names):
+    for name in _as_list(names):
         if name not in known:
             raise (
                 unknown("axis for average:", str(name), known)
                 if known
                 else UserError(f"average={name}: nothing is swept, so there is nothing to average over")
             )
-    return tuple(map(str, _listed_or_none(names)))
+    return tuple(map(str, _as_list(names)))
 
 
 def _decision(config: Mapping[str, Any]) -> Decision:
-    names = [coerce(str, name, "theta") for name in _listed_or_none(config["theta"])]
+    names = [coerce(str, name, "theta") for name in _as_list(config["theta"])]
     at = config["theta0"]
-    values = None if at is None else tuple(coerce(float, value, "theta0") for value in _listed_or_none(at))
+    values = None if at is None else tuple(coerce(float, value, "theta0") for value in _as_list(at))
     if values is not None and not all(map(math.isfinite, values)):
         raise UserError(f"theta0={list(values)} must be finite")
     return Decision(tuple(names), values)
 
 
-def _listed_or_none(value: Any) -> list[Any]:
+def _as_list(value: Any) -> list[Any]:
     return [] if value is None else list(value) if isinstance(value, list | tuple) else [value]
 
 
@@ -308,14 +310,14 @@ def _execution(config: Mapping[str, Any]) -> Execution:
     workers = config["workers"]
     if workers is not None and coerce(int, workers, "workers") < 0:
         raise UserError(f"workers={workers} must be at least 0, or null for the number of cores")
-    retry = config["retry"] if isinstance(config["retry"], list) else [config["retry"]]
+    memory = _amount("memory", config["memory"], BYTES, "4g, 500m")
     return Execution(
         workers=None if workers is None else coerce(int, workers, "workers"),
         timeout=_amount("timeout", config["timeout"], SECONDS, "600, 10m"),
-        memory=_whole(_amount("memory", config["memory"], BYTES, "4g, 500m")),
+        memory=None if memory is None else math.ceil(memory),
         stop=_one_of("on_error", config["on_error"], ("continue", "stop")) == "stop",
         versions=_one_of("versions", config["versions"], ("ignore", "warn", "rerun")),
-        retry=tuple(_one_of("retry", status, STATUSES) for status in retry if status is not None),
+        retry=tuple(_one_of("retry", status, STATUSES) for status in _as_list(config["retry"]) if status is not None),
         launcher=_one_of("launcher", config["launcher"], tuple(CLUSTERS)),
         cluster=_cluster(config, str(config["launcher"])),
     )
@@ -333,20 +335,20 @@ CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
 
 
 def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
-    """Check the settings of all launchers; returns those of the chosen one."""
-    result: dict[str, dict[str, Any]] = {name: {} for name in CLUSTERS}
-    for one, known in CLUSTERS.items():
-        given = _table(config, one) if known else {}
-        for name in given:
-            if name not in known:
-                raise unknown(f"setting of {one}", name, known)
-        for name, (kind, empty) in known.items():
-            value = given.get(name)
-            result[one][name] = None if value is None and empty else coerce(kind, value, f"{one}.{name}")
-            if kind is not str and not result[one][name] >= 1:
-                raise UserError(f"{one}.{name}={value} must be at least 1")
-    _one_of("slurm.cluster", result["slurm"]["cluster"], ("slurm", "local"))
-    return result[launcher]
+    """Validate the settings of all launchers and return those of the chosen one."""
+    settings: dict[str, dict[str, Any]] = {name: {} for name in CLUSTERS}
+    for name, types in CLUSTERS.items():
+        given = _mapping(config, name) if types else {}
+        for key in given:
+            if key not in types:
+                raise unknown(f"setting of {name}", key, types)
+        for key, (kind, may_be_null) in types.items():
+            value = given.get(key)
+            settings[name][key] = None if value is None and may_be_null else coerce(kind, value, f"{name}.{key}")
+            if kind is not str and not settings[name][key] >= 1:
+                raise UserError(f"{name}.{key}={value} must be at least 1")
+    _one_of("slurm.cluster", settings["slurm"]["cluster"], ("slurm", "local"))
+    return settings[launcher]
 
 
 def _one_of(key: str, value: Any, allowed: Sequence[str]) -> str:
@@ -370,23 +372,19 @@ def _amount(key: str, value: Any, units: Mapping[str, float], example: str) -> f
     return amount
 
 
-def _whole(amount: float | None) -> int | None:
-    return None if amount is None else math.ceil(amount)
-
-
-def _table(config: Mapping[str, Any], key: str) -> dict[str, Any]:
+def _mapping(config: Mapping[str, Any], key: str) -> dict[str, Any]:
     value = {} if config.get(key) is None else config[key]
     if not isinstance(value, Mapping):
-        raise UserError(f"{key}={value!r} must be a table of settings: {key}.name=value")
+        raise UserError(f"{key}={value!r} must be a table: write {key}.name=value")
     return {str(k): v for k, v in value.items()}
 
 
-def _listed(config: Mapping[str, Any], kind: str) -> list[Any]:
+def _at_least_one(config: Mapping[str, Any], kind: str) -> list[Any]:
     value = config.get(kind)
-    listed = value if isinstance(value, list) else [value]
-    if not listed or value is None:
+    items = value if isinstance(value, list) else [value]
+    if not items or value is None:
         raise UserError(f"{kind} is empty: give at least one of {', '.join(sorted(registry.entries()[kind]))}")
-    return listed
+    return items
 
 
 def _choice(kind: str, text: Any) -> Choice:

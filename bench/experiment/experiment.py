@@ -1,4 +1,4 @@
-"""An experiment: a named sweep, resolved once when configuration is read."""
+"""An experiment: a named sweep, as read from its configuration."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class Choice:
 
 @dataclass(frozen=True)
 class Execution:
-    """How cells are run; it decides none of their numbers."""
+    """How cells are run. It affects none of their numbers."""
 
     workers: int | None = None
-    """Number of processes; None for the number of cores, 0 to work in this process."""
+    """Number of processes; None for the number of cores, 0 for this process only."""
     timeout: float | None = None
     """Seconds that a cell may take."""
     memory: int | None = None
-    """Bytes that a worker may hold."""
+    """Bytes of memory that a worker may use."""
     stop: bool = False
     """Whether the first failed cell ends the run."""
     versions: str = "warn"
@@ -51,33 +51,33 @@ class Execution:
 
 @dataclass(frozen=True)
 class Budget:
-    """How much is spent on a reference gradient."""
+    """The budget of a reference gradient."""
 
     samples: int = 1 << 18
-    """Most samples of a sampled reference."""
+    """Largest number of samples."""
     tolerance: float = 0.005
     """Standard error, relative to the gradient, at which sampling stops."""
 
 
 @dataclass(frozen=True)
 class TableLayout:
-    """How the table of a paper is laid out; it decides no number."""
+    """The layout of the table for a paper. It affects no number."""
 
     columns: str = ""
-    """The swept axis across; empty for the longest."""
+    """The swept axis whose values are columns; empty for the axis with most values."""
     rows: tuple[str, ...] = ("estimator",)
-    """What gets a row of its own: estimators, with those backends on one row that agree, or also each backend."""
+    """``estimator``, where backends that agree share a row, or also ``backend`` for a row per backend."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A named sweep: which plugins, which parameters, how many samples, and what is measured."""
+    """A named sweep: plugins, parameters, sample counts, and the study that measures each cell."""
 
     name: str
     study: Plugin
-    """What to measure in each cell: a :class:`bench.experiment.study.Study`."""
+    """The :class:`bench.experiment.study.Study` that measures each cell."""
     columns: Columns
-    """The columns of its rows, which are those of the study."""
+    """The columns of its rows, as the study declares them."""
     choices: Mapping[str, Sequence[Choice]]
     """By axis (``scene``, ...), in the order of the study's axes."""
     values: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
@@ -91,26 +91,26 @@ class Experiment:
     results_dir: Path = Path("results")
     question: str = ""
     marks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """Per axis, named values to draw as lines in the charts."""
+    """Named values by axis, drawn as lines in the charts."""
     compile_time: bool = False
-    """Whether charts of error against time add compilation to it."""
+    """Whether charts of error against time include the compile time."""
     formats: tuple[str, ...] = ("png",)
     """File formats of the charts."""
     table: TableLayout = TableLayout()
     average: tuple[str, ...] = ()
-    """Swept axes over which averages are written; it decides no number."""
+    """Swept axes over which averages are written; the rows do not depend on it."""
     reference: Budget = Budget()
     compile_cache: Path | None = None
-    """Folder of compiled programs kept between runs."""
+    """Folder in which compiled programs are cached between runs."""
     plugins: tuple[Path, ...] = ()
     """Folders with the user's own plugins."""
     timing: bool = False
-    """Whether cells are timed, each by itself on the machine."""
+    """Whether cells are timed, one at a time on the machine."""
     execution: Execution = Execution()
 
     @property
     def budget(self) -> Budget | None:
-        """Budget of a cell's reference gradient; None where the study needs none."""
+        """Budget of a cell's reference gradient; None if the study needs none."""
         return self.reference if self.columns.referenced else None
 
     @property

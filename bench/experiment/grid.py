@@ -35,7 +35,7 @@ def is_theta_axis(axis: str) -> bool:
 
 
 def parameter_name(axis: str) -> str:
-    """Return the last part of an axis: ``gamma`` for ``alpha_order.gamma``, but ``theta0.2`` for a coordinate of theta0."""
+    """Return the parameter that an axis names: ``gamma`` for ``alpha_order.gamma``, ``theta0.2`` for ``theta0.2``."""
     return axis if is_theta_axis(axis) else axis.rpartition(".")[2]
 
 
@@ -57,7 +57,7 @@ def cells(experiment: Experiment) -> list[Cell]:
 
 
 def _check_theta(cells: Sequence[Cell]) -> None:
-    """Raise the first error of theta if it is valid in no cell; otherwise invalid cells report the error in their rows."""
+    """Raise the first error of theta if it is valid in no cell. Otherwise the rows report the error."""
     first: UserError | None = None
     for cell in cells:
         try:
@@ -73,7 +73,7 @@ def _check_theta(cells: Sequence[Cell]) -> None:
 
 
 def refuse_too_many(sweep: Mapping[str, Any], cells_per_point: int = 1) -> None:
-    """Raise :class:`UserError` for a sweep of more than :data:`MAX_CELLS` cells, with ``cells_per_point`` at each point."""
+    """Raise :class:`UserError` for a sweep of more than :data:`MAX_CELLS` cells."""
     size = _size(sweep) * cells_per_point
     if size > MAX_CELLS:
         raise UserError(
@@ -168,7 +168,7 @@ def coerce_finite(values: Any, name: str) -> tuple[float, ...]:
     if not all(map(math.isfinite, numbers)):
         raise UserError(f"{name}={list(numbers)} must be finite")
     if "." in name and len(numbers) != 1:
-        raise UserError(f"{name} takes one number, given {list(numbers)}")
+        raise UserError(f"{name} takes one number at a time, given {list(numbers)}")
     return numbers
 
 
@@ -233,7 +233,7 @@ class _Expansion:
         )  # fmt: skip
 
     def _decision(self, point: Mapping[str, Any], parts: Mapping[str, Plugin | None]) -> Decision:
-        """Return the meaning and value of theta at a point of the sweep; coordinates that are not swept keep their values."""
+        """Return theta at a point of the sweep; coordinates that are not swept keep their values."""
         decision = self._experiment.decision
         given = {name: coerce_finite(values, name) for name, values in point.items() if is_theta_axis(name)}
         if not given:
@@ -303,7 +303,7 @@ _built: dict[tuple[type[Plugin], str], Plugin] = {}
 
 
 def _build(plugin: type[Plugin], values: Sequence[tuple[str, Any]]) -> Plugin:
-    """Return the instance with these values, built once; 1, 1.0 and True differ, since a parameter may accept only one."""
+    """Return the instance with these values, built once. 1, 1.0 and True differ: a parameter may accept one only."""
     key = (plugin, repr(values))
     if key not in _built:
         _built[key] = build(plugin, dict(values))

@@ -8,22 +8,24 @@ from bench.model import Backend, Problem, Program, registry
 from bench.model.parameters import build, remember
 
 
-def able_backends(program: Program, ranked: bool = False) -> list[Backend]:
+def capable_backends(program: Program, for_references: bool = False) -> list[Backend]:
     """Return the available backends, with default parameters, that can run a program.
 
-    With ``ranked``, only those that compute references are returned, best first.
+    With ``for_references``, only those that compute references are returned, best first.
     """
     backends = []
     for entry in registry.entries()["backends"].values():
         if entry.plugin is None or not entry.available or not issubclass(entry.plugin, Backend):
             continue
-        if ranked and entry.plugin.reference_rank is None:  # not asked, since a backend may have to trace the program
+        if (
+            for_references and entry.plugin.reference_rank is None
+        ):  # not asked, since a backend may have to trace the program
             continue
         with suppress(Exception):  # a backend that fails at this question cannot run the program
             backend = _default(entry.plugin)
             if backend.incompatibility(program) is None:
                 backends.append(backend)
-    return sorted(backends, key=lambda backend: backend.reference_rank or 0) if ranked else backends
+    return sorted(backends, key=lambda backend: backend.reference_rank or 0) if for_references else backends
 
 
 @remember
@@ -33,6 +35,6 @@ def _default(plugin: type[Backend]) -> Backend:
     return backend
 
 
-def linearising_backends(program: Program) -> list[str]:
+def backends_with_jacobians(program: Program) -> list[str]:
     """Return the names of the available backends whose problems give step Jacobians for a program."""
-    return [b.name for b in able_backends(program) if type(b.compile(program)).jacobians is not Problem.jacobians]
+    return [b.name for b in capable_backends(program) if type(b.compile(program)).jacobians is not Problem.jacobians]

@@ -1,4 +1,4 @@
-"""The contract of a study: what is measured of each cell, and how it is shown."""
+"""The contract of a study: what it measures in each cell, and how it presents the rows."""
 
 from __future__ import annotations
 
@@ -21,38 +21,38 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Study(Plugin):
-    """Measures something in each cell, and turns rows into tables, charts and a page.
+    """Measures each cell, and turns rows into tables, charts and a page.
 
-    A study is found like any plugin: by its folder under ``bench/studies``, in a folder of the user's own, or by an
+    A study is registered like any plugin: as a folder under ``bench/studies``, in a folder of the user's own, or by an
     entry point.
     """
 
     kind: ClassVar[str] = "studies"
     axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "estimator")
-    """The axes of its grid, each a kind of plugins in the singular."""
+    """The axes of its grid, each a kind of plugin in the singular."""
     columns: ClassVar[Columns]
     """The columns of its rows."""
     timed: ClassVar[bool] = False
-    """Whether its cells are timed unless the user says otherwise: one at a time, with the machine to themselves."""
+    """Whether its cells are timed by default: one at a time, with the machine to themselves."""
 
     @abstractmethod
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return status, reason and the study's columns for one cell; an exception becomes status and reason."""
+        """Return status, reason and the study's columns for one cell. An exception becomes status and reason."""
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
-        """Return a cell's plugins by axis, without those that make no difference to it; by default all."""
+        """Return a cell's plugins by axis, without those that do not affect its results; by default all."""
         return given
 
     def unsupported_reason(self, cell: Cell) -> str | None:
-        """Return why the study cannot measure a cell, or None; asked when a run is planned."""
+        """Return why the study cannot measure a cell, or None; called when a run is planned."""
         return None
 
     @abstractmethod
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write tables and charts from rows, and return the files' paths; it prints nothing."""
+        """Write tables and charts from rows, and return the files' paths. It must not print."""
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print what the user should see first."""
+        """Print a summary of the rows for the terminal."""
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
         """Return a :class:`bench.report.web.content.Content`; None for a table and a chart of any two numbers."""
@@ -63,7 +63,7 @@ class Study(Plugin):
         return [experiment.name, self.name]
 
     def faults(self, rows: pd.DataFrame) -> int:
-        """Count rows with a fault, such as a gradient no one should use; ``gradcheck`` then ends with status 1."""
+        """Return the number of rows with a fault, such as a wrong gradient: ``gradcheck`` then exits with 1."""
         return 0
 
 

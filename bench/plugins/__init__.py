@@ -1,6 +1,6 @@
-"""The built-in plugins under one name, wherever they lie: beside the package in a checkout, inside it when installed.
+"""The built-in plugins as one package, from beside ``bench`` in a checkout and from inside it in an installation.
 
-A top-level package called ``plugins`` would be hidden by any folder of that name where a command is run.
+A top-level package called ``plugins`` would be shadowed by a folder of that name in the working folder.
 """
 
 from pathlib import Path

@@ -112,7 +112,7 @@ def link_exclusively(path: Path, name: Path) -> None:
 
 
 def _rename_exclusively(path: Path, name: Path) -> None:
-    """Rename a file unless the new name exists, in one step if the system can; ``os.rename`` would overwrite the file."""
+    """Rename a file unless the new name exists, in one step if the system can. ``os.rename`` would overwrite."""
     system, names = ctypes.CDLL(None, use_errno=True), (os.fsencode(path), os.fsencode(name))
     failed = errno.ENOSYS
     if hasattr(system, "renameat2"):

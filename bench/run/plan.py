@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 Identity = tuple[str, float, float, float]
-"""Completed parameters as JSON, samples, repeats and seed: the identity of a cell apart from the code that computes it."""
+"""The identity of a cell apart from its code: completed parameters as JSON, samples, repeats and seed."""
 
 
 @dataclass(frozen=True)
@@ -116,9 +116,11 @@ def expected_seconds(runs: Sequence[Planned], rows: pd.DataFrame) -> float:
         return math.nan
     rate = history["wall_s"] / (history["samples"] * history["repeats"])
     similar = rate.groupby([history["backend"].str.partition("[")[0], history["estimator"]]).median().to_dict()
-    typical = float(rate.median())
-    names = [(item.cell, item.cell.parts.get("estimator")) for item in runs]
-    return sum(similar.get((c.backend.name, e.name if e else ""), typical) * c.samples * c.repeats for c, e in names)
+    typical = rate.median()
+    estimators = [item.cell.parts.get("estimator") for item in runs]
+    names = [(item.cell.backend.name, e.name if e else "") for item, e in zip(runs, estimators, strict=True)]
+    sizes = [item.cell.samples * item.cell.repeats for item in runs]
+    return float(sum(similar.get(name, typical) * size for name, size in zip(names, sizes, strict=True)))
 
 
 def versions(backend: Backend) -> str:

@@ -309,7 +309,7 @@ class Pool:
         return worker
 
     def _collect(self, worker: _Worker, waiting: deque[deque[Any]]) -> list[Answer]:
-        """Return a worker's new answers; one that has died or exceeds a limit is removed, and its items are reassigned."""
+        """Return a worker's new answers. A worker that has died or exceeds a limit is removed and its items reassigned."""
         answers = worker.receive()
         end = self._check(worker)
         if end is None:

@@ -1,7 +1,7 @@
-"""Kills the processes that a run has started once the run has ended, for any reason: a process that does nothing else.
+"""A process that kills the processes a run has started once the run has ended, for any reason.
 
-A worker cannot do this itself: a plugin may hold the interpreter lock, or the worker may be stopped. On Linux the kernel
-kills the workers of a run that has ended, but not the processes that they have started.
+A worker cannot do this itself: a plugin may hold the interpreter lock, or the worker may be stopped. On Linux the
+kernel kills the workers of a run that has ended, but not the processes that they have started.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Reference gradients on disk: each is computed once, beside the experiments, and shared by all cells that need it."""
+"""Reference gradients: each is computed once, stored beside the experiments, and shared by all cells that need it."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class References:
 
     def __init__(self, experiment: Experiment, problems: Problems) -> None:
         self._problems = problems
-        # absolute: a plugin at work may leave the working folder
+        # absolute, since a plugin may change the working folder
         self._directory = experiment.results_dir.absolute() / "references"
         self._budget = experiment.reference
-        self._known: dict[str, Reference] = {}
+        self._references: dict[str, Reference] = {}
 
     def stored(self, cell: Cell) -> bool:
         """Return whether the reference of the cell's program is on disk."""
@@ -36,64 +36,63 @@ class References:
     def of(self, cell: Cell) -> Reference:
         """Return the reference of the cell's program, from the best backend that can run it."""
         key = cell.reference_key
-        if key not in self._known:
+        if key not in self._references:
             result = load(self._path(cell))
             if result is None:
-                result = self._certified(cell)
+                result = self._compute(cell)
                 save(result, self._path(cell))
-            self._known[key] = result
-        return self._known[key]
+            self._references[key] = result
+        return self._references[key]
 
-    def _certified(self, cell: Cell) -> Reference:
-        """Compute the reference on the first backend that can; raises the first one's error where none can.
+    def _compute(self, cell: Cell) -> Reference:
+        """Compute the reference on the first backend that can; raises the error of the first backend if none can.
 
-        A backend may accept a program and fail at it, at a branch on a traced value for example.
+        A backend may accept a program and then fail to run it, at a branch on a traced value for example. Then the next
+        one is used.
         """
         failed: list[tuple[str, Exception]] = []
-        budget = self._budget.samples, self._budget.tolerance
         for backend in {fingerprint(b): b for b in cell.reference_backends}.values():
             try:
-                result = self._of_backend(backend, cell, *budget)
+                result = self._compute_on(backend, cell)
             except Exception as error:
                 failed.append((backend.name, error))
                 continue
             if not failed:
                 return result
-            said = ", ".join(f"{name} ({type(error).__name__})" for name, error in failed)
-            note = f"the reference is from {backend.name}, after a failure of {said}"
+            failures = ", ".join(f"{name} ({type(error).__name__})" for name, error in failed)
+            note = f"the reference is from {backend.name}, after a failure of {failures}"
             return replace(result, note="; ".join(part for part in (note, result.note) if part))
         raise failed[0][1]
 
-    def _of_backend(self, backend: Backend, cell: Cell, samples: int, tolerance: float) -> Reference:
-        """Compute the reference on one backend: of J_sigma, or of the smoothing that the estimator asks for."""
-        asked = cell.smoothing()
-        if asked is None:
+    def _compute_on(self, backend: Backend, cell: Cell) -> Reference:
+        """Compute the reference on one backend: of J_sigma, or of the smoothed objective that the estimator needs."""
+        budget, smoothing = (self._budget.samples, self._budget.tolerance), cell.smoothing()
+        if smoothing is None:
             problem = self._problems.of(backend, cell)
-            return reference.certify(problem, backend.provides, samples, tolerance, self._stood_for(cell))
-        if asked.shape == "ball":
+            return reference.certify(problem, backend.provides, *budget, self._physical_gradient(cell))
+        if smoothing.shape == "ball":
             problem = self._problems.of(backend, cell)
-            return smoothed.over_ball(problem, backend.provides, asked.radius, samples, tolerance)
-        wider = backend.compile(smoothed.widened(cell.program(), asked.radius))
-        found = reference.certify(wider, backend.provides, samples, tolerance)
-        return replace(found, method=f"gaussian[radius={asked.radius:g}],{found.method}")
+            return smoothed.over_ball(problem, backend.provides, smoothing.radius, *budget)
+        widened = backend.compile(smoothed.widened(cell.program(), smoothing.radius))
+        result = reference.certify(widened, backend.provides, *budget)
+        return replace(result, method=f"gaussian[radius={smoothing.radius:g}],{result.method}")
 
     def _path(self, cell: Cell) -> Path:
         return self._directory / f"{cell.reference_key}.parquet"
 
-    def _stood_for(self, cell: Cell) -> np.ndarray | None:
-        """Return the gradient that the program's own, at w = 0, approximates: the physics', if the scene knows it.
+    def _physical_gradient(self, cell: Cell) -> np.ndarray | None:
+        """Return the exact gradient at w = 0 that the program's gradient approximates, if the scene knows it.
 
-        For a backend with physics of its own and a scene that does not know the physics' gradient, it is that of the
-        scene's own program.
+        If it does not, and the cell's backend has physics of its own, return the gradient of the scene's own program.
         """
         program = cell.program()
         physical = program.physical_gradient()
         if physical is None and "physics" in cell.backend.provides:
             for backend in cell.ranked_backends:
                 if "grad" in backend.provides:
-                    still = np.zeros((program.n_noise, 1))
-                    with suppress(Exception):  # a backend that fails at the program gives way to the next
-                        return self._problems.of(backend, cell).grad(program.theta0, still)[:, 0]
+                    no_noise = np.zeros((program.n_noise, 1))
+                    with suppress(Exception):  # if a backend cannot run the program, the next one is used
+                        return self._problems.of(backend, cell).grad(program.theta0, no_noise)[:, 0]
         return physical
 
 
@@ -101,12 +100,12 @@ def save(reference: Reference, path: Path) -> None:
     """Store a reference as Parquet."""
     import pandas as pd
 
-    lines = [("batch", row) for row in reference.batches]
-    lines += [
+    rows = [("batch", row) for row in reference.batches]
+    rows += [
         (name, value) for name, value in (("plain", reference.plain), ("physical", reference.physical)) if value.size
     ]
     table = pd.DataFrame(
-        {"part": [name for name, _ in lines], "gradient": [list(row) for _, row in lines],
+        {"part": [name for name, _ in rows], "gradient": [list(row) for _, row in rows],
          "method": reference.method, "error": reference.error, "note": reference.note}
     )  # fmt: skip
     buffer = io.BytesIO()
@@ -125,7 +124,7 @@ def load(path: Path) -> Reference | None:
         table = pd.read_parquet(path)
         rows = {name: np.stack(list(part)) for name, part in table.groupby("part")["gradient"]}
         vectors = {name: rows[name][0] for name in ("plain", "physical") if name in rows}
-        words = str(table["method"][0]), float(table["error"][0])
-        return Reference(rows["batch"], *words, **vectors, note=str(table["note"][0]))
+        method, error = str(table["method"][0]), float(table["error"][0])
+        return Reference(rows["batch"], method, error, **vectors, note=str(table["note"][0]))
     except Exception:
         return None

@@ -31,8 +31,8 @@ def run(
 ) -> None:
     """Run the missing cells and store their rows.
 
-    ``on_finished`` is called with every cell and row that was stored, and ``on_progress`` now and then with the names of
-    the tasks being worked on. Raises :class:`Stopped` after a failed cell if the experiment has ``on_error=stop``.
+    ``on_finished`` is called with every cell and row that was stored, and ``on_progress`` now and then with the names
+    of the tasks being worked on. Raises :class:`Stopped` after a failed cell if the experiment has ``on_error=stop``.
     """
     store.prepare()
     _Run(experiment, store, on_finished, on_progress).run_all(planned)

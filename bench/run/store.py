@@ -1,7 +1,7 @@
 """Stores rows on disk.
 
-Rows that finish together are one small JSON file under ``pending/``. At the end of a run the small files are folded into
-``rows.parquet``. Every file is written completely under a unique name and then renamed into place, and is deleted only
+Rows that finish together are one small JSON file under ``pending/``. At the end of a run the small files are folded
+into ``rows.parquet``. Every file is written completely under a unique name and then renamed into place, and is deleted only
 by a run that has read it and written its rows into another file. So nothing is locked, a run can be killed at any
 moment, and several can write to one directory: the stored rows are the union of all files, the newest row of each key.
 The newest row is the one with the largest ``sequence``, a count that only grows. Clocks may be wrong on one of several
@@ -258,8 +258,8 @@ def _was_removed(error: OSError, folder: Path) -> bool:
 def _is_complete(before: Mapping[Path, FileId], after: Mapping[Path, FileId]) -> bool:
     """Return whether the files listed before reading contained all rows, given the files listed after reading.
 
-    A listing is not a snapshot: rows that were folded meanwhile may be missed in the small files and in the table. In that
-    case a file has gone, or there is a new table. Small files that are new contain rows stored since.
+    A listing is not a snapshot: rows that were folded meanwhile may be missed in the small files and in the table. In
+    that case a file has gone, or there is a new table. Small files that are new contain rows stored since.
     """
     added = after.keys() - before.keys()
     return before.items() <= after.items() and not any(path.suffix == ".parquet" for path in added)
@@ -294,7 +294,7 @@ def _read_files(paths: Iterable[Path]) -> Iterator[tuple[Path, pd.DataFrame]]:
     for path in paths:
         try:
             if path.suffix == ".parquet":
-                # opened once: pandas opens a path twice, for the schema and the pages, and it may be replaced in between
+                # read once: pandas opens a path twice, and the file may be replaced in between
                 yield path, pd.read_parquet(io.BytesIO(path.read_bytes()))
             else:
                 rows.extend(_rows_in(json.loads(path.read_text())))

@@ -16,7 +16,7 @@ from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import cells
-from bench.experiment.reference_backends import linearising_backends
+from bench.experiment.reference_backends import backends_with_jacobians
 from bench.measure import noise
 from bench.measure.contacts import split
 from bench.model import EngineScene, Jacobians, LoopOps, MechanicalScene, Problem, Program, Unsupported, rollout
@@ -107,7 +107,7 @@ def _of_cell(session: Session, cell: Cell, seeded: bool) -> Trace:
 
 def _cannot(cell: Cell, program: Program, reason: str) -> UserError:
     """Return why a cell cannot be traced, and the backends that can trace its program."""
-    able = sorted(name for name in linearising_backends(program) if name != cell.backend.name)
+    able = sorted(name for name in backends_with_jacobians(program) if name != cell.backend.name)
     hint = f"; use backends=[{'] or backends=['.join(able)}]" if able else ""
     return UserError(f"{cell.scene.name} on backend {cell.backend.name} cannot be traced: {reason}{hint}")
 

@@ -82,7 +82,7 @@ def test_a_reason_is_one_line_of_a_length_that_can_be_read():
     row = tasks.row_of(made, cell, {"status": "error", "reason": "\x1b[31m\0\n" + "x" * 3_000_000})
     assert len(row["reason"]) < 2100
     assert row["reason"].isprintable()
-    assert row["reason"].endswith("letters)")
+    assert row["reason"].endswith("characters)")
 
 
 @pytest.mark.parametrize("start", "=+-@")

@@ -1,4 +1,4 @@
-"""Backends that fail at a program give way to the next, and a scene may name those it runs on."""
+"""If a backend cannot run a program, the next one computes the reference; a scene may name its backends."""
 
 import numpy as np
 import pytest

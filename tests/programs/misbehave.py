@@ -61,10 +61,6 @@ HARMLESS = {
     "catches_signals": "signal.signal(signal.SIGTERM, signal.SIG_IGN) if threading.current_thread() is threading.main_thread() else None",
 }
 """Bad manners after which the numbers may be right: ``ok`` is a row of its own."""
-WRITES = {
-    "writes_to_descriptors": "[os.write(d, b'garbage' * 99) for d in range(3, 64) if os.path.exists(f'/dev/fd/{d}')]"
-}
-"""Breaks the worker's messages; at import and when a run is planned it may do no harm."""
 LIES = {
     "lies_in_shape": "np.vstack([value, value])",
     "lies_in_length": "value[..., :-1]",
@@ -92,9 +88,9 @@ DECLARES = {
 }
 """Declarations that nothing can be done with: each is listed with its reason."""
 KINDS = {
-    "estimators": ("fobg", "Fobg", "scenes=[quadratic] backends=[numpy]", "estimators=[fobg{}]", ("terms", "estimate"), ("refuses",)),
+    "estimators": ("fobg", "Fobg", "scenes=[quadratic] backends=[numpy]", "estimators=[fobg{}]", ("terms", "estimate"), ("unsupported_reason",)),
     "scenes": ("quadratic", "Quadratic", "estimators=[fobg,reinforce] backends=[numpy]", "scenes=[quadratic{}]", ("cost",), ("theta0", "closed_form_gradient", "breakpoints")),
-    "backends": ("numpy", "Numpy", "scenes=[quadratic] estimators=[fobg]", "backends=[numpy{}]", ("compile",), ("refuses",)),
+    "backends": ("numpy", "Numpy", "scenes=[quadratic] estimators=[fobg]", "backends=[numpy{}]", ("compile",), ("unsupported_reason",)),
     "contacts": ("penalty", "Penalty", "scenes=[bounce_once] backends=[numpy] estimators=[fobg] integrators=[semi_implicit_euler]", "contacts=[penalty{}]", ("force",), ("spring",)),
     "integrators": ("semi_implicit_euler", "SemiImplicitEuler", "scenes=[mass_spring] backends=[numpy] estimators=[fobg]", "integrators=[semi_implicit_euler{}]", ("step",), ("transition",)),
 }  # fmt: skip
@@ -121,13 +117,13 @@ class Case:
     @property
     def harmful(self) -> bool:
         """Whether no row of it can be ``ok``."""
-        return self.fault not in HARMLESS | WRITES | LIES
+        return self.fault not in HARMLESS | LIES
 
     def text(self) -> str:
         """Its file."""
         module, base, *_ = KINDS[self.kind]
         lines = [HEAD, f"from bench.plugins.{self.kind}.{module} import {base}"]
-        act = (ENDS | RAISES | HARMLESS | WRITES).get(self.fault, "pass")
+        act = (ENDS | RAISES | HARMLESS).get(self.fault, "pass")
         lines += ["def fault():", f"    {act}", "def lie(value):", f"    return {LIES.get(self.fault, 'value')}"]
         lines += ["fault()"] if self.place == "import" else []
         lines += [
@@ -149,7 +145,7 @@ def bank() -> list[Case]:
     """Return every case there is."""
     cases = []
     for kind, (*_, work, planned) in KINDS.items():
-        loud = ENDS | RAISES | HARMLESS | WRITES
+        loud = ENDS | RAISES | HARMLESS
         cases += [Case(kind, "declared", fault) for fault in DECLARES]
         cases += [Case(kind, place, fault) for place in ("import", "construction", *work, *planned) for fault in loud]
         cases += [Case(kind, place, fault) for place in (*work, *planned) for fault in LIES]

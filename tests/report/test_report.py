@@ -486,7 +486,7 @@ def test_columns_and_rows_of_the_papers_table_can_be_chosen(tmp_path, capsys):
     for word, said in (
         ("table.columns=sigmas", "did you mean 'sigma'"),
         ("columns=sigmas", "did you mean 'sigma'"),
-        ("table.rows=[backend]", "must hold estimator"),
+        ("table.rows=[backend]", "must contain estimator"),
         ("table.row=[estimator]", "table.row"),
     ):
         assert main(["plan", *words, word]) == 2

@@ -1,5 +1,6 @@
 """The same tasks, the same rows: on this machine, on a Ray cluster that loses a node, and as jobs of Slurm."""
 
+import ast
 import importlib.util
 import os
 import subprocess
@@ -94,6 +95,17 @@ def test_a_launcher_whose_library_is_absent_says_how_to_get_it(tmp_path, capsys,
     words = [*WORDS, "estimators=[fobg]", f"launcher={launcher}", f"results_dir={tmp_path}"]
     assert main(words) == 2
     assert f"pip install 'diffsim-bench[{launcher}]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("package", ["run", "run/launchers", "experiment", "plugins"])
+def test_no_module_imports_the_package_that_gathers_it(package):
+    folder = Path(config.__file__).parents[1] / package
+    name = f"bench.{package.replace('/', '.')}"
+    names = {path.stem for path in folder.glob("*.py")} | {path.name for path in folder.iterdir() if path.is_dir()}
+    for path in folder.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if path.name != "__init__.py" and isinstance(node, ast.ImportFrom) and node.module == name:
+                assert {alias.name for alias in node.names} <= names, f"{path.name} imports from {name}"
 
 
 def test_groups_are_cut_only_as_far_as_all_slots_get_a_part():

@@ -441,9 +441,9 @@ class Moves(Numpy):
     name = "moves"
     def __post_init__(self):
         os.fork()
-    def refuses(self, *given):
+    def unsupported_reason(self, *given):
         os.chdir({elsewhere!r})
-        return super().refuses(*given)
+        return super().unsupported_reason(*given)
 """
 
 

@@ -48,7 +48,8 @@ class RayLauncher:
             import ray
         except ImportError as error:
             raise unavailable("ray", error) from None
-        self._ray, self._experiment, self._timed, self._kind = ray, experiment, timed, kind
+        self._ray: Any = ray
+        self._experiment, self._timed, self._kind = experiment, timed, kind
         self._settings = experiment.execution.cluster
         self._jobs: list[_SentJob] = []
         self._losses = Losses(MAX_LOSSES)

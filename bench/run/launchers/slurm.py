@@ -41,7 +41,7 @@ def import_submitit() -> Any:
 
 
 class SlurmLauncher:
-    """Runs jobs through submitit; timed jobs run one after another, each on a whole node, all on one kind of machine."""
+    """Runs jobs through submitit. Timed jobs run one after another, on whole nodes of one kind."""
 
     def __init__(self, experiment: Experiment, timed: bool, kind: str) -> None:
         try:
