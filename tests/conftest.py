@@ -50,8 +50,8 @@ def backend(request):
 
 
 @pytest.fixture(autouse=True)
-def no_plugin_trial(monkeypatch):
-    """Import plugin files without a trial in another process. Tests of the trial replace this fixture."""
+def untried(monkeypatch):
+    """Plugin files are imported without a trial in a process of their own; tests of the trial replace this fixture."""
     monkeypatch.setattr(trial, "fatal", lambda *_: {})
 
 

@@ -408,7 +408,7 @@ def test_page_has_text_tables_and_charts(tmp_path):
     assert {"report.html", "report.txt", "derivatives.csv", "steps.png", "lines.png", "sigmas.png"} <= names
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("data:image/png;base64") == 3
-    assert "RIGHT" in page
+    assert "RIGHT: the gradient is the derivative of its cost" in page
     assert '<span class="said">not checked: thetas far from this one</span>' in page  # a sentence wraps,
     assert "\n  theta[0] " in page  # and a row keeps its columns
 

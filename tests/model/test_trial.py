@@ -27,7 +27,7 @@ ODD = "from bench.model import SampleMean\nclass Odd(SampleMean):\n    name = 'o
 
 
 @pytest.fixture(autouse=True)
-def no_plugin_trial():
+def untried():
     """Here files are tried."""
 
 
