@@ -1,4 +1,4 @@
-"""Chromium without a window, driven over its debugging protocol: what a page shows, says and does."""
+"""Drives headless Chromium over its debugging protocol, to test the pages."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 
 
 class Page:
-    """One page, opened from disk with the network cut off."""
+    """A page opened from disk without a network."""
 
     def __init__(self, socket: Any) -> None:
         self._socket = socket
         self._count = 0
         self.said: list[str] = []
-        """Errors and warnings of the page: console, exceptions, what the browser itself logs."""
+        """Errors and warnings: from the console, exceptions and the browser's own log."""
         self.requests: list[str] = []
-        """Addresses beyond the page's own file and its data."""
+        """Addresses the page requested from outside its own file."""
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.send(f"{domain}.enable")
         offline = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
         self.send("Network.emulateNetworkConditions", **offline)
 
     def send(self, method: str, **params: Any) -> Any:
-        """The result of one command."""
+        """Send a command of the protocol and return its result."""
         self._count += 1
         self._socket.send(json.dumps({"id": self._count, "method": method, "params": params}))
         while True:
@@ -43,42 +43,42 @@ class Page:
             self._hear(message)
 
     def _hear(self, message: dict[str, Any]) -> None:
-        told = message.get("params", {})
+        params = message.get("params", {})
         if message.get("method") == "Runtime.exceptionThrown":
-            self.said.append(json.dumps(told["exceptionDetails"]))
-        if message.get("method") == "Runtime.consoleAPICalled" and told["type"] in ("error", "warning", "assert"):
-            self.said.append(json.dumps(told["args"]))
-        if message.get("method") == "Log.entryAdded" and told["entry"]["level"] in ("error", "warning"):
-            self.said.append(told["entry"]["text"])
+            self.said.append(json.dumps(params["exceptionDetails"]))
+        if message.get("method") == "Runtime.consoleAPICalled" and params["type"] in ("error", "warning", "assert"):
+            self.said.append(json.dumps(params["args"]))
+        if message.get("method") == "Log.entryAdded" and params["entry"]["level"] in ("error", "warning"):
+            self.said.append(params["entry"]["text"])
         if message.get("method") == "Network.requestWillBeSent":
-            address = told["request"]["url"]
+            address = params["request"]["url"]
             if not address.startswith(("file:", "data:", "blob:")):
                 self.requests.append(address)
 
     def do(self, script: str) -> Any:
-        """The value of an expression in the page, awaited."""
-        found = self.send("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
-        assert "exceptionDetails" not in found, found["exceptionDetails"]
-        return found["result"].get("value")
+        """Evaluate a JavaScript expression in the page, await it, and return its value."""
+        answer = self.send("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
 
     def wait(self, condition: str, seconds: float = 60.0) -> Any:
-        """The value of a condition as soon as it holds."""
+        """Wait until a JavaScript condition holds, and return its value."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            found = self.do(condition)
-            if found:
-                return found
+            value = self.do(condition)
+            if value:
+                return value
             time.sleep(0.05)
-        raise AssertionError(f"not within {seconds} s: {condition}; the page said {self.said}")
+        raise AssertionError(f"not within {seconds} s: {condition}; messages of the page: {self.said}")
 
     def open(self, path: Path) -> None:
-        """Show a file and wait until its charts in sight are drawn."""
+        """Open a file and wait until its visible charts are drawn."""
         self.said.clear()
         self.send("Page.navigate", url=path.resolve().as_uri())
         self.wait("document.readyState === 'complete' && document.documentElement.dataset.loaded")
 
     def size(self, width: int, height: int, dark: bool = False) -> None:
-        """Size of the window, and whether the reader's system is dark."""
+        """Set the size of the window in pixels, and whether the system prefers a dark theme."""
         self.send(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
         )
@@ -86,26 +86,26 @@ class Page:
         self.send("Emulation.setEmulatedMedia", features=features)
 
     def press(self, key: str) -> None:
-        """One key."""
+        """Press and release a key."""
         codes = {"Tab": 9, "Enter": 13, "Escape": 27, "ArrowDown": 40, "ArrowUp": 38}
         text = {"text": "\r"} if key == "Enter" else {}
         for kind in ("keyDown", "keyUp"):
             self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=codes[key], **text)
 
     def click(self, x: float, y: float) -> None:
-        """The left button at a place of the window."""
+        """Click the left button at a position in the window, in pixels."""
         self.send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
         for kind in ("mousePressed", "mouseReleased"):
             self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     def picture(self, path: Path) -> None:
-        """The window as PNG."""
+        """Write a screenshot of the window as PNG."""
         path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))
 
 
 @contextmanager
 def chromium(profile: Path) -> Iterator[Page]:
-    """A page in a browser with an empty profile of its own."""
+    """Start a browser with an empty profile and yield its page."""
     from websockets.sync.client import connect
 
     assert CHROMIUM is not None
@@ -133,14 +133,14 @@ def chromium(profile: Path) -> Iterator[Page]:
 
 
 def _address(profile: Path) -> str:
-    """Where the browser's first page listens."""
+    """Return the WebSocket address of the browser's first page."""
     from urllib.request import ProxyHandler, build_opener
 
     end = time.monotonic() + 60
-    said = profile / "DevToolsActivePort"
+    port_file = profile / "DevToolsActivePort"
     while time.monotonic() < end:
-        if said.exists() and len(said.read_text().splitlines()) == 2:
-            port = said.read_text().splitlines()[0]
+        if port_file.exists() and len(port_file.read_text().splitlines()) == 2:
+            port = port_file.read_text().splitlines()[0]
             with build_opener(ProxyHandler({})).open(f"http://127.0.0.1:{port}/json/list", timeout=20) as answer:
                 pages = [page for page in json.load(answer) if page["type"] == "page"]
             if pages:

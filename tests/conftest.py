@@ -1,4 +1,4 @@
-"""What every test stands on: quick compilation, and the registered backends as a fixture."""
+"""Settings and fixtures of all tests: quick compilation, and the registered backends."""
 
 import os
 
@@ -23,13 +23,13 @@ def pytest_configure(config):
 
 
 LONG = {"fused"}
-"""Backends that compile each program for seconds, whatever its size."""
+"""Backends that take seconds to compile any program."""
 BACKENDS = [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in registry.entries()["backends"]]
 
 
 @pytest.fixture(params=BACKENDS)
 def backend(request):
-    """Each registered backend that can run a scene's own program, with its default parameters.
+    """Return a backend with its default parameters, for each registered one that can run a scene's own program.
 
     A test marked ``needs("root")`` is skipped on backends that provide no root finder; one marked ``needs("physics")`` runs
     on physics engines, which step a model of their own.
@@ -56,8 +56,8 @@ def untried(monkeypatch):
 
 
 @pytest.fixture(autouse=True)
-def forgotten_folders():
-    """Plugin folders that a test has added are gone after it, and with them their plugins."""
+def remove_plugin_folders():
+    """Remove the plugin folders that a test added, with their plugins."""
     before = registry.folders()
     yield
     if registry.folders() != before:

@@ -1,4 +1,4 @@
-"""Rows as a run makes them, without running anything: from real cells, or made up of columns."""
+"""Result rows for tests of reports, without a run: of real cells, or made up from columns."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ SPEED = {"jax": 2e-4, "torch": 8e-3, "numpy": 3e-3, "implicit": 6e-4}
 VIEWS = {"scene": ("horizon", "dt", "sigma", "noise"), "contact": ("stiffness",), "backend": ("dtype",)}
 """The columns that show a parameter of the plugin on an axis."""
 WHO = (*IDENTITY, "experiment", "dim", "key", "study", "parameters")
-"""The columns that a failed cell has as well."""
+"""The columns that rows of failed cells have too."""
 
 
 # ------------------------------------------------------------------------------------------------ made-up results
 
 
 def results(stiffness: float, sigma: float, samples: int, repeats: int, seed: int, estimator: str, backend: str, contact: str) -> dict[str, Any]:  # fmt: skip
-    """Results of one cell: first-order estimates turn biased and wild where contact is stiff, others do not."""
+    """Return made-up results of a cell: stiff contact makes first-order estimates biased and noisy, and no others."""
     k, n = stiffness, samples
     stiff = max(k, 1.0) / 3e3 if math.isfinite(k) else 0.1
     first = estimator in ("fobg", "alpha_order", "inverse_variance")
@@ -70,13 +70,13 @@ def results(stiffness: float, sigma: float, samples: int, repeats: int, seed: in
 
 
 def loaded(*words: str) -> tuple[Experiment, list[Cell]]:
-    """An experiment and its cells."""
+    """Return the experiment of a command line, and its cells."""
     made = config.load(list(words))
     return made, cells(made)
 
 
 def rows_of(made: Experiment, of: Sequence[Cell]) -> pd.DataFrame:
-    """Rows of real cells with made-up results; a cell that would be refused is refused."""
+    """Return rows of real cells with made-up results. Cells that a run would refuse have its status and reason."""
     rows = []
     for cell in of:
         row = blank_row(made, cell)
@@ -95,7 +95,7 @@ def rows_of(made: Experiment, of: Sequence[Cell]) -> pd.DataFrame:
 
 
 def row(**values: Any) -> dict[str, Any]:
-    """A row with these columns and, in ``parameters``, what they say; plugins need not exist."""
+    """Return a row with these columns and the ``parameters`` they imply. Its plugins need not exist."""
     given = {
         "scene": "pushing", "contact": "penalty", "integrator": "semi_implicit_euler", "backend": "jax",
         "estimator": "fobg", "noise": "action", "horizon": 20, "dt": 0.01, "stiffness": 1e3, "sigma": 0.1,
@@ -111,13 +111,13 @@ def row(**values: Any) -> dict[str, Any]:
 
 
 def failed(status: str, reason: str, **values: Any) -> dict[str, Any]:
-    """A row without results."""
+    """Return a row of a failed cell, without results."""
     made, empty = row(**values), COLUMNS.blank()
     return {name: made[name] if name in WHO else empty[name] for name in made} | {"status": status, "reason": reason}
 
 
 def described_by(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters that a cell with these identity columns would have."""
+    """Return the parameters of a cell with these identity columns."""
     parts: dict[str, Any] = {"study": {"name": "bias_variance", "timed_calls": 5}}
     for axis in BiasVariance.axes:
         name, own = _parsed(axis, given)
@@ -134,7 +134,7 @@ def described_by(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _parsed(axis: str, given: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Name and parameters of an identity string; a made-up one is a name, whatever brackets it has."""
+    """Return name and parameters of an identity string. An identity of no registered plugin is a name as a whole."""
     params = given["estimator_params"] if axis == "estimator" else ""
     try:
         name, own = parse_identity(f"{given[axis]}[{params}]" if params else given[axis])
@@ -148,7 +148,7 @@ def _plain(value: Any) -> Any:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Rows as they are loaded."""
+    """Return a table of rows, as loading a store does."""
     return COLUMNS.typed(pd.DataFrame(rows))
 
 
@@ -158,7 +158,7 @@ def stiffness_rows(
     estimators: Sequence[str] = NAMES,
     backends: Sequence[str] = BACKENDS,
 ) -> pd.DataFrame:
-    """4 backends x 6 estimators x 2 contact laws x 7 stiffnesses x 2 sigmas."""
+    """Return made-up rows of 4 backends, 6 estimators, 2 contact laws, 7 stiffnesses and 2 sigmas, or as given."""
     rows = []
     for sigma, k, contact, backend, estimator in itertools.product(
         sigmas, stiffness, ("penalty", "complementarity"), backends, estimators
@@ -179,7 +179,7 @@ def stiffness_rows(
 
 
 def small_rows(**given: Any) -> pd.DataFrame:
-    """Two stiffnesses at one sigma."""
+    """Return made-up rows of two stiffnesses at one sigma."""
     return stiffness_rows(**{"stiffness": (1e2, 1e4), "sigmas": (0.1,), **given})
 
 
@@ -191,7 +191,7 @@ def experiment(
     formats: tuple[str, ...] = ("png",),
     table: TableLayout | None = None,
 ) -> Experiment:
-    """An experiment to show made-up rows of: a sweep and nothing that could be run."""
+    """Return an experiment for reports of made-up rows; it cannot be run."""
     return Experiment(
         name=name,
         study=BiasVariance(),

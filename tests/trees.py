@@ -1,4 +1,4 @@
-"""A copy of the code that plugins can be added to and files edited in."""
+"""A copy of the code, in which tests add plugins and edit files, and commands that run in it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 class Tree:
-    """A copy of the code that plugins can be added to, and commands run in."""
+    """A copy of the code, in which tests add plugins, edit files and run commands."""
 
     def __init__(self, root: Path) -> None:
         self.root, self.packages = root / "tree", root / "site"
@@ -21,11 +21,11 @@ class Tree:
         self.packages.mkdir()
 
     def add(self, path: str, text: str) -> None:
-        """A file in the tree."""
+        """Write a file of the copy, at a path relative to its root."""
         (self.root / path).write_text(text)
 
     def install(self, package: str, text: str, entry_points: str) -> None:
-        """What ``pip install`` does to a package of one module: its code, and metadata that names its entry points."""
+        """Install a package of one module as ``pip install`` does: its code, and metadata with its entry points."""
         (self.packages / f"{package}.py").write_text(text)
         information = self.packages / f"{package}-1.0.dist-info"
         information.mkdir()
@@ -33,14 +33,14 @@ class Tree:
         (information / "entry_points.txt").write_text(entry_points)
 
     def run(self, *words: str) -> subprocess.CompletedProcess[str]:
-        """``python -m bench`` with these words."""
+        """Run ``python -m bench`` with these arguments in the copy."""
         environment = {**os.environ, "PYTHONPATH": str(self.packages), "PYTHONDONTWRITEBYTECODE": "1"}
         return subprocess.run(
             [sys.executable, "-m", "bench", *words], cwd=self.root, env=environment, capture_output=True, text=True
         )
 
 
-HEARD = """
+DEFAULT_SIGNALS = """
 import os, signal, sys
 for name in ("SIGINT", "SIGTERM", "SIGHUP"):
     signal.signal(getattr(signal, name), signal.SIG_DFL)
@@ -49,8 +49,8 @@ os.execv(sys.argv[1], sys.argv[1:])
 
 
 def hearing_signals(*words: str) -> list[str]:
-    """``python -m bench`` with these words, as a command that hears signals.
+    """Return the command line of ``python -m bench`` with default signal handlers.
 
-    A shell ignores interrupts in its background jobs and nohup hang-ups, and what they start inherits that.
+    A shell ignores SIGINT in background jobs, nohup ignores SIGHUP, and their child processes inherit that.
     """
-    return [sys.executable, "-c", HEARD, sys.executable, "-m", "bench", *words]
+    return [sys.executable, "-c", DEFAULT_SIGNALS, sys.executable, "-m", "bench", *words]

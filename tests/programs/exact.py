@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 WHERE = ("stored_at", "sequence", "wall_s")
-"""Columns that say when a row was made, and differ between two runs."""
+"""Columns that record when and how fast a row was made, which differ between runs."""
 
 
 def bits(value: Any) -> Any:
@@ -31,12 +31,12 @@ def by_key(rows: pd.DataFrame, without: tuple[str, ...] = WHERE) -> dict[str, di
 
 def differences(rows: Mapping[str, Mapping[str, Any]], truth: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return where rows differ from the right ones, value by value; rows that are not there yet are no difference."""
-    found = []
+    lines = []
     for key, row in rows.items():
         right = truth.get(key)
         if right is None:
-            found.append(f"{key[:8]} is not among the right ones")
+            lines.append(f"{key[:8]} is not among the right ones")
         else:
             names = [name for name in {**right, **row} if right.get(name, "no column") != row.get(name, "no column")]
-            found += [f"{key[:8]} {name}: {right.get(name)!r} became {row.get(name)!r}" for name in names]
-    return found
+            lines += [f"{key[:8]} {name}: {right.get(name)!r} became {row.get(name)!r}" for name in names]
+    return lines

@@ -1,7 +1,7 @@
-"""Plants one-line faults in the core and reports which a test kills: `python tests/programs/mutants.py [words of file or fault]`.
+"""Plants one-line faults in the core and reports which of them a test notices: `python tests/programs/mutants.py [WORD ...]`.
 
-Each fault is planted in a copy of the tree, in a process forked after the libraries are loaded, and the tests named beside
-it run until one fails. Run by hand: it takes some minutes.
+Each fault whose file or text contains a word is planted in a copy of the tree, in a process forked after the libraries are
+loaded, and the tests named beside it run until one fails. Run by hand: all faults take half an hour.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 CPU, MEMORY = 40, 6 << 30
-"""Seconds and bytes that the tests of one fault may take."""
+"""CPU seconds and bytes that the tests of one fault may use."""
 ROOT = Path(__file__).resolve().parents[2]
 COPIED = ("bench", "plugins", "conf", "tests", "docs", "README.md", "CONTRIBUTING.md", "pyproject.toml")
 
 
 class Fault(NamedTuple):
-    """A text in a file, what it becomes, and the tests that should notice."""
+    """A source line, its faulty replacement, and the tests that should fail."""
 
     path: str
     old: str
@@ -323,7 +323,7 @@ its least number of points: the second level, before which it never stops, has t
 
 
 def killed(fault: Fault, folder: Path) -> bool:
-    """Plant the fault in the copy at ``folder`` and run its tests in a forked process; return whether one failed."""
+    """Plant the fault in the copy at ``folder``, run its tests in a forked process, and return whether one failed."""
     path = folder / fault.path
     text = path.read_text()
     if text.count(fault.old) != 1:
@@ -353,13 +353,13 @@ def killed(fault: Fault, folder: Path) -> bool:
 
 
 def stale(faults: list[Fault]) -> list[str]:
-    """Say which faults cannot be planted, as the code no longer holds their text exactly once."""
+    """Return a message per fault that cannot be planted, since the code does not contain its text exactly once."""
     held = {path: (ROOT / path).read_text() for path in {fault.path for fault in faults}}
     return [f"{f.path} does not hold exactly one: {f.old}" for f in faults if held[f.path].count(f.old) != 1]
 
 
 def main(words: list[str]) -> int:
-    """Run all faults whose text holds one of the words; return 1 if any survives."""
+    """Run the faults whose file or text contains one of the words, or all; return 1 if any survives."""
     chosen = [fault for fault in FAULTS if not words or any(word in f"{fault.path} {fault.old}" for word in words)]
     if lost := stale(chosen):
         raise SystemExit("\n".join(lost))
@@ -387,10 +387,11 @@ def main(words: list[str]) -> int:
                 raise SystemExit(f"{tests} fails without any fault: mend that first")
         for fault in chosen:
             started = time.perf_counter()
-            found = killed(fault, folder)
-            survivors += [] if found else [fault]
-            told = f"{fault.path}: {fault.old.strip()[:70]} -> {fault.new.strip()[:50]}"
-            print(f"{'killed  ' if found else 'SURVIVED'} {time.perf_counter() - started:5.1f}s  {told}", flush=True)
+            is_killed = killed(fault, folder)
+            survivors += [] if is_killed else [fault]
+            description = f"{fault.path}: {fault.old.strip()[:70]} -> {fault.new.strip()[:50]}"
+            verdict = "killed  " if is_killed else "SURVIVED"
+            print(f"{verdict} {time.perf_counter() - started:5.1f}s  {description}", flush=True)
     print(f"{len(chosen) - len(survivors)} of {len(chosen)} faults killed")
     return int(bool(survivors))
 

