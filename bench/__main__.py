@@ -1,6 +1,7 @@
 """``python -m bench``."""
 
-import atexit
+import contextlib
+import logging
 import os
 import sys
 import threading
@@ -11,22 +12,24 @@ from bench.model import guard
 
 
 def command() -> None:
-    """Run one command and end the process with its status, whatever plugins have left running in it."""
-    own = os.getpid()
+    """Run one command and end the process with its status, even if plugins have left threads or processes running."""
+    pid = os.getpid()
     try:
         status = main()
-    except Exception:  # a fault of this package: told in full, and the command ends all the same
+    except Exception:  # a bug of this package
         traceback.print_exc()
         status = 1
-    guard.exit_if_forked(own)
+    guard.exit_if_forked(pid)
     guard.kill_children()
-    if any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread()):
-        # a thread that a plugin left running must not keep the finished command waiting
-        atexit._run_exitfuncs()
-        for stream in (sys.stdout, sys.stderr):
+    if all(thread.daemon or thread is threading.main_thread() for thread in threading.enumerate()):
+        sys.exit(status)
+    # sys.exit would wait for the other threads, and a thread of a plugin may never end. This package needs no cleanup at
+    # exit: its files and temporary folders are closed when a command returns
+    logging.shutdown()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):  # a plugin may have closed or replaced it
             stream.flush()
-        os._exit(status)
-    sys.exit(status)
+    os._exit(status)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""The verbs of the command line: a thin layer over the Python face and the modules below it."""
+"""The commands of the command line: a thin layer over the modules below."""
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import os
 import re
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from bench.errors import INTERRUPTED, UserError, printable, unknown
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from bench.experiment.experiment import Experiment
+    from bench.model import registry
     from bench.run.execute import Finished
 
 SETTINGS = """\
@@ -35,17 +37,17 @@ STATUS = """\
 Exit status: 0 every cell has a row that is not 'error'; 1 some cell failed unexpectedly; 2 bad input.
 """
 EXAMINE = """\
-  theta=1,0            where: numbers, names with numbers (mass:1,gain:2), or a name in the file; by default theta
+  theta=1,0            the point: numbers, names with numbers (mass:1,gain:2), or a name in the file; by default theta
   grad=jax             jax, torch, or a function: a name in the file, or FILE:NAME; without it, differences alone
   sigma=0.003,0.05     standard deviations of noise on theta
   noise=200            the cost is cost(theta, w), with w of that many standard normal numbers
-  budget=60s           time for everything
-  batch=loop           how it takes several thetas: loop, vmap, columns (d, B) or rows (B, d); by default detected
-  scale=1,0.1          the size of each input; by default its own
+  budget=60s           time for the whole examination
+  batch=loop           batching of thetas: loop, vmap, columns (d, B) or rows (B, d); by default detected
+  scale=1,0.1          the typical size of each input; by default its value
   seed=0               of the random directions and noise
   save=DIR             write text, tables, charts and report.html there
   --quiet              no progress
-Exit status: 0 the gradient can be trusted; 1 something cannot; 2 bad input.
+Exit status: 0 the gradient can be trusted; 1 it cannot; 2 bad input.
 """
 QUIET, CONFIG_DIR = "--quiet", "--config-dir"
 
@@ -62,25 +64,25 @@ class Verb:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status."""
+    """Run one command. Returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with _stopped_by_signals():
+        with _stop_on_signals():
             return _dispatch(words)
     except UserError as error:
         print("bench:", printable(error), file=sys.stderr)
         return 2
     except BrokenPipeError:
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, the reader has gone; nothing may be written at exit
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, the reader is closed, and writing at exit would fail
         return 0
     except OSError as error:
         where = f"'{printable(error.filename)}': " if error.filename else ""
         print(f"bench: {where}{error.strerror or printable(error)}", file=sys.stderr)
         return 2
     except RuntimeError as error:
-        if "home directory" not in str(error):  # what pathlib says of ~ and ~name
+        if "home directory" not in str(error):  # the message of pathlib for ~ and ~name
             raise
-        print("bench: a folder begins with ~ and a name that no user of this machine has", file=sys.stderr)
+        print("bench: a folder starts with ~ and an unknown user name", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("\nbench: stopped", file=sys.stderr)
@@ -88,12 +90,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextmanager
-def _stopped_by_signals() -> Iterator[None]:
-    """Have SIGTERM and SIGHUP stop a command like Ctrl-C, and a second one of the three end it at once and in silence.
+def _stop_on_signals() -> Iterator[None]:
+    """Make SIGTERM and SIGHUP stop a command like Ctrl-C, and a second signal end it immediately without a message.
 
-    Nothing is lost then: finished rows are on disk, and workers end with their run. A signal that arrives in a finaliser
-    or a callback of the garbage collector, where Python prints an exception and goes on, says nothing: ``INTERRUPTED`` is
-    set, and the run stops after the cell.
+    Nothing is lost then: finished rows are on disk, and workers end with their run. In a finaliser or a callback of the
+    garbage collector, Python would print the exception and go on. There it stays silent, ``INTERRUPTED`` is set, and the
+    run stops after the cell.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -106,30 +108,30 @@ def _stopped_by_signals() -> Iterator[None]:
         INTERRUPTED.set()
         raise KeyboardInterrupt
 
-    def drop(lost: sys.UnraisableHookArgs, /) -> None:
-        if not (lost.exc_type is KeyboardInterrupt and INTERRUPTED.is_set()):
-            before_dropped(lost)
+    def hide_interrupt(unraisable: sys.UnraisableHookArgs, /) -> None:
+        if not (unraisable.exc_type is KeyboardInterrupt and INTERRUPTED.is_set()):
+            previous_hook(unraisable)
 
-    before_dropped = sys.unraisablehook
-    sys.unraisablehook = drop
-    before = {name: signal.getsignal(name) for name in names}
+    previous_hook = sys.unraisablehook
+    sys.unraisablehook = hide_interrupt
+    handlers = {name: signal.getsignal(name) for name in names}
     for name in names:
-        if before[name] not in (signal.SIG_IGN, None):  # as under nohup
+        if handlers[name] not in (signal.SIG_IGN, None):  # as under nohup
             signal.signal(name, stop)
     try:
         yield
     finally:
         INTERRUPTED.clear()
-        if sys.unraisablehook is drop:
-            sys.unraisablehook = before_dropped
-        for name, handler in before.items():
+        if sys.unraisablehook is hide_interrupt:
+            sys.unraisablehook = previous_hook
+        for name, handler in handlers.items():
             if signal.getsignal(name) is stop:
                 signal.signal(name, handler)
 
 
 def _dispatch(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help", "help"):
-        print(_overview(), end="")
+        _print_overview()
         return 0 if words else 2
     if words[0] in ("--version", "-V"):
         from bench import __version__
@@ -140,7 +142,7 @@ def _dispatch(words: list[str]) -> int:
     if "=" not in words[0] and not words[0].startswith("-"):
         verb = words.pop(0)
     if words[:1] in (["-m"], ["--multirun"]):
-        raise UserError("one run is one experiment, and its grid is expanded by bench itself: leave out --multirun")
+        raise UserError("one run is one experiment, and bench expands its grid: leave out --multirun")
     if verb not in VERBS:
         raise unknown("command", verb, VERBS)
     if any(word in ("-h", "--help") for word in words):
@@ -150,7 +152,7 @@ def _dispatch(words: list[str]) -> int:
     return VERBS[verb].call(words)
 
 
-def _overview() -> str:
+def _print_overview() -> None:
     from bench.experiment import config
 
     lines = [f"  python -m bench {verb.usage:<45} {verb.does}" for verb in VERBS.values()]
@@ -160,14 +162,14 @@ def _overview() -> str:
         f"Each takes --help.  Experiments: {', '.join(config.experiments())}\n{SETTINGS}",
         STATUS,
     ]
-    return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
+    print("\n\n".join(part.rstrip("\n") for part in parts))
 
 
 # ------------------------------------------------------------------------------------------------------ run
 
 
-def _loaded(words: Sequence[str], notes: bool = True) -> Experiment:
-    """Load the experiment that the words describe."""
+def _load(words: Sequence[str], notes: bool = True) -> Experiment:
+    """Load the experiment that the words describe. Prints notes about them on stderr if ``notes``."""
     from bench.experiment import config
 
     overrides, folders = [], []
@@ -188,12 +190,12 @@ def _loaded(words: Sequence[str], notes: bool = True) -> Experiment:
 
 
 def _run(words: list[str]) -> int:
-    finished = _executed(_loaded(words), words)
-    return finished if isinstance(finished, int) else _finished(finished, words)[0]
+    finished = _execute(_load(words), words)
+    return finished if isinstance(finished, int) else _finish(finished, words)[0]
 
 
-def _executed(experiment: Experiment, words: Sequence[str]) -> Finished | int:
-    """Return the finished run, or the exit status of one that ended early."""
+def _execute(experiment: Experiment, words: Sequence[str]) -> Finished | int:
+    """Run an experiment. Returns the finished run, or the exit status if it ended early."""
     from bench.experiment.grid import cells
     from bench.run import runner
     from bench.run.execute import execute, store_of
@@ -204,18 +206,18 @@ def _executed(experiment: Experiment, words: Sequence[str]) -> Finished | int:
         store = store_of(experiment)
         keys = {cell.key for cell in cells(experiment)}
         stored = int(store.load()["key"].isin(keys).sum())
-        interrupted = isinstance(end, KeyboardInterrupt)
-        why = "stopped" if interrupted else f"stopped after a failed cell ({printable(end)})"
+        is_interrupt = isinstance(end, KeyboardInterrupt)
+        why = "stopped" if is_interrupt else f"stopped after a failed cell ({printable(end)})"
         again = shlex.join(["python", "-m", "bench", *words])
         print(
-            f"\nbench: {why}; {stored} of {len(keys)} cells are stored in '{store.directory}', go on with: {again}",
+            f"\nbench: {why}; {stored} of {len(keys)} cells are stored in '{store.directory}'. Continue with: {again}",
             file=sys.stderr,
         )
-        return 130 if interrupted else 1
+        return 130 if is_interrupt else 1
 
 
-def _finished(finished: Finished, words: Sequence[str]) -> tuple[int, pd.DataFrame]:
-    """Return exit status and rows, after all files are written and then shown."""
+def _finish(finished: Finished, words: Sequence[str]) -> tuple[int, pd.DataFrame]:
+    """Write and show all files of a finished run. Returns the exit status and the rows."""
     from bench.report.finish import finish
 
     rows, paths = finish(finished, words)
@@ -240,7 +242,7 @@ def _print_written(paths: Sequence[Path]) -> None:
 def _report(words: list[str]) -> int:
     from bench.report.finish import report
 
-    experiment = _loaded(words, notes=False)
+    experiment = _load(words, notes=False)
     return _show(experiment, *report(experiment))
 
 
@@ -248,7 +250,7 @@ def _plan(words: list[str]) -> int:
     from bench.run import plan, progress
     from bench.run.execute import store_of
 
-    experiment = _loaded(words)
+    experiment = _load(words)
     store = store_of(experiment)
     progress.print_plan(experiment, plan.plan(experiment, store), store.load())
     if experiment.execution.launcher == "slurm":
@@ -262,40 +264,36 @@ def _plan(words: list[str]) -> int:
 
 
 def _list(words: list[str]) -> int:
-    """List plugins of the given kinds or names."""
+    """List the plugins of the given kinds or names, or all."""
+    from bench.experiment.words import parse_words
     from bench.model import registry
     from bench.model.identity import text_of
     from bench.model.parameters import parameters, singular
 
-    folders = [word.partition("=")[2] for word in words if word.startswith("plugins=")]
-    words = [word for word in words if not word.startswith("plugins=")]
-    for folder in folders:
-        registry.add_folder(Path(folder))
+    names, _, _ = parse_words(words, "list", {})
     table = registry.entries()
     kinds = {name: kind for kind in table for name in (kind, singular(kind))}
-    names = {name for entries in table.values() for name in entries}
-    for word in words:
-        if word not in names and word not in kinds:
-            raise unknown("plugin or kind", word, {*names, *table})
-    wanted = {kinds[word] for word in words if word in kinds}
+    plugins = {name for entries in table.values() for name in entries}
+    for name in names:
+        if name not in plugins and name not in kinds:
+            raise unknown("plugin or kind", name, {*plugins, *table})
+    selected_kinds = {kinds[name] for name in names if name in kinds}
     for kind, entries in table.items():
-        listed = {name: e for name, e in entries.items() if not words or kind in wanted or name in words}
+        listed = {name: e for name, e in entries.items() if not names or kind in selected_kinds or name in names}
         if listed:
             print(f"\n{printable(kind)}")
         for name, entry in sorted(listed.items()):
-            print(f"  {printable(name):<22}{printable(_facts(entry))}")
-            if entry.plugin is None:
-                continue
-            for parameter in parameters(entry.plugin).values():
+            print(f"  {printable(name):<22}{printable(_describe(entry))}")
+            for parameter in parameters(entry.plugin).values() if entry.plugin else ():
                 unit = f" [{parameter.unit}]" if parameter.unit else ""
                 choices = f" ({' | '.join(parameter.choices)})" if parameter.choices else ""
-                print(
-                    f"      {printable(f'{parameter.name}={text_of(parameter.default)}{unit}  {parameter.doc}{choices}')}"
-                )
+                line = f"{parameter.name}={text_of(parameter.default)}{unit}  {parameter.doc}{choices}"
+                print(f"      {printable(line)}")
     return 0
 
 
-def _facts(entry: Any) -> str:
+def _describe(entry: registry.Entry) -> str:
+    """Return the first line of a plugin's docstring, its capabilities, and why it is unavailable."""
     from bench.model import Backend, Estimator, Integrator, Scene
 
     plugin = entry.plugin
@@ -306,12 +304,12 @@ def _facts(entry: Any) -> str:
         facts.append(f"provides {', '.join(sorted(plugin.provides))}")
     elif issubclass(plugin, Estimator):
         facts.append(f"needs {', '.join(sorted(plugin.needs))}")
-        facts.append(
-            "unbiased"
-            + (", across jumps too" if plugin.unbiased_at_discontinuities else " where the cost is continuous")
-        )
         if not plugin.unbiased:
-            facts[-1] = "biased at finite N"
+            facts.append("biased at finite N")
+        elif plugin.unbiased_at_discontinuities:
+            facts.append("unbiased, across jumps too")
+        else:
+            facts.append("unbiased where the cost is continuous")
     elif issubclass(plugin, Integrator):
         facts.append(f"order {plugin.order}")
     elif issubclass(plugin, Scene) and plugin.neglected_effects:
@@ -324,65 +322,58 @@ def _facts(entry: Any) -> str:
 # ---------------------------------------------------------------------------------------- checks and traces
 
 
-def _bench_self(words: list[str]) -> int:
-    from bench import benchself
-
-    return benchself.main(words)
-
-
 def _check(words: list[str]) -> int:
+    """Verify the declarations of the named plugins, or of all."""
     from bench import conformance
+    from bench.experiment.words import parse_words
     from bench.model import registry
 
-    for folder in [word.partition("=")[2] for word in words if word.startswith("plugins=")]:
-        registry.add_folder(Path(folder))
-    words = [word for word in words if not word.startswith("plugins=")]
-    names = {name for table in registry.entries().values() for name in table}
-    for word in words:
-        if word not in names:
-            raise unknown("plugin", word, names)
-    return conformance.main(words)
+    names, _, _ = parse_words(words, "check", {})
+    plugins = {name for table in registry.entries().values() for name in table}
+    for name in names:
+        if name not in plugins:
+            raise unknown("plugin", name, plugins)
+    return conformance.main(names)
 
 
-def _scenes_first(words: Sequence[str], verb: str) -> tuple[list[str], list[str]]:
-    """Return the scenes that a command names first, and its settings; raises :class:`UserError` if it names none."""
+def _split_scenes(words: Sequence[str], verb: str) -> tuple[list[str], list[str]]:
+    """Return the scenes named first and the settings after them. Raises :class:`UserError` if no scene is named."""
     scenes = list(itertools.takewhile(lambda word: "=" not in word.partition("[")[0] and word[0] != "-", words))
-    rest = list(words[len(scenes) :])
-    if not scenes and not any(word.lstrip("+").startswith("scenes=") for word in rest):
+    settings = list(words[len(scenes) :])
+    if not scenes and not any(word.lstrip("+").startswith("scenes=") for word in settings):
         from bench.model import registry
 
         names = ", ".join(registry.entries()["scenes"])
         raise UserError(f"name a scene: python -m bench {verb} SCENE ... [key=value ...]; scenes are {names}")
-    return scenes, rest
+    return ([f"scenes=[{','.join(scenes)}]"] if scenes else []), settings
 
 
-def _sets_a_horizon(word: str) -> bool:
+def _sets_horizon(word: str) -> bool:
     """Return whether a word of the command line sets the horizon of a scene, as a setting or in brackets."""
     return re.match(r"scene\.\w+\.horizon=|[^=]*\[(.*,)?horizon=|\+?scenes=.*[\[,]horizon=", word) is not None
 
 
 def _gradcheck(words: list[str]) -> int:
-    """Run ``gradient_check`` on the scenes named first, with the overrides that follow; a fault too gives status 1."""
+    """Run ``gradient_check`` on the scenes named first. Returns 1 also if a gradient is wrong."""
     from dataclasses import replace
 
     from bench.experiment.study import study_of
     from bench.model.parameters import parameters
 
-    scenes, rest = _scenes_first(words, "gradcheck")
-    settings_ = [f"scenes=[{','.join(scenes)}]", "name=gradcheck"] if scenes else ["name=gradcheck"]
-    experiment = _loaded(["experiment=gradient_check", *settings_, *rest])
+    scenes, settings = _split_scenes(words, "gradcheck")
+    experiment = _load(["experiment=gradient_check", *scenes, "name=gradcheck", *settings])
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
-    own = [word for word in words if _sets_a_horizon(word)]
-    swept = any(word.startswith("sweep.horizon=") for word in rest)
-    if own:
-        told = f"sweep.horizon overrules {own[0]}" if swept else f"{own[0]} replaces the sweep over horizons"
-        print(f"bench: {told}", file=sys.stderr)
-    if (own and not swept) or not any(plugin and "horizon" in parameters(plugin) for plugin in plugins):
+    horizons = [word for word in words if _sets_horizon(word)]
+    is_swept = any(word.startswith("sweep.horizon=") for word in settings)
+    if horizons:
+        effect = f"sweep.horizon overrides {horizons[0]}" if is_swept else f"{horizons[0]} replaces the horizon sweep"
+        print(f"bench: {effect}", file=sys.stderr)
+    if (horizons and not is_swept) or not any(plugin and "horizon" in parameters(plugin) for plugin in plugins):
         experiment = replace(experiment, sweep={k: v for k, v in experiment.sweep.items() if k != "horizon"})
-    finished = _executed(experiment, words)
+    finished = _execute(experiment, words)
     if isinstance(finished, int):
         return finished
-    status, rows = _finished(finished, ["gradcheck", *words])
+    status, rows = _finish(finished, ["gradcheck", *words])
     return 1 if status or study_of(experiment).faults(rows) else 0
 
 
@@ -390,51 +381,25 @@ def _trace(words: list[str]) -> int:
     """Trace one rollout of each scene named first: at w = 0, or for a noise sample if ``seed=`` is given."""
     from bench import trace
 
-    scenes, rest = _scenes_first(words, "trace")
-    settings_ = [f"scenes=[{','.join(scenes)}]"] if scenes else []
-    experiment = _loaded([*settings_, *rest], notes=False)
-    for one in trace.run(experiment, any(word.startswith("seed=") for word in rest)):
-        paths = trace.write(one, experiment.results_dir, experiment.formats)
-        print(f"\n{printable(one.title)}")
-        for sentence in one.report():
+    scenes, settings = _split_scenes(words, "trace")
+    experiment = _load([*scenes, *settings], notes=False)
+    for rollout in trace.run(experiment, any(word.startswith("seed=") for word in settings)):
+        paths = trace.write(rollout, experiment.results_dir, experiment.formats)
+        print(f"\n{printable(rollout.title)}")
+        for sentence in rollout.report():
             print(f"  {printable(sentence)}")
         _print_written(paths)
     return 0
 
 
-def _claims(words: list[str]) -> int:
-    """Run published results again."""
-    from bench import claims
+def _main_of(module: str) -> Callable[[list[str]], int]:
+    """Return the function ``main`` of a module, which is imported when the function is called."""
 
-    return claims.main(words)
+    def call(words: list[str]) -> int:
+        status: int = importlib.import_module(module).main(words)
+        return status
 
-
-def _compare(words: list[str]) -> int:
-    """Compare two directories of results, or two git revisions of them, cell by cell."""
-    from bench import compare
-
-    return compare.main(words)
-
-
-def _examine(words: list[str]) -> int:
-    """Examine a simulator of one's own."""
-    from bench.examine import command
-
-    return command.main(words)
-
-
-def _history(words: list[str]) -> int:
-    """Follow results over versions in one chart."""
-    from bench.compare import history
-
-    return history.main(words)
-
-
-def _index(words: list[str]) -> int:
-    """Write the page over all experiments of a folder."""
-    from bench.report import index
-
-    return index.main(words)
+    return call
 
 
 VERBS = {
@@ -448,7 +413,7 @@ VERBS = {
     ),
     "plan": Verb(
         _plan, "plan +experiment=NAME [key=value ...]", "cells, how many are stored, expected time",
-        "Refused cells are listed with their reason.\n" + SETTINGS,
+        "Cells that cannot run are listed with their reason.\n" + SETTINGS,
     ),
     "list": Verb(
         _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
@@ -456,40 +421,40 @@ VERBS = {
     ),
     "check": Verb(
         _check, "check [NAME ...] [plugins=DIR]", "the conformance kit on some plugins, or all",
-        "Every fact that a plugin declares is verified by running it. Exit status 1 when a check fails.\n",
+        "Verifies by running each plugin what the plugin declares. Exit status 1 when a check fails.\n",
     ),
     "gradcheck": Verb(
-        _gradcheck, "gradcheck SCENE ... [key=value ...]", "gradients against differences of the cost, and what is wrong",
+        _gradcheck, "gradcheck SCENE ... [key=value ...]", "gradients compared with differences of the cost",
         f"Exit status 1 when a gradient must not be used.\n{SETTINGS}",
     ),
     "examine": Verb(
-        _examine, "examine FILE:COST [key=value ...]", "your own simulator: its gradient, jumps, and what to use",
+        _main_of("bench.examine.command"), "examine FILE:COST [key=value ...]", "your own simulator: its gradient, jumps, and what to use",
         EXAMINE,
     ),
     "trace": Verb(
-        _trace, "trace SCENE ... [key=value ...]", "one rollout: do gradient spikes line up with contact switches?",
+        _trace, "trace SCENE ... [key=value ...]", "one rollout: do gradient spikes coincide with contact switches?",
         f"Without noise, or with seed=S the first sample of that seed.\n{SETTINGS}",
     ),
     "bench-self": Verb(
-        _bench_self, "bench-self [quick=true] [results_dir=DIR]", "the harness's own speed, beside a NumPy loop and native code",
+        _main_of("bench.benchself"), "bench-self [quick=true] [results_dir=DIR]", "speed of the harness, compared with a NumPy loop and native code",
     ),
     "claims": Verb(
-        _claims, "claims [NAME ...] [--list] [--quick] [--again] [results_dir=DIR]", "published results run again, each with a verdict",
-        "What is stored under results_dir/claims is not measured again unless its code has changed, or with --again.\n"
-        "--quick: those that take less than 5 s. Exit status 1 when a claim is not reproduced.\n",
+        _main_of("bench.claims"), "claims [NAME ...] [--list] [--quick] [--again] [results_dir=DIR] [plugins=DIR]", "published results run again, each with a verdict",
+        "Results stored under results_dir/claims are measured again only if their code has changed, or with --again.\n"
+        "--quick: only claims that take less than 5 s. Exit status 1 when a claim is not reproduced.\n",
     ),
     "compare": Verb(
-        _compare, "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
+        _main_of("bench.compare"), "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
         "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
-        "times only with --timings, against the spread between runs: again=DIR,DIR names further runs of BEFORE.\n"
+        "times only with --timings, compared with the spread between runs: again=DIR,DIR names further runs of BEFORE.\n"
         "Written to out=DIR (runs/compare): compare.csv, .md, .json, .xml (JUnit) and .html.\n",
     ),
     "index": Verb(
-        _index, "index [DIR]", "a page over all experiments of a results folder, with the state of each",
-        "DIR is results without one. Written to DIR/index.html; nothing is simulated.\n",
+        _main_of("bench.report.index"), "index [DIR]", "a page over all experiments of a results folder, with the state of each",
+        "DIR is results by default. Written to DIR/index.html. Nothing is simulated.\n",
     ),
     "history": Verb(
-        _history, "history DIR DIR ... [out=DIR]", "errors and failures over versions, as one small chart",
+        _main_of("bench.compare.history"), "history DIR DIR ... [out=DIR]", "errors and failures over versions, as one small chart",
         "Directories or git revisions, the oldest first. Written to out=DIR (runs/history): history.png, .csv and .md.\n",
     ),
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Ctrl-C while the command is still importing: it ends with a line, where Python would print the middle of an import."""
+"""Ends the command with one line if Ctrl-C arrives while it is still importing."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import sys
 
 
 def exit_on_interrupt() -> None:
-    """Have Ctrl-C end the command at once, until it sees to signals itself; nothing where bench is a library.
+    """Make Ctrl-C end the command immediately, until the command handles signals itself.
 
-    Nothing is running or half written yet. ``import bench`` in a program of someone else leaves its signals alone.
+    Nothing is running or half written during imports. A program that imports ``bench`` as a library keeps its handlers.
     """
-    if _is_the_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _stop)
+    if _is_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _exit)
 
 
-def _is_the_command() -> bool:
+def _is_command() -> bool:
     words, script = sys.orig_argv, (sys.argv or [""])[0]
-    if script == "-m":  # the module is being looked for, and its package imported
+    if script == "-m":  # Python is still importing the package of the module
         return "-m" in words and words[words.index("-m") + 1] == "bench"
     return os.path.basename(script) == "diffsim-bench"
 
 
-def _stop(*_: object) -> None:
+def _exit(*_: object) -> None:
     os.write(2, b"\nbench: stopped\n")
     os._exit(130)

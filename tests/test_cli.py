@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import subprocess
 import sys
 
@@ -311,3 +312,22 @@ def test_bad_new_settings(words, said, tmp_path, capsys):
     message = capsys.readouterr().err
     for part in said:
         assert part in message
+
+
+def test_a_thread_of_a_plugin_and_a_closed_stream_do_not_keep_a_command_waiting(tmp_path):
+    """Without a shutdown by Python, what was printed arrives all the same, and the status is that of the command."""
+    code = """if True:
+        import sys, threading, time
+        import bench.__main__ as command
+        threading.Thread(target=time.sleep, args=(600,)).start()
+        def main():
+            print("all of it")
+            sys.stderr.close()
+            return 3
+        command.main = main
+        command.command()
+    """
+    inherited = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=inherited, capture_output=True, timeout=60)
+    assert done.returncode == 3
+    assert done.stdout == b"all of it\n"

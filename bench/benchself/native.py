@@ -1,4 +1,4 @@
-"""The native reference: a fused C loop with its own adjoint, made by the system's compiler."""
+"""The native baseline: a fused C loop with a hand-written adjoint, compiled by the system's compiler."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
+COMPILERS = ("cc", "gcc", "clang")
 FLAGS = ("-O3", "-march=native", "-shared", "-fPIC")
 LANES = 32
-"""Batches must be a multiple of this."""
+"""Batch sizes must be a multiple of this number."""
 
 
 class Unavailable(Exception):
-    """Raised when there is no compiler here, or it failed."""
+    """Raised if no compiler is installed or the compiler fails."""
 
 
 class Parameters(ctypes.Structure):
@@ -28,7 +29,7 @@ class Parameters(ctypes.Structure):
 
 
 def gradient(scene: Any, stiffness: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the function from ``theta (T,)``, ``w (T, B)`` to df/dtheta ``(T, B)``; raises :class:`Unavailable`."""
+    """Return the function from ``theta (T,)`` and ``w (T, B)`` to df/dtheta ``(T, B)``. Raises :class:`Unavailable`."""
     library = _library()
     values = Parameters(scene.dt, scene.mass, scene.velocity_factor, scene.speed, scene.sigma, stiffness)
     pointer = np.ctypeslib.ndpointer(np.float64, flags="C_CONTIGUOUS")
@@ -46,9 +47,9 @@ def gradient(scene: Any, stiffness: float) -> Callable[[np.ndarray, np.ndarray],
 
 
 def _library() -> ctypes.CDLL:
-    compiler = next((found for name in ("cc", "gcc", "clang") if (found := shutil.which(name))), None)
+    compiler = next(filter(None, map(shutil.which, COMPILERS)), None)
     if compiler is None:
-        raise Unavailable("no C compiler (cc, gcc, clang) was found")
+        raise Unavailable(f"no C compiler ({', '.join(COMPILERS)}) was found")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pushing.so"
         source = Path(__file__).with_name("pushing.c")

@@ -12,7 +12,7 @@ import pandas as pd
 from bench.claims.claim import VERDICTS, Claim, Figure
 from bench.claims.discovery import LESSONS
 from bench.claims.results import FAILED, ClaimResult
-from bench.report.tables import csv, escape_latex, escape_markdown
+from bench.report.tables import csv, escape_latex, escape_markdown, plain_markdown
 from bench.report.text import counted, duration, number
 from bench.run.files import write_all
 
@@ -23,7 +23,8 @@ BOLD_WIDTH, SMALL_WIDTH = 48, 54
 """Characters of a bold and of a small line above a chart 3.5 inches wide."""
 CSS = """body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
 table{border-collapse:collapse;font-size:14px;margin:.6rem 0}td,th{padding:.15rem .8rem .15rem 0;text-align:left}
-td.n{text-align:right;font-variant-numeric:tabular-nums}th{border-bottom:1px solid #888}img{max-width:100%}
+td:is(:nth-child(2),:nth-child(3),:nth-child(5)){text-align:right;font-variant-numeric:tabular-nums}
+th{border-bottom:1px solid #888}img{max-width:100%}
 .reproduced{color:#00664a}.reserved{color:#8a5a00}.bad{color:#b00020}code{background:#f2f2f2;padding:0 .2rem}
 section{margin-top:2.2rem}h3{margin:1.8rem 0 .2rem}p{margin:.3rem 0}.bad b{color:#b00020}"""
 
@@ -96,11 +97,6 @@ def detectable_text(figure: Figure) -> str:
     )
 
 
-def sensitivity_text(figure: Figure) -> str:
-    """Return whether the figure detects an error of 5%, and the reason if not, as text."""
-    return f"no: {figure.limitation}" if figure.limitation else "yes"
-
-
 def insensitive_text(figures: Sequence[Figure]) -> str:
     """Return how many figures cannot detect an error of 5%, and why, as text. Empty if all can."""
     limits = [figure.limitation for figure in figures if figure.limitation]
@@ -108,6 +104,21 @@ def insensitive_text(figures: Sequence[Figure]) -> str:
         return ""
     reasons = ", ".join(f"{limits.count(limit)} for {limit}" for limit in dict.fromkeys(limits))
     return f"{len(limits)} of {counted(len(figures), 'figure')} cannot detect an error of 5%: {reasons}"
+
+
+def readable_figures(figures: Sequence[Figure]) -> pd.DataFrame:
+    """Return the table of figures that people read: a row per figure, every value as text."""
+    return pd.DataFrame(
+        {
+            "figure": figure.what,
+            "published": figure.published,
+            "measured (95%)": measured_text(figure),
+            "agrees": "yes" if figure.agrees else "NO",
+            "would fail at": detectable_text(figure),
+            "detects 5%": f"no: {figure.limitation}" if figure.limitation else "yes",
+        }
+        for figure in figures
+    )
 
 
 def figures_table(results: Results) -> pd.DataFrame:
@@ -149,16 +160,7 @@ def markdown(results: Results) -> str:
         for claim, result in own:
             parts.append(f"### {claim.name}: {result.verdict}\n\n{claim.statement} ({claim.source})\n")
             if result.figures:
-                lines = [
-                    "| figure | published | measured | agrees | would fail at | detects 5% |",
-                    "|---|---|---|---|---|---|",
-                ]
-                lines += [
-                    f"| {escape_markdown(f.what)} | {f.published} | {measured_text(f)} | {'yes' if f.agrees else '**no**'} "
-                    f"| {detectable_text(f)} | {sensitivity_text(f)} |"
-                    for f in result.figures
-                ]
-                parts.append("\n".join(lines) + "\n")
+                parts.append(plain_markdown(readable_figures(result.figures)) + "\n")
             if result.remark:
                 parts.append(f"*{escape_markdown(result.remark)}*\n")
             if sentence := insensitive_text(result.figures):
@@ -203,11 +205,9 @@ def page(results: Results, charts: dict[str, Path]) -> str:
                 f"<p>{escape(claim.statement)} <i>{escape(claim.source)}</i></p>"
             )
             if result.figures:
-                rows = "".join(_row(figure) for figure in result.figures)
-                body.append(
-                    "<table><tr><th>figure</th><th>published</th><th>measured (95%)</th><th>agrees</th>"
-                    f"<th>would fail at</th><th>detects 5%</th></tr>{rows}</table>"
-                )
+                with pd.option_context("display.max_colwidth", None):  # else long texts would be cut
+                    table = readable_figures(result.figures).to_html(index=False, border=0, justify="left")
+                body.append(table.replace("<td>NO</td>", '<td class="bad">no</td>'))
             if result.remark:
                 body.append(f"<p><b>Reservation:</b> {escape(result.remark)}</p>")
             if sentence := insensitive_text(result.figures):
@@ -226,30 +226,14 @@ def page(results: Results, charts: dict[str, Path]) -> str:
     )
 
 
-def _row(figure: Figure) -> str:
-    cells = [
-        figure.what,
-        figure.published,
-        measured_text(figure),
-        "yes" if figure.agrees else "no",
-        detectable_text(figure),
-        sensitivity_text(figure),
-    ]
-    kinds = ("", "n", "n", "", "n", "")
-    line = "".join(f'<td class="{kind}">{escape(cell)}</td>' for kind, cell in zip(kinds, cells, strict=True))
-    return f'<tr class="{"" if figure.agrees else "bad"}">{line}</tr>'
-
-
 def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> Iterator[str]:
     """Yield the lines that the terminal shows for one claim."""
-    worst = [figure for figure in result.figures if not figure.agrees]
     origin = ", as stored" if is_stored else ""
     yield f"{claim.name:<4} {result.verdict:<29} {duration(result.seconds):>7}{origin}  {claim.statement}"
-    for figure in worst:
-        yield f"       {figure.what}: published {figure.published}, measured {measured_text(figure)}"
-    if result.remark:
-        yield f"       {result.remark}"
-    if sentence := insensitive_text(result.figures):
+    for figure in result.figures:
+        if not figure.agrees:
+            yield f"       {figure.what}: published {figure.published}, measured {measured_text(figure)}"
+    for sentence in filter(None, (result.remark, insensitive_text(result.figures))):
         yield f"       {sentence}"
 
 

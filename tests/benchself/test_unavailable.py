@@ -14,6 +14,6 @@ def test_an_absent_library_is_a_line_with_the_command_that_installs_it(monkeypat
     settings["subjects"] = [one for one in settings["subjects"] if one["backend"] == "fused"]
     entry = dataclasses.replace(registry.find("backends", "fused"), reason="not installed: numba; pip install numba")
     monkeypatch.setattr(registry, "find", lambda kind, name: entry)
-    line, device = rollouts.backends(settings, True)
+    line, device = rollouts.measure_backends(settings, True)
     assert line.note == "unavailable: not installed: numba; pip install numba"
-    assert device.note == "no device: every line is of the processor"
+    assert device.note == "no device: every row is of the processor"

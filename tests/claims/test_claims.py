@@ -79,7 +79,8 @@ def test_a_figure_that_cannot_detect_5_percent_says_so_and_why():
 
 
 def test_a_claim_none_of_whose_figures_detects_5_percent_is_reserved_and_says_so(toy, tmp_path, monkeypatch, capsys):
-    coarse = [Figure("one", "1.0", 1.0, spread=0.2), Figure("seven", "7", 7.0)]
+    name = "one, which has a name of more than the fifty characters of a table"
+    coarse = [Figure(name, "1.0", 1.0, spread=0.2), Figure("seven", "7", 7.0)]
     assert verdict(coarse) == RESERVED
     assert verdict([*coarse, Figure("fine", "2.000", 2.0)]) == REPRODUCED
     monkeypatch.setattr(toy, "measure", lambda self: Outcome(coarse))
@@ -89,6 +90,7 @@ def test_a_claim_none_of_whose_figures_detects_5_percent_is_reserved_and_says_so
     made = tmp_path / "claims"
     assert said in (made / "claims.md").read_text()
     assert "no: the printed digits" in (made / "claims.html").read_text()
+    assert f"<td>{name}</td>" in (made / "claims.html").read_text()
     assert "the printed digits" in (made / "claims.csv").read_text()
 
 

@@ -329,9 +329,9 @@ def test_horizon_set_for_a_scene_is_checked_and_said(tmp_path, capsys):
     words = ["backends=[numpy]", f"results_dir={tmp_path}", "formats=[]", "workers=0"]
     assert main(["gradcheck", "pendulum", "scene.pendulum.horizon=3", *words]) == 0
     assert set(pd.read_csv(tmp_path / "gradcheck" / "gradient_check.csv")["horizon"]) == {3}
-    assert "scene.pendulum.horizon=3 replaces the sweep" in capsys.readouterr().err
+    assert "scene.pendulum.horizon=3 replaces the horizon sweep" in capsys.readouterr().err
     assert main(["gradcheck", "pendulum[horizon=3]", "sweep.horizon=[2]", *words]) == 0
-    assert "sweep.horizon overrules pendulum[horizon=3]" in capsys.readouterr().err
+    assert "sweep.horizon overrides pendulum[horizon=3]" in capsys.readouterr().err
 
 
 def test_step_beyond_the_stability_limit_is_said(tmp_path, capsys):

@@ -250,7 +250,7 @@ def test_first_failure_can_end_the_run(tree):
     done = tree.run(*words, "on_error=stop")
     assert done.returncode == 1
     assert "no estimate" in done.stderr
-    assert "go on with: python -m bench" in done.stderr
+    assert "Continue with: python -m bench" in done.stderr
     rows = pd.read_parquet(tree.root / "out" / "stops" / "rows.parquet")
     assert "refuses" in set(rows["estimator"])
     again = tree.run(*words)
@@ -290,7 +290,7 @@ def test_stopping_a_run_leaves_rows_and_no_process(tree, sent, status):
     said = process.communicate(timeout=30)[1]
     assert process.returncode == status
     if sent == signal.SIGINT:
-        assert f"1 of 2 cells are stored in 'out/{where}', go on with: python -m bench" in said
+        assert f"1 of 2 cells are stored in 'out/{where}'. Continue with: python -m bench" in said
         assert "Traceback" not in said
     wait_for(lambda: not descendants_of(tree), 10.0)
     done = tree.run("plan", *words)

@@ -1,4 +1,4 @@
-"""C3: a thrown ball and a wall: a descent on first-order gradients stops where the wall begins."""
+"""C3: a thrown ball and a wall. A descent on first-order gradients stops where the wall begins."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RUNS = 60
 
 @dataclass(frozen=True)
 class BallWithWall(FunctionScene):
-    """A ball thrown at speed 1 and angle x stops at a wall that it does not pass; f = -(distance reached)^2."""
+    """A ball thrown at speed 1 and angle x stops at a wall unless it clears it: f = -(distance reached)^2."""
 
     name = "ball_with_wall"
     continuous: ClassVar[bool] = False
@@ -35,7 +35,7 @@ class BallWithWall(FunctionScene):
         return np.array([self.start])
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """Return the negative square of the place of landing, or of the wall."""
+        """Return the negative square of the distance to the landing point, or to the wall."""
         angle = x[0]
         reached = xp.sin(2 * angle) / GRAVITY
         flight = WALL / xp.cos(angle)
@@ -63,7 +63,7 @@ class ThrownBall(Claim):
     quick = False
 
     def measure(self) -> Outcome:
-        """Place the jumps, integrate the gradients, and descend."""
+        """Locate the jumps and kinks, integrate the gradients, and run the descents."""
         at = problem(BallWithWall(sigma=SIGMA))
         still = np.zeros((1, 1))
 
@@ -78,7 +78,7 @@ class ThrownBall(Claim):
         lowest = brentq(lambda x: zeroth(x)[0], 0.8, 0.93, xtol=1e-7)
         false_zero = brentq(lambda x: first(x)[0], 0.69, 0.78, xtol=1e-6)
         figures = [
-            # the places are given to one unit of their last digit: the second jump is at 1.199344
+            # positions are published to one unit of their last digit: the second jump is at 1.199344
             Figure("first jump", "0.69320", edges[0], spread=1e-5),
             Figure("second jump", "1.19935", edges[1], spread=1e-5),
             Figure("first kink", "0.31467", kinks[0], spread=1e-5),
@@ -97,7 +97,7 @@ class ThrownBall(Claim):
             Figure("end of the first-order descent", "0.494", *ends["fobg"], spread=0.003),
             Figure("end of the zeroth-order descent", "0.8515", *ends["reinforce"], spread=0.0035),
             Figure("end of the alpha-order descent, as published", "0.8515", *ends["alpha_order"], spread=0.0035),
-            # 0.98 is of one run: what runs differ by is its spread
+            # 0.98 is of one run, so the spread is that between runs
             Figure("share of its estimates with alpha = 0", "0.98", *off[0], spread=2 * between),
         ]
         grid = np.linspace(0.1, 1.4, 60)
@@ -123,9 +123,9 @@ class ThrownBall(Claim):
     def _descents(
         self, at: Problem
     ) -> tuple[dict[str, tuple[float, float]], list[tuple[float, float]], float, np.ndarray]:
-        """Return ends and shares of alpha = 0 with standard errors, the share's spread from run to run, and a path.
+        """Return ends and shares of alpha = 0 with standard errors, the share's spread between runs, and a path.
 
-        The shares are those of the published setting, of the same with a baseline, and of what the published code passes.
+        The shares are for the published setting, the same with a baseline, and the setting of the published code.
         """
         first, path = stochastic_descent(at, False, 0.1, 0.1, 1000, seed=3)
         ends = {"fobg": centre(first), "reinforce": centre(stochastic_descent(at, True, 0.1, 0.1, 1000, seed=33)[0])}
@@ -147,7 +147,7 @@ class ThrownBall(Claim):
         return ends, share, spread, path[::20, 0]
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw both gradients, and where the descents end."""
+        """Draw both gradients and the ends of the descents."""
         axes.plot(series["x"], series["truth"], color=GREY, label="true")
         axes.plot(series["x"], series["first"], color=ink("fobg"), label="first-order mean")
         axes.axhline(0.0, color=GREY, linewidth=0.6)
@@ -156,7 +156,7 @@ class ThrownBall(Claim):
 
 
 def _exact_descent(at: Problem) -> np.ndarray:
-    """Return the path of descent on the smoothed cost's own gradient, by a fine rule."""
+    """Return the path of descent on the gradient of the smoothed cost, by quadrature."""
     nodes, weights = rule(8000)
     theta, path = np.array([0.1]), [0.1]
     for _ in range(1000):

@@ -1,4 +1,4 @@
-"""C8 and C9: one bounce: the time of impact decides the gradient's sign, and a penalty's gradient hangs on the step."""
+"""C8 and C9: one bounce: the time of impact decides the gradient's sign, and a penalty's gradient depends on the step."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class TimeOfImpact(Claim):
     labels = ("initial height [m]", "final height [m]")
 
     def measure(self) -> Outcome:
-        """Differentiate both programs off the boundary between steps, and around the source's own start."""
+        """Differentiate both programs away from the boundary between steps, and around the source's start."""
         still = np.zeros((3, 1))
         step = 1 / 480
         heights = np.linspace(1 - 4 * step, 1 + 8 * step, 97)
@@ -77,7 +77,7 @@ class PenaltyPhase(Claim):
     quick = False
 
     def measure(self) -> Outcome:
-        """Take the root mean square over 256 starts within one step's travel."""
+        """Compute the root mean square error over 256 starts within the distance of one step."""
         figures, series = [], {"k": [1e2, 1e3, 1e4, 1e5]}
         coarse, fine = ("0.020", "0.439", "2.37", "55.5"), ("2.3e-4", "0.0046", "0.0199", "0.391")
         for parts, published in ((480, coarse), (48000, fine)):

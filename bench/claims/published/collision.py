@@ -1,4 +1,4 @@
-"""C11: pushing one ball so that it strikes another: without the time of impact descent learns to give up."""
+"""C11: pushing one ball so that it strikes another: without the time of impact, descent learns to avoid contact."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 FITTED = 1e4
-"""The penalty's stiffness whose descent ends where the source's does [N/m]."""
+"""The penalty stiffness whose descent ends where the source's descent ends [N/m]."""
 TRIED = (1e2, 1e3, 3e3, FITTED, 3e4, 1e5)
-"""Every stiffness that was tried."""
+"""All tested stiffnesses [N/m]."""
 LABELS = {"with": "with time of impact", "without": "without", "penalty": "penalty"}
 
 

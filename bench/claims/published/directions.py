@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 D, REPEATS = 20, {20: 16_000, 100: 16_000, 400: 4000}
-"""Variables, and estimates for each number of samples."""
+"""Number of variables, and of estimates per number of samples."""
 CHUNK = 2000
-"""Estimates at once."""
+"""Number of estimates per batch."""
 
 
 class Directions(Claim):

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DryFriction(FunctionScene):
-    """A block at rest pushed by x: it accelerates by x - mu sign(x) where |x| > mu, else not at all."""
+    """A block at rest is pushed with force x. Its acceleration is x - mu sign(x) if |x| > mu, else 0."""
 
     name = "dry_friction"
     mu: float = param(1.0, "largest friction force")
@@ -48,7 +48,7 @@ class Sticking(Claim):
     labels = ("push F", "derivative of the acceleration")
 
     def measure(self) -> Outcome:
-        """Take the exact derivative, and integrate both orders over the noise."""
+        """Compute the exact derivative, and integrate both orders over the noise."""
         at = problem(DryFriction(sigma=1.0))
         exact = float(at.grad(np.zeros(1), np.zeros((1, 1)))[0, 0])
         (first, first_error), _ = moments(at, estimator("fobg"))

@@ -1,4 +1,4 @@
-"""C4: a pivot that falls off: descent on first-order gradients walks over the edge."""
+"""C4: a pivot that falls off. Descent on first-order gradients goes over the edge."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIGMA = 0.02
 
 @dataclass(frozen=True)
 class Pivot(FunctionScene):
-    """f = -sin^2 x up to |x| = pi/4, 0 beyond: the further the better, until it falls."""
+    """f = -sin^2 x up to |x| = pi/4 and 0 beyond: further is better, until the pivot falls."""
 
     name = "pivot"
     continuous: ClassVar[bool] = False

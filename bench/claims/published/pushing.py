@@ -1,4 +1,4 @@
-"""C16 and C17: pushing through a stiff contact: how much of the blow-up is the contact's?"""
+"""C16 and C17: pushing through a stiff contact: how much of the variance comes from the contact?"""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 SMOOTHED, COARSE, FINE = 20_000, 20_000, 4096
 """Samples of each variance."""
 TAILS = 0.25
-"""Relative error of a variance of 1,000 samples beyond which a few of them decide it."""
+"""Relative error of a variance of 1,000 samples above which a few samples dominate it."""
 
 
 def sampled(
@@ -114,7 +114,7 @@ class StiffPush(Claim):
     quick = False
 
     def measure(self) -> Outcome:
-        """Sample the published step, then a step 20 times finer with every control held over 20 steps."""
+        """Sample with the published step, then with a step 20 times finer, each control held over 20 steps."""
         values = "velocity_factor=0.998,push=0.1,sigma=0.1"
         finer = f"velocity_factor={0.998 ** (1 / 20)!r},push=0.1,sigma=0.1,horizon=4000,hold=20,dt=0.00025"
         coarse = {10.0: "46", 100.0: "7e2", 300.0: "4e4", 1000.0: "1e10"}
@@ -154,7 +154,7 @@ class StiffPush(Claim):
 
 
 def _heavy(what: str, text: str, measured: float, error: float, count: int) -> Figure:
-    """Return a figure compared by its errors and the source's, or by a factor where tails rule and no error is one."""
+    """Return a figure that is compared by the errors of both sides, or by a factor if heavy tails dominate the error."""
     if error * math.sqrt(count / 1000) < TAILS * measured:
         return Figure(what, text, measured, error, spread=source_error((measured, error), count))
     return Figure(what, text, measured, error, factor=10.0)

@@ -32,7 +32,7 @@ class Ramp(Claim):
     quick = False
 
     def measure(self) -> Outcome:
-        """Find the crossing of the variances, and errors of small batches."""
+        """Compute the width at which the variances are equal, and the errors of small batches."""
         first, zeroth = estimator("fobg"), estimator("reinforce")
 
         def gap(nu: float) -> float:
@@ -67,7 +67,7 @@ class Ramp(Claim):
         )
 
     def _errors(self, at: Any, draw: np.random.Generator, count: int, expected: tuple[str, str]) -> list[Figure]:
-        """Return mean absolute errors over 1,000 theta in [-1, 1]; the source drew them once, so its spread counts."""
+        """Return mean absolute errors over 1,000 random theta in [-1, 1]. The source drew them once, which is its spread."""
         from scipy.special import ndtr
 
         repeats = max(4, 4000 // count)

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 PUBLISHED = {0.1: "1.26", 0.05: "0.61", 0.02: "0.145", 0.01: "0.149", 1e-3: "0.012", 1e-4: "4.5e-4"}
 STARTS = 40_000
-"""Starts over which each error is averaged."""
+"""Number of starts over which each error is averaged."""
 GRIDS = (500, 1000, 2000)
-"""Counts of evenly spaced starts that the source may have taken: its spread is what their averages differ by."""
+"""Possible numbers of evenly spaced starts of the source. Its spread is the difference of their averages."""
 GOLDEN = (5**0.5 - 1) / 2
 KINK, SPEED = 0.305149, 0.800354
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 TOOTH = 40
-"""Starts over which the impact moves by one step: 2 m/s times 2 ms."""
+"""Number of starts over which the impact moves by one step: 2 m/s times 2 ms."""
 
 
 class Teeth(Claim):

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 SAMPLES = 400_000
 AT_GAIN = 8 * SAMPLES
-"""Samples at T = 20, whose gain the source gives with two digits."""
+"""Number of samples at T = 20, where the source gives the gain with two digits."""
 
 
 @dataclass(frozen=True)
 class Tent(FunctionScene):
-    """x is mapped to 1 - |1 - 2 x| again and again; f is the last value."""
+    """x is mapped to 1 - |1 - 2 x| in each step, and f is the last value."""
 
     name = "tent"
     steps: int = param(10, "iterations", positive=True)

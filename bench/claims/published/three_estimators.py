@@ -113,7 +113,7 @@ class ThreeEstimators(Claim):
         )
 
     def _best_baseline(self, at: Any, k: float, nodes: np.ndarray, weights: np.ndarray) -> Figure:
-        """Return the score's variance with the constant that makes it least."""
+        """Return the score estimator's variance with the constant baseline that minimises it."""
         cost, score = at.value(np.ones(1), nodes), nodes[0]
         best = (cost * score**2) @ weights / (score**2 @ weights)
         values = (cost - best) * score
@@ -131,5 +131,5 @@ class ThreeEstimators(Claim):
 
 
 def _exact(text: str) -> str:
-    """Return a whole number of the source's formula with the digits that it stands for."""
+    """Return an integer of the source's formula as text with enough digits to be exact."""
     return text if "." in text else f"{text}.000"

@@ -1,4 +1,4 @@
-"""C10: descending a throw at ground and wall: the law decides whether the target is met."""
+"""C10: descent on a throw against ground and wall. The contact law decides whether the target is reached."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 SINGLE = 2 * 2.0**-24 * math.sqrt(288)
-"""Relative rounding, of position and velocity, over 288 steps in single precision: the published ends have no more digits."""
+"""Relative rounding error of position and velocity over 288 steps in single precision, as in the published ends."""
 LABELS = {"with": "with time of impact", "without": "without", "penalty": "penalty"}
 
 

@@ -1,4 +1,4 @@
-"""L1 and L2: short windows need a value at their end; and a curve may be scored on another objective than it was given."""
+"""L1 and L2: short windows need a terminal value, and a curve can be scored on another objective than it minimised."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ EFFORT, VALUE, GAIN = 10.0, 3.701562, 0.270156
 
 @dataclass(frozen=True)
 class Window(FunctionScene):
-    """theta holds the controls of a window of the plant x' = x + u from 1: sum x^2 + 10 u^2, plus a value of the end."""
+    """The controls of a short window of the plant x' = x + u from x = 1: f = sum (x^2 + 10 u^2) + value x_H^2."""
 
     name = "window"
     steps: int = param(1, "H", positive=True)
     value: float = param(0.0, "weight of the squared end state")
 
     def theta0(self) -> np.ndarray:
-        """Return no control."""
+        """Return zero controls."""
         return np.zeros(self.steps)
 
     def cost(self, xp: Any, x: Array) -> Array:
@@ -40,7 +40,7 @@ class Window(FunctionScene):
 
 
 class Windows(Claim):
-    """Short windows with and without a value."""
+    """Short windows with and without a terminal value."""
 
     name = "L1"
     lesson = "Windows and objectives"
@@ -53,7 +53,7 @@ class Windows(Claim):
     labels = ("window H", "excess cost")
 
     def measure(self) -> Outcome:
-        """Find the optimum of each window by its gradient, which is linear in the controls."""
+        """Compute the optimum of each window from its gradient, which is linear in the controls."""
         gains = ("0.0", "0.090909", "0.160305", "0.206541", "0.234621", "0.250723")
         excesses = ("", "0.68526", "0.15146", "0.04044", "0.01129", "0.00319")
         figures: list[Figure] = []
@@ -77,7 +77,7 @@ class Windows(Claim):
 
 
 def _first_gain(scene: Window) -> float:
-    """Return -u_0 of the best controls: the gradient is linear, so that d + 1 gradients give the optimum."""
+    """Return -u_0 of the optimal controls. The gradient is linear, so d + 1 gradients give the optimum."""
     at = problem(scene)
     d = scene.steps
     points = np.concatenate([np.zeros((d, 1)), np.eye(d)], axis=1)
@@ -92,7 +92,7 @@ def _infinite_horizon_cost(gain: float) -> float:
 
 
 class OtherObjective(Claim):
-    """An iLQR curve and what it minimises."""
+    """An iLQR curve and the objective that it minimises."""
 
     name = "L2"
     lesson = "Windows and objectives"
@@ -102,7 +102,7 @@ class OtherObjective(Claim):
     labels = ("iteration", "cost above the least, 349.49")
 
     def measure(self) -> Outcome:
-        """Run iLQR on weights 1/2 and 20, scored on 1 and 1, then on those it is scored by."""
+        """Run iLQR with weights 1/2 and 20 and with weights 1 and 1, both scored with 1 and 1."""
         published = ("1856.154", "1202.106", "699.799", "423.583", "357.476", "357.297")
         given = _ilqr(effort=0.5, terminal=20.0, iterations=5)
         scored = _ilqr(effort=1.0, terminal=1.0, iterations=25)
@@ -127,7 +127,7 @@ class OtherObjective(Claim):
 
 
 def _ilqr(effort: float, terminal: float, iterations: int, dt: float = 0.05, horizon: int = 200) -> list[float]:
-    """Return the costs, with weights 1 and 1, of iLQR iterates that minimise other weights; full steps."""
+    """Return the costs, with weights 1 and 1, of full-step iLQR iterates that minimise the cost with other weights."""
     scene = f"pendulum_swing[horizon={horizon},dt={dt!r},effort={{}},terminal={{}}]"
     given, scored = problem(scene.format(effort, terminal)), problem(scene.format(1.0, 1.0))
     still = np.zeros((horizon, 1))

@@ -1,4 +1,4 @@
-"""Lines of the table: measured number, target, and the files they are written to."""
+"""Rows of the speed table: measured number and target, and the files that they are written to."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from bench.run.record import machine
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """One measured number: at most ``target`` is wanted, NaN for no target."""
+    """One measured number, which should be at most ``target``. NaN: no target."""
 
     what: str
     value: float
     unit: str
     target: float = math.nan
     spread: float = math.nan
-    """Interquartile range over median of the timed calls."""
+    """Interquartile range of the timed calls divided by their median."""
     note: str = ""
 
     @property
@@ -32,19 +32,19 @@ class SpeedRow:
         return self.value / self.target
 
 
-def texts(lines: Sequence[SpeedRow]) -> list[dict[str, str]]:
-    """Return the lines as they are printed."""
+def format_rows(rows: Sequence[SpeedRow]) -> list[dict[str, str]]:
+    """Return the rows as printed, by column."""
     return [
         {
-            "what": line.what,
-            "measured": _number(line.value),
-            "unit": line.unit,
-            "target": _number(line.target),
-            "ratio": _number(line.ratio),
-            "spread": "" if math.isnan(line.spread) else f"{line.spread:.0%}",
-            "note": line.note,
+            "what": row.what,
+            "measured": _number(row.value),
+            "unit": row.unit,
+            "target": _number(row.target),
+            "ratio": _number(row.ratio),
+            "spread": "" if math.isnan(row.spread) else f"{row.spread:.0%}",
+            "note": row.note,
         }
-        for line in lines
+        for row in rows
     ]
 
 
@@ -52,30 +52,30 @@ def _number(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.3g}" if abs(value) < 1e4 else f"{value:.0f}"
 
 
-def show(lines: Sequence[SpeedRow]) -> None:
+def show(rows: Sequence[SpeedRow]) -> None:
     """Print the table."""
     from rich.console import Console
     from rich.table import Table
 
-    rows = texts(lines)
-    table = Table(*rows[0], title="bench-self")
-    for row in rows:
+    formatted = format_rows(rows)
+    table = Table(*formatted[0], title="bench-self")
+    for row in formatted:
         table.add_row(*row.values())
     Console(width=130).print(table)
 
 
-def write(lines: Sequence[SpeedRow], directory: Path, load_before: list[float] | None) -> list[Path]:
-    """Write ``bench_self`` as .csv, .md and .json; returns their paths."""
+def write(rows: Sequence[SpeedRow], directory: Path, load_before: list[float] | None) -> list[Path]:
+    """Write ``bench_self`` as .csv, .md and .json. Returns their paths."""
     import pandas as pd
 
     make_directory(directory)
-    table = pd.DataFrame([{**asdict(line), "ratio": line.ratio} for line in lines])
+    table = pd.DataFrame([{**asdict(row), "ratio": row.ratio} for row in rows])
     record: dict[str, Any] = {
         "machine": machine(), "load_average_before": load_before, "lines": json.loads(table.to_json(orient="records")),
     }  # fmt: skip
     contents = {
         "bench_self.csv": table.to_csv(index=False, lineterminator="\n"),
-        "bench_self.md": "# bench-self\n\n" + plain_markdown(pd.DataFrame(texts(lines))) + "\n",
+        "bench_self.md": "# bench-self\n\n" + plain_markdown(pd.DataFrame(format_rows(rows))) + "\n",
         "bench_self.json": json.dumps(record, indent=1) + "\n",
     }
     return write_all(directory, contents)
