@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.experiment.axes import Axis, axes, relabelled, with_axes
+from bench.experiment.axes import Axis, axes, relabel, with_axes
 from bench.experiment.columns import IDENTITY
 from bench.experiment.experiment import Experiment
 from bench.report.tables import csv, plain_markdown
@@ -57,7 +57,7 @@ def averages(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     over = [axis for axis in found if _meant(axis, wanted)]
     gone = {axis.column for axis in over} | {column for axis in over for column in axis.moves}
     gone_axes = [axis for axis in found if axis.column in gone]
-    wide = relabelled(with_axes(experiment, good), gone_axes).reset_index(drop=True)
+    wide = relabel(with_axes(experiment, good), gone_axes).reset_index(drop=True)
     left = [axis.column for axis in found if axis.column not in gone]
     keys = [name for name in dict.fromkeys([*IDENTITY, *left]) if name in wide and name not in gone]
     numbers = [

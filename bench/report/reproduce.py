@@ -15,7 +15,7 @@ from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget, Experiment
 from bench.experiment.grid import COUNTS
-from bench.experiment.parameters import NOT_PLUGINS, parsed
+from bench.experiment.parameters import NOT_PLUGINS, parse
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, registry
 from bench.model.identity import changed, identity
@@ -29,7 +29,7 @@ def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     folders = plugin_folders(experiment.plugins)
     revive = Reviver()
     lines: list[list[str]] = []
-    for given, row in zip(parsed(rows), rows[["key", *COUNTS]].to_dict("records"), strict=True):
+    for given, row in zip(parse(rows), rows[["key", *COUNTS]].to_dict("records"), strict=True):
         try:
             cell = revive.cell(given, row, experiment.timing)
         except (UserError, KeyError):

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.experiment.axes import Axis, axes, relabelled, shown_by, values_of
+from bench.experiment.axes import Axis, axes, relabel, shown_by, values_of
 from bench.experiment.columns import IDENTITY
 from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
@@ -78,7 +78,7 @@ class Arranged:
 def arranged(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
     """Arrange rows for reading."""
     swept_axes = axes(experiment.sweep, rows)
-    table = relabelled(rows, swept_axes)
+    table = relabel(rows, swept_axes)
     for axis in swept_axes:
         if axis.column not in rows:
             views = {view: table[view].mask(shown_by(view, axis, rows)) for view in VIEWS_OF_LAWS}

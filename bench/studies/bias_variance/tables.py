@@ -73,7 +73,7 @@ def readable(experiment: Experiment, rows: pd.DataFrame) -> Readable:
     """Return the main table: identity and swept columns that vary, the results, status and reason of failures."""
     swept_axes = axes.axes(experiment.sweep, rows)
     swept = [axis.column for axis in swept_axes if axis.column not in rows and not _is_shown(rows, axis)]
-    rows = axes.relabelled(axes.with_axes(experiment, rows), swept_axes)
+    rows = axes.relabel(axes.with_axes(experiment, rows), swept_axes)
     varying, shared = _varying(rows, swept)
     reasons = {text: i + 1 for i, text in enumerate(dict.fromkeys(r for r in rows["reason"] if r))}
     status = ["status"] if reasons or (rows["status"] != "ok").any() else []
