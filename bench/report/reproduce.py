@@ -27,7 +27,7 @@ HEAD = "python -m bench name=one_cell"
 def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     """Return each row's words after :data:`HEAD`, quoted for a shell; none if one of its plugins is not installed."""
     folders = plugin_folders(experiment.plugins)
-    revive = Reviver()
+    revive = CellBuilder()
     lines: list[list[str]] = []
     for given, row in zip(parse(rows), rows[["key", *COUNTS]].to_dict("records"), strict=True):
         try:
@@ -35,11 +35,11 @@ def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
         except (UserError, KeyError):
             lines.append([])
         else:
-            lines.append([shlex.quote(word) for word in [*folders, *words(cell)]])
+            lines.append([shlex.quote(word) for word in [*folders, *cell_settings(cell)]])
     return lines
 
 
-class Reviver:
+class CellBuilder:
     """Makes cells from rows, building each plugin once."""
 
     def __init__(self) -> None:
@@ -77,11 +77,11 @@ class Reviver:
         return self._known[text]
 
 
-def words(cell: Cell) -> list[str]:
+def cell_settings(cell: Cell) -> list[str]:
     """Return the settings under which one cell, with the same key, is a whole experiment."""
-    parts = [f"study={_identity(cell.study)}", *plugins(cell)]
+    parts = [f"study={_identity(cell.study)}", *plugin_settings(cell)]
     parts += [f"{name}={getattr(cell, name)}" for name in ("samples", "repeats", "seed")]
-    parts += decided(cell)
+    parts += theta_settings(cell)
     if cell.budget is not None:
         default = Budget()
         for name in ("samples", "tolerance"):
@@ -92,7 +92,7 @@ def words(cell: Cell) -> list[str]:
     return parts
 
 
-def plugins(cell: Cell, without: Collection[str] = ()) -> list[str]:
+def plugin_settings(cell: Cell, without: Collection[str] = ()) -> list[str]:
     """Return a setting for the plugin on each axis, ``contacts=[penalty[stiffness=100]]``, except axes ``without``.
 
     Parameters at their defaults are left out; the scene's contact values count as the defaults of its contact law.
@@ -105,7 +105,7 @@ def plugins(cell: Cell, without: Collection[str] = ()) -> list[str]:
     ]
 
 
-def decided(cell: Cell) -> list[str]:
+def theta_settings(cell: Cell) -> list[str]:
     """Return the settings for theta and the point of the gradients, if they are not the scene's own."""
     names, at = cell.decision.names, cell.decision.at
     return [f"theta=[{','.join(names)}]"] * bool(names) + (
@@ -128,7 +128,7 @@ def check_of(cell: Cell) -> str:
     if isinstance(cell.scene, MechanicalScene):
         scene, line = _identity(cell.scene, {"horizon": cell.scene.horizon}), [f"sweep.horizon=[{cell.scene.horizon}]"]
     study = [f"study={_identity(cell.study)}"] * bool(changed(cell.study))
-    line += [*plugins(cell, without=("scene", "estimator")), f"seed={cell.seed}", *decided(cell), *study]
+    line += [*plugin_settings(cell, without=("scene", "estimator")), f"seed={cell.seed}", *theta_settings(cell), *study]
     return shlex.join(["python", "-m", "bench", "gradcheck", scene, *line])
 
 

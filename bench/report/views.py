@@ -1,7 +1,7 @@
 """Rows arranged for reading: what tables, charts and pages share.
 
 :func:`arranged` puts the swept axes into columns; then rows along one axis (:func:`along`), one problem at a time
-(:mod:`bench.report.problems`), and in it one line per estimator with the backends that agree merged (:func:`lines`).
+(:mod:`bench.report.problems`), and in it one line per estimator with the backends that agree merged (:func:`estimator_curves`).
 """
 
 from __future__ import annotations
@@ -36,14 +36,15 @@ EXACT, CLOSE = 1e-6, 1e-2
 
 
 def attempted(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of cells that were not refused."""
+    """Return the rows of cells that were run, without those that were refused."""
     return rows[~rows["status"].isin(("unsupported", "unavailable"))]
 
 
 def latest(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the newest row of each cell, when editing a plugin has left rows of older versions behind.
+    """Return each cell's newest row, its parameters completed with today's defaults.
 
-    Rows of versions that did not store their parameters are distinguished by their other columns.
+    Editing a plugin leaves rows of its older versions behind. Rows of versions that did not store their parameters are
+    distinguished by their identity columns.
     """
     rows = completed_rows(rows)
     bare = rows["parameters"] == ""
@@ -87,8 +88,8 @@ def arranged(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
 
 
 def along(shown: Arranged, axis: Axis | None) -> pd.DataFrame:
-    """Return rows that an axis applies to, seeds merged, its values only in a new column ``x`` (0 without an axis)."""
-    table = merge_seeds(shown.rows).copy()  # in one piece: taking parts of many pieces is slow
+    """Return the rows that an axis applies to, seeds merged, its values in a new column ``x`` alone (0 without an axis)."""
+    table = merge_seeds(shown.rows).copy()  # one block of memory: slicing a fragmented table is slow
     if axis is None:
         return table.assign(x=0.0)
     table = table.assign(x=table[axis.column], **{axis.column: math.nan})
@@ -96,7 +97,7 @@ def along(shown: Arranged, axis: Axis | None) -> pd.DataFrame:
 
 
 def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
-    """Merge seeds to one row per cell, medians over those that ended well; ``lost`` counts those that did not."""
+    """Merge seeds into one row per cell: medians over its rows that are ok; ``lost`` counts rows that failed."""
     good = rows["status"] == "ok"
     rows = rows.assign(lost=(~good & rows.index.isin(attempted(rows).index)).astype(float))
     if rows["seed"].nunique() < 2:
@@ -139,13 +140,13 @@ class Curve:
 
 
 RUN = ("estimator", "estimator_params", "backend", "dtype")
-"""Columns that tell the runs of one family along an axis apart."""
+"""Columns that distinguish the runs of one problem along an axis."""
 
 
-def lines(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Curve]:
-    """Return the lines of one family, in order of appearance; cells that were never run are left out.
+def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Curve]:
+    """Return one problem's curves, one per estimator, in order of appearance; refused cells are omitted.
 
-    Backends within a relative difference of ``close`` are merged into one line; without it, each is a line of its own.
+    Backends within a relative difference of ``close`` are merged into one curve; with None each backend has its own.
     """
     rows = attempted(rows)
     several = rows["dtype"].nunique() > 1
@@ -196,6 +197,13 @@ def _agree(a: _Run, b: _Run, tolerance: float) -> bool:
     return bool(alike.all())
 
 
+def is_logarithmic(values: Any) -> bool:
+    """Return whether an axis of these values is logarithmic: all finite ones are positive, the largest 8 times the least."""
+    finite = np.asarray(values, dtype=float)
+    finite = finite[np.isfinite(finite)]
+    return bool(finite.size and finite.min() > 0 and finite.max() >= 8 * finite.min())
+
+
 def pareto(time: pd.Series, error: pd.Series) -> np.ndarray:
     """Return a mask of the points for which no other is smaller in both."""
     points = pd.DataFrame({"time": time.to_numpy(), "error": error.to_numpy()})
@@ -204,12 +212,12 @@ def pareto(time: pd.Series, error: pd.Series) -> np.ndarray:
 
 
 def unsteady(rows: Any) -> Any:
-    """Return whether a timing's interquartile range is over 20% of its median: of one row, or of each of several."""
+    """Return whether a timing's interquartile range is over 20% of its median: of one row, or of each row of a table."""
     return rows["time_iqr_s"] > NOISY * rows["time_s"]
 
 
-def resolved(row: Any) -> Any:
-    """Return whether the bias of a row, or of each of some rows, can be distinguished from 0."""
+def is_bias_resolved(row: Any) -> Any:
+    """Return whether the bias is distinguishable from 0: of one row, or of each row of a table."""
     return row["bias_low"] > 0
 
 
@@ -220,9 +228,9 @@ def relative(row: Any, column: str) -> float:
 
 
 def rmse_interval(row: Any) -> tuple[Any, Any]:
-    """Return the 95% interval of the relative RMSE of a row, or of each of some rows; NaN where the variance has none.
+    """Return the 95% interval of the relative RMSE of one row, or of each row of a table; NaN where the variance has none.
 
-    It goes from the lower to the upper ends of bias and variance, RMSE^2 = bias^2 + variance.
+    RMSE^2 = bias^2 + variance, so its ends are those of bias and variance together.
     """
     norm = np.where(row["reference_norm"] > 0, row["reference_norm"], math.nan)
     low, high = (

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from bench.experiment import axes as sweep
@@ -21,10 +20,11 @@ from bench.report.problems import (
     value_text,
 )
 from bench.report.style import MARKERS, VARIANTS, colour, marker
-from bench.report.views import attempted
+from bench.report.views import attempted, is_logarithmic
 
 __all__ = ["distinguishing_columns"]
 columns_of, grouped, problems, shown_as, together = part_columns, problem_numbers, problem_names, value_text, axes_of
+logarithmic = is_logarithmic
 """The names under which the studies use these functions."""
 SYMBOLS = dict(
     zip(
@@ -137,12 +137,6 @@ STATUS = [TableColumn("status", "status", "text"), TableColumn("reason", "reason
 def numeric_axis(axis: sweep.Axis, column: str = "x", log: bool = True) -> PlotAxis:
     """Return a swept parameter as an axis of a chart, named with its unit and what moves with it."""
     return PlotAxis(column, axis.title, log)
-
-
-def logarithmic(values: pd.Series) -> bool:
-    """Return whether a logarithmic scale suits some values: all are positive and some far apart."""
-    finite_values = values[np.isfinite(values)]
-    return bool(len(finite_values) and finite_values.min() > 0 and finite_values.max() > 10 * finite_values.min())
 
 
 def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:

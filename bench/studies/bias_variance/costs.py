@@ -59,7 +59,7 @@ PROGRAM = (
 )  # fmt: skip
 
 
-def charged(rows: pd.DataFrame) -> pd.DataFrame:
+def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the measured cost of a gradient in rollouts, per program and backend.
 
     It is the ratio of seconds per gradient to seconds per rollout, from the fastest rows that use gradients alone and
@@ -96,14 +96,14 @@ ROLLOUTS = Cost(
 EQUAL_ROLLOUTS, EQUAL_TIME = "rmse_equal_rollouts", "rmse_equal_time"
 
 
-def at_equal_cost(rows: pd.DataFrame) -> pd.DataFrame:
+def with_errors_at_equal_cost(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the relative RMSE that each estimator would have for the same rollouts, and for the same time.
 
     An estimate from c times fewer samples has the same bias and c times the variance. ``rmse_equal_rollouts`` is for as
     many rollouts as there are samples, a gradient at its measured cost (:func:`charged`); ``rmse_equal_time`` for the time
     of the fastest estimate from as many samples on the same problem, each estimator on its fastest backend.
     """
-    rows = charged(rows)
+    rows = with_gradient_cost(rows)
     good = rows["status"] == "ok"
     setting = [number_problems(rows), rows["samples"], rows["seed"]]
     label = rows["estimator"] + "[" + rows["estimator_params"] + "]"

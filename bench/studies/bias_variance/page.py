@@ -14,7 +14,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.model import registry
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.style import Look
+from bench.report.style import EstimatorStyles
 from bench.report.text import axis_value, counted, duration, number
 from bench.report.views import (
     CATEGORIES,
@@ -22,8 +22,8 @@ from bench.report.views import (
     Curve,
     arranged,
     attempted,
-    lines,
-    resolved,
+    estimator_curves,
+    is_bias_resolved,
     rmse_interval,
     unsteady,
 )
@@ -40,7 +40,7 @@ from bench.report.web.content import (
     nothing_ran,
     titled,
 )
-from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, at_equal_cost
+from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, with_errors_at_equal_cost
 from bench.studies.bias_variance.findings import lowest, problems, span, winners
 from bench.studies.bias_variance.panels import FLOOR
 
@@ -48,7 +48,7 @@ BIAS = PlotAxis(
     "bias_shown", "relative bias |bias| / |∇J|", True, "bias_from", "bias_to", "bias_limit", "larger than the gradient"
 )
 VARIANCE = PlotAxis("variance_rel", "relative variance of one estimate", True, "variance_from", "variance_to")
-RMSE = PlotAxis("rmse_rel", "relative RMSE of one estimate", above_one="worse than answering zero")
+RMSE = PlotAxis("rmse_rel", "relative RMSE of one estimate", above_one="worse than the zero estimate")
 TIMES = (
     PlotAxis("time_s", "time of one estimate [s]"),
     PlotAxis("time_total_s", "time of the first estimate, with compilation [s]"),
@@ -76,14 +76,14 @@ EXCEPTIONS = 2
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the finding, what to use where, and the charts."""
-    shown = arranged(experiment, at_equal_cost(rows))
+    shown = arranged(experiment, with_errors_at_equal_cost(rows))
     summaries = [ProblemSummary(axis, family) for axis, family in problems(shown)]
-    table_ = derived(rows)
-    labelled = derived(shown.rows)
+    table_ = with_plotted_columns(rows)
+    labelled = with_plotted_columns(shown.rows)
     charts = [
         Chart(
             "Error against time",
-            "Each point is one cell. Lower left is better; above 1 an estimate is worse than answering zero. "
+            "Each point is one cell. Lower left is better; above 1 an estimate is worse than the zero estimate. "
             "Points with a ring are not beaten in both by any point shown of the same problem.",
             TIMES,
             [RMSE, BIAS],
@@ -113,7 +113,8 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         )
     )
     return Content(
-        finding=nothing_ran(rows) or _joined(failing(rows), finding(summaries), fastest(rows), refused(rows)),
+        finding=nothing_ran(rows)
+        or _join_sentences(failure_sentence(rows), finding(summaries), fastest(rows), refusal_sentence(rows)),
         rows=table_,
         columns=[*identity_columns(rows)[:IN_SIGHT], TIME, *STATUS, *RESULTS, *identity_columns(rows)[IN_SIGHT:]],
         charts=charts,
@@ -123,10 +124,10 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     )
 
 
-def derived(rows: pd.DataFrame) -> pd.DataFrame:
+def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
     """Add the columns that charts draw: errors in units of |grad J|, and labels that distinguish points and lines."""
     norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
-    limit = ~resolved(rows)
+    limit = ~is_bias_resolved(rows)
     values = {
         "bias_shown": (rows["bias"].where(~limit, rows["bias_high"]) / norm).clip(lower=FLOOR),
         "bias_from": (rows["bias_low"] / norm).clip(lower=FLOOR),
@@ -182,7 +183,7 @@ def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
 
 def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
     """Return the charts' own colour, marker and line style of every estimator in the rows."""
-    styles = Look(rows, sorted(registry.entries()["estimators"]))
+    styles = EstimatorStyles(rows, sorted(registry.entries()["estimators"]))
     looks = {}
     for estimator, params in dict.fromkeys(zip(rows["estimator"], rows["estimator_params"], strict=True)):
         line = Curve(estimator, params, {}, rows.iloc[:0], {}, frozenset(), 0)
@@ -200,7 +201,7 @@ class ProblemSummary:
     def __init__(self, axis: axes.Axis | None, family: ProblemRows) -> None:
         self.axis, self.title = axis, family.title()
         self.kind = ", ".join(str(value) for name, value in family.identity.items() if name in CATEGORIES)
-        self.lines = lines(family.rows)
+        self.lines = estimator_curves(family.rows)
         self.lowest = lowest(self.lines, EQUAL_ROLLOUTS)
         self.winners = winners(self.lines, EQUAL_ROLLOUTS)
 
@@ -216,7 +217,7 @@ class ProblemSummary:
 
 
 @dataclass(frozen=True)
-class Elsewhere:
+class BetterElsewhere:
     """A place where the estimator that is best most often is not: what to use instead, and the errors of both."""
 
     problem: str
@@ -235,11 +236,11 @@ class Elsewhere:
     def sentence(self, main: str) -> str:
         """Write the exception: ``pushing, penalty, stiffness >=1e4: use reinforce (0.5, where fobg has 300)``."""
         where = ", ".join(filter(None, [self.problem, self.where])) or "elsewhere"
-        return f"{where}: use {self.use} ({between(self.errors)}, where {main} has {between(self.instead_of)})"
+        return f"{where}: use {self.use} ({range_text(self.errors)}, where {main} has {range_text(self.instead_of)})"
 
 
-def failing(rows: pd.DataFrame) -> str:
-    """Write which estimators fail and how: worse than answering zero beyond their interval, no better, or no number.
+def failure_sentence(rows: pd.DataFrame) -> str:
+    """Write which estimators fail and how: worse than the zero estimate beyond their interval, no better, or no number.
 
     The estimator with the largest error comes first, at most :data:`NAMED` of them; nothing if none fails.
     """
@@ -250,7 +251,7 @@ def failing(rows: pd.DataFrame) -> str:
         lows = rmse_interval(bad)[0]
         worse, lost = int((lows > 1).sum()), int((part["status"] != "ok").sum())
         texts = [
-            f"worse than answering zero in {worse} (up to {number(bad['rmse_rel'].max())} times the gradient)"
+            f"worse than the zero estimate in {worse} (up to {number(bad['rmse_rel'].max())} times the gradient)"
             if worse
             else "",
             f"no better than zero in {len(bad) - worse}" if len(bad) > worse else "",
@@ -263,7 +264,7 @@ def failing(rows: pd.DataFrame) -> str:
     return "; ".join(text for _, text in found[:NAMED])
 
 
-def _joined(*parts: str) -> str:
+def _join_sentences(*parts: str) -> str:
     """Join the parts that say something; a capital stands only at the start."""
     said = [part for part in parts if part]
     return "; ".join([*said[:1], *(part[0].lower() + part[1:] for part in said[1:])]) + "."
@@ -281,10 +282,10 @@ def finding(summaries: Sequence[ProblemSummary]) -> str:
     share = f"{len(errors)} of {counted(len(settings), 'setting')}"
     if len(errors) == len(settings):
         share = f"all {counted(len(settings), 'setting')}" if len(settings) > 1 else "the one setting"
-    text = f"Use {main}: lowest relative RMSE at equal rollouts in {share} ({between(errors)})"
+    text = f"Use {main}: lowest relative RMSE at equal rollouts in {share} ({range_text(errors)})"
     if min(errors) >= 1:
-        text = f"Nothing beats answering zero: even {main}, lowest in {share}, has a relative RMSE of {between(errors)} at equal rollouts"
-    others = elsewhere(summaries, main)
+        text = f"Nothing beats the zero estimate: even {main}, lowest in {share}, has a relative RMSE of {range_text(errors)} at equal rollouts"
+    others = exceptions_to(summaries, main)
     left = counted(len(others) - EXCEPTIONS, "further exception") if len(others) > EXCEPTIONS else ""
     return "; ".join(filter(None, [text, *(other.sentence(main) for other in others[:EXCEPTIONS]), left]))
 
@@ -305,14 +306,14 @@ def fastest(rows: pd.DataFrame) -> str:
     return f"a relative RMSE of {GOAL:g} is reached first by {way} in {share} ({duration(times[0])} to {duration(times[-1])})"
 
 
-def refused(rows: pd.DataFrame) -> str:
+def refusal_sentence(rows: pd.DataFrame) -> str:
     """Write which backends refused every cell, with the commonest reason; nothing if none did."""
     left = rows[(rows["status"] == "unsupported") & ~rows["backend"].isin(attempted(rows)["backend"])]
     reasons = left.groupby("backend", sort=False)["reason"].agg(lambda reasons: reasons.mode().iloc[0])
     return "; ".join(f"{backend} refuses: {reason}" for backend, reason in reasons.items())
 
 
-def elsewhere(summaries: Sequence[ProblemSummary], main: str) -> list[Elsewhere]:
+def exceptions_to(summaries: Sequence[ProblemSummary], main: str) -> list[BetterElsewhere]:
     """Return the settings where another estimator than ``main`` is best, the largest difference first.
 
     A statement true of every problem with the same scene and law is printed once.
@@ -323,7 +324,7 @@ def elsewhere(summaries: Sequence[ProblemSummary], main: str) -> list[Elsewhere]
         for use in dict.fromkeys(one.winners[x][0] for x in places):
             mine = [x for x in places if one.winners[x][0] == use]
             errors, instead_of = [one.lowest[x] for x in mine], one.errors(main, mine)
-            exceptions.append(Elsewhere(one.title, one.kind, one.where(mine), use, errors, instead_of))
+            exceptions.append(BetterElsewhere(one.title, one.kind, one.where(mine), use, errors, instead_of))
     merged = []
     for other in exceptions:
         alike = [e for e in exceptions if (e.kind, e.where, e.use) == (other.kind, other.where, other.use)]
@@ -331,7 +332,7 @@ def elsewhere(summaries: Sequence[ProblemSummary], main: str) -> list[Elsewhere]
             merged.append(other)
         elif alike[0] is other:
             both = [[v for e in alike for v in getattr(e, name)] for name in ("errors", "instead_of")]
-            merged.append(Elsewhere(other.kind, other.kind, other.where, other.use, *both))
+            merged.append(BetterElsewhere(other.kind, other.kind, other.where, other.use, *both))
     return sorted(merged, key=lambda other: -other.factor)
 
 
@@ -353,15 +354,15 @@ def answers(summaries: Sequence[ProblemSummary]) -> pd.DataFrame:
                     "problem": one.title,
                     "where": one.where(places) or "everywhere",
                     "use": ", ".join(labels),
-                    "relative RMSE at equal rollouts": between(one.lowest[x] for x in places),
+                    "relative RMSE at equal rollouts": range_text(one.lowest[x] for x in places),
                     "next best": f"{following} ({number(rest[following])})" if following else "-",
-                    "worse than answering zero": ", ".join(useless) or "-",
+                    "worse than the zero estimate": ", ".join(useless) or "-",
                 }
             )
     return pd.DataFrame(entries)
 
 
-def between(values: Iterable[float]) -> str:
+def range_text(values: Iterable[float]) -> str:
     """Write a range: ``0.12``, or ``0.10 to 0.15``; ``no result`` for no values."""
     numbers = list(values)
     if not numbers:

@@ -18,7 +18,7 @@ from bench.experiment.experiment import Experiment
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.tables import escape_latex, escape_markdown
 from bench.report.text import axis_value, number
-from bench.report.views import Arranged, lines, rmse_interval
+from bench.report.views import Arranged, estimator_curves, rmse_interval
 from bench.studies.bias_variance.findings import problems
 
 WIDTH = 504.0
@@ -96,7 +96,7 @@ def _axis(name: str, shown: Arranged) -> Axis:
 
 
 def _block(axis: Axis | None, family: ProblemRows, apart: bool) -> Block:
-    curves = lines(family.rows, close=None) if apart else lines(family.rows)
+    curves = estimator_curves(family.rows, close=None) if apart else estimator_curves(family.rows)
     values = sorted({x for line in curves for x in line.at})
     labels = [line.label for line in curves]
     rows = []

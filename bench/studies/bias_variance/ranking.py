@@ -16,7 +16,7 @@ from bench.run.files import write_all
 LEAST = 3
 """Estimators from which on the table is written: with fewer the main table shows it at a glance."""
 WORTHLESS = 0.99
-"""Relative RMSE from which on an estimate is no better than answering zero."""
+"""Relative RMSE from which on an estimate is no better than the zero estimate."""
 MANY = 2.5
 """Evaluations per sample from which on they are printed."""
 WINS, FAILS, BIASED = "wins", "fails", "biased"
@@ -24,7 +24,7 @@ WINS, FAILS, BIASED = "wins", "fails", "biased"
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write the table as Markdown and CSV; nothing where few estimators ran, or something was swept."""
-    table = standing(rows)
+    table = rank_estimators(rows)
     if table.empty:
         return []
     texts = pd.DataFrame(
@@ -33,10 +33,10 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     )
     legend = (
         "\n\nRelative RMSE [95% interval] at equal samples, not at equal rollouts. *wins*: not distinguishable from the lowest "
-        "of its column. *fails*: no better than answering zero. *biased*: more than half of the error is bias. *(40x)*: it "
+        "of its column. *fails*: no better than the zero estimate. *biased*: more than half of the error is bias. *(40x)*: it "
         "evaluates 40 costs and gradients per sample, where others take one or two.\n"
     )
-    contents = {"standing.md": plain_markdown(texts) + legend + _best_text(best(table)), "standing.csv": csv(table)}
+    contents = {"ranking.md": plain_markdown(texts) + legend + _best_text(best(table)), "ranking.csv": csv(table)}
     return write_all(experiment.directory, contents)
 
 
@@ -85,7 +85,7 @@ def _column(table: pd.DataFrame, problem: str) -> list[str]:
     return [part["text"].get(label, "") for label in dict.fromkeys(table["label"])]
 
 
-def standing(rows: pd.DataFrame) -> pd.DataFrame:
+def rank_estimators(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one row per cell: estimator, problem, relative RMSE with its interval, and how it stands.
 
     Empty unless at least three estimators ran on each of several problems, once each. The interval combines those of
@@ -112,12 +112,12 @@ def standing(rows: pd.DataFrame) -> pd.DataFrame:
     )  # fmt: skip
     good = table["status"] == "ok"
     lowest = table[good].groupby("problem")["high"].min()
-    table["stands"] = [_stands(row, lowest.get(row.problem, math.nan)) for row in table.itertuples()]
+    table["stands"] = [_verdict(row, lowest.get(row.problem, math.nan)) for row in table.itertuples()]
     table["text"] = [_text(row) for row in table.itertuples()]
     return table.reset_index(drop=True)
 
 
-def _stands(row: object, lowest: float) -> str:
+def _verdict(row: object, lowest: float) -> str:
     status, low, share, rmse = (getattr(row, name) for name in ("status", "low", "share", "rmse_rel"))
     if status != "ok":
         return str(status)

@@ -26,7 +26,7 @@ FOOTNOTES = [
     "0 (< u): the bias is not distinguishable from 0, its 95% interval reaches up to u. "
     f"{DOUBTED.strip()}: the estimator declares to be unbiased and the interval excludes 0, so {UNEXPLAINED}.",
     "relative bias and rel. RMSE: divided by the norm of the reference gradient. A relative RMSE above 1 is worse "
-    "than answering zero.",
+    "than the zero estimate.",
     "variance: trace of the covariance of one estimate. time: one estimate, steady state, without compilation. "
     f"{UNSTEADY}: the interquartile range of its calls is over 20% of it; something else ran beside them.",
 ]

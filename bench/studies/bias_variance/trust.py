@@ -52,7 +52,7 @@ RULES: Mapping[str, Callable[[pd.DataFrame], Any]] = {
 }
 
 
-def judged(rows: pd.DataFrame) -> pd.DataFrame:
+def score_rules(rows: pd.DataFrame) -> pd.DataFrame:
     """Return a line per rule: cells trusted, wrong ones among them, and right ones that were not trusted."""
     wrong = rows["rmse_rel"] >= WRONG
     lines = []
@@ -72,7 +72,7 @@ def main(words: Sequence[str]) -> None:
     print(
         f"{', '.join(estimators)}: {len(rows)} cells, {(rows['rmse_rel'] >= WRONG).sum()} wrong by {WRONG:g} of the gradient or more\n"
     )
-    print(plain_markdown(judged(rows).astype(str)))
+    print(plain_markdown(score_rules(rows).astype(str)))
 
 
 if __name__ == "__main__":
