@@ -88,7 +88,7 @@ def test_finding_leads_with_what_fails_and_tells_worse_than_zero_from_no_better(
         "wild is worse than the zero estimate in 1 (up to 50 times the gradient), no better than zero in 1, "
         "without a number in 1 of 4 cells; "
     )
-    assert not bias_variance_page.failing(rows[rows["estimator"] == "fine"])
+    assert not bias_variance_page.failure_sentence(rows[rows["estimator"] == "fine"])
 
 
 def test_finding_tells_of_backends_that_refused_every_cell():
@@ -409,7 +409,7 @@ def test_filters_stay_in_the_address_and_the_csv_has_what_is_shown(shown, tmp_pa
 
 
 def test_no_panel_pools_stiffness_or_sigma():
-    derived = bias_variance_page.derived(stiffness_rows())
+    derived = bias_variance_page.with_plotted_columns(stiffness_rows())
     pooled = derived.groupby("problem")[["stiffness", "sigma"]].nunique()
     assert (pooled == 1).all().all()
 

@@ -100,7 +100,7 @@ def with_errors_at_equal_cost(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the relative RMSE that each estimator would have for the same rollouts, and for the same time.
 
     An estimate from c times fewer samples has the same bias and c times the variance. ``rmse_equal_rollouts`` is for as
-    many rollouts as there are samples, a gradient at its measured cost (:func:`charged`); ``rmse_equal_time`` for the time
+    many rollouts as there are samples, a gradient at its measured cost (:func:`with_gradient_cost`); ``rmse_equal_time`` for the time
     of the fastest estimate from as many samples on the same problem, each estimator on its fastest backend.
     """
     rows = with_gradient_cost(rows)

@@ -50,7 +50,7 @@ def lowest(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, floa
 def winners(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, list[str]]:
     """Return, at each ``x``, the estimators whose error is lowest or not distinguishable from the lowest.
 
-    ``error`` is a column: ``rmse_rel`` compares at equal samples, those of :func:`~.costs.at_equal_cost` at equal cost.
+    ``error`` is a column: ``rmse_rel`` compares at equal samples, those of :func:`~.costs.with_errors_at_equal_cost` at equal cost.
     """
     named = {}
     for x, low in lowest(curves, error).items():
