@@ -42,8 +42,10 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     if rows.empty:
         raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
     with guard.quiet("a plugin"), guard.guarded():  # the commands that repeat a cell are made from its plugins
-        works = (study_of(experiment).write, _page, averages.write)
-        return [path for paths in run_tasks([partial(work, experiment, rows) for work in works]) for path in paths]
+        writers = (study_of(experiment).write, _page, averages.write)
+        return [
+            path for paths in run_tasks([partial(writer, experiment, rows) for writer in writers]) for path in paths
+        ]
 
 
 def _page(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:

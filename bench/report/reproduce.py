@@ -1,4 +1,4 @@
-"""Gives the command that runs one cell again by itself, from its row."""
+"""Builds, from a row, the command that runs its cell again."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
 
 
 class CellBuilder:
-    """Makes cells from rows, building each plugin once."""
+    """Builds cells from rows, and each plugin once."""
 
     def __init__(self) -> None:
         self._known: dict[str, Plugin] = {}
@@ -78,7 +78,7 @@ class CellBuilder:
 
 
 def cell_settings(cell: Cell) -> list[str]:
-    """Return the settings under which one cell, with the same key, is a whole experiment."""
+    """Return the settings of an experiment that consists of one cell, with the same key."""
     parts = [f"study={_identity(cell.study)}", *plugin_settings(cell)]
     parts += [f"{name}={getattr(cell, name)}" for name in ("samples", "repeats", "seed")]
     parts += theta_settings(cell)
@@ -106,7 +106,7 @@ def plugin_settings(cell: Cell, without: Collection[str] = ()) -> list[str]:
 
 
 def theta_settings(cell: Cell) -> list[str]:
-    """Return the settings for theta and the point of the gradients, if they are not the scene's own."""
+    """Return the settings of theta and of the point of the gradients; none where they are the scene's own."""
     names, at = cell.decision.names, cell.decision.at
     return [f"theta=[{','.join(names)}]"] * bool(names) + (
         [] if at is None else [f"theta0=[{','.join(map(repr, at))}]"]

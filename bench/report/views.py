@@ -111,6 +111,17 @@ def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
     return merged.assign(lost=rows["lost"].groupby(cell).sum()).reset_index(drop=True)
 
 
+def estimator_label(estimator: str, params: str) -> str:
+    """Return an estimator's identity string: its name, and in brackets the parameters that differ from their defaults."""
+    return f"{estimator}[{params}]" if params else estimator
+
+
+def estimator_labels(rows: pd.DataFrame) -> pd.Series:
+    """Return the estimator's identity string of each row."""
+    labels = map(estimator_label, rows["estimator"], rows["estimator_params"])
+    return pd.Series(list(labels), index=rows.index, dtype=object)
+
+
 @dataclass(frozen=True, eq=False)
 class Curve:
     """One estimator along ``x``, on one backend or on several that agree."""
@@ -136,7 +147,7 @@ class Curve:
     @property
     def label(self) -> str:
         """The estimator's identity string."""
-        return f"{self.estimator}[{self.params}]" if self.params else self.estimator
+        return estimator_label(self.estimator, self.params)
 
 
 RUN = ("estimator", "estimator_params", "backend", "dtype")

@@ -22,10 +22,10 @@ def test_winners_failures_and_bias():
     ]
     rows += [cell("missing", "one", 0, 1, status="unsupported"), cell("loud", "two", 0, 9.0, rollouts=320.0)]
     table = rank_estimators(pd.DataFrame(rows)).set_index(["label", "problem"])
-    assert table.loc[("good", "one"), "stands"] == "wins"
-    assert table.loc[("near", "one"), "stands"] == "wins"
-    assert table.loc[("off", "one"), "stands"] == "fails, biased"
-    assert table.loc[("loud", "two"), "stands"] == "fails"
+    assert table.loc[("good", "one"), "verdict"] == "wins"
+    assert table.loc[("near", "one"), "verdict"] == "wins"
+    assert table.loc[("off", "one"), "verdict"] == "fails, biased"
+    assert table.loc[("loud", "two"), "verdict"] == "fails"
     assert table.loc[("loud", "two"), "text"].endswith("fails (40x)")
     assert table.loc[("missing", "one"), "text"] == "unsupported"
     assert np.isclose(table.loc[("good", "one"), "high"], (1.2 * 0.04) ** 0.5 / 2)
@@ -49,5 +49,5 @@ def test_the_best_setting_is_chosen_at_equal_work():
     table = best(rank_estimators(pd.DataFrame(rows))).set_index(["estimator", "problem"])
     assert table.loc[("set", "one"), "label"] == "set[a=2]"
     assert np.isclose(table.loc[("costly", "one"), "equal"], (4 * 0.04) ** 0.5 / 2)
-    assert table.loc[("plain", "two"), "stands"] == "wins"
-    assert table.loc[("costly", "two"), "stands"] == ""
+    assert table.loc[("plain", "two"), "verdict"] == "wins"
+    assert table.loc[("costly", "two"), "verdict"] == ""

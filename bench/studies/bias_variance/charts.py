@@ -41,13 +41,13 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
     def drawn(name: str, figure: Callable[[], Figure]) -> list[Path]:
         with styled():
-            made = figure()
-            made.draw_without_rendering()  # places everything, once
-            made.set_layout_engine(None)
-            return save(made, experiment.directory / name, experiment.formats)
+            chart = figure()
+            chart.draw_without_rendering()  # computes the layout, once
+            chart.set_layout_engine(None)
+            return save(chart, experiment.directory / name, experiment.formats)
 
-    works = [partial(drawn, name, figure) for name, figure in chart_drawers(experiment, rows).items()]
-    return [path for paths in run_tasks(works) for path in paths]
+    tasks = [partial(drawn, name, figure) for name, figure in chart_drawers(experiment, rows).items()]
+    return [path for paths in run_tasks(tasks) for path in paths]
 
 
 def file_name(axis: Axis, kind: str = "bias_variance") -> str:
@@ -68,7 +68,7 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
 
 
 def chart_drawers(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
-    """Return, by file name, what draws each chart."""
+    """Return, by file name, a function that draws the chart."""
     shown = arranged(experiment, with_gradient_cost(rows))
     rows = shown.rows
     look = EstimatorStyles(rows, sorted(registry.entries()["estimators"]))
@@ -76,7 +76,7 @@ def chart_drawers(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Calla
     merged = [f"medians over {seeds} seeds"] if seeds > 1 else []
     for law in rows.loc[rows["reason"].str.contains(SURROGATE, regex=False), "contact"].unique():
         merged.append(f"{plain(law)}: {SURROGATE}")
-    made: dict[str, Callable[[], Figure]] = {}
+    drawers: dict[str, Callable[[], Figure]] = {}
 
     def problems(axis: Axis | None, drawable: Callable[[pd.DataFrame], bool]) -> list[ProblemRows]:
         return [p for p in split_by_problem(shown, axis) if drawable(p.rows)]
@@ -85,15 +85,15 @@ def chart_drawers(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Calla
     for axis in swept:
         chosen, held = choose_problems(problems(axis, lambda part: attempted(part)["x"].nunique() > 1))
         if chosen:
-            made[file_name(axis)] = partial(bias_variance, chosen, held + merged, look, axis, shown.marks(axis))
-    nothing_swept = not made
+            drawers[file_name(axis)] = partial(bias_variance, chosen, held + merged, look, axis, shown.marks(axis))
+    nothing_swept = not drawers
     good = rows[rows["status"] == "ok"]
     # noise changes an estimate and not its time
     longest = max((axis for axis in swept if axis.short != "sigma"), key=lambda axis: swept[axis], default=None)
     if longest is not None and good["samples"].nunique() < 2 and good["time_s"].notna().any():
         chosen, held = choose_problems(problems(longest, lambda part: TIME.known(part)["x"].nunique() >= FEWEST))
         if chosen:
-            made[file_name(longest, "time")] = partial(draw_error_against_time, chosen, held + merged, look, longest)
+            drawers[file_name(longest, "time")] = partial(draw_error_against_time, chosen, held + merged, look, longest)
     if good["samples"].nunique() > 1 or good["backend"].nunique() > 1:
         for name, cost in (
             ("speed_accuracy", TIME_COMPILED if experiment.compile_time else TIME),
@@ -103,18 +103,20 @@ def chart_drawers(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Calla
             curves = [problem for problem in costed if attempted(problem.rows)["x"].nunique() > 1]
             chosen, held = choose_problems(curves or costed)
             if chosen and (cost is not ROLLOUTS or good["samples"].nunique() > 1):
-                made[name] = partial(_costs, chosen, held + merged, look, cost)
-        raced = (
+                drawers[name] = partial(_costs, chosen, held + merged, look, cost)
+        swept_in_samples = (
             problems(SAMPLES, lambda part: attempted(part)["x"].nunique() > 1) if good["samples"].nunique() > 1 else []
         )
-        if raced:
+        if swept_in_samples:
             costs = [TIME, ROLLOUTS] if good["time_s"].notna().any() else [ROLLOUTS]
-            made["summary_matrix"] = partial(draw_summary_matrix, choose_problems(raced, 2 * ROOM)[0], costs)
+            drawers["summary_matrix"] = partial(
+                draw_summary_matrix, choose_problems(swept_in_samples, 2 * ROOM)[0], costs
+            )
     if nothing_swept:
         chosen = problems(None, lambda part: len(attempted(part)) > 0)
         if chosen:
-            made["overview"] = partial(overview, chosen, merged, look)
-    return made
+            drawers["overview"] = partial(overview, chosen, merged, look)
+    return drawers
 
 
 def _costs(problems: Sequence[ProblemRows], notes: Sequence[str], look: EstimatorStyles, cost: Cost) -> Figure:
@@ -122,21 +124,21 @@ def _costs(problems: Sequence[ProblemRows], notes: Sequence[str], look: Estimato
 
 
 def _panel_sentences(problems: Sequence[ProblemRows], cost: Cost) -> tuple[dict[int, str], str]:
-    """Return, for each problem by place, who reaches an error of 10% and of 1% first, and who leads over all.
+    """Return sentences by position of their problem, which estimator reaches 10% and 1% error first, and a title over all.
 
-    Where samples are not swept nobody reaches anything: it is told who is most accurate and who fastest.
+    Where samples are not swept, the title names the most accurate and the fastest estimator.
     """
     kind = "rollouts" if cost is ROLLOUTS else "time"
-    said = {}
+    sentences = {}
     every: list[dict[str, Any]] = []
     for place, problem in enumerate(problems):
         if problem.rows["x"].nunique() > 1:
             entries = [time_to_accuracy.line(problem, target, kind, cost) for target in time_to_accuracy.TARGETS]
-            said[place] = "\n".join(map(time_to_accuracy.sentence, entries))
+            sentences[place] = "\n".join(map(time_to_accuracy.sentence, entries))
             every += entries
-    return said, time_to_accuracy.summarise_leaders(every) if every else time_to_accuracy.summarise_accuracy_and_cost(
-        problems, cost
-    )
+    if every:
+        return sentences, time_to_accuracy.summarise_leaders(every)
+    return sentences, time_to_accuracy.summarise_accuracy_and_cost(problems, cost)
 
 
 def _has_costs(cost: Cost, rows: pd.DataFrame) -> bool:

@@ -1,6 +1,6 @@
 """Error against time along a swept axis: each estimator one curve through all values of the axis, labelled with them.
 
-It shows at a glance whether a stiffer contact or a longer horizon costs time, accuracy, or both.
+The chart shows whether a stiffer contact or a longer horizon costs time, accuracy, or both.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ APART = 0.075, 0.06
 LETTER = 0.0115, 0.05
 """Width of a letter and height of a line of labels, as parts of a panel."""
 FACTOR = 2.0
-"""Factors below this are not worth telling in a title."""
+"""Factors below this are not reported in a title."""
 
 
 def draw_error_against_time(
@@ -85,11 +85,11 @@ def _median(line: Curve) -> float:
 
 
 def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -> str:
-    """Write what going along the axis does to error and time of the estimator that is most accurate at its start.
+    """Summarise how error and time grow along the axis, for the estimator that is most accurate at its first value.
 
-    Told are the problem where the error grows most and the one where it grows least.
+    The title names the problem where the error grows most and the problem where it grows least.
     """
-    said: list[tuple[float, str]] = []
+    texts: list[tuple[float, str]] = []
     for family, curves in parts:
         named = winners(curves)
         first = named[min(named)][0] if named else ""
@@ -103,11 +103,11 @@ def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -
         ]
         text = f"{first} {' and '.join(grown)}" if grown else f"neither error nor time of {first} doubles"
         kinds = [str(value) for name, value in family.identity.items() if name in CATEGORIES]
-        said.append((factors[0], f"{kinds[-1] if kinds else family.title()}: {text}"))
-    if not said:
+        texts.append((factors[0], f"{kinds[-1] if kinds else family.title()}: {text}"))
+    if not texts:
         return f"Error against time along {axis.column}"
-    told = dict.fromkeys(text for _, text in (max(said), min(said)))
-    return f"Along {axis.column}, " + "; ".join(told)
+    extremes = dict.fromkeys(text for _, text in (max(texts), min(texts)))
+    return f"Along {axis.column}, " + "; ".join(extremes)
 
 
 def _scale_ends(values: Sequence[float]) -> tuple[float, float]:

@@ -23,6 +23,7 @@ from bench.report.views import (
     arranged,
     attempted,
     estimator_curves,
+    estimator_labels,
     is_bias_resolved,
     rmse_interval,
     unsteady,
@@ -75,7 +76,7 @@ EXCEPTIONS = 2
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the finding, what to use where, and the charts."""
+    """Return the finding, the recommended estimators and the charts."""
     shown = arranged(experiment, with_errors_at_equal_cost(rows))
     summaries = [ProblemSummary(axis, family) for axis, family in problems(shown)]
     table_ = with_plotted_columns(rows)
@@ -141,10 +142,10 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
     texts = {
         "bias_limit": limit.astype(float),
         "unsteady": unsteady(rows).astype(float),
-        "series": _label(rows),
+        "series": estimator_labels(rows),
         # a panel never pools what makes costs differ
         "problem": titled(rows.assign(**_named(rows)), ["scene", "contact", *POOLED]),
-        "line": rows["backend"] + " " + rows["dtype"] + " " + _label(rows),
+        "line": rows["backend"] + " " + rows["dtype"] + " " + estimator_labels(rows),
         "setting": number_problems(rows).astype(str),
     }
     return rows.assign(**{name: column.where(good) for name, column in values.items()}, **texts)
@@ -159,11 +160,6 @@ def _named(rows: pd.DataFrame) -> dict[str, Iterable[str]]:
     }
 
 
-def _label(rows: pd.DataFrame) -> pd.Series:
-    params = rows["estimator_params"]
-    return rows["estimator"].where(params == "", rows["estimator"] + "[" + params + "]")
-
-
 def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
     """Return the rows along an axis, seeds merged, by problem; only problems with at least two values of it."""
     rows = shown.rows
@@ -175,7 +171,7 @@ def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
         part = family.rows[family.rows["status"] == "ok"]
         if part["x"].nunique() > 1:
             part = part.sort_values(["line", "x"], kind="stable").assign(
-                facet=family.title(), row=part["key"].map(place), series=_label(part)
+                facet=family.title(), row=part["key"].map(place), series=estimator_labels(part)
             )
             parts.append(part[["row", "x", "facet", "series", "line", *(drawn if merged else [])]])
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
@@ -218,7 +214,7 @@ class ProblemSummary:
 
 @dataclass(frozen=True)
 class BetterElsewhere:
-    """A place where the estimator that is best most often is not: what to use instead, and the errors of both."""
+    """A range where the estimator that is best most often is not the best: the better estimator, and both errors."""
 
     problem: str
     kind: str
@@ -240,12 +236,12 @@ class BetterElsewhere:
 
 
 def failure_sentence(rows: pd.DataFrame) -> str:
-    """Write which estimators fail and how: worse than the zero estimate beyond their interval, no better, or no number.
+    """Write which estimators fail and how: worse than the zero estimate by more than their interval, no better, or no number.
 
-    The estimator with the largest error comes first, at most :data:`NAMED` of them; nothing if none fails.
+    The estimators with the largest errors come first, at most :data:`NAMED`. The text is empty if none fails.
     """
-    found = []
-    for label, part in attempted(rows).groupby(_label(attempted(rows)), sort=False):
+    failures = []
+    for label, part in attempted(rows).groupby(estimator_labels(attempted(rows)), sort=False):
         good = part[(part["status"] == "ok") & np.isfinite(part["rmse_rel"])]
         bad = good[good["rmse_rel"] >= 1]
         lows = rmse_interval(bad)[0]
@@ -259,15 +255,15 @@ def failure_sentence(rows: pd.DataFrame) -> str:
         ]
         if any(texts):
             worst = float(bad["rmse_rel"].max()) if len(bad) else 0.0
-            found.append((worst, f"{label} is {', '.join(filter(None, texts))} of {counted(len(part), 'cell')}"))
-    found.sort(key=lambda one: -one[0])
-    return "; ".join(text for _, text in found[:NAMED])
+            failures.append((worst, f"{label} is {', '.join(filter(None, texts))} of {counted(len(part), 'cell')}"))
+    failures.sort(key=lambda failure: -failure[0])
+    return "; ".join(text for _, text in failures[:NAMED])
 
 
 def _join_sentences(*parts: str) -> str:
-    """Join the parts that say something; a capital stands only at the start."""
-    said = [part for part in parts if part]
-    return "; ".join([*said[:1], *(part[0].lower() + part[1:] for part in said[1:])]) + "."
+    """Join the parts that are not empty into one sentence, with a capital at its start alone."""
+    texts = [part for part in parts if part]
+    return "; ".join([*texts[:1], *(part[0].lower() + part[1:] for part in texts[1:])]) + "."
 
 
 def finding(summaries: Sequence[ProblemSummary]) -> str:
@@ -297,7 +293,7 @@ def fastest(rows: pd.DataFrame) -> str:
         return ""
     settings = good["time_s"].groupby(number_problems(good))
     first = good.loc[settings.idxmin()]
-    ways = _label(first) + " on " + first["backend"]
+    ways = estimator_labels(first) + " on " + first["backend"]
     way = ways.value_counts().index[0]
     times = sorted(first.loc[ways == way, "time_s"])
     if len(first) < 2:
@@ -314,9 +310,9 @@ def refusal_sentence(rows: pd.DataFrame) -> str:
 
 
 def exceptions_to(summaries: Sequence[ProblemSummary], main: str) -> list[BetterElsewhere]:
-    """Return the settings where another estimator than ``main`` is best, the largest difference first.
+    """Return the settings where an estimator other than ``main`` is best, the largest difference first.
 
-    A statement true of every problem with the same scene and law is printed once.
+    A statement that is true of every problem with the same scene and contact law is made once.
     """
     exceptions = []
     for one in summaries:
@@ -337,7 +333,7 @@ def exceptions_to(summaries: Sequence[ProblemSummary], main: str) -> list[Better
 
 
 def answers(summaries: Sequence[ProblemSummary]) -> pd.DataFrame:
-    """Return what to use where: a line per problem and stretch of its axis with the same best estimators."""
+    """Return the recommended estimators: a line per problem and range of its axis with the same best estimators."""
     entries = []
     for one in summaries:
         groups: dict[tuple[str, ...], list[float]] = {}

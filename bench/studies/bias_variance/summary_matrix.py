@@ -1,4 +1,4 @@
-"""One figure for five seconds: what each estimator needs for an error, scene by scene, and who is first."""
+"""The summary matrix: the cost of each estimator to reach an error, by problem, and the first estimator of each."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SHADES = (
 )
 """Largest factor over the first of a column, with the colours of cell and text."""
 WHY = {"never": "bias", "unknown": "bias?"}
-"""What stands in a cell without a number."""
+"""Texts of cells without a number."""
 LEGEND = (
     "Dark and bold: the first of its column; lighter: up to 3, and up to 30 times as much. Lead: the first over the next "
     "estimator, with its 95% interval; open where that reaches 1. bias: its bias is larger than the error. bias?: no bias known to be below the error."
@@ -67,7 +67,7 @@ def _title(found: Mapping[tuple[Cost, float], Sequence[Mapping[str, tuple[Requir
     firsts = Counter(_first(column) for column in columns)
     unsure = firsts.pop(None, 0)
     if not firsts:
-        return f"Which estimator is first to {target:.0%} error cannot be told on any problem"
+        return f"Which estimator is first to {target:.0%} error is not distinguishable on any problem"
     name, times = firsts.most_common(1)[0]
     kind = "rollouts" if cost is ROLLOUTS else "time"
     said = f"{name} is first to {target:.0%} error by {kind} on {times} of {counted(len(columns), 'problem')}"
@@ -82,7 +82,7 @@ def _first(column: Mapping[str, tuple[RequiredCost, str]]) -> str | None:
 
 
 def _best(reached: Mapping[str, RequiredCost]) -> dict[str, tuple[RequiredCost, str]]:
-    """Return what each estimator needs on its best backend, and that backend."""
+    """Return each estimator's cost on its best backend, and that backend."""
     best: dict[str, tuple[RequiredCost, str]] = {}
     for name, way in reached.items():
         estimator, _, backend = name.partition(" on ")
@@ -119,7 +119,7 @@ def _matrix(
 
 
 def _lead(column: Mapping[str, tuple[RequiredCost, str]]) -> str:
-    """Return the factor between the first and the second, or that their intervals do not tell them apart."""
+    """Return the factor between the first and the second with its interval, or ``open`` where the interval reaches 1."""
     ways = sorted((way for way, _ in column.values() if math.isfinite(way.cost)), key=lambda way: way.cost)
     if len(ways) < 2:
         return "alone" if ways else ""

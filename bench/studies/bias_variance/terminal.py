@@ -24,6 +24,7 @@ from bench.report.views import (
     arranged,
     bias_text,
     estimator_curves,
+    estimator_label,
     is_bias_resolved,
     relative,
     unsteady,
@@ -112,7 +113,7 @@ def _show_pivot(console: Console, group: ProblemRows, axis: Axis) -> None:
 
 
 def _cell(row: dict[str, Any] | None, best: float) -> tuple[Text, Text]:
-    """Write bias and RMSE of a cell, or what became of it."""
+    """Return the texts of a cell's bias and RMSE, or its status if it failed."""
     if row is None or row["status"] != "ok":
         return Text("" if row is None else row["status"][:6], "red"), Text()
     if is_bias_resolved(row):
@@ -172,13 +173,13 @@ def _show_legend(console: Console, condensed: bool) -> None:
 
 
 def _show_reasons(console: Console, rows: pd.DataFrame) -> None:
-    """Print what failed or was refused, and why; reasons that differ only in numbers are merged."""
-    noted = rows[rows["reason"] != ""]
-    if noted.empty:
+    """Print the reasons of rows that failed, were refused or have a remark; reasons that differ in numbers alone are merged."""
+    remarked = rows[rows["reason"] != ""]
+    if remarked.empty:
         return
     console.print("\nFailed, refused or noted", style="bold")
-    kinds = noted["reason"].str.replace(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", regex=True)
-    for (status, _), part in sorted(noted.groupby(["status", kinds]), key=lambda item: -len(item[1])):
+    kinds = remarked["reason"].str.replace(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", regex=True)
+    for (status, _), part in sorted(remarked.groupby(["status", kinds]), key=lambda item: -len(item[1])):
         more = "" if part["reason"].nunique() == 1 else " (for example)"
         _print_wrapped(console, f"{len(part)} {status}: {one_line(part['reason'].iloc[0])}{more}", 2)
 
@@ -189,7 +190,7 @@ def _print_wrapped(console: Console, text: str, indent: int) -> None:
 
 
 def _show_verdict(console: Console, group: ProblemRows, axis: Axis | None) -> None:
-    """Print, for one problem, the estimators of lowest error, those whose error is bias, useless ones, and where."""
+    """Print one problem's verdict: the estimators of lowest error, the biased and the useless ones, each with its range."""
     console.print(f"  {group.title()}" + (f", by {axis.title}" if axis else ""), style="bold")
     curves = estimator_curves(group.rows)
     ranked = {f"lowest error at equal {cost}": _winners(curves, error) for cost, error in COSTS.items()}
@@ -203,9 +204,9 @@ def _show_verdict(console: Console, group: ProblemRows, axis: Axis | None) -> No
     ):
         where: dict[str, dict[float, bool]] = {}
         for line in curves:
-            there = where.setdefault(line.label, {})
+            holds_at = where.setdefault(line.label, {})
             for x, row in line.at.items():
-                there[x] = there.get(x, False) or (row["status"] == "ok" and test(row))
+                holds_at[x] = holds_at.get(x, False) or (row["status"] == "ok" and test(row))
         parts = [f"{label} {span(holds)}".strip() for label, holds in where.items() if any(holds.values())]
         if parts:
             _print_wrapped(console, f"{text}: {', '.join(parts)}", 4)
@@ -243,5 +244,5 @@ def _first(rows: pd.DataFrame, goal: float) -> str:
     if good.empty:
         return "none"
     row = good.loc[good["time_s"].idxmin()]
-    label = f"{row['estimator']}[{row['estimator_params']}]" if row["estimator_params"] else row["estimator"]
+    label = estimator_label(row["estimator"], row["estimator_params"])
     return f"{label} on {row['backend']} in {duration(row['time_s'])} with {row['x']:g} samples"

@@ -1,4 +1,4 @@
-"""Finds, for a given relative error, which estimator on which backend is fastest, and by what factor.
+"""Finds the estimator and backend that reach a given relative error fastest, and the factor over the next.
 
 The mean square error of an estimate from N samples is bias^2 + v / N. Between two measured N it is interpolated; beyond
 the largest one it is extrapolated by that law, and only to errors above what is known of the bias.
@@ -28,7 +28,7 @@ from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost, with_gradien
 
 SAMPLES = Axis("samples", ("samples",))
 TARGETS = (0.1, 0.01)
-"""Relative errors asked for."""
+"""Relative errors to reach."""
 NOTES = (
     "cost: of the cheapest estimate that reaches the error, in seconds without compilation, or in rollouts, where a "
     "gradient counts as the rollouts that take as long (as measured at the most samples; as one where it was not). how: "
@@ -41,7 +41,7 @@ NOTES = (
 
 @dataclass(frozen=True)
 class RequiredCost:
-    """What a method needs to reach an error, or why that is unknown."""
+    """The cost of a method to reach an error, or the reason why it is unknown."""
 
     how: str
     """``measured``, ``at once``, ``extrapolated``, ``never`` or ``unknown``."""
@@ -144,7 +144,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def methods(problem: ProblemRows, target: float, cost: Cost) -> dict[str, RequiredCost]:
-    """Return what each method needs for an error: per estimator and backend in time, per estimator in rollouts."""
+    """Return each method's cost to reach an error: per estimator and backend in time, per estimator in rollouts."""
     reached: dict[str, RequiredCost] = {}
     for curve in estimator_curves(problem.rows, close=None):
         name = curve.label if cost is ROLLOUTS else f"{curve.label} on {curve.rows['backend'].iloc[0]}"
@@ -160,7 +160,7 @@ def estimator_of(method: str) -> str:
 
 
 def line(problem: ProblemRows, target: float, kind: str, cost: Cost) -> dict[str, Any]:
-    """Return the fastest method, the next one of another estimator if there is one, and those that are out."""
+    """Return a line of the table: the fastest method, the next one (of another estimator if possible), and the excluded ones."""
     reached = methods(problem, target, cost)
     ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
     entry: dict[str, Any] = {
@@ -208,7 +208,7 @@ def texts(best: pd.DataFrame) -> pd.DataFrame:
 
 
 def sentence(entry: Any) -> str:
-    """Return a line of the table as a sentence: who gets there first, and by what factor over the next."""
+    """Return a line of the table as a sentence: the first method, and its factor over the next."""
     what = f"to {entry['relative error']:.0%}"
     if entry["fastest"] == "-":
         never = "nobody, all have a larger bias"
@@ -222,13 +222,13 @@ def sentence(entry: Any) -> str:
 
 
 def sentences(best: pd.DataFrame) -> list[str]:
-    """Return a sentence per problem: who reaches each error first in time (rollouts where no time is known)."""
+    """Return a sentence per problem: the method that reaches each error first in time (in rollouts where no time is known)."""
     kind = "time" if (best["by"] == "time").any() else "rollouts"
     chosen = best[best["by"] == kind].to_dict("records")
-    told: dict[str, list[str]] = {}
+    by_problem: dict[str, list[str]] = {}
     for entry in chosen:
-        told.setdefault(entry["problem"], []).append(sentence(entry))
-    return [f"{problem}: {'; '.join(sentences)}." for problem, sentences in told.items()]
+        by_problem.setdefault(entry["problem"], []).append(sentence(entry))
+    return [f"{problem}: {'; '.join(sentences)}." for problem, sentences in by_problem.items()]
 
 
 def _is_clearly_first(entry: Any) -> bool:
@@ -240,7 +240,7 @@ def _is_clearly_first(entry: Any) -> bool:
 
 
 def summarise_leaders(entries: Sequence[Any]) -> str:
-    """Write who is certainly first on most problems: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
+    """Name the estimator that is certainly first on most problems: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
     said: list[str] = []
     before = ""
     for target in dict.fromkeys(entry["relative error"] for entry in entries):
@@ -257,7 +257,7 @@ def summarise_leaders(entries: Sequence[Any]) -> str:
 
 
 def summarise_accuracy_and_cost(problems: Sequence[ProblemRows], cost: Cost) -> str:
-    """Write who is most accurate on most problems, who costs least, and on how many of those it is useless."""
+    """Name the estimators that are most accurate and cheapest on most problems, and count where the cheapest is useless."""
     accurate: Counter[str] = Counter()
     cheap: Counter[str] = Counter()
     useless: Counter[str] = Counter()
