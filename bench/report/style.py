@@ -54,7 +54,7 @@ WORDS = {"dt": "time step", "sigma": "noise"}
 """Words for an axis before its symbol, where they differ from its parameter's name."""
 
 
-class EstimatorStyles:
+class Styles:
     """The colour, marker and line style of each estimator and backend, the same in all charts.
 
     ``names`` are all registered estimators, so that an estimator's style does not depend on the others in the chart.

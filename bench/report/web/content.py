@@ -27,11 +27,7 @@ columns_of, grouped, problems, shown_as, together = part_columns, problem_number
 logarithmic = is_logarithmic
 """The names under which the studies use these functions."""
 SYMBOLS = dict(
-    zip(
-        MARKERS,
-        ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star"),
-        strict=True,
-    )
+    zip(MARKERS, ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star"), strict=True)
 )
 """Plotly's names of the charts' markers."""
 DASHES = dict(zip(map(str, VARIANTS), ("solid", "dash", "dot"), strict=True))

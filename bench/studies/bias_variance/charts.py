@@ -23,7 +23,7 @@ from bench.model import SURROGATE, registry
 from bench.report.cores import run_tasks
 from bench.report.figures import save, styled
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.style import EstimatorStyles, plain, symbol
+from bench.report.style import Styles, plain, symbol
 from bench.report.views import CATEGORIES, arranged, attempted
 from bench.studies.bias_variance import time_to_accuracy
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost, with_gradient_cost
@@ -71,7 +71,7 @@ def chart_drawers(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Calla
     """Return, by file name, a function that draws the chart."""
     shown = arranged(experiment, with_gradient_cost(rows))
     rows = shown.rows
-    look = EstimatorStyles(rows, sorted(registry.entries()["estimators"]))
+    look = Styles(rows, sorted(registry.entries()["estimators"]))
     seeds = rows["seed"].nunique()
     merged = [f"medians over {seeds} seeds"] if seeds > 1 else []
     for law in rows.loc[rows["reason"].str.contains(SURROGATE, regex=False), "contact"].unique():
@@ -119,7 +119,7 @@ def chart_drawers(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Calla
     return drawers
 
 
-def _costs(problems: Sequence[ProblemRows], notes: Sequence[str], look: EstimatorStyles, cost: Cost) -> Figure:
+def _costs(problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles, cost: Cost) -> Figure:
     return speed_accuracy(problems, notes, look, cost, *_panel_sentences(problems, cost))
 
 

@@ -19,7 +19,7 @@ from bench.experiment.axes import Axis
 from bench.report.page import columns, page, shared
 from bench.report.problems import ProblemRows
 from bench.report.scales import log_axis
-from bench.report.style import SHADE, EstimatorStyles, axis_name, plain
+from bench.report.style import SHADE, Styles, axis_name, plain
 from bench.report.text import axis_value, number
 from bench.report.views import CATEGORIES, Curve, estimator_curves
 from bench.studies.bias_variance.costs import TIME
@@ -35,9 +35,7 @@ FACTOR = 2.0
 """Factors below this are not reported in a title."""
 
 
-def draw_error_against_time(
-    problems: Sequence[ProblemRows], notes: Sequence[str], look: EstimatorStyles, axis: Axis
-) -> Figure:
+def draw_error_against_time(problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles, axis: Axis) -> Figure:
     """Draw relative RMSE against the time of one estimate, a panel per problem, a curve per estimator.
 
     Each curve joins the values of the axis in order, on the backend that is fastest in the median; numbers beside it are

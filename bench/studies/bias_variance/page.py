@@ -14,7 +14,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.model import registry
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.style import EstimatorStyles
+from bench.report.style import Styles
 from bench.report.text import axis_value, counted, duration, number
 from bench.report.views import (
     CATEGORIES,
@@ -179,7 +179,7 @@ def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
 
 def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
     """Return the charts' own colour, marker and line style of every estimator in the rows."""
-    styles = EstimatorStyles(rows, sorted(registry.entries()["estimators"]))
+    styles = Styles(rows, sorted(registry.entries()["estimators"]))
     looks = {}
     for estimator, params in dict.fromkeys(zip(rows["estimator"], rows["estimator_params"], strict=True)):
         line = Curve(estimator, params, {}, rows.iloc[:0], {}, frozenset(), 0)

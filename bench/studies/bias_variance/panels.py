@@ -29,7 +29,7 @@ from bench.report.style import (
     SHADE,
     SIZE,
     TICK,
-    EstimatorStyles,
+    Styles,
     axis_name,
     backend_rank,
     plain,
@@ -55,7 +55,7 @@ DOWN, LEFT = (
 
 
 def bias_variance(
-    problems: Sequence[ProblemRows], notes: Sequence[str], look: EstimatorStyles, axis: Axis, marks: Mapping[str, float]
+    problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles, axis: Axis, marks: Mapping[str, float]
 ) -> Figure:
     """Draw relative RMSE, and its parts below it: bias and variance; against one axis, a column of panels per problem.
 
@@ -147,7 +147,7 @@ def _draw_errors(panel: Axes, line: Curve, place: Transform, style: Mapping[str,
         )  # fmt: skip
 
 
-def _draw_points(panel: Axes, at: np.ndarray, found: Points, style: Mapping[str, Any], lying: bool = False) -> None:
+def _draw_points(panel: Axes, at: np.ndarray, points: Points, style: Mapping[str, Any], lying: bool = False) -> None:
     """Draw full markers with intervals, hollow ones with arrows at upper limits; ``lying``: values to the right."""
     mark: Any = {
         "color": style["color"],
@@ -155,21 +155,21 @@ def _draw_points(panel: Axes, at: np.ndarray, found: Points, style: Mapping[str,
         "zorder": 3,
         "transform": style.get("transform", panel.transData),
     }
-    limit, clear = found.limit, ~found.limit
-    bars = np.array([(found.value - found.low)[clear], (found.high - found.value)[clear]])
+    limit, clear = points.limit, ~points.limit
+    bars = np.array([(points.value - points.low)[clear], (points.high - points.value)[clear]])
     bars = np.nan_to_num(bars, posinf=0.0).clip(min=0.0)
-    points: Any = (at[clear], found.value[clear])
-    limits: Any = (at[limit], found.value[limit])
+    centres: Any = (at[clear], points.value[clear])
+    limits: Any = (at[limit], points.value[limit])
     if lying:
-        points, limits = points[::-1], limits[::-1]
+        centres, limits = centres[::-1], limits[::-1]
     error: Any = {"xerr": bars} if lying else {"yerr": bars}
-    panel.errorbar(points[0], points[1], elinewidth=0.8, marker=style["marker"], **error, **mark)
+    panel.errorbar(centres[0], centres[1], elinewidth=0.8, marker=style["marker"], **error, **mark)
     panel.plot(*limits, marker=style["marker"], markerfacecolor="white", markeredgewidth=0.9, **mark)
     panel.plot(*limits, marker=LEFT if lying else DOWN, markersize=18, markerfacecolor="none", **mark)
 
 
 def _line_legends(
-    drawn: Sequence[Sequence[Curve]], look: EstimatorStyles, axis: Axis, marks: Mapping[str, float]
+    drawn: Sequence[Sequence[Curve]], look: Styles, axis: Axis, marks: Mapping[str, float]
 ) -> tuple[list[Any], list[Any]]:
     """Return legend handles: estimators, then the meaning of symbols."""
     every = [(line, curves) for curves in drawn for line in curves]
@@ -207,16 +207,16 @@ BACKENDS = ("solid", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)), (0, (8, 2)
 def speed_accuracy(
     problems: Sequence[ProblemRows],
     notes: Sequence[str],
-    look: EstimatorStyles,
+    look: Styles,
     cost: Cost,
-    said: Mapping[int, str],
+    sentences: Mapping[int, str],
     first: str,
 ) -> Figure:
     """Draw relative RMSE of one estimate against its cost, a panel per problem, a curve per estimator and backend.
 
     Colour and marker are the estimator, the line style the backend; the best backend's curve has the estimator's name at
-    its end. Along a thin grey guide the error falls as N^-1/2; a dotted line is a bias that no samples remove. ``said``
-    are sentences by problem, ``first`` one over all of them, the title.
+    its end. Along a thin grey guide the error falls as N^-1/2; a dotted line is a bias that no samples remove. ``sentences``
+    are texts by problem, ``first`` one over all of them, the title.
     """
     drawn = [estimator_curves(problem.rows, close=None) for problem in problems]
     every = [line for curves in drawn for line in curves]
@@ -243,8 +243,8 @@ def speed_accuracy(
         _draw_guide(panel, cost.known(problem.rows), cost)
         _name_curves(panel, curves, cost, look, figure.get_figwidth() / across - MARGIN)
         room = 132 // across
-        told = ["\n".join(textwrap.wrap(text, room)) for text in said.get(place, "").splitlines()]
-        panel.set_xlabel("\n".join([cost.label, *told]), fontsize=6.2)
+        wrapped_lines = ["\n".join(textwrap.wrap(text, room)) for text in sentences.get(place, "").splitlines()]
+        panel.set_xlabel("\n".join([cost.label, *wrapped_lines]), fontsize=6.2)
     return figure
 
 
@@ -287,7 +287,7 @@ def _draw_guide(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
     )
 
 
-def _name_curves(panel: Axes, curves: Sequence[Curve], cost: Cost, look: EstimatorStyles, width: float) -> None:
+def _name_curves(panel: Axes, curves: Sequence[Curve], cost: Cost, look: Styles, width: float) -> None:
     """Write each estimator's name at the end of its cheapest curve, names apart and within the ``width`` in inches."""
     ends: dict[str, tuple[float, float, Curve]] = {}
     for line in curves:
@@ -332,7 +332,7 @@ def _draw_scales(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
         panel.axhspan(1.0, high * tall, zorder=0, **SHADE)
 
 
-def overview(problems: Sequence[ProblemRows], notes: Sequence[str], look: EstimatorStyles) -> Figure:
+def overview(problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles) -> Figure:
     """Draw relative bias and RMSE of every estimator, a panel per problem; the title says who fails on how many."""
     every = [estimator_curves(problem.rows, ALIKE) for problem in problems]
     drawn = [{_row_label(line, curves): line for line in curves} for curves in every]

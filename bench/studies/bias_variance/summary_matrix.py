@@ -41,19 +41,21 @@ def draw_summary_matrix(problems: Sequence[ProblemRows], costs: Sequence[Cost]) 
 
     The last row is the factor between the first and the second estimator, with its 95% interval.
     """
-    found = {
+    costs_by_target = {
         (cost, target): [_best(methods(problem, target, cost)) for problem in problems]
         for cost in costs
         for target in TARGETS
     }
-    names = list(dict.fromkeys(name for columns in found.values() for column in columns for name in column))
-    size = max(6.0, 1.5 + 0.93 * len(problems)), 0.9 + (0.45 + 0.27 * (len(names) + 1)) * len(found)
+    names = list(dict.fromkeys(name for columns in costs_by_target.values() for column in columns for name in column))
+    size = max(6.0, 1.5 + 0.93 * len(problems)), 0.9 + (0.45 + 0.27 * (len(names) + 1)) * len(costs_by_target)
     figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(rect=(0.01, 0.0, 0.98, 1.0)))
     FigureCanvasAgg(figure)
-    figure.suptitle(f"{_title(found)}\nWhat one estimate needs, on its best backend", fontsize=9, fontweight="bold")
+    figure.suptitle(
+        f"{_title(costs_by_target)}\nWhat one estimate needs, on its best backend", fontsize=9, fontweight="bold"
+    )
     figure.supxlabel(textwrap.fill(LEGEND, int(19 * size[0])), fontsize=6.5)
-    panels = figure.subplots(len(found), 1, squeeze=False)[:, 0]
-    for panel, ((cost, target), columns) in zip(panels, found.items(), strict=True):
+    panels = figure.subplots(len(costs_by_target), 1, squeeze=False)[:, 0]
+    for panel, ((cost, target), columns) in zip(panels, costs_by_target.items(), strict=True):
         _matrix(panel, columns, names, cost)
         panel.set_title(f"{target:.0%} error: {cost.label}", fontsize=8, loc="left", fontweight="bold")
         panel.set_xticks(range(len(problems)), [plain(p.title().partition(",")[0]) for p in problems], fontsize=6.5)
@@ -61,17 +63,17 @@ def draw_summary_matrix(problems: Sequence[ProblemRows], costs: Sequence[Cost]) 
     return figure
 
 
-def _title(found: Mapping[tuple[Cost, float], Sequence[Mapping[str, tuple[RequiredCost, str]]]]) -> str:
+def _title(costs_by_target: Mapping[tuple[Cost, float], Sequence[Mapping[str, tuple[RequiredCost, str]]]]) -> str:
     """Write which estimator is first most often at the first cost and error."""
-    (cost, target), columns = next(iter(found.items()))
+    (cost, target), columns = next(iter(costs_by_target.items()))
     firsts = Counter(_first(column) for column in columns)
     unsure = firsts.pop(None, 0)
     if not firsts:
         return f"Which estimator is first to {target:.0%} error is not distinguishable on any problem"
     name, times = firsts.most_common(1)[0]
     kind = "rollouts" if cost is ROLLOUTS else "time"
-    said = f"{name} is first to {target:.0%} error by {kind} on {times} of {counted(len(columns), 'problem')}"
-    return said + (f", open on {unsure}" if unsure else "")
+    title = f"{name} is first to {target:.0%} error by {kind} on {times} of {counted(len(columns), 'problem')}"
+    return title + (f", open on {unsure}" if unsure else "")
 
 
 def _first(column: Mapping[str, tuple[RequiredCost, str]]) -> str | None:

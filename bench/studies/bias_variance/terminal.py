@@ -226,8 +226,8 @@ def _winners(curves: Sequence[Curve], error: str) -> str:
 
 
 def _is_mostly_bias(row: Any) -> bool:
-    found = is_bias_resolved(row) and row["bias_rel"] > NEGLIGIBLE and row["bias"] ** 2 > row["rmse"] ** 2 / 2
-    return bool(found and not _has_unexplained_bias(row))
+    dominates = is_bias_resolved(row) and row["bias_rel"] > NEGLIGIBLE and row["bias"] ** 2 > row["rmse"] ** 2 / 2
+    return bool(dominates and not _has_unexplained_bias(row))
 
 
 def _has_unexplained_bias(row: Any) -> bool:

@@ -148,9 +148,9 @@ def methods(problem: ProblemRows, target: float, cost: Cost) -> dict[str, Requir
     reached: dict[str, RequiredCost] = {}
     for curve in estimator_curves(problem.rows, close=None):
         name = curve.label if cost is ROLLOUTS else f"{curve.label} on {curve.rows['backend'].iloc[0]}"
-        found = required_cost(curve, target, cost)
-        if name not in reached or found.cost < reached[name].cost or math.isnan(reached[name].cost):
-            reached[name] = found
+        needed = required_cost(curve, target, cost)
+        if name not in reached or needed.cost < reached[name].cost or math.isnan(reached[name].cost):
+            reached[name] = needed
     return reached
 
 
@@ -241,7 +241,7 @@ def _is_clearly_first(entry: Any) -> bool:
 
 def summarise_leaders(entries: Sequence[Any]) -> str:
     """Name the estimator that is certainly first on most problems: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
-    said: list[str] = []
+    clauses: list[str] = []
     before = ""
     for target in dict.fromkeys(entry["relative error"] for entry in entries):
         asked = [entry for entry in entries if entry["relative error"] == target]
@@ -250,10 +250,10 @@ def summarise_leaders(entries: Sequence[Any]) -> str:
         ways = {method for method in clear if estimator_of(method) == leader}
         name = ways.pop() if len(ways) == 1 else leader
         who = "" if name == before else f"{name} is {'certainly ' * (not clear)}first "
-        error, among = " error" * (not said), f" of {counted(len(asked), 'problem')}" if name != before else ""
-        said.append(f"{who}to {target:.0%}{error} on {count}{among}")
+        error, among = " error" * (not clauses), f" of {counted(len(asked), 'problem')}" if name != before else ""
+        clauses.append(f"{who}to {target:.0%}{error} on {count}{among}")
         before = name
-    return ", ".join(said)
+    return ", ".join(clauses)
 
 
 def summarise_accuracy_and_cost(problems: Sequence[ProblemRows], cost: Cost) -> str:
