@@ -15,7 +15,7 @@ from bench.experiment.study import study_of
 from bench.model import guard
 from bench.report import averages, web
 from bench.report.cores import run_tasks
-from bench.report.views import latest
+from bench.report.views import newest_rows
 from bench.run.execute import Finished, store_of
 from bench.run.record import record
 from bench.run.store import ordered
@@ -33,7 +33,7 @@ def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, list
 
 def report(experiment: Experiment) -> tuple[pd.DataFrame, list[Path]]:
     """Write the files of an experiment again from its newest stored rows; nothing is simulated."""
-    rows = latest(store_of(experiment).load())
+    rows = newest_rows(store_of(experiment).load())
     return rows, write(experiment, rows)
 
 

@@ -1,6 +1,6 @@
 """Rows arranged for reading: what tables, charts and pages share.
 
-:func:`arranged` puts the swept axes into columns; then rows along one axis (:func:`along`), one problem at a time
+:func:`arrange` puts the swept axes into columns; then rows along one axis (:func:`rows_along`), one problem at a time
 (:mod:`bench.report.problems`), and in it one line per estimator with the backends that agree merged (:func:`estimator_curves`).
 """
 
@@ -40,7 +40,7 @@ def attempted(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[~rows["status"].isin(("unsupported", "unavailable"))]
 
 
-def latest(rows: pd.DataFrame) -> pd.DataFrame:
+def newest_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Return each cell's newest row, its parameters completed with today's defaults.
 
     Editing a plugin leaves rows of its older versions behind. Rows of versions that did not store their parameters are
@@ -67,7 +67,7 @@ class Arranged:
 
     def swept(self) -> dict[Axis, int]:
         """Return the axes with two or more values in the rows, and how many; never the seed, which is averaged over."""
-        counts = {a: int(along(self, a)["x"].nunique()) for a in self.axes if a.column != "seed"}
+        counts = {a: int(rows_along(self, a)["x"].nunique()) for a in self.axes if a.column != "seed"}
         return {axis: count for axis, count in counts.items() if count > 1}
 
     def marks(self, axis: Axis) -> Mapping[str, float]:
@@ -76,7 +76,7 @@ class Arranged:
         return next((self.experiment.marks[name] for name in names if name in self.experiment.marks), {})
 
 
-def arranged(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
+def arrange(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
     """Arrange rows for reading."""
     swept_axes = axes(experiment.sweep, rows)
     table = relabel(rows, swept_axes)
@@ -87,7 +87,7 @@ def arranged(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
     return Arranged(experiment, table, tuple(swept_axes))
 
 
-def along(shown: Arranged, axis: Axis | None) -> pd.DataFrame:
+def rows_along(shown: Arranged, axis: Axis | None) -> pd.DataFrame:
     """Return the rows that an axis applies to, seeds merged, its values in a new column ``x`` alone (0 without an axis)."""
     table = merge_seeds(shown.rows).copy()  # one block of memory: slicing a fragmented table is slow
     if axis is None:
@@ -257,3 +257,7 @@ def bias_text(row: Any, norm: float = 1.0, interval: bool = True) -> str:
         return f"0 (< {number(high, 3)})" if high > 0 else "0"
     text = number(value, 3)
     return f"{text} [{number(low, 3)}, {number(high, 3)}]" if interval and math.isfinite(low + high) else text
+
+
+along, arranged, latest = rows_along, arrange, newest_rows
+"""The names under which the other studies and commands use these functions."""

@@ -8,7 +8,7 @@ from bench.experiment import columns
 from bench.experiment.columns import COMMON, IDENTITY
 from bench.experiment.experiment import Experiment
 from bench.report.text import counted
-from bench.report.views import arranged, is_logarithmic
+from bench.report.views import arrange, is_logarithmic
 from bench.report.web.content import (
     STATUS,
     Chart,
@@ -24,7 +24,7 @@ from bench.report.web.content import (
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return counts, a chart of the study's own numbers against the swept ones, and the table."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     table = shown.rows
     own = [
         column

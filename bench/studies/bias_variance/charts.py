@@ -24,7 +24,7 @@ from bench.report.cores import run_tasks
 from bench.report.figures import save, styled
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.style import Styles, plain, symbol
-from bench.report.views import CATEGORIES, arranged, attempted
+from bench.report.views import CATEGORIES, arrange, attempted
 from bench.studies.bias_variance import time_to_accuracy
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost, with_gradient_cost
 from bench.studies.bias_variance.error_against_time import FEWEST, draw_error_against_time
@@ -57,7 +57,7 @@ def file_name(axis: Axis, kind: str = "bias_variance") -> str:
 
 def along_longest(experiment: Experiment, rows: pd.DataFrame) -> list[str]:
     """Return the names of the charts along swept axes, the longest axis first."""
-    swept = arranged(experiment, rows).swept()
+    swept = arrange(experiment, rows).swept()
     return [file_name(axis) for axis in sorted(swept, key=lambda axis: -swept[axis])]
 
 
@@ -69,7 +69,7 @@ def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
 
 def chart_drawers(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
     """Return, by file name, a function that draws the chart."""
-    shown = arranged(experiment, with_gradient_cost(rows))
+    shown = arrange(experiment, with_gradient_cost(rows))
     rows = shown.rows
     look = Styles(rows, sorted(registry.entries()["estimators"]))
     seeds = rows["seed"].nunique()

@@ -20,7 +20,7 @@ from bench.report.views import (
     CATEGORIES,
     Arranged,
     Curve,
-    arranged,
+    arrange,
     attempted,
     estimator_curves,
     estimator_labels,
@@ -38,7 +38,7 @@ from bench.report.web.content import (
     TableColumn,
     identity_columns,
     look,
-    nothing_ran,
+    no_result_sentence,
     titled,
 )
 from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, with_errors_at_equal_cost
@@ -77,7 +77,7 @@ EXCEPTIONS = 2
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the finding, the recommended estimators and the charts."""
-    shown = arranged(experiment, with_errors_at_equal_cost(rows))
+    shown = arrange(experiment, with_errors_at_equal_cost(rows))
     summaries = [ProblemSummary(axis, family) for axis, family in problems(shown)]
     table_ = with_plotted_columns(rows)
     labelled = with_plotted_columns(shown.rows)
@@ -114,7 +114,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         )
     )
     return Content(
-        finding=nothing_ran(rows)
+        finding=no_result_sentence(rows)
         or _join_sentences(failure_sentence(rows), finding(summaries), fastest(rows), refusal_sentence(rows)),
         rows=table_,
         columns=[*identity_columns(rows)[:IN_SIGHT], TIME, *STATUS, *RESULTS, *identity_columns(rows)[IN_SIGHT:]],

@@ -17,7 +17,7 @@ from bench.experiment.parameters import number_problems
 from bench.measure.statistics import UNEXPLAINED, unexplained
 from bench.report.tables import csv, escape_markdown
 from bench.report.text import axis_value, number
-from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, arranged, bias_text, pareto, unsteady
+from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, arrange, bias_text, pareto, unsteady
 from bench.run.files import write_all
 from bench.studies.bias_variance import pivot
 
@@ -34,7 +34,7 @@ FOOTNOTES = [
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``bias_variance`` (.csv, .md, .tex) and ``speed_accuracy.csv``; returns their paths."""
-    paper = pivot.pivot(experiment, arranged(experiment, rows))
+    paper = pivot.pivot(experiment, arrange(experiment, rows))
     return write_all(
         experiment.directory,
         {

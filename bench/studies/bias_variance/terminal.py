@@ -21,7 +21,7 @@ from bench.report.text import axis_value, duration, number, one_line
 from bench.report.views import (
     UNSTEADY,
     Curve,
-    arranged,
+    arrange,
     bias_text,
     estimator_curves,
     estimator_label,
@@ -50,7 +50,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
     console.print(f"{len(rows)} cells: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
-    parts = problems(arranged(experiment, with_errors_at_equal_cost(rows)))
+    parts = problems(arrange(experiment, with_errors_at_equal_cost(rows)))
     condensed = len(rows) > FULL_ROWS
     for axis, group in parts:
         if condensed and axis is not None:

@@ -22,7 +22,7 @@ from bench.measure.statistics import unexplained
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import axis_value, counted, number
-from bench.report.views import Curve, arranged, estimator_curves
+from bench.report.views import Curve, arrange, estimator_curves
 from bench.run.files import write_all
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost, with_gradient_cost
 
@@ -130,7 +130,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     """Return a line per problem, kind of cost and target; empty where samples were not swept."""
     if rows["samples"].nunique() < 2:
         return pd.DataFrame()
-    shown = arranged(experiment, with_gradient_cost(rows))
+    shown = arrange(experiment, with_gradient_cost(rows))
     costs = (("time", TIME), ("rollouts", ROLLOUTS))
     timed = bool(np.isfinite(shown.rows["time_s"]).any())
     entries = [
