@@ -1,4 +1,4 @@
-"""What a stored row says about its cell: its plugins, and the swept axes as numbers, all from its own parameters."""
+"""Reads the swept axes of stored rows as numeric columns, and rebuilds the plugins of a row, from its own parameters."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from bench.errors import UserError
 from bench.experiment.cell import labels
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, THETA, applies, expand, is_theta_axis, parameter_name, swept
-from bench.experiment.parameters import NOT_PLUGINS, as_number, flatten, swept_columns
-from bench.experiment.parameters import parsed as parsed
+from bench.experiment.parameters import NOT_PLUGINS, as_number, flatten, parse, swept_columns
 from bench.model import Plugin, registry
 from bench.model.parameters import Parameter, build, parameters
 
 if TYPE_CHECKING:
     import numpy as np
     import pandas as pd
+
+parsed = parse
+"""The name under which the studies use :func:`~bench.experiment.parameters.parse`."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Axis:
 
     @property
     def title(self) -> str:
-        """The axis with its unit and what moves with it: ``dt [s], with horizon``."""
+        """The axis with its unit and the axes that step with it: ``dt [s], with horizon``."""
         unit = f" [{self.unit}]" if self.unit else ""
         return f"{self.column}{unit}" + (f", with {', '.join(self.moves)}" if self.moves else "")
 
@@ -96,7 +98,7 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
     import numpy as np
 
     table = flatten(rows).drop_duplicates()
-    coordinates = _moved(table) if THETA in swept(sweep) else ()
+    coordinates = _varying_coordinates(table) if THETA in swept(sweep) else ()
     names = [part for name in swept(sweep) for part in (coordinates if name == THETA else (name,))]
     groups: dict[str, list[str]] = {}
     for name in names:
@@ -106,7 +108,7 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
         clash = bool((np.sum([_has_value(name, table) for name in members], axis=0) > 1).any())
         for part in [[name] for name in members] if clash else [members]:
             column = part[0] if clash else own_name
-            axis = Axis(column, tuple(part), *_meaning(part, table))
+            axis = Axis(column, tuple(part), *_unit_and_doc(part, table))
             values = values_of(axis, rows)
             is_known = np.isfinite(values)
             if not is_known.any():
@@ -116,8 +118,10 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
                 if not np.array_equal(shown[is_known], values[is_known]):
                     axis = Axis(part[0] if "." in part[0] else f"swept.{own_name}", axis.names, axis.unit, axis.doc)
             result.append(axis)
-    together = [*_together(sweep), *([frozenset(coordinates)] if len(coordinates) > 1 else [])]
-    return [Axis(axis.column, axis.names, axis.unit, axis.doc, _moving(axis, result, together)) for axis in result]
+    together = [*_zipped_names(sweep), *([frozenset(coordinates)] if len(coordinates) > 1 else [])]
+    return [
+        Axis(axis.column, axis.names, axis.unit, axis.doc, _columns_in_step(axis, result, together)) for axis in result
+    ]
 
 
 def _has_value(name: str, table: pd.DataFrame) -> np.ndarray:
@@ -128,7 +132,7 @@ def _has_value(name: str, table: pd.DataFrame) -> np.ndarray:
     return np.any(values, axis=0).astype(int) if values else np.zeros(len(table), dtype=int)
 
 
-def _moved(table: pd.DataFrame) -> tuple[str, ...]:
+def _varying_coordinates(table: pd.DataFrame) -> tuple[str, ...]:
     """Return the names of theta0's coordinates that differ between rows; ``theta0`` where it has but one."""
     coordinates = [column for column in table if is_theta_axis(column)]
     if len(coordinates) < 2:
@@ -136,25 +140,26 @@ def _moved(table: pd.DataFrame) -> tuple[str, ...]:
     return tuple(column for column in coordinates if table[column].nunique() > 1)
 
 
-def _moving(axis: Axis, found: Sequence[Axis], together: Sequence[frozenset[str]]) -> tuple[str, ...]:
+def _columns_in_step(axis: Axis, others: Sequence[Axis], together: Sequence[frozenset[str]]) -> tuple[str, ...]:
+    """Return the columns of the axes that step together with an axis."""
     partners = {name for group in together for name in group if group & set(axis.names)} - set(axis.names)
-    return tuple(other.column for other in found if other is not axis and partners & set(other.names))
+    return tuple(other.column for other in others if other is not axis and partners & set(other.names))
 
 
-def _together(sweep: Mapping[str, Any]) -> list[frozenset[str]]:
-    """Return the groups of names that step together in a ``zip``, wherever it stands in the sweep."""
+def _zipped_names(sweep: Mapping[str, Any]) -> list[frozenset[str]]:
+    """Return, for each ``zip`` at any depth of the sweep, the names that step together."""
     groups = []
     for name, value in sweep.items():
         if name == "zip":
             groups.append(frozenset(expand({"zip": value})[0]))
         elif name == "product":
-            groups += _together(value)
+            groups += _zipped_names(value)
         elif name == "union":
-            groups += [group for part in value for group in _together(part)]
+            groups += [group for part in value for group in _zipped_names(part)]
     return groups
 
 
-def _meaning(names: Iterable[str], table: pd.DataFrame) -> tuple[str, str]:
+def _unit_and_doc(names: Iterable[str], table: pd.DataFrame) -> tuple[str, str]:
     """Return unit and meaning of a parameter, as its plugins declare them; empty where their units differ."""
     meanings = {}
     for name in names:
@@ -168,7 +173,7 @@ def _meaning(names: Iterable[str], table: pd.DataFrame) -> tuple[str, str]:
 
 
 def declared_parameters(kind: str, name: str) -> Mapping[str, Parameter]:
-    """Return the parameters that a plugin declares; none where it is not installed here."""
+    """Return the parameters that a plugin declares, by name; none where it is not installed."""
     entry = registry.entries().get(kind, {}).get(name)
     return parameters(entry.plugin) if entry is not None and entry.plugin is not None else {}
 
@@ -179,20 +184,20 @@ def with_axes(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows as the CSV has them: the study's table, the swept axes, then the cell's whole identity."""
+    """Return rows with the columns of the CSV: the study's table, the swept axes, then the cell's whole identity."""
     extra = [axis.column for axis in axes(experiment.sweep, rows) if axis.column not in rows]
     wide = with_axes(experiment, rows)
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
     texts = [name for name in experiment.columns.of_kind("text") if name in wide]
-    return wide.assign(**{name: wide[name].map(_harmless) for name in texts})
+    return wide.assign(**{name: wide[name].map(_escape_formula) for name in texts})
 
 
-def _harmless(text: Any) -> Any:
-    """Return a string that a spreadsheet shows and does not calculate: with an apostrophe before a formula's sign."""
+def _escape_formula(text: Any) -> Any:
+    """Return text with an apostrophe before a formula's sign, so that a spreadsheet shows it instead of evaluating it."""
     return f"'{text}" if isinstance(text, str) and text[:1] in ("=", "+", "-", "@") else text
 
 
-def revived(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
+def build_plugins(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
     """Build the plugins described by a row's parameters, by axis; raises :class:`UserError` if one is not installed."""
     parts: dict[str, Plugin | None] = {}
     for axis, part in given.items():
@@ -203,7 +208,7 @@ def revived(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
     return parts
 
 
-def relabelled(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
+def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
     """Return rows whose identity strings omit the parameters of swept axes, which have columns of their own.
 
     Rows whose plugins are not installed keep their identity strings.
@@ -211,7 +216,7 @@ def relabelled(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
     names = [name for axis in axes for name in axis.names]
     read = cache(lambda text: _labels(json.loads(text), names))
     lines = []
-    for given in parsed(rows):
+    for given in parse(rows):
         estimator = {axis: part for axis, part in given.items() if axis == "estimator"}
         problem = {axis: part for axis, part in given.items() if axis != "estimator"}
         lines.append(read(json.dumps(problem)) | read(json.dumps(estimator)))
@@ -230,6 +235,6 @@ def _labels(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, str]:
     if not any(hidden.values()):
         return {}
     try:
-        return labels(revived(given), hidden)
+        return labels(build_plugins(given), hidden)
     except UserError:
         return {}

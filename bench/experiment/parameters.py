@@ -29,7 +29,7 @@ VIEWS = ("noise", "horizon", "dt", "stiffness", "sigma", "smoothing")
 """Identity columns that show a problem's parameters; they identify the problem of rows without parameters."""
 
 
-def parsed(rows: pd.DataFrame) -> list[Mapping[str, Any]]:
+def parse(rows: pd.DataFrame) -> list[Mapping[str, Any]]:
     """Return each row's parameters by axis, with today's defaults where the row lacks one; empty where it has none."""
     if "parameters" not in rows:
         return [{}] * len(rows)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from bench.experiment.axes import Axis, axes, relabelled, with_axes
+from bench.experiment.axes import Axis, axes, relabel, with_axes
 from bench.experiment.columns import IDENTITY
 from bench.experiment.experiment import Experiment
 from bench.report.tables import csv, plain_markdown
@@ -27,7 +27,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     if table.empty:
         return []
     shown = table[table["quantity"].isin(ROOM)] if table["quantity"].isin(ROOM).any() else table
-    said = shown.drop(columns=["standard_error"]).assign(
+    texts = shown.drop(columns=["standard_error"]).assign(
         mean=[
             f"{number(m)} +- {number(1.96 * e)}" for m, e in zip(shown["mean"], shown["standard_error"], strict=True)
         ],
@@ -38,7 +38,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         "been drawn at random), root mean square, least and largest.\n"
     )
     return write_all(
-        experiment.directory, {"averages.csv": csv(table), "averages.md": plain_markdown(said.astype(str)) + legend}
+        experiment.directory, {"averages.csv": csv(table), "averages.md": plain_markdown(texts.astype(str)) + legend}
     )
 
 
@@ -53,13 +53,13 @@ def averages(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     good = rows[rows["status"] == "ok"]
     if not wanted or good.empty:
         return pd.DataFrame()
-    found = axes(experiment.sweep, good)
-    over = [axis for axis in found if _meant(axis, wanted)]
-    gone = {axis.column for axis in over} | {column for axis in over for column in axis.moves}
-    gone_axes = [axis for axis in found if axis.column in gone]
-    wide = relabelled(with_axes(experiment, good), gone_axes).reset_index(drop=True)
-    left = [axis.column for axis in found if axis.column not in gone]
-    keys = [name for name in dict.fromkeys([*IDENTITY, *left]) if name in wide and name not in gone]
+    swept = axes(experiment.sweep, good)
+    over = [axis for axis in swept if _is_named(axis, wanted)]
+    averaged = {axis.column for axis in over} | {column for axis in over for column in axis.moves}
+    averaged_axes = [axis for axis in swept if axis.column in averaged]
+    wide = relabel(with_axes(experiment, good), averaged_axes).reset_index(drop=True)
+    left = [axis.column for axis in swept if axis.column not in averaged]
+    keys = [name for name in dict.fromkeys([*IDENTITY, *left]) if name in wide and name not in averaged]
     numbers = [
         column.name
         for column in experiment.columns.all
@@ -77,7 +77,7 @@ def averages(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     return table.drop(columns=same).reset_index(drop=True)
 
 
-def _meant(axis: Axis, wanted: tuple[str, ...]) -> bool:
+def _is_named(axis: Axis, wanted: tuple[str, ...]) -> bool:
     """Whether a name means an axis: its column, a name in the sweep, or ``theta0`` for its coordinates."""
     names = {axis.column, axis.short, axis.column.partition(".")[0], *axis.names}
     return bool(names & set(wanted))

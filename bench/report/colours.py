@@ -1,4 +1,4 @@
-"""The colour and the marker that an estimator has in every chart, by its place among all registered ones."""
+"""The colour and marker of an estimator in every chart, by its position among all registered estimators."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from bench.model import registry
 from bench.report.style import colour, marker
 
 
-def ink(estimator: str) -> str:
+def estimator_colour(estimator: str) -> str:
     """Return the estimator's colour."""
     return colour(_place(estimator))
 
 
-def stamp(estimator: str, variant: int = 0) -> str:
+def estimator_marker(estimator: str, variant: int = 0) -> str:
     """Return the estimator's marker, another for each variant of its parameters."""
     return marker(_place(estimator), variant)
 
@@ -19,3 +19,7 @@ def stamp(estimator: str, variant: int = 0) -> str:
 def _place(estimator: str) -> int:
     names = sorted(registry.entries()["estimators"])
     return names.index(estimator) if estimator in names else len(names)
+
+
+ink, stamp = estimator_colour, estimator_marker
+"""The names under which the studies and claims use these functions."""

@@ -86,7 +86,7 @@ def _start_worker(parent: int) -> None:
 def _run(place: int) -> bytes:
     """Run a task and return its result and its error, pickled."""
     try:
-        outcome = (_tasks[place](), None)
+        outcome: tuple[Any, Exception | None] = (_tasks[place](), None)
     except Exception as error:
         outcome = (None, error)
     return pickle.dumps(outcome)

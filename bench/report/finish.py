@@ -15,7 +15,7 @@ from bench.experiment.study import study_of
 from bench.model import guard
 from bench.report import averages, web
 from bench.report.cores import run_tasks
-from bench.report.views import latest
+from bench.report.views import newest_rows
 from bench.run.execute import Finished, store_of
 from bench.run.record import record
 from bench.run.store import sort_rows
@@ -33,7 +33,7 @@ def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, list
 
 def report(experiment: Experiment) -> tuple[pd.DataFrame, list[Path]]:
     """Write the files of an experiment again from its newest stored rows; nothing is simulated."""
-    rows = latest(store_of(experiment).load())
+    rows = newest_rows(store_of(experiment).load())
     return rows, write(experiment, rows)
 
 
@@ -41,10 +41,14 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write the study's tables and charts, and the page; raises :class:`UserError` where there are no rows."""
     if rows.empty:
         raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
-    # the commands that repeat a cell are built from its plugins
-    with guard.capture_output("a plugin"), guard.protect_process():
-        works = (study_of(experiment).write, _page, averages.write)
-        return [path for paths in run_tasks([partial(work, experiment, rows) for work in works]) for path in paths]
+    with (
+        guard.capture_output("a plugin"),
+        guard.protect_process(),
+    ):  # the commands that repeat a cell are made from its plugins
+        writers = (study_of(experiment).write, _page, averages.write)
+        return [
+            path for paths in run_tasks([partial(writer, experiment, rows) for writer in writers]) for path in paths
+        ]
 
 
 def _page(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:

@@ -59,22 +59,22 @@ def _article(folder: Path, place: Path) -> str:
     e = html.escape
     record = _record(place / "run.json")
     name = str(record.get("experiment") or place.name)
-    there = place.relative_to(folder)
+    relative = place.relative_to(folder)
     page = place / "report.html"
-    heading = f'<a href="{e((there / page.name).as_posix())}">{e(name)}</a>' if page.exists() else e(name)
+    heading = f'<a href="{e((relative / page.name).as_posix())}">{e(name)}</a>' if page.exists() else e(name)
     parts = [f"<h2>{heading}</h2>"]
     if record.get("question"):
         parts.append(f"<p><em>{e(str(record['question']))}</em></p>")
     if finding := _finding(page):
         parts.append(f"<p>{finding}</p>")
     parts.append(f'<p class="state">{_state(place / "rows.parquet", record)}</p>')
-    said = [str(record[key]) for key in ("finished", "git_commit") if record.get(key)]
-    said[1:] = [f"commit {commit[:12]}" for commit in said[1:]]
+    notes = [str(record[key]) for key in ("finished", "git_commit") if record.get(key)]
+    notes[1:] = [f"commit {commit[:12]}" for commit in notes[1:]]
     files = sorted(path.name for path in place.iterdir() if path.suffix in (".md", ".csv", ".png", ".tex"))
-    links = [f'<a href="{e((there / file).as_posix())}">{e(file)}</a>' for file in files if "plotted" not in file]
+    links = [f'<a href="{e((relative / file).as_posix())}">{e(file)}</a>' for file in files if "plotted" not in file]
     if not page.exists():
-        said.append("no page yet: python -m bench report writes it")
-    parts.append(f'<p class="soft">{e("; ".join(said))}<br>{", ".join(links)}</p>')
+        notes.append("no page yet: python -m bench report writes it")
+    parts.append(f'<p class="soft">{e("; ".join(notes))}<br>{", ".join(links)}</p>')
     return "<article>\n" + "\n".join(parts) + "\n</article>"
 
 
@@ -105,9 +105,9 @@ def _finding(page: Path) -> str:
         text = page.read_text(errors="replace")
     except OSError:
         return ""
-    found = re.search(r'id="finding">(.*?)</p>', text, re.DOTALL)
+    match = re.search(r'id="finding">(.*?)</p>', text, re.DOTALL)
     # the page has a clause per element
-    text = re.sub(r"<(?!/?(br|b|em)\b)[^>]*>", "; ", found[1]) if found else ""
+    text = re.sub(r"<(?!/?(br|b|em)\b)[^>]*>", "; ", match[1]) if match else ""
     return re.sub(r"(\s*;\s*)+", "; ", re.sub(r"(&\w+);", r"\1\0", text)).strip("; ").replace("\0", ";")
 
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from bench.report.problems import ProblemRows
-from bench.report.style import inches, plain, quantity, wrapped
+from bench.report.style import plain, quantity, width_in_inches, wrapped
 from bench.report.views import CATEGORIES
 
 WIDTH, NARROW = 7.16, 3.5
@@ -80,7 +80,7 @@ def _panels(grid: np.ndarray, titles: Sequence[str], labels: Sequence[str]) -> l
 
 def _legend_columns(entries: Sequence[Any], width: float) -> int:
     """Return the most columns in which legend entries fit ``width`` inches; entries fill column after column."""
-    lengths = np.array([0.6 + inches(entry.get_label()) for entry in entries])
+    lengths = np.array([0.6 + width_in_inches(entry.get_label()) for entry in entries])
     for count in range(len(lengths), 1, -1):
         if sum(column.max() for column in np.array_split(lengths, count)) <= width:
             return count
@@ -100,7 +100,7 @@ def _legends(figure: SubFigure, legends: Iterable[Sequence[Any]], counts: Iterab
 def _panel_titles(problems: Sequence[ProblemRows], width: float) -> list[str]:
     """Return titles that distinguish problems, all broken before their numbers if one is too long for a line."""
     parts = [_title(problem) for problem in problems]
-    if all(inches(", ".join(kinds + numbers)) <= width for kinds, numbers in parts):
+    if all(width_in_inches(", ".join(kinds + numbers)) <= width for kinds, numbers in parts):
         return [", ".join(kinds + numbers) for kinds, numbers in parts]
     return ["\n".join(wrapped(part, width) for part in both if part) for both in parts]
 

@@ -15,7 +15,7 @@ import pandas as pd
 from bench.experiment.axes import Axis, smoothing_of
 from bench.experiment.parameters import PROBLEM, number_problems
 from bench.report.text import axis_value
-from bench.report.views import CATEGORIES, RUN, Arranged, along
+from bench.report.views import CATEGORIES, RUN, Arranged, rows_along
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ def split_by_problem(shown: Arranged, axis: Axis | None, always: Sequence[str] =
     A swept quantity distinguishes problems if it varies at a fixed value ``x`` of the axis. One that moves with the axis,
     as in a ``zip``, does not. Sample counts, repeats and parameters of estimators count as swept quantities here.
     """
-    table = along(shown, axis)
+    table = rows_along(shown, axis)
     if table.empty:
         return []
     quantities = shown.numbers

@@ -1,4 +1,4 @@
-"""Gives the command that runs one cell again by itself, from its row."""
+"""Builds, from a row, the command that runs its cell again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget, Experiment
 from bench.experiment.grid import COUNTS
-from bench.experiment.parameters import NOT_PLUGINS, parsed
+from bench.experiment.parameters import NOT_PLUGINS, parse
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, registry
 from bench.model.identity import changed, identity
@@ -27,20 +27,20 @@ HEAD = "python -m bench name=one_cell"
 def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     """Return each row's words after :data:`HEAD`, quoted for a shell; none if one of its plugins is not installed."""
     folders = plugin_folders(experiment.plugins)
-    revive = Reviver()
+    revive = CellBuilder()
     lines: list[list[str]] = []
-    for given, row in zip(parsed(rows), rows[["key", *COUNTS]].to_dict("records"), strict=True):
+    for given, row in zip(parse(rows), rows[["key", *COUNTS]].to_dict("records"), strict=True):
         try:
             cell = revive.cell(given, row, experiment.timing)
         except (UserError, KeyError):
             lines.append([])
         else:
-            lines.append([shlex.quote(word) for word in [*folders, *words(cell)]])
+            lines.append([shlex.quote(word) for word in [*folders, *cell_settings(cell)]])
     return lines
 
 
-class Reviver:
-    """Makes cells from rows, building each plugin once."""
+class CellBuilder:
+    """Builds cells from rows, and each plugin once."""
 
     def __init__(self) -> None:
         self._known: dict[str, Plugin] = {}
@@ -77,11 +77,11 @@ class Reviver:
         return self._known[text]
 
 
-def words(cell: Cell) -> list[str]:
-    """Return the settings under which one cell, with the same key, is a whole experiment."""
-    parts = [f"study={_identity(cell.study)}", *plugins(cell)]
+def cell_settings(cell: Cell) -> list[str]:
+    """Return the settings of an experiment that consists of one cell, with the same key."""
+    parts = [f"study={_identity(cell.study)}", *plugin_settings(cell)]
     parts += [f"{name}={getattr(cell, name)}" for name in ("samples", "repeats", "seed")]
-    parts += decided(cell)
+    parts += theta_settings(cell)
     if cell.budget is not None:
         default = Budget()
         for name in ("samples", "tolerance"):
@@ -92,7 +92,7 @@ def words(cell: Cell) -> list[str]:
     return parts
 
 
-def plugins(cell: Cell, without: Collection[str] = ()) -> list[str]:
+def plugin_settings(cell: Cell, without: Collection[str] = ()) -> list[str]:
     """Return a setting for the plugin on each axis, ``contacts=[penalty[stiffness=100]]``, except axes ``without``.
 
     Parameters at their defaults are left out; the scene's contact values count as the defaults of its contact law.
@@ -105,8 +105,8 @@ def plugins(cell: Cell, without: Collection[str] = ()) -> list[str]:
     ]
 
 
-def decided(cell: Cell) -> list[str]:
-    """Return the settings for theta and the point of the gradients, if they are not the scene's own."""
+def theta_settings(cell: Cell) -> list[str]:
+    """Return the settings of theta and of the point of the gradients; none where they are the scene's own."""
     names, at = cell.decision.names, cell.decision.at
     return [f"theta=[{','.join(names)}]"] * bool(names) + (
         [] if at is None else [f"theta0=[{','.join(map(repr, at))}]"]
@@ -128,7 +128,7 @@ def check_of(cell: Cell) -> str:
     if isinstance(cell.scene, MechanicalScene):
         scene, line = _identity(cell.scene, {"horizon": cell.scene.horizon}), [f"sweep.horizon=[{cell.scene.horizon}]"]
     study = [f"study={_identity(cell.study)}"] * bool(changed(cell.study))
-    line += [*plugins(cell, without=("scene", "estimator")), f"seed={cell.seed}", *decided(cell), *study]
+    line += [*plugin_settings(cell, without=("scene", "estimator")), f"seed={cell.seed}", *theta_settings(cell), *study]
     return shlex.join(["python", "-m", "bench", "gradcheck", scene, *line])
 
 

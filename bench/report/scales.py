@@ -13,6 +13,7 @@ from matplotlib.transforms import Affine2D, Transform, blended_transform_factory
 
 from bench.report.style import MARKS, SHADE
 from bench.report.text import axis_value
+from bench.report.views import is_logarithmic
 
 TICKS = (
     (1, (1, 1.5, 2, 3, 5, 7)), (1, (1, 2, 5)), (1, (1, 3)), (1, (1,)), (2, (1,)), (3, (1,)), (4, (1,)), (6, (1,)), (10, (1,))
@@ -20,20 +21,15 @@ TICKS = (
 """Choices of ticks on a logarithmic axis, finest first: every how many decades, and where in a decade."""
 
 
-def logarithmic(values: np.ndarray) -> bool:
-    """Return whether the values of a swept axis ask for a logarithmic scale."""
-    return bool(values.min() > 0 and values.max() >= 8 * values.min())
-
-
 def shifts(values: np.ndarray, count: int, columns: int) -> list[Affine2D]:
     """Return sideways shifts for ``count`` lines by a part of the smallest step, so that no points hide others.
 
     They go before a panel's own transform, so that points move on paper while their data stay the same.
     """
-    positions = np.log10(values) if logarithmic(values) else values
+    positions = np.log10(values) if is_logarithmic(values) else values
     step = min(0.4 * np.diff(positions).min(), 0.003 * columns * count * np.ptp(positions)) / max(count, 2)
     offsets = step * (np.arange(count) - (count - 1) / 2)
-    return [Affine2D().scale(10**o, 1) if logarithmic(values) else Affine2D().translate(o, 0) for o in offsets]
+    return [Affine2D().scale(10**o, 1) if is_logarithmic(values) else Affine2D().translate(o, 0) for o in offsets]
 
 
 def in_data(panel: Axes, artist: Line2D) -> bool:
@@ -48,7 +44,7 @@ def above(panel: Axes, place: Transform) -> Transform:
 
 def scale_x(panel: Axes, values: np.ndarray) -> None:
     """Set the scale of a swept axis, labelled at its values if they are few."""
-    if logarithmic(values):
+    if is_logarithmic(values):
         margin = (values.max() / values.min()) ** 0.07
         log_axis(panel, "x", values.min() / margin, values.max() * margin, values if len(values) <= 6 else ())
         return

@@ -26,7 +26,6 @@ GREY = "#404040"
 SHADE: dict[str, Any] = {"color": "#d9d9d9", "alpha": 0.5, "linewidth": 0}
 CROSS: dict[str, Any] = {"marker": "x", "markersize": 5, "markeredgewidth": 1.4, "linestyle": "none"}
 TICK: dict[str, Any] = {"marker": "|", "markersize": 9, "markeredgewidth": 2, "linestyle": "none"}
-FRONT: dict[str, Any] = {"color": "#bdbdbd", "linewidth": 3, "label": "Pareto front"}
 SIZE = 8
 STYLE: dict[str, Any] = {
     **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize", "legend.fontsize"), SIZE),
@@ -55,11 +54,11 @@ WORDS = {"dt": "time step", "sigma": "noise"}
 """Words for an axis before its symbol, where they differ from its parameter's name."""
 
 
-class Look:
-    """The colour, marker and line style of every estimator and backend, the same in all charts.
+class Styles:
+    """The colour, marker and line style of each estimator and backend, the same in all charts.
 
-    ``names`` are all registered estimators, so that an estimator looks the same whatever else is drawn. Beyond the
-    palette's length, colours repeat with another marker, and darker.
+    ``names`` are all registered estimators, so that an estimator's style does not depend on the others in the chart.
+    Beyond the palette's length, hues repeat darker or lighter and with another marker.
     """
 
     def __init__(self, rows: pd.DataFrame, names: Sequence[str]) -> None:
@@ -107,8 +106,8 @@ def marker(place: int, variant: int = 0) -> str:
     return MARKERS[(place + place // len(PALETTE) + 3 * variant) % len(MARKERS)]
 
 
-def twin(line: Curve, lines: Sequence[Curve]) -> int:
-    """Return how many lines of the same estimator on other backends come before this one."""
+def backend_rank(line: Curve, lines: Sequence[Curve]) -> int:
+    """Return a line's position, from 0, among the lines of the same estimator on several backends."""
     return [other for other in lines if other.label == line.label].index(line)
 
 
@@ -141,8 +140,8 @@ def plain(text: str) -> str:
 
 
 @cache
-def inches(text: str) -> float:
-    """Return the width of a text as printed."""
+def width_in_inches(text: str) -> float:
+    """Return the printed width of a text in inches."""
     from matplotlib.cbook import is_math_text
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
@@ -153,12 +152,16 @@ def inches(text: str) -> float:
     return float(width / 72)
 
 
+inches = width_in_inches
+"""The name under which the studies use :func:`width_in_inches`."""
+
+
 def wrapped(parts: Sequence[str], width: float, between: str = ", ") -> str:
     """Join parts by ``between``, in lines of at most ``width`` inches unless one part is longer."""
     out = ""
     for part in filter(None, parts):
         last = out.rpartition("\n")[2]
         out += (
-            "" if not out else between if inches(last + between + part) <= width else between.rstrip() + "\n"
+            "" if not out else between if width_in_inches(last + between + part) <= width else between.rstrip() + "\n"
         ) + part
     return out

@@ -1,7 +1,7 @@
 """Rows arranged for reading: what tables, charts and pages share.
 
-:func:`arranged` puts the swept axes into columns; then rows along one axis (:func:`along`), one problem at a time
-(:mod:`bench.report.problems`), and in it one line per estimator with the backends that agree merged (:func:`lines`).
+:func:`arrange` puts the swept axes into columns; then rows along one axis (:func:`rows_along`), one problem at a time
+(:mod:`bench.report.problems`), and in it one line per estimator with the backends that agree merged (:func:`estimator_curves`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.experiment.axes import Axis, axes, relabelled, shown_by, values_of
+from bench.experiment.axes import Axis, axes, relabel, shown_by, values_of
 from bench.experiment.columns import IDENTITY
 from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
@@ -36,14 +36,15 @@ EXACT, CLOSE = 1e-6, 1e-2
 
 
 def attempted(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of cells that were not refused."""
+    """Return the rows of cells that were run, without those that were refused."""
     return rows[~rows["status"].isin(("unsupported", "unavailable"))]
 
 
-def latest(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the newest row of each cell, when editing a plugin has left rows of older versions behind.
+def newest_rows(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return each cell's newest row, its parameters completed with today's defaults.
 
-    Rows of versions that did not store their parameters are distinguished by their other columns.
+    Editing a plugin leaves rows of its older versions behind. Rows of versions that did not store their parameters are
+    distinguished by their identity columns.
     """
     rows = completed_rows(rows)
     bare = rows["parameters"] == ""
@@ -66,7 +67,7 @@ class Arranged:
 
     def swept(self) -> dict[Axis, int]:
         """Return the axes with two or more values in the rows, and how many; never the seed, which is averaged over."""
-        counts = {a: int(along(self, a)["x"].nunique()) for a in self.axes if a.column != "seed"}
+        counts = {a: int(rows_along(self, a)["x"].nunique()) for a in self.axes if a.column != "seed"}
         return {axis: count for axis, count in counts.items() if count > 1}
 
     def marks(self, axis: Axis) -> Mapping[str, float]:
@@ -75,10 +76,10 @@ class Arranged:
         return next((self.experiment.marks[name] for name in names if name in self.experiment.marks), {})
 
 
-def arranged(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
+def arrange(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
     """Arrange rows for reading."""
     swept_axes = axes(experiment.sweep, rows)
-    table = relabelled(rows, swept_axes)
+    table = relabel(rows, swept_axes)
     for axis in swept_axes:
         if axis.column not in rows:
             views = {view: table[view].mask(shown_by(view, axis, rows)) for view in VIEWS_OF_LAWS}
@@ -86,9 +87,9 @@ def arranged(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
     return Arranged(experiment, table, tuple(swept_axes))
 
 
-def along(shown: Arranged, axis: Axis | None) -> pd.DataFrame:
-    """Return rows that an axis applies to, seeds merged, its values only in a new column ``x`` (0 without an axis)."""
-    table = merge_seeds(shown.rows).copy()  # in one piece: taking parts of many pieces is slow
+def rows_along(shown: Arranged, axis: Axis | None) -> pd.DataFrame:
+    """Return the rows that an axis applies to, seeds merged, its values in a new column ``x`` alone (0 without an axis)."""
+    table = merge_seeds(shown.rows).copy()  # one block of memory: slicing a fragmented table is slow
     if axis is None:
         return table.assign(x=0.0)
     table = table.assign(x=table[axis.column], **{axis.column: math.nan})
@@ -96,7 +97,7 @@ def along(shown: Arranged, axis: Axis | None) -> pd.DataFrame:
 
 
 def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
-    """Merge seeds to one row per cell, medians over those that ended well; ``lost`` counts those that did not."""
+    """Merge seeds into one row per cell: medians over its rows that are ok; ``lost`` counts rows that failed."""
     good = rows["status"] == "ok"
     rows = rows.assign(lost=(~good & rows.index.isin(attempted(rows).index)).astype(float))
     if rows["seed"].nunique() < 2:
@@ -108,6 +109,17 @@ def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
     medians = rows[good].groupby(cell[good])[list(rows.select_dtypes("number").columns)].median()
     merged.loc[medians.index, medians.columns] = medians
     return merged.assign(lost=rows["lost"].groupby(cell).sum()).reset_index(drop=True)
+
+
+def estimator_label(estimator: str, params: str) -> str:
+    """Return an estimator's identity string: its name, and in brackets the parameters that differ from their defaults."""
+    return f"{estimator}[{params}]" if params else estimator
+
+
+def estimator_labels(rows: pd.DataFrame) -> pd.Series:
+    """Return the estimator's identity string of each row."""
+    labels = map(estimator_label, rows["estimator"], rows["estimator_params"])
+    return pd.Series(list(labels), index=rows.index, dtype=object)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,17 +147,17 @@ class Curve:
     @property
     def label(self) -> str:
         """The estimator's identity string."""
-        return f"{self.estimator}[{self.params}]" if self.params else self.estimator
+        return estimator_label(self.estimator, self.params)
 
 
 RUN = ("estimator", "estimator_params", "backend", "dtype")
-"""Columns that tell the runs of one family along an axis apart."""
+"""Columns that distinguish the runs of one problem along an axis."""
 
 
-def lines(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Curve]:
-    """Return the lines of one family, in order of appearance; cells that were never run are left out.
+def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Curve]:
+    """Return one problem's curves, one per estimator, in order of appearance; refused cells are omitted.
 
-    Backends within a relative difference of ``close`` are merged into one line; without it, each is a line of its own.
+    Backends within a relative difference of ``close`` are merged into one curve; with None each backend has its own.
     """
     rows = attempted(rows)
     several = rows["dtype"].nunique() > 1
@@ -196,6 +208,13 @@ def _agree(a: _Run, b: _Run, tolerance: float) -> bool:
     return bool(alike.all())
 
 
+def is_logarithmic(values: Any) -> bool:
+    """Return whether an axis of these values is logarithmic: all finite ones are positive, the largest 8 times the least."""
+    finite = np.asarray(values, dtype=float)
+    finite = finite[np.isfinite(finite)]
+    return bool(finite.size and finite.min() > 0 and finite.max() >= 8 * finite.min())
+
+
 def pareto(time: pd.Series, error: pd.Series) -> np.ndarray:
     """Return a mask of the points for which no other is smaller in both."""
     points = pd.DataFrame({"time": time.to_numpy(), "error": error.to_numpy()})
@@ -204,12 +223,12 @@ def pareto(time: pd.Series, error: pd.Series) -> np.ndarray:
 
 
 def unsteady(rows: Any) -> Any:
-    """Return whether a timing's interquartile range is over 20% of its median: of one row, or of each of several."""
+    """Return whether a timing's interquartile range is over 20% of its median: of one row, or of each row of a table."""
     return rows["time_iqr_s"] > NOISY * rows["time_s"]
 
 
-def resolved(row: Any) -> Any:
-    """Return whether the bias of a row, or of each of some rows, can be distinguished from 0."""
+def is_bias_resolved(row: Any) -> Any:
+    """Return whether the bias is distinguishable from 0: of one row, or of each row of a table."""
     return row["bias_low"] > 0
 
 
@@ -220,9 +239,9 @@ def relative(row: Any, column: str) -> float:
 
 
 def rmse_interval(row: Any) -> tuple[Any, Any]:
-    """Return the 95% interval of the relative RMSE of a row, or of each of some rows; NaN where the variance has none.
+    """Return the 95% interval of the relative RMSE of one row, or of each row of a table; NaN where the variance has none.
 
-    It goes from the lower to the upper ends of bias and variance, RMSE^2 = bias^2 + variance.
+    RMSE^2 = bias^2 + variance, so its ends are those of bias and variance together.
     """
     norm = np.where(row["reference_norm"] > 0, row["reference_norm"], math.nan)
     low, high = (
@@ -238,3 +257,7 @@ def bias_text(row: Any, norm: float = 1.0, interval: bool = True) -> str:
         return f"0 (< {number(high, 3)})" if high > 0 else "0"
     text = number(value, 3)
     return f"{text} [{number(low, 3)}, {number(high, 3)}]" if interval and math.isfinite(low + high) else text
+
+
+along, arranged, latest = rows_along, arrange, newest_rows
+"""The names under which the other studies and commands use these functions."""

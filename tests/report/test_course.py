@@ -71,5 +71,5 @@ def test_a_title_names_the_few_problems_that_fail():
     ]  # fmt: skip
     shown = views.arranged(experiment(sweep={"sigma": [0.03, 0.1, 0.3, 1.0]}, marks={}), table(made))
     axis = next(axis for axis in shown.swept() if axis.column == "sigma")
-    parts = [(part, views.lines(part.rows)) for part in split_by_problem(shown, axis)]
+    parts = [(part, views.estimator_curves(part.rows)) for part in split_by_problem(shown, axis)]
     assert findings.headline(parts, axis) == "fobg fails everywhere on one and from sigma 0.3 on two, penalty"

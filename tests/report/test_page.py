@@ -73,7 +73,7 @@ def test_finding_names_the_estimators_and_their_errors_where_each_is_to_be_used(
 
 def test_finding_says_when_nothing_beats_zero_and_when_nothing_ran():
     rows = table([row(stiffness=k, rmse_rel=3.0) for k in (10.0, 100.0)])
-    assert "nothing beats answering zero" in finding(page(rows))
+    assert "nothing beats the zero estimate" in finding(page(rows))
     rows["status"], rows["reason"] = "error", "it broke"
     assert "No cell gave a result" in finding(page(rows))
 
@@ -85,10 +85,10 @@ def test_finding_leads_with_what_fails_and_tells_worse_than_zero_from_no_better(
     rows.loc[2, "variance_low"] = (40.0 * rows["reference_norm"][2]) ** 2
     rows.loc[3, ["status", "reason"]] = ["diverged", "too far"]
     assert finding(page(rows)).startswith(
-        "wild is worse than answering zero in 1 (up to 50 times the gradient), no better than zero in 1, "
+        "wild is worse than the zero estimate in 1 (up to 50 times the gradient), no better than zero in 1, "
         "without a number in 1 of 4 cells; "
     )
-    assert not bias_variance_page.failing(rows[rows["estimator"] == "fine"])
+    assert not bias_variance_page.failure_sentence(rows[rows["estimator"] == "fine"])
 
 
 def test_finding_tells_of_backends_that_refused_every_cell():
@@ -144,7 +144,7 @@ def test_command_of_a_cell_makes_that_cell(name):
     made = config.load([f"experiment={name}"])
     every = grid.cells(made)
     for cell in every[:: max(1, len(every) // 2)]:
-        told = shlex.split(" ".join([reproduce.HEAD, *map(shlex.quote, reproduce.words(cell))]))
+        told = shlex.split(" ".join([reproduce.HEAD, *map(shlex.quote, reproduce.cell_settings(cell))]))
         assert told[:3] == ["python", "-m", "bench"]
         again = config.load(told[3:])
         assert [other.key for other in grid.cells(again)] == [cell.key]
@@ -336,7 +336,7 @@ def test_a_browser_shows_what_fails_first_and_tells_worse_from_no_better(browser
     browser.size(1280, 900)
     browser.open(path)
     assert browser.do("document.getElementById('finding').innerText").startswith(
-        "wild is worse than answering zero in 1 (up to 50 times the gradient), no better than zero in 1 of 3 cells"
+        "wild is worse than the zero estimate in 1 (up to 50 times the gradient), no better than zero in 1 of 3 cells"
     )
     assert browser.do("document.getElementById('finding').getBoundingClientRect().bottom") < 900
     browser.size(*WIDE)
@@ -392,7 +392,7 @@ def test_filters_stay_in_the_address_and_the_csv_has_what_is_shown(shown, tmp_pa
 
 
 def test_no_panel_pools_stiffness_or_sigma():
-    derived = bias_variance_page.derived(stiffness_rows())
+    derived = bias_variance_page.with_plotted_columns(stiffness_rows())
     pooled = derived.groupby("problem")[["stiffness", "sigma"]].nunique()
     assert (pooled == 1).all().all()
 

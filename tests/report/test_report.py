@@ -36,7 +36,7 @@ from bench.report import views
 from bench.report.figures import save, styled
 from bench.report.plotted import plotted
 from bench.report.problems import split_by_problem
-from bench.report.style import PALETTE, Look, axis_name, colour
+from bench.report.style import PALETTE, Styles, axis_name, colour
 from bench.report.text import number
 from bench.run.store import Store
 from bench.studies.bias_variance import charts, findings, pivot, tables, terminal
@@ -173,7 +173,7 @@ def test_backends_that_agree_are_one_line():
 
     def merged():
         family = families(rows, "stiffness")[0]
-        return [dict(line.backends) for line in views.lines(family.rows)]
+        return [dict(line.backends) for line in views.estimator_curves(family.rows)]
 
     assert merged() == [{"jax": True, "torch": True, "numpy": False}]
     rows.loc[rows["backend"] == "torch", "rmse"] *= 1.5
@@ -657,8 +657,11 @@ def test_forty_estimators_have_forty_colours_each_told_from_the_one_it_comes_fro
 def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
     def look(*estimators):
         rows = table([row(estimator=name, stiffness=k) for name in estimators for k in (1e2, 1e4)])
-        styles = Look(rows, NAMES)
-        return {line.label: styles.marked(line) for line in views.lines(rows.assign(x=rows["stiffness"], lost=0.0))}
+        styles = Styles(rows, NAMES)
+        return {
+            line.label: styles.marked(line)
+            for line in views.estimator_curves(rows.assign(x=rows["stiffness"], lost=0.0))
+        }
 
     every = look(*NAMES)
     assert len({(style["color"], style["marker"]) for style in every.values()}) == len(NAMES)
@@ -680,7 +683,7 @@ def test_titles_say_where_the_best_estimator_fails_and_what_never_does():
         given = experiment(sweep={"stiffness": [10.0, 1e3, 1e5]}, marks={"stiffness": marks})
         shown = views.arranged(given, table(made))
         axis = named(shown, "stiffness")
-        parts = [(part, views.lines(part.rows)) for part in split_by_problem(shown, axis)]
+        parts = [(part, views.estimator_curves(part.rows)) for part in split_by_problem(shown, axis)]
         return findings.headline(parts, axis, marks)
 
     stiff = lambda contact, k: 9.0 if contact == "penalty" and k > 1e4 else 0.1  # noqa: E731
@@ -719,7 +722,7 @@ def test_twelve_estimators_stay_distinct_for_colour_blind_readers_too(eyes):
     """Colours differ by 8 (just noticeable: 2.3), and by 30 where the marker is the same."""
     seen = np.array(BLIND.get(eyes, np.eye(3)))
     names = [f"estimator_{i}" for i in range(12)]
-    look = Look(table([row(estimator=name) for name in names]), names)
+    look = Styles(table([row(estimator=name) for name in names]), names)
     styles = [look.marked(views.Curve(name, "", {}, pd.DataFrame(), {}, frozenset(), 0)) for name in names]
     linear = [
         np.array([c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(s["color"])])

@@ -17,12 +17,12 @@ from bench.studies.bias_variance.costs import (
     ROLLOUTS,
     TIME,
     TIME_COMPILED,
-    at_equal_cost,
-    charged,
+    with_errors_at_equal_cost,
+    with_gradient_cost,
 )
 from bench.studies.bias_variance.findings import winners
 from bench.studies.bias_variance.panels import apart
-from bench.studies.bias_variance.time_to_accuracy import leaders, reach, sentence, table
+from bench.studies.bias_variance.time_to_accuracy import required_cost, sentence, summarise_leaders, table
 
 SAMPLES = (16, 64, 256)
 VARIANCE = 4.0
@@ -64,18 +64,18 @@ def line(**values):
     ],
 )
 def test_unbiased_methods_follow_the_law(target, how, samples):
-    found = reach(line(), target, TIME)
+    found = required_cost(line(), target, TIME)
     assert found.how == how
     assert found.samples == pytest.approx(samples)
     assert found.cost == pytest.approx(1e-3 * samples)
-    assert reach(line(), target, ROLLOUTS).cost == pytest.approx(2 * samples)
+    assert required_cost(line(), target, ROLLOUTS).cost == pytest.approx(2 * samples)
     assert TIME_COMPILED.of(rows()).iloc[0] == pytest.approx(2.016)
 
 
 def test_the_cheapest_sufficient_samples_are_taken_not_the_fewest():
     """Where 16 samples take 120 us and 256 take 64 us, both within the error, the answer is 64 us."""
     slow_start = line().rows.assign(time_s=[120e-6, 200e-6, 64e-6])
-    found = reach(Curve("e", "", {"b": True}, slow_start, {"b": 1.0}, frozenset(), 0), 0.6, TIME)
+    found = required_cost(Curve("e", "", {"b": True}, slow_start, {"b": 1.0}, frozenset(), 0), 0.6, TIME)
     assert (found.cost, found.samples) == (64e-6, 256)
 
 
@@ -83,7 +83,9 @@ def test_a_gradient_costs_what_it_takes():
     """Gradients at 3 ms and rollouts at 1 ms each: 16 gradients are 48 rollouts, the estimator with both 64."""
     first = rows(rollouts=0.0).assign(time_s=lambda r: 3e-3 * r["gradients"])
     zeroth = rows(gradients=0.0, estimator="z")
-    found = charged(pd.concat([first, zeroth, rows(estimator="both"), rows(backend="other")], ignore_index=True))
+    found = with_gradient_cost(
+        pd.concat([first, zeroth, rows(estimator="both"), rows(backend="other")], ignore_index=True)
+    )
     assert ROLLOUTS.of(found).tolist()[::3] == pytest.approx([48, 16, 64, 32])
 
 
@@ -94,7 +96,7 @@ def test_findings_rank_at_equal_rollouts_and_at_equal_time_not_at_equal_samples(
     table = pd.concat([rows(**single), rows(**pairs)], ignore_index=True)
     table = table[table["samples"] == 16].reset_index(drop=True)
     table.loc[1, ["rollouts", "rmse_rel", "time_s"]] = [32.0, math.sqrt(0.625 * VARIANCE / 16), 4 * 0.016]
-    found = at_equal_cost(table)
+    found = with_errors_at_equal_cost(table)
     assert found[EQUAL_ROLLOUTS].tolist() == pytest.approx([0.5, 0.5 * math.sqrt(1.25)])
     assert found[EQUAL_TIME].tolist() == pytest.approx([0.5, 0.5 * math.sqrt(2.5)])
     lines = [
@@ -102,13 +104,13 @@ def test_findings_rank_at_equal_rollouts_and_at_equal_time_not_at_equal_samples(
     ]
     assert winners(lines) == {16: ["pairs"]}
     assert winners(lines, EQUAL_ROLLOUTS) == winners(lines, EQUAL_TIME) == {16: ["single"]}
-    assert at_equal_cost(table.assign(time_s=math.nan))[EQUAL_TIME].isna().all()
+    assert with_errors_at_equal_cost(table.assign(time_s=math.nan))[EQUAL_TIME].isna().all()
 
 
 def test_an_estimator_is_timed_on_its_fastest_backend_and_its_bias_stays():
     slow, fast = rows(bias=0.3).assign(time_s=8e-3), rows(bias=0.3, backend="fast").assign(time_s=4e-3)
     other = rows(estimator="other").assign(time_s=1e-3)
-    found = at_equal_cost(pd.concat([slow, fast, other], ignore_index=True))[EQUAL_TIME]
+    found = with_errors_at_equal_cost(pd.concat([slow, fast, other], ignore_index=True))[EQUAL_TIME]
     worse = [math.sqrt(0.3**2 + 4 * VARIANCE / n) for n in SAMPLES]
     assert found.tolist() == pytest.approx([*worse, *worse, *(math.sqrt(VARIANCE / n) for n in SAMPLES)])
 
@@ -121,26 +123,26 @@ def test_without_times_only_rollouts_are_ranked_and_numbers_are_numbers(tmp_path
 
 
 def test_a_bias_below_the_error_takes_more_samples():
-    found = reach(line(bias=0.06), 0.1, TIME)
+    found = required_cost(line(bias=0.06), 0.1, TIME)
     assert found.how == "extrapolated"
     assert found.samples == pytest.approx(VARIANCE / (0.1**2 - 0.06**2))
 
 
 def test_a_bias_above_the_error_never_gets_there():
-    assert reach(line(bias=0.2), 0.1, TIME).how == "never"
+    assert required_cost(line(bias=0.2), 0.1, TIME).how == "never"
 
 
 def test_a_bias_that_is_not_explained_leaves_it_open():
-    assert reach(line(bias=0.2, reason=f"declared unbiased: {UNEXPLAINED}"), 0.1, TIME).how == "unknown"
+    assert required_cost(line(bias=0.2, reason=f"declared unbiased: {UNEXPLAINED}"), 0.1, TIME).how == "unknown"
 
 
 def test_a_bias_that_may_exceed_the_error_is_not_extrapolated():
-    assert reach(line(bias=0.1, resolved=False), 0.1, TIME).how == "unknown"
-    assert reach(line(bias=0.01, resolved=False), 0.1, TIME).how == "extrapolated"
+    assert required_cost(line(bias=0.1, resolved=False), 0.1, TIME).how == "unknown"
+    assert required_cost(line(bias=0.01, resolved=False), 0.1, TIME).how == "extrapolated"
 
 
 def test_failed_rows_tell_nothing():
-    assert reach(line(status="nonfinite"), 0.1, TIME).how == "unknown"
+    assert required_cost(line(status="nonfinite"), 0.1, TIME).how == "unknown"
 
 
 def test_table_names_the_fastest_and_by_how_much(tmp_path):
@@ -225,7 +227,7 @@ def test_charts_name_curves_floors_and_the_first_at_a_glance(tmp_path):
         guide.get_xdata()[1] / guide.get_xdata()[0]
     )
     assert slope == pytest.approx(-0.5)
-    cells = [text.get_text() for text in drawn["at_a_glance"].axes[0].texts]
+    cells = [text.get_text() for text in drawn["summary_matrix"].axes[0].texts]
     assert cells == ["400 ms\nb", "1.2 s\nother", "bias", "3.0 times\n(2.3 to 3.9)"]
 
 
@@ -252,13 +254,13 @@ def test_a_leader_is_an_estimator_and_its_backend_where_that_is_one():
         return {"relative error": target, "fastest": fastest, "next": following, "factor_low": low}
 
     both = [entry("a on x", "b on x", 2.0), entry("a on x", "b on y", 1.5), entry("b on x", "a on x", 0.9)]
-    assert leaders(both) == "a on x is first to 10% error on 2 of 3 problems"
+    assert summarise_leaders(both) == "a on x is first to 10% error on 2 of 3 problems"
     assert (
-        leaders([entry("a on x", "b on x", 2.0), entry("a on y", "a on x", 0.5)])
+        summarise_leaders([entry("a on x", "b on x", 2.0), entry("a on y", "a on x", 0.5)])
         == "a is first to 10% error on 2 of 2 problems"
     )
     assert (
-        leaders([entry("a on x", "b on x", 0.5), entry("-", "-", 0.0)])
+        summarise_leaders([entry("a on x", "b on x", 0.5), entry("-", "-", 0.0)])
         == "nobody is certainly first to 10% error on 2 of 2 problems"
     )
 

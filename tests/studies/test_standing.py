@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from bench.studies.bias_variance.ranking import best, standing
+from bench.studies.bias_variance.ranking import best, rank_estimators
 
 
 def cell(estimator, scene, bias, variance, **more):
@@ -21,11 +21,11 @@ def test_winners_failures_and_bias():
         cell(e, s, b, v) for s in ("one", "two") for e, b, v in (("good", 0, 0.04), ("near", 0, 0.05), ("off", 3, 0.1))
     ]
     rows += [cell("missing", "one", 0, 1, status="unsupported"), cell("loud", "two", 0, 9.0, rollouts=320.0)]
-    table = standing(pd.DataFrame(rows)).set_index(["label", "problem"])
-    assert table.loc[("good", "one"), "stands"] == "wins"
-    assert table.loc[("near", "one"), "stands"] == "wins"
-    assert table.loc[("off", "one"), "stands"] == "fails, biased"
-    assert table.loc[("loud", "two"), "stands"] == "fails"
+    table = rank_estimators(pd.DataFrame(rows)).set_index(["label", "problem"])
+    assert table.loc[("good", "one"), "verdict"] == "wins"
+    assert table.loc[("near", "one"), "verdict"] == "wins"
+    assert table.loc[("off", "one"), "verdict"] == "fails, biased"
+    assert table.loc[("loud", "two"), "verdict"] == "fails"
     assert table.loc[("loud", "two"), "text"].endswith("fails (40x)")
     assert table.loc[("missing", "one"), "text"] == "unsupported"
     assert np.isclose(table.loc[("good", "one"), "high"], (1.2 * 0.04) ** 0.5 / 2)
@@ -33,8 +33,8 @@ def test_winners_failures_and_bias():
 
 def test_swept_rows_and_single_problems_have_no_such_table():
     rows = [cell(e, "one", 0, 1) for e in "abc"]
-    assert standing(pd.DataFrame(rows)).empty
-    assert standing(pd.DataFrame([*rows, *rows])).empty
+    assert rank_estimators(pd.DataFrame(rows)).empty
+    assert rank_estimators(pd.DataFrame([*rows, *rows])).empty
 
 
 def test_the_best_setting_is_chosen_at_equal_work():
@@ -46,8 +46,8 @@ def test_the_best_setting_is_chosen_at_equal_work():
             ("plain", "", 0.0, 0.09, 1), ("costly", "", 0.0, 0.04, 4), ("set", "a=1", 0.0, 0.25, 1), ("set", "a=2", 0.0, 0.08, 1),
         )
     ]  # fmt: skip
-    table = best(standing(pd.DataFrame(rows))).set_index(["estimator", "problem"])
+    table = best(rank_estimators(pd.DataFrame(rows))).set_index(["estimator", "problem"])
     assert table.loc[("set", "one"), "label"] == "set[a=2]"
     assert np.isclose(table.loc[("costly", "one"), "equal"], (4 * 0.04) ** 0.5 / 2)
-    assert table.loc[("plain", "two"), "stands"] == "wins"
-    assert table.loc[("costly", "two"), "stands"] == ""
+    assert table.loc[("plain", "two"), "verdict"] == "wins"
+    assert table.loc[("costly", "two"), "verdict"] == ""

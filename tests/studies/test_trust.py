@@ -16,7 +16,7 @@ def rows():
 
 
 def test_rules_count_what_they_pass_and_what_they_hold_back():
-    found = trust.judged(rows()).set_index("rule")
+    found = trust.score_rules(rows()).set_index("rule")
     counts = ["trusted", "of those wrong", "right ones not trusted"]
     assert found[counts].to_numpy().tolist() == [[4, 2, 0], [3, 2, 1], [2, 0, 0], [1, 0, 1]]
 

@@ -16,7 +16,7 @@ from bench.errors import UserError
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.report import reproduce
-from bench.report.views import arranged
+from bench.report.views import arrange
 from bench.report.web import generic
 from bench.report.web.content import Content
 from bench.report.web.document import assemble
@@ -40,7 +40,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         result = generic.content(experiment, rows)
     if not isinstance(result, Content):
         raise UserError(f"study {study.name}: page() must return a bench.report.web.content.Content or None")
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     swept = [axis.column for axis in shown.axes]
     missing = {name: shown.rows[name].to_numpy() for name in swept if name not in result.rows}
     return replace(result, rows=result.rows.assign(**missing), swept=swept)

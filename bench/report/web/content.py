@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from bench.experiment import axes as sweep
@@ -21,17 +20,11 @@ from bench.report.problems import (
     value_text,
 )
 from bench.report.style import MARKERS, VARIANTS, colour, marker
-from bench.report.views import attempted
+from bench.report.views import attempted, is_logarithmic
 
 __all__ = ["distinguishing_columns"]
-columns_of, grouped, problems, shown_as, together = part_columns, problem_numbers, problem_names, value_text, axes_of
-"""The names under which the studies use these functions."""
 SYMBOLS = dict(
-    zip(
-        MARKERS,
-        ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star"),
-        strict=True,
-    )
+    zip(MARKERS, ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star"), strict=True)
 )
 """Plotly's names of the charts' markers."""
 DASHES = dict(zip(map(str, VARIANTS), ("solid", "dash", "dot"), strict=True))
@@ -139,14 +132,8 @@ def numeric_axis(axis: sweep.Axis, column: str = "x", log: bool = True) -> PlotA
     return PlotAxis(column, axis.title, log)
 
 
-def logarithmic(values: pd.Series) -> bool:
-    """Return whether a logarithmic scale suits some values: all are positive and some far apart."""
-    finite_values = values[np.isfinite(values)]
-    return bool(len(finite_values) and finite_values.min() > 0 and finite_values.max() > 10 * finite_values.min())
-
-
 def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:
-    """Return, per row, the values of some text columns, joined by commas; ``none`` and nothing are left out."""
+    """Return, per row, the values of some text columns joined by commas, without ``none`` and empty ones."""
     return pd.Series(
         [", ".join(text for text in map(str, row) if text not in ("", "none")) for row in rows[list(names)].to_numpy()],
         index=rows.index,
@@ -154,14 +141,17 @@ def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:
     )
 
 
-def nothing_ran(rows: pd.DataFrame) -> str:
-    """Return a sentence if there is no result at all; nothing if there is one."""
-    tried = attempted(rows)
-    if (tried["status"] == "ok").any():
-        return ""
-    return "No cell gave a result: the table has the reason of each."
+def no_result_sentence(rows: pd.DataFrame) -> str:
+    """Return a sentence that no cell has a result; empty if one has."""
+    has_result = bool((attempted(rows)["status"] == "ok").any())
+    return "" if has_result else "No cell gave a result: the table has the reason of each."
 
 
 def finite(value: float) -> bool:
     """Return whether a value is a finite number."""
     return isinstance(value, int | float) and math.isfinite(value)
+
+
+columns_of, grouped, problems, shown_as, together = part_columns, problem_numbers, problem_names, value_text, axes_of
+logarithmic, nothing_ran = is_logarithmic, no_result_sentence
+"""The names under which the studies use these functions."""

@@ -8,7 +8,7 @@ from bench.experiment import columns
 from bench.experiment.columns import COMMON, IDENTITY
 from bench.experiment.experiment import Experiment
 from bench.report.text import counted
-from bench.report.views import arranged
+from bench.report.views import arrange, is_logarithmic
 from bench.report.web.content import (
     STATUS,
     Chart,
@@ -16,7 +16,6 @@ from bench.report.web.content import (
     PlotAxis,
     TableColumn,
     identity_columns,
-    logarithmic,
     looks,
     numeric_axis,
     titled,
@@ -25,7 +24,7 @@ from bench.report.web.content import (
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return counts, a chart of the study's own numbers against the swept ones, and the table."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     table = shown.rows
     own = [
         column
@@ -36,7 +35,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     texts = [column.name for column in own if column.kind == "text" and table[column.name].nunique() > 1]
     named = [name for name in ("scene", "contact", "estimator", "estimator_params") if table[name].nunique() > 1]
     named_rows = table.assign(series=titled(table, named or ["scene"]))
-    swept = {axis.column: numeric_axis(axis, axis.column, logarithmic(table[axis.column])) for axis in shown.swept()}
+    swept = {axis.column: numeric_axis(axis, axis.column, is_logarithmic(table[axis.column])) for axis in shown.swept()}
     moving = [name for name in IDENTITY if name in table.select_dtypes("number") and table[name].nunique() > 1]
     x = [*swept.values(), *(_axis(table, COMMON[name]) for name in moving if name not in swept)]
     y = [_axis(table, column) for column in numbers]
@@ -57,4 +56,4 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
 
 def _axis(rows: pd.DataFrame, column: columns.Column) -> PlotAxis:
     unit = f" [{column.unit}]" if column.unit else ""
-    return PlotAxis(column.name, column.name.replace("_", " ") + unit, logarithmic(rows[column.name]))
+    return PlotAxis(column.name, column.name.replace("_", " ") + unit, is_logarithmic(rows[column.name]))

@@ -23,13 +23,13 @@ from bench.model import SURROGATE, registry
 from bench.report.cores import run_tasks
 from bench.report.figures import save, styled
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.style import Look, plain, symbol
-from bench.report.views import CATEGORIES, arranged, attempted
+from bench.report.style import Styles, plain, symbol
+from bench.report.views import CATEGORIES, arrange, attempted
 from bench.studies.bias_variance import time_to_accuracy
-from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost, charged
-from bench.studies.bias_variance.error_against_time import FEWEST, course
+from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost, with_gradient_cost
+from bench.studies.bias_variance.error_against_time import FEWEST, draw_error_against_time
 from bench.studies.bias_variance.panels import bias_variance, overview, speed_accuracy
-from bench.studies.bias_variance.summary_matrix import glance
+from bench.studies.bias_variance.summary_matrix import draw_summary_matrix
 from bench.studies.bias_variance.time_to_accuracy import SAMPLES
 
 ROOM = 4
@@ -41,13 +41,13 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
     def drawn(name: str, figure: Callable[[], Figure]) -> list[Path]:
         with styled():
-            made = figure()
-            made.draw_without_rendering()  # places everything, once
-            made.set_layout_engine(None)
-            return save(made, experiment.directory / name, experiment.formats)
+            chart = figure()
+            chart.draw_without_rendering()  # computes the layout, once
+            chart.set_layout_engine(None)
+            return save(chart, experiment.directory / name, experiment.formats)
 
-    works = [partial(drawn, name, figure) for name, figure in drawings(experiment, rows).items()]
-    return [path for paths in run_tasks(works) for path in paths]
+    tasks = [partial(drawn, name, figure) for name, figure in chart_drawers(experiment, rows).items()]
+    return [path for paths in run_tasks(tasks) for path in paths]
 
 
 def file_name(axis: Axis, kind: str = "bias_variance") -> str:
@@ -57,91 +57,95 @@ def file_name(axis: Axis, kind: str = "bias_variance") -> str:
 
 def along_longest(experiment: Experiment, rows: pd.DataFrame) -> list[str]:
     """Return the names of the charts along swept axes, the longest axis first."""
-    swept = arranged(experiment, rows).swept()
+    swept = arrange(experiment, rows).swept()
     return [file_name(axis) for axis in sorted(swept, key=lambda axis: -swept[axis])]
 
 
 def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
     """Return the charts by file name."""
     with styled():
-        return {name: figure() for name, figure in drawings(experiment, rows).items()}
+        return {name: figure() for name, figure in chart_drawers(experiment, rows).items()}
 
 
-def drawings(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
-    """Return, by file name, what draws each chart."""
-    shown = arranged(experiment, charged(rows))
+def chart_drawers(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
+    """Return, by file name, a function that draws the chart."""
+    shown = arrange(experiment, with_gradient_cost(rows))
     rows = shown.rows
-    look = Look(rows, sorted(registry.entries()["estimators"]))
+    look = Styles(rows, sorted(registry.entries()["estimators"]))
     seeds = rows["seed"].nunique()
     merged = [f"medians over {seeds} seeds"] if seeds > 1 else []
     for law in rows.loc[rows["reason"].str.contains(SURROGATE, regex=False), "contact"].unique():
         merged.append(f"{plain(law)}: {SURROGATE}")
-    made: dict[str, Callable[[], Figure]] = {}
+    drawers: dict[str, Callable[[], Figure]] = {}
 
     def problems(axis: Axis | None, drawable: Callable[[pd.DataFrame], bool]) -> list[ProblemRows]:
         return [p for p in split_by_problem(shown, axis) if drawable(p.rows)]
 
     swept = shown.swept()
     for axis in swept:
-        chosen, held = choose(problems(axis, lambda part: attempted(part)["x"].nunique() > 1))
+        chosen, held = choose_problems(problems(axis, lambda part: attempted(part)["x"].nunique() > 1))
         if chosen:
-            made[file_name(axis)] = partial(bias_variance, chosen, held + merged, look, axis, shown.marks(axis))
-    nothing_swept = not made
+            drawers[file_name(axis)] = partial(bias_variance, chosen, held + merged, look, axis, shown.marks(axis))
+    nothing_swept = not drawers
     good = rows[rows["status"] == "ok"]
     # noise changes an estimate and not its time
     longest = max((axis for axis in swept if axis.short != "sigma"), key=lambda axis: swept[axis], default=None)
     if longest is not None and good["samples"].nunique() < 2 and good["time_s"].notna().any():
-        chosen, held = choose(problems(longest, lambda part: TIME.known(part)["x"].nunique() >= FEWEST))
+        chosen, held = choose_problems(problems(longest, lambda part: TIME.known(part)["x"].nunique() >= FEWEST))
         if chosen:
-            made[file_name(longest, "time")] = partial(course, chosen, held + merged, look, longest)
+            drawers[file_name(longest, "time")] = partial(draw_error_against_time, chosen, held + merged, look, longest)
     if good["samples"].nunique() > 1 or good["backend"].nunique() > 1:
         for name, cost in (
             ("speed_accuracy", TIME_COMPILED if experiment.compile_time else TIME),
             ("rollouts_accuracy", ROLLOUTS),
         ):
-            costed = problems(SAMPLES, partial(_costed, cost))
+            costed = problems(SAMPLES, partial(_has_costs, cost))
             curves = [problem for problem in costed if attempted(problem.rows)["x"].nunique() > 1]
-            chosen, held = choose(curves or costed)
+            chosen, held = choose_problems(curves or costed)
             if chosen and (cost is not ROLLOUTS or good["samples"].nunique() > 1):
-                made[name] = partial(_costs, chosen, held + merged, look, cost)
-        raced = (
+                drawers[name] = partial(_costs, chosen, held + merged, look, cost)
+        swept_in_samples = (
             problems(SAMPLES, lambda part: attempted(part)["x"].nunique() > 1) if good["samples"].nunique() > 1 else []
         )
-        if raced:
+        if swept_in_samples:
             costs = [TIME, ROLLOUTS] if good["time_s"].notna().any() else [ROLLOUTS]
-            made["at_a_glance"] = partial(glance, choose(raced, 2 * ROOM)[0], costs)
+            drawers["summary_matrix"] = partial(
+                draw_summary_matrix, choose_problems(swept_in_samples, 2 * ROOM)[0], costs
+            )
     if nothing_swept:
         chosen = problems(None, lambda part: len(attempted(part)) > 0)
         if chosen:
-            made["overview"] = partial(overview, chosen, merged, look)
-    return made
+            drawers["overview"] = partial(overview, chosen, merged, look)
+    return drawers
 
 
-def _costs(problems: Sequence[ProblemRows], notes: Sequence[str], look: Look, cost: Cost) -> Figure:
-    return speed_accuracy(problems, notes, look, cost, *_said(problems, cost))
+def _costs(problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles, cost: Cost) -> Figure:
+    return speed_accuracy(problems, notes, look, cost, *_panel_sentences(problems, cost))
 
 
-def _said(problems: Sequence[ProblemRows], cost: Cost) -> tuple[dict[int, str], str]:
-    """Return, for each problem by place, who reaches an error of 10% and of 1% first, and who leads over all.
+def _panel_sentences(problems: Sequence[ProblemRows], cost: Cost) -> tuple[dict[int, str], str]:
+    """Return sentences by position of their problem, which estimator reaches 10% and 1% error first, and a title over all.
 
-    Where samples are not swept nobody reaches anything: it is told who is most accurate and who fastest.
+    Where samples are not swept, the title names the most accurate and the fastest estimator.
     """
     kind = "rollouts" if cost is ROLLOUTS else "time"
-    said = {}
+    sentences = {}
     every: list[dict[str, Any]] = []
     for place, problem in enumerate(problems):
         if problem.rows["x"].nunique() > 1:
             entries = [time_to_accuracy.line(problem, target, kind, cost) for target in time_to_accuracy.TARGETS]
-            said[place] = "\n".join(map(time_to_accuracy.sentence, entries))
+            sentences[place] = "\n".join(map(time_to_accuracy.sentence, entries))
             every += entries
-    return said, time_to_accuracy.leaders(every) if every else time_to_accuracy.front(problems, cost)
+    if every:
+        return sentences, time_to_accuracy.summarise_leaders(every)
+    return sentences, time_to_accuracy.summarise_accuracy_and_cost(problems, cost)
 
 
-def _costed(cost: Cost, rows: pd.DataFrame) -> bool:
+def _has_costs(cost: Cost, rows: pd.DataFrame) -> bool:
     return len(cost.known(rows)) > 1
 
 
-def choose(problems: Sequence[ProblemRows], room: int = ROOM) -> tuple[list[ProblemRows], list[str]]:
+def choose_problems(problems: Sequence[ProblemRows], room: int = ROOM) -> tuple[list[ProblemRows], list[str]]:
     """Choose the problems to draw if there are more than fit, and report how many values of each number are shown.
 
     Every scene and contact law is drawn. The number with most values gets the remaining room, at evenly spaced ranks
@@ -152,7 +156,7 @@ def choose(problems: Sequence[ProblemRows], room: int = ROOM) -> tuple[list[Prob
     kinds: dict[tuple[Any, ...], list[ProblemRows]] = {}
     for problem in problems:
         kinds.setdefault(tuple(problem.identity.get(k) for k in CATEGORIES), []).append(problem)
-    kept = {p for members in kinds.values() for p in _thinned(members, problems, max(1, room // len(kinds)))}
+    kept = {p for members in kinds.values() for p in _choose_values(members, problems, max(1, room // len(kinds)))}
     notes = []
     for name in _numbers(problems):
         every, drawn = ({p.identity[name] for p in some if name in p.identity} for some in (problems, kept))
@@ -165,7 +169,7 @@ def _numbers(problems: Iterable[ProblemRows]) -> list[str]:
     return list(dict.fromkeys(k for p in problems for k in p.identity if k not in CATEGORIES))
 
 
-def _thinned(members: Sequence[ProblemRows], problems: Sequence[ProblemRows], room: int) -> list[ProblemRows]:
+def _choose_values(members: Sequence[ProblemRows], problems: Sequence[ProblemRows], room: int) -> list[ProblemRows]:
     """Return the problems of one scene and contact law that :func:`choose` keeps."""
 
     def values(some: Iterable[ProblemRows], name: str) -> list[float]:

@@ -11,6 +11,7 @@ import pandas as pd
 
 from bench.experiment.parameters import number_problems
 from bench.report.text import axis_value, duration
+from bench.report.views import estimator_labels
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,11 @@ PROGRAM = (
 )  # fmt: skip
 
 
-def charged(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with the measured cost of a gradient in rollouts, per program and backend.
+def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with a column :data:`RATIO`: the measured cost of a gradient in rollouts, per program and backend.
 
-    It is the ratio of seconds per gradient to seconds per rollout, from the fastest rows that use gradients alone and
-    costs alone, at the largest number of samples that has both; NaN where nothing was measured.
+    It is the ratio of seconds per gradient to seconds per rollout, from the fastest rows that use gradients alone or
+    rollouts alone, at the largest number of samples that has both. It is NaN where nothing was measured.
     """
     keys = [name for name in PROGRAM if name in rows]
     program = rows.groupby(keys, dropna=False).ngroup()
@@ -96,17 +97,17 @@ ROLLOUTS = Cost(
 EQUAL_ROLLOUTS, EQUAL_TIME = "rmse_equal_rollouts", "rmse_equal_time"
 
 
-def at_equal_cost(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with the relative RMSE that each estimator would have for the same rollouts, and for the same time.
+def with_errors_at_equal_cost(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with each estimator's relative RMSE at equal rollouts and at equal time.
 
     An estimate from c times fewer samples has the same bias and c times the variance. ``rmse_equal_rollouts`` is for as
-    many rollouts as there are samples, a gradient at its measured cost (:func:`charged`); ``rmse_equal_time`` for the time
+    many rollouts as there are samples, a gradient at its measured cost (:func:`with_gradient_cost`); ``rmse_equal_time`` for the time
     of the fastest estimate from as many samples on the same problem, each estimator on its fastest backend.
     """
-    rows = charged(rows)
+    rows = with_gradient_cost(rows)
     good = rows["status"] == "ok"
     setting = [number_problems(rows), rows["samples"], rows["seed"]]
-    label = rows["estimator"] + "[" + rows["estimator_params"] + "]"
+    label = estimator_labels(rows)
     time = rows["time_s"].where(good & (rows["time_s"] > 0))
     fastest = time.groupby([*setting, label]).transform("min")
     factors = {

@@ -1,6 +1,6 @@
 """Error against time along a swept axis: each estimator one curve through all values of the axis, labelled with them.
 
-It shows at a glance whether a stiffer contact or a longer horizon costs time, accuracy, or both.
+The chart shows whether a stiffer contact or a longer horizon costs time, accuracy, or both.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from bench.experiment.axes import Axis
 from bench.report.page import columns, page, shared
 from bench.report.problems import ProblemRows
 from bench.report.scales import log_axis
-from bench.report.style import SHADE, Look, axis_name, plain
+from bench.report.style import SHADE, Styles, axis_name, plain
 from bench.report.text import axis_value, number
-from bench.report.views import CATEGORIES, Curve, lines
+from bench.report.views import CATEGORIES, Curve, estimator_curves
 from bench.studies.bias_variance.costs import TIME
 from bench.studies.bias_variance.findings import winners
 
@@ -32,16 +32,16 @@ APART = 0.075, 0.06
 LETTER = 0.0115, 0.05
 """Width of a letter and height of a line of labels, as parts of a panel."""
 FACTOR = 2.0
-"""Factors below this are not worth telling in a title."""
+"""Factors below this are not reported in a title."""
 
 
-def course(problems: Sequence[ProblemRows], notes: Sequence[str], look: Look, axis: Axis) -> Figure:
+def draw_error_against_time(problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles, axis: Axis) -> Figure:
     """Draw relative RMSE against the time of one estimate, a panel per problem, a curve per estimator.
 
     Each curve joins the values of the axis in order, on the backend that is fastest in the median; numbers beside it are
     those values. All panels have the same scales. The title says what the axis does to error and time.
     """
-    drawn = [fastest(lines(problem.rows, close=None)) for problem in problems]
+    drawn = [fastest(estimator_curves(problem.rows, close=None)) for problem in problems]
     entries = {
         line.label: Line2D([], [], label=plain(line.label), **look.marked(line)) for part in drawn for line in part
     }
@@ -49,16 +49,16 @@ def course(problems: Sequence[ProblemRows], notes: Sequence[str], look: Look, ax
     figure, panels = page(
         problems, across, 2.4, ("relative RMSE",), headline(list(zip(problems, drawn, strict=True)), axis),
         [*shared(problems, axis.column), *notes, f"numbers: {axis_name(axis)}", "each estimator on its fastest backend"],
-        (list(entries.values()), [Patch(label="worse than answering zero", **SHADE)]),
+        (list(entries.values()), [Patch(label="worse than the zero estimate", **SHADE)]),
     )  # fmt: skip
     known = [TIME.known(line.rows) for part in drawn for line in part]
-    extent = [_ends([value for rows in known for value in rows[name]]) for name in ("time_s", "rmse_rel")]
+    extent = [_scale_ends([value for rows in known for value in rows[name]]) for name in ("time_s", "rmse_rel")]
     for (panel,), curves in zip(panels, drawn, strict=True):
         log_axis(panel, "x", *extent[0], text=TIME.text)
         log_axis(panel, "y", *extent[1])
         if extent[1][1] > 1:
             panel.axhspan(1.0, extent[1][1], zorder=0, **SHADE)
-        taken = [(x - 0.008, y, 0.016) for line in curves for _, x, y in _places(panel, TIME.known(line.rows))]
+        taken = [(x - 0.008, y, 0.016) for line in curves for _, x, y in _panel_positions(panel, TIME.known(line.rows))]
         for line in curves:
             rows = TIME.known(line.rows).sort_index()
             style = {**look.marked(line), "markersize": 3.5, "alpha": 0.85}
@@ -83,11 +83,11 @@ def _median(line: Curve) -> float:
 
 
 def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -> str:
-    """Write what going along the axis does to error and time of the estimator that is most accurate at its start.
+    """Summarise how error and time grow along the axis, for the estimator that is most accurate at its first value.
 
-    Told are the problem where the error grows most and the one where it grows least.
+    The title names the problem where the error grows most and the problem where it grows least.
     """
-    said: list[tuple[float, str]] = []
+    texts: list[tuple[float, str]] = []
     for family, curves in parts:
         named = winners(curves)
         first = named[min(named)][0] if named else ""
@@ -101,21 +101,21 @@ def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -
         ]
         text = f"{first} {' and '.join(grown)}" if grown else f"neither error nor time of {first} doubles"
         kinds = [str(value) for name, value in family.identity.items() if name in CATEGORIES]
-        said.append((factors[0], f"{kinds[-1] if kinds else family.title()}: {text}"))
-    if not said:
+        texts.append((factors[0], f"{kinds[-1] if kinds else family.title()}: {text}"))
+    if not texts:
         return f"Error against time along {axis.column}"
-    told = dict.fromkeys(text for _, text in (max(said), min(said)))
-    return f"Along {axis.column}, " + "; ".join(told)
+    extremes = dict.fromkeys(text for _, text in (max(texts), min(texts)))
+    return f"Along {axis.column}, " + "; ".join(extremes)
 
 
-def _ends(values: Sequence[float]) -> tuple[float, float]:
+def _scale_ends(values: Sequence[float]) -> tuple[float, float]:
     """Return the ends of a scale, with room for labels."""
     low, high = min(values), max(values)
     margin = max(high / low, 4.0) ** 0.12
     return low / margin, high * margin
 
 
-def _places(panel: Axes, rows: Any) -> list[tuple[float, float, float]]:
+def _panel_positions(panel: Axes, rows: Any) -> list[tuple[float, float, float]]:
     """Return the axis's value of each point and its place, as parts of the panel."""
     ends = [np.log(panel.get_xlim()), np.log(panel.get_ylim())]
     at = [(np.log(rows[n]) - e[0]) / (e[1] - e[0]) for n, e in zip(("time_s", "rmse_rel"), ends, strict=True)]
@@ -125,7 +125,7 @@ def _places(panel: Axes, rows: Any) -> list[tuple[float, float, float]]:
 def _label(panel: Axes, rows: Any, colour: str, taken: list[tuple[float, float, float]]) -> None:
     """Write the axis's values beside a curve; neighbours too close for labels of their own share one: ``10-1000``."""
     runs: list[list[tuple[float, float, float]]] = []
-    for point in _places(panel, rows):
+    for point in _panel_positions(panel, rows):
         if runs and all(abs(point[i + 1] - runs[-1][0][i + 1]) < APART[i] for i in (0, 1)):
             runs[-1].append(point)
         else:
@@ -136,13 +136,13 @@ def _label(panel: Axes, rows: Any, colour: str, taken: list[tuple[float, float, 
         wide = LETTER[0] * len(text)
         if x + wide > 1:
             x = min(p[1] for p in run) - 0.02 - wide
-        place = _free(x, y, wide, taken)
+        place = _free_height(x, y, wide, taken)
         if math.isfinite(place):
             taken.append((x, place, wide))
             panel.text(x, place, text, transform=panel.transAxes, color=colour, fontsize=5.5, va="center", zorder=5)
 
 
-def _free(x: float, y: float, wide: float, taken: Sequence[tuple[float, float, float]]) -> float:
+def _free_height(x: float, y: float, wide: float, taken: Sequence[tuple[float, float, float]]) -> float:
     """Return the height nearest to ``y`` where a text hides no other; NaN where none is near."""
     for step in (0, 1, -1, 2, -2, 3, -3):
         place = y + step * LETTER[1] / 2

@@ -27,7 +27,7 @@ NAMED = 2
 
 
 def problems(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
-    """Return the problems to report, each along the longest axis it was swept along; every cell that ran is in one."""
+    """Return the problems to report, each with the longest axis along which it was swept; every cell that ran is in one."""
     swept = shown.swept()
     parts: list[tuple[Axis | None, ProblemRows]] = []
     seen: set[str] = set()
@@ -50,7 +50,8 @@ def lowest(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, floa
 def winners(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, list[str]]:
     """Return, at each ``x``, the estimators whose error is lowest or not distinguishable from the lowest.
 
-    ``error`` is a column: ``rmse_rel`` compares at equal samples, those of :func:`~.costs.at_equal_cost` at equal cost.
+    ``error`` is a column: ``rmse_rel`` compares at equal samples, the columns of
+    :func:`~.costs.with_errors_at_equal_cost` at equal cost.
     """
     named = {}
     for x, low in lowest(curves, error).items():
@@ -77,9 +78,9 @@ def span(where: Mapping[float, bool]) -> str:
 def headline(
     parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis, marks: Mapping[str, float] = MappingProxyType({})
 ) -> str:
-    """Write where estimators fail, the one that is lowest most often first, and which never does.
+    """Summarise failures along an axis: where the most frequently best estimator fails, and which estimators never fail.
 
-    Failing is an error no better than answering zero, or a cell that did not end well.
+    An estimator fails where it is no better than the zero estimate, or where its cell has no result.
     """
     names = _by_wins(parts)
     bad = {name: [_failures(curves, name) for _, curves in parts] for name in names}
@@ -88,8 +89,8 @@ def headline(
     useless = [name for name in names if all(all(where.values()) for where in bad[name])]
     broken = [name for name in names if name not in (*sound, *useless)]
     families = [family for family, _ in parts]
-    clauses = [f"{broken[0]} fails {_where(bad[broken[0]], families, axis, marks)}"] if broken else []
-    change = max((_change(line) for _, curves in parts for line in curves), default=math.inf)
+    clauses = [f"{broken[0]} fails {_failure_range(bad[broken[0]], families, axis, marks)}"] if broken else []
+    change = max((_error_ratio(line) for _, curves in parts for line in curves), default=math.inf)
     flat = not broken and change < FLAT
     if flat:
         clauses.append(f"{axis.column} changes no error by more than a factor of {number(change)}")
@@ -100,18 +101,20 @@ def headline(
     return "; ".join(clauses) or f"No estimator is better than zero anywhere along {axis.column}"
 
 
-def tally(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> str:
-    """Write on how many problems the estimator that is lowest most often fails, and how many fail on none.
+def failure_summary(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> str:
+    """Summarise failures: how often the most frequently best estimator fails, and how many estimators never fail.
 
-    Failing is what it is in :func:`headline`.
+    The criterion of failure is that of :func:`headline`.
     """
     names = _by_wins(parts)
-    found = {name: [any(where.values()) for _, curves in parts if (where := _failures(curves, name))] for name in names}
-    broken = [name for name in names if any(found[name])]
-    sound = sum(bool(tried) and not any(tried) for tried in found.values())
+    failed = {
+        name: [any(where.values()) for _, curves in parts if (where := _failures(curves, name))] for name in names
+    }
+    broken = [name for name in names if any(failed[name])]
+    sound = sum(bool(tried) and not any(tried) for tried in failed.values())
     if not broken:
-        return "Every estimator is better than answering zero on every problem that it was run on"
-    first, tried = broken[0], found[broken[0]]
+        return "Every estimator is better than the zero estimate on every problem that it was run on"
+    first, tried = broken[0], failed[broken[0]]
     if len(parts) == 1:
         return f"{first} fails; {sound or 'none'} of {len(names)} estimators {'is' if sound == 1 else 'are'} better than zero"
     among = f"{sum(tried)} of {len(tried)} problem{'s' * (len(tried) > 1)}"
@@ -119,12 +122,12 @@ def tally(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> str:
 
 
 def _by_wins(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> list[str]:
-    """Return the estimators, the one that is lowest most often first."""
+    """Return the estimators, the most frequently best one first."""
     wins = Counter(label for _, curves in parts for labels in winners(curves).values() for label in labels)
     return sorted(dict.fromkeys(line.label for _, curves in parts for line in curves), key=lambda name: -wins[name])
 
 
-def _change(line: Curve) -> float:
+def _error_ratio(line: Curve) -> float:
     """Return the ratio of a line's largest to its smallest error; 1 where it has fewer than two."""
     rows = line.rows[line.rows["status"] == "ok"]
     errors = rows.loc[np.isfinite(rows["rmse_rel"]), "rmse_rel"]
@@ -132,7 +135,7 @@ def _change(line: Curve) -> float:
 
 
 def _failures(curves: Sequence[Curve], name: str) -> dict[float, bool]:
-    """Return, at each ``x`` that an estimator was run at, whether it failed on any backend; refused cells are left out."""
+    """Return, for each ``x`` at which an estimator ran, whether it failed on any backend; refused cells are omitted."""
     where: dict[float, bool] = {}
     for line in curves:
         for x, row in line.at.items() if line.label == name else ():
@@ -141,19 +144,19 @@ def _failures(curves: Sequence[Curve], name: str) -> dict[float, bool]:
     return dict(sorted(where.items()))
 
 
-def _spoken(where: str, axis: Axis) -> str:
+def _range_text(where: str, axis: Axis) -> str:
     """Write a :func:`span` as it is said: ``from stiffness 1e4``, ``everywhere``."""
     sign = "from" if where.startswith(">=") else "up to" if where.startswith("<=") else "at"
     return f"{sign} {axis.column} {where.removeprefix('at ').lstrip('<>=')}" if where else "everywhere"
 
 
-def _where(
+def _failure_range(
     bad: Sequence[Mapping[float, bool]], families: Sequence[ProblemRows], axis: Axis, marks: Mapping[str, float]
 ) -> str:
     """Write where along an axis something fails, and in which of several problems."""
     failing = [i for i, where in enumerate(bad) if any(where.values())]
     spans = list(dict.fromkeys(span(bad[i]) for i in failing))
-    text = _spoken(spans[0], axis) if len(spans) == 1 and spans[0] else ""
+    text = _range_text(spans[0], axis) if len(spans) == 1 and spans[0] else ""
     ends = [
         (max((x for x, b in bad[i].items() if not b), default=0.0), min(x for x, b in bad[i].items() if b))
         for i in failing
@@ -168,7 +171,7 @@ def _where(
             return f"{text} with {' and '.join(sorted(mine))}, not with {' and '.join(sorted(others))}".strip()
     n_run = sum(map(bool, bad))
     if not beyond and len(failing) < n_run and len(failing) <= NAMED:
-        return " and ".join(f"{_spoken(span(bad[i]), axis)} on {families[i].title()}" for i in failing)
+        return " and ".join(f"{_range_text(span(bad[i]), axis)} on {families[i].title()}" for i in failing)
     if not text and len(spans) == 1:
         text = "everywhere"
     where = "" if len(failing) == n_run else f" in {len(failing)} of {n_run} problems"

@@ -14,16 +14,17 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.model import registry
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.style import Look
+from bench.report.style import Styles
 from bench.report.text import axis_value, counted, duration, number
 from bench.report.views import (
     CATEGORIES,
     Arranged,
     Curve,
-    arranged,
+    arrange,
     attempted,
-    lines,
-    resolved,
+    estimator_curves,
+    estimator_labels,
+    is_bias_resolved,
     rmse_interval,
     unsteady,
 )
@@ -37,10 +38,10 @@ from bench.report.web.content import (
     TableColumn,
     identity_columns,
     look,
-    nothing_ran,
+    no_result_sentence,
     titled,
 )
-from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, at_equal_cost
+from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, with_errors_at_equal_cost
 from bench.studies.bias_variance.findings import lowest, problems, span, winners
 from bench.studies.bias_variance.panels import FLOOR
 
@@ -48,7 +49,7 @@ BIAS = PlotAxis(
     "bias_shown", "relative bias |bias| / |∇J|", True, "bias_from", "bias_to", "bias_limit", "larger than the gradient"
 )
 VARIANCE = PlotAxis("variance_rel", "relative variance of one estimate", True, "variance_from", "variance_to")
-RMSE = PlotAxis("rmse_rel", "relative RMSE of one estimate", above_one="worse than answering zero")
+RMSE = PlotAxis("rmse_rel", "relative RMSE of one estimate", above_one="worse than the zero estimate")
 TIMES = (
     PlotAxis("time_s", "time of one estimate [s]"),
     PlotAxis("time_total_s", "time of the first estimate, with compilation [s]"),
@@ -75,15 +76,15 @@ EXCEPTIONS = 2
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the finding, what to use where, and the charts."""
-    shown = arranged(experiment, at_equal_cost(rows))
+    """Return the finding, the recommended estimators and the charts."""
+    shown = arrange(experiment, with_errors_at_equal_cost(rows))
     summaries = [ProblemSummary(axis, family) for axis, family in problems(shown)]
-    table_ = derived(rows)
-    labelled = derived(shown.rows)
+    table_ = with_plotted_columns(rows)
+    labelled = with_plotted_columns(shown.rows)
     charts = [
         Chart(
             "Error against time",
-            "Each point is one cell. Lower left is better; above 1 an estimate is worse than answering zero. "
+            "Each point is one cell. Lower left is better; above 1 an estimate is worse than the zero estimate. "
             "Points with a ring are not beaten in both by any point shown of the same problem.",
             TIMES,
             [RMSE, BIAS],
@@ -113,7 +114,8 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         )
     )
     return Content(
-        finding=nothing_ran(rows) or _joined(failing(rows), finding(summaries), fastest(rows), refused(rows)),
+        finding=no_result_sentence(rows)
+        or _join_sentences(failure_sentence(rows), finding(summaries), fastest(rows), refusal_sentence(rows)),
         rows=table_,
         columns=[*identity_columns(rows)[:IN_SIGHT], TIME, *STATUS, *RESULTS, *identity_columns(rows)[IN_SIGHT:]],
         charts=charts,
@@ -123,10 +125,10 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     )
 
 
-def derived(rows: pd.DataFrame) -> pd.DataFrame:
+def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
     """Add the columns that charts draw: errors in units of |grad J|, and labels that distinguish points and lines."""
     norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
-    limit = ~resolved(rows)
+    limit = ~is_bias_resolved(rows)
     values = {
         "bias_shown": (rows["bias"].where(~limit, rows["bias_high"]) / norm).clip(lower=FLOOR),
         "bias_from": (rows["bias_low"] / norm).clip(lower=FLOOR),
@@ -140,10 +142,10 @@ def derived(rows: pd.DataFrame) -> pd.DataFrame:
     texts = {
         "bias_limit": limit.astype(float),
         "unsteady": unsteady(rows).astype(float),
-        "series": _label(rows),
+        "series": estimator_labels(rows),
         # a panel never pools what makes costs differ
         "problem": titled(rows.assign(**_named(rows)), ["scene", "contact", *POOLED]),
-        "line": rows["backend"] + " " + rows["dtype"] + " " + _label(rows),
+        "line": rows["backend"] + " " + rows["dtype"] + " " + estimator_labels(rows),
         "setting": number_problems(rows).astype(str),
     }
     return rows.assign(**{name: column.where(good) for name, column in values.items()}, **texts)
@@ -158,11 +160,6 @@ def _named(rows: pd.DataFrame) -> dict[str, Iterable[str]]:
     }
 
 
-def _label(rows: pd.DataFrame) -> pd.Series:
-    params = rows["estimator_params"]
-    return rows["estimator"].where(params == "", rows["estimator"] + "[" + params + "]")
-
-
 def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
     """Return the rows along an axis, seeds merged, by problem; only problems with at least two values of it."""
     rows = shown.rows
@@ -174,7 +171,7 @@ def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
         part = family.rows[family.rows["status"] == "ok"]
         if part["x"].nunique() > 1:
             part = part.sort_values(["line", "x"], kind="stable").assign(
-                facet=family.title(), row=part["key"].map(place), series=_label(part)
+                facet=family.title(), row=part["key"].map(place), series=estimator_labels(part)
             )
             parts.append(part[["row", "x", "facet", "series", "line", *(drawn if merged else [])]])
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
@@ -182,7 +179,7 @@ def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
 
 def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
     """Return the charts' own colour, marker and line style of every estimator in the rows."""
-    styles = Look(rows, sorted(registry.entries()["estimators"]))
+    styles = Styles(rows, sorted(registry.entries()["estimators"]))
     looks = {}
     for estimator, params in dict.fromkeys(zip(rows["estimator"], rows["estimator_params"], strict=True)):
         line = Curve(estimator, params, {}, rows.iloc[:0], {}, frozenset(), 0)
@@ -200,7 +197,7 @@ class ProblemSummary:
     def __init__(self, axis: axes.Axis | None, family: ProblemRows) -> None:
         self.axis, self.title = axis, family.title()
         self.kind = ", ".join(str(value) for name, value in family.identity.items() if name in CATEGORIES)
-        self.lines = lines(family.rows)
+        self.lines = estimator_curves(family.rows)
         self.lowest = lowest(self.lines, EQUAL_ROLLOUTS)
         self.winners = winners(self.lines, EQUAL_ROLLOUTS)
 
@@ -216,8 +213,8 @@ class ProblemSummary:
 
 
 @dataclass(frozen=True)
-class Elsewhere:
-    """A place where the estimator that is best most often is not: what to use instead, and the errors of both."""
+class BetterElsewhere:
+    """A range where the estimator that is best most often is not the best: the better estimator, and both errors."""
 
     problem: str
     kind: str
@@ -235,22 +232,22 @@ class Elsewhere:
     def sentence(self, main: str) -> str:
         """Write the exception: ``pushing, penalty, stiffness >=1e4: use reinforce (0.5, where fobg has 300)``."""
         where = ", ".join(filter(None, [self.problem, self.where])) or "elsewhere"
-        return f"{where}: use {self.use} ({between(self.errors)}, where {main} has {between(self.instead_of)})"
+        return f"{where}: use {self.use} ({range_text(self.errors)}, where {main} has {range_text(self.instead_of)})"
 
 
-def failing(rows: pd.DataFrame) -> str:
-    """Write which estimators fail and how: worse than answering zero beyond their interval, no better, or no number.
+def failure_sentence(rows: pd.DataFrame) -> str:
+    """Write which estimators fail and how: worse than the zero estimate by more than their interval, no better, or no number.
 
-    The estimator with the largest error comes first, at most :data:`NAMED` of them; nothing if none fails.
+    The estimators with the largest errors come first, at most :data:`NAMED`. The text is empty if none fails.
     """
-    found = []
-    for label, part in attempted(rows).groupby(_label(attempted(rows)), sort=False):
+    failures = []
+    for label, part in attempted(rows).groupby(estimator_labels(attempted(rows)), sort=False):
         good = part[(part["status"] == "ok") & np.isfinite(part["rmse_rel"])]
         bad = good[good["rmse_rel"] >= 1]
         lows = rmse_interval(bad)[0]
         worse, lost = int((lows > 1).sum()), int((part["status"] != "ok").sum())
         texts = [
-            f"worse than answering zero in {worse} (up to {number(bad['rmse_rel'].max())} times the gradient)"
+            f"worse than the zero estimate in {worse} (up to {number(bad['rmse_rel'].max())} times the gradient)"
             if worse
             else "",
             f"no better than zero in {len(bad) - worse}" if len(bad) > worse else "",
@@ -258,15 +255,15 @@ def failing(rows: pd.DataFrame) -> str:
         ]
         if any(texts):
             worst = float(bad["rmse_rel"].max()) if len(bad) else 0.0
-            found.append((worst, f"{label} is {', '.join(filter(None, texts))} of {counted(len(part), 'cell')}"))
-    found.sort(key=lambda one: -one[0])
-    return "; ".join(text for _, text in found[:NAMED])
+            failures.append((worst, f"{label} is {', '.join(filter(None, texts))} of {counted(len(part), 'cell')}"))
+    failures.sort(key=lambda failure: -failure[0])
+    return "; ".join(text for _, text in failures[:NAMED])
 
 
-def _joined(*parts: str) -> str:
-    """Join the parts that say something; a capital stands only at the start."""
-    said = [part for part in parts if part]
-    return "; ".join([*said[:1], *(part[0].lower() + part[1:] for part in said[1:])]) + "."
+def _join_sentences(*parts: str) -> str:
+    """Join the parts that are not empty into one sentence, with a capital at its start alone."""
+    texts = [part for part in parts if part]
+    return "; ".join([*texts[:1], *(part[0].lower() + part[1:] for part in texts[1:])]) + "."
 
 
 def finding(summaries: Sequence[ProblemSummary]) -> str:
@@ -281,10 +278,10 @@ def finding(summaries: Sequence[ProblemSummary]) -> str:
     share = f"{len(errors)} of {counted(len(settings), 'setting')}"
     if len(errors) == len(settings):
         share = f"all {counted(len(settings), 'setting')}" if len(settings) > 1 else "the one setting"
-    text = f"Use {main}: lowest relative RMSE at equal rollouts in {share} ({between(errors)})"
+    text = f"Use {main}: lowest relative RMSE at equal rollouts in {share} ({range_text(errors)})"
     if min(errors) >= 1:
-        text = f"Nothing beats answering zero: even {main}, lowest in {share}, has a relative RMSE of {between(errors)} at equal rollouts"
-    others = elsewhere(summaries, main)
+        text = f"Nothing beats the zero estimate: even {main}, lowest in {share}, has a relative RMSE of {range_text(errors)} at equal rollouts"
+    others = exceptions_to(summaries, main)
     left = counted(len(others) - EXCEPTIONS, "further exception") if len(others) > EXCEPTIONS else ""
     return "; ".join(filter(None, [text, *(other.sentence(main) for other in others[:EXCEPTIONS]), left]))
 
@@ -296,7 +293,7 @@ def fastest(rows: pd.DataFrame) -> str:
         return ""
     settings = good["time_s"].groupby(number_problems(good))
     first = good.loc[settings.idxmin()]
-    ways = _label(first) + " on " + first["backend"]
+    ways = estimator_labels(first) + " on " + first["backend"]
     way = ways.value_counts().index[0]
     times = sorted(first.loc[ways == way, "time_s"])
     if len(first) < 2:
@@ -305,17 +302,17 @@ def fastest(rows: pd.DataFrame) -> str:
     return f"a relative RMSE of {GOAL:g} is reached first by {way} in {share} ({duration(times[0])} to {duration(times[-1])})"
 
 
-def refused(rows: pd.DataFrame) -> str:
+def refusal_sentence(rows: pd.DataFrame) -> str:
     """Write which backends refused every cell, with the commonest reason; nothing if none did."""
     left = rows[(rows["status"] == "unsupported") & ~rows["backend"].isin(attempted(rows)["backend"])]
     reasons = left.groupby("backend", sort=False)["reason"].agg(lambda reasons: reasons.mode().iloc[0])
     return "; ".join(f"{backend} refuses: {reason}" for backend, reason in reasons.items())
 
 
-def elsewhere(summaries: Sequence[ProblemSummary], main: str) -> list[Elsewhere]:
-    """Return the settings where another estimator than ``main`` is best, the largest difference first.
+def exceptions_to(summaries: Sequence[ProblemSummary], main: str) -> list[BetterElsewhere]:
+    """Return the settings where an estimator other than ``main`` is best, the largest difference first.
 
-    A statement true of every problem with the same scene and law is printed once.
+    A statement that is true of every problem with the same scene and contact law is made once.
     """
     exceptions = []
     for one in summaries:
@@ -323,7 +320,7 @@ def elsewhere(summaries: Sequence[ProblemSummary], main: str) -> list[Elsewhere]
         for use in dict.fromkeys(one.winners[x][0] for x in places):
             mine = [x for x in places if one.winners[x][0] == use]
             errors, instead_of = [one.lowest[x] for x in mine], one.errors(main, mine)
-            exceptions.append(Elsewhere(one.title, one.kind, one.where(mine), use, errors, instead_of))
+            exceptions.append(BetterElsewhere(one.title, one.kind, one.where(mine), use, errors, instead_of))
     merged = []
     for other in exceptions:
         alike = [e for e in exceptions if (e.kind, e.where, e.use) == (other.kind, other.where, other.use)]
@@ -331,12 +328,12 @@ def elsewhere(summaries: Sequence[ProblemSummary], main: str) -> list[Elsewhere]
             merged.append(other)
         elif alike[0] is other:
             both = [[v for e in alike for v in getattr(e, name)] for name in ("errors", "instead_of")]
-            merged.append(Elsewhere(other.kind, other.kind, other.where, other.use, *both))
+            merged.append(BetterElsewhere(other.kind, other.kind, other.where, other.use, *both))
     return sorted(merged, key=lambda other: -other.factor)
 
 
 def answers(summaries: Sequence[ProblemSummary]) -> pd.DataFrame:
-    """Return what to use where: a line per problem and stretch of its axis with the same best estimators."""
+    """Return the recommended estimators: a line per problem and range of its axis with the same best estimators."""
     entries = []
     for one in summaries:
         groups: dict[tuple[str, ...], list[float]] = {}
@@ -353,15 +350,15 @@ def answers(summaries: Sequence[ProblemSummary]) -> pd.DataFrame:
                     "problem": one.title,
                     "where": one.where(places) or "everywhere",
                     "use": ", ".join(labels),
-                    "relative RMSE at equal rollouts": between(one.lowest[x] for x in places),
+                    "relative RMSE at equal rollouts": range_text(one.lowest[x] for x in places),
                     "next best": f"{following} ({number(rest[following])})" if following else "-",
-                    "worse than answering zero": ", ".join(useless) or "-",
+                    "worse than the zero estimate": ", ".join(useless) or "-",
                 }
             )
     return pd.DataFrame(entries)
 
 
-def between(values: Iterable[float]) -> str:
+def range_text(values: Iterable[float]) -> str:
     """Write a range: ``0.12``, or ``0.10 to 0.15``; ``no result`` for no values."""
     numbers = list(values)
     if not numbers:

@@ -29,16 +29,16 @@ from bench.report.style import (
     SHADE,
     SIZE,
     TICK,
-    Look,
+    Styles,
     axis_name,
-    inches,
+    backend_rank,
     plain,
     quantity,
-    twin,
+    width_in_inches,
 )
-from bench.report.views import Curve, lines, pareto, resolved, rmse_interval
+from bench.report.views import Curve, estimator_curves, is_bias_resolved, pareto, rmse_interval
 from bench.studies.bias_variance.costs import Cost
-from bench.studies.bias_variance.findings import headline, tally
+from bench.studies.bias_variance.findings import failure_summary, headline
 
 ALIKE = 0.03
 """Backends within this relative difference are one line: less could not be seen."""
@@ -55,13 +55,13 @@ DOWN, LEFT = (
 
 
 def bias_variance(
-    problems: Sequence[ProblemRows], notes: Sequence[str], look: Look, axis: Axis, marks: Mapping[str, float]
+    problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles, axis: Axis, marks: Mapping[str, float]
 ) -> Figure:
     """Draw relative RMSE, and its parts below it: bias and variance; against one axis, a column of panels per problem.
 
     The title says where the best estimator fails.
     """
-    drawn = [lines(problem.rows, ALIKE) for problem in problems]
+    drawn = [estimator_curves(problem.rows, ALIKE) for problem in problems]
     across = columns(len(problems), 4)
     figure, panels = page(
         problems, across, 4.5, ("relative RMSE", "|bias| / |∇J|", "variance / |∇J|²"),
@@ -90,7 +90,7 @@ def bias_variance(
 
 def _deviation(line: Curve, curves: Sequence[Curve]) -> dict[str, Any]:
     """Return the line style of backends whose numbers differ from the first backend's."""
-    place = twin(line, curves)
+    place = backend_rank(line, curves)
     return {"linestyle": DEVIANT[(place - 1) % len(DEVIANT)]} if place else {}
 
 
@@ -147,7 +147,7 @@ def _draw_errors(panel: Axes, line: Curve, place: Transform, style: Mapping[str,
         )  # fmt: skip
 
 
-def _draw_points(panel: Axes, at: np.ndarray, found: Points, style: Mapping[str, Any], lying: bool = False) -> None:
+def _draw_points(panel: Axes, at: np.ndarray, points: Points, style: Mapping[str, Any], lying: bool = False) -> None:
     """Draw full markers with intervals, hollow ones with arrows at upper limits; ``lying``: values to the right."""
     mark: Any = {
         "color": style["color"],
@@ -155,21 +155,21 @@ def _draw_points(panel: Axes, at: np.ndarray, found: Points, style: Mapping[str,
         "zorder": 3,
         "transform": style.get("transform", panel.transData),
     }
-    limit, clear = found.limit, ~found.limit
-    bars = np.array([(found.value - found.low)[clear], (found.high - found.value)[clear]])
+    limit, clear = points.limit, ~points.limit
+    bars = np.array([(points.value - points.low)[clear], (points.high - points.value)[clear]])
     bars = np.nan_to_num(bars, posinf=0.0).clip(min=0.0)
-    points: Any = (at[clear], found.value[clear])
-    limits: Any = (at[limit], found.value[limit])
+    centres: Any = (at[clear], points.value[clear])
+    limits: Any = (at[limit], points.value[limit])
     if lying:
-        points, limits = points[::-1], limits[::-1]
+        centres, limits = centres[::-1], limits[::-1]
     error: Any = {"xerr": bars} if lying else {"yerr": bars}
-    panel.errorbar(points[0], points[1], elinewidth=0.8, marker=style["marker"], **error, **mark)
+    panel.errorbar(centres[0], centres[1], elinewidth=0.8, marker=style["marker"], **error, **mark)
     panel.plot(*limits, marker=style["marker"], markerfacecolor="white", markeredgewidth=0.9, **mark)
     panel.plot(*limits, marker=LEFT if lying else DOWN, markersize=18, markerfacecolor="none", **mark)
 
 
 def _line_legends(
-    drawn: Sequence[Sequence[Curve]], look: Look, axis: Axis, marks: Mapping[str, float]
+    drawn: Sequence[Sequence[Curve]], look: Styles, axis: Axis, marks: Mapping[str, float]
 ) -> tuple[list[Any], list[Any]]:
     """Return legend handles: estimators, then the meaning of symbols."""
     every = [(line, curves) for curves in drawn for line in curves]
@@ -183,7 +183,7 @@ def _line_legends(
         symbols.append(_handle(f"{', '.join(dict.fromkeys(names))}, where different", linestyle=dashes))
     rows = pd.concat([line.rows for line, _ in every])
     good = rows[rows["status"] == "ok"]
-    texts = ["bias not distinguishable from 0: 95% limit"] * bool((~resolved(good)).any())
+    texts = ["bias not distinguishable from 0: 95% limit"] * bool((~is_bias_resolved(good)).any())
     texts += ["below the scale"] * bool(_estimates(rows, "variance", 2).limit.any())
     if texts:
         symbols.append(_handle(", or ".join(texts), marker="o", markerfacecolor="white", linestyle="none"))
@@ -205,15 +205,20 @@ BACKENDS = ("solid", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)), (0, (8, 2)
 
 
 def speed_accuracy(
-    problems: Sequence[ProblemRows], notes: Sequence[str], look: Look, cost: Cost, said: Mapping[int, str], first: str
+    problems: Sequence[ProblemRows],
+    notes: Sequence[str],
+    look: Styles,
+    cost: Cost,
+    sentences: Mapping[int, str],
+    first: str,
 ) -> Figure:
     """Draw relative RMSE of one estimate against its cost, a panel per problem, a curve per estimator and backend.
 
     Colour and marker are the estimator, the line style the backend; the best backend's curve has the estimator's name at
-    its end. Along a thin grey guide the error falls as N^-1/2; a dotted line is a bias that no samples remove. ``said``
-    are sentences by problem, ``first`` one over all of them, the title.
+    its end. Along a thin grey guide the error falls as N^-1/2; a dotted line is a bias that no samples remove. ``sentences``
+    are texts by problem, ``first`` one over all of them, the title.
     """
-    drawn = [lines(problem.rows, close=None) for problem in problems]
+    drawn = [estimator_curves(problem.rows, close=None) for problem in problems]
     every = [line for curves in drawn for line in curves]
     backends = list(dict.fromkeys(line.rows["backend"].iloc[0] for line in every))
     dashes = {name: BACKENDS[i % len(BACKENDS)] for i, name in enumerate(backends)}
@@ -222,7 +227,7 @@ def speed_accuracy(
     symbols += [
         Line2D([], [], **GUIDE, label="error falling as $N^{-1/2}$"),
         Line2D([], [], color=GREY, linewidth=0.9, linestyle=":", label="bias, which samples do not remove"),
-        Patch(label="worse than answering zero", **SHADE),
+        Patch(label="worse than the zero estimate", **SHADE),
     ]
     across = columns(len(problems), 2)
     figure, panels = page(
@@ -238,8 +243,8 @@ def speed_accuracy(
         _draw_guide(panel, cost.known(problem.rows), cost)
         _name_curves(panel, curves, cost, look, figure.get_figwidth() / across - MARGIN)
         room = 132 // across
-        told = ["\n".join(textwrap.wrap(text, room)) for text in said.get(place, "").splitlines()]
-        panel.set_xlabel("\n".join([cost.label, *told]), fontsize=6.2)
+        wrapped_lines = ["\n".join(textwrap.wrap(text, room)) for text in sentences.get(place, "").splitlines()]
+        panel.set_xlabel("\n".join([cost.label, *wrapped_lines]), fontsize=6.2)
     return figure
 
 
@@ -282,7 +287,7 @@ def _draw_guide(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
     )
 
 
-def _name_curves(panel: Axes, curves: Sequence[Curve], cost: Cost, look: Look, width: float) -> None:
+def _name_curves(panel: Axes, curves: Sequence[Curve], cost: Cost, look: Styles, width: float) -> None:
     """Write each estimator's name at the end of its cheapest curve, names apart and within the ``width`` in inches."""
     ends: dict[str, tuple[float, float, Curve]] = {}
     for line in curves:
@@ -297,7 +302,7 @@ def _name_curves(panel: Axes, curves: Sequence[Curve], cost: Cost, look: Look, w
     heights = apart([(np.log(error) - low) / (high - low) for _, (_, error, _) in named], APART, 0.04, 0.96)
     for (label, (at, _, line)), height in zip(named, heights, strict=True):
         left, right = np.log(panel.get_xlim())
-        x = min((np.log(at) - left) / (right - left) + 0.03, 1.0 - inches(label) * NAME_SIZE / SIZE / width)
+        x = min((np.log(at) - left) / (right - left) + 0.03, 1.0 - width_in_inches(label) * NAME_SIZE / SIZE / width)
         panel.text(
             x, height, plain(label), transform=panel.transAxes, color=look.line(line)["color"], fontsize=NAME_SIZE, va="center",
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.3, "alpha": 0.75}, zorder=5,
@@ -315,7 +320,7 @@ def apart(heights: Sequence[float], gap: float, low: float, high: float) -> list
 
 
 def _draw_scales(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
-    """Set the panel's scales, with room at the right for names, and shade errors above that of answering zero."""
+    """Set the panel's scales, with room at the right for names, and shade errors above that of the zero estimate."""
     at = cost.of(rows)
     low, high = rows["rmse_rel"].min(), rows["rmse_rel"].max()
     spread = np.minimum(cost.spread(rows), at / 2)
@@ -327,9 +332,9 @@ def _draw_scales(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
         panel.axhspan(1.0, high * tall, zorder=0, **SHADE)
 
 
-def overview(problems: Sequence[ProblemRows], notes: Sequence[str], look: Look) -> Figure:
+def overview(problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles) -> Figure:
     """Draw relative bias and RMSE of every estimator, a panel per problem; the title says who fails on how many."""
-    every = [lines(problem.rows, ALIKE) for problem in problems]
+    every = [estimator_curves(problem.rows, ALIKE) for problem in problems]
     drawn = [{_row_label(line, curves): line for line in curves} for curves in every]
     labels = list(dict.fromkeys(label for curves in drawn for label in curves))
     symbols: list[Any] = [
@@ -342,7 +347,7 @@ def overview(problems: Sequence[ProblemRows], notes: Sequence[str], look: Look) 
         symbols.append(_handle("cell failed", **CROSS))
     figure, panels = page(
         problems, columns(len(problems), 3), 0.55 + 0.24 * len(labels), ("",),
-        tally(list(zip(problems, every, strict=True))),
+        failure_summary(list(zip(problems, every, strict=True))),
         ["Relative bias and RMSE of one estimate", *shared(problems, ""), *notes], ([], symbols), sharey=True,
     )  # fmt: skip
     for (panel,), curves in zip(panels, drawn, strict=True):

@@ -18,7 +18,7 @@ from bench.experiment.experiment import Experiment
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.tables import escape_latex, escape_markdown
 from bench.report.text import axis_value, number
-from bench.report.views import Arranged, lines, rmse_interval
+from bench.report.views import Arranged, estimator_curves, rmse_interval
 from bench.studies.bias_variance.findings import problems
 
 WIDTH = 504.0
@@ -89,14 +89,14 @@ def pivot(experiment: Experiment, shown: Arranged) -> Pivot:
 
 def _axis(name: str, shown: Arranged) -> Axis:
     swept = list(shown.swept())
-    found = [axis for axis in swept if name in (axis.column, axis.short, *axis.names)]
-    if not found:
+    named = [axis for axis in swept if name in (axis.column, axis.short, *axis.names)]
+    if not named:
         raise unknown("column of the table:", name, [axis.column for axis in swept])
-    return found[0]
+    return named[0]
 
 
 def _block(axis: Axis | None, family: ProblemRows, apart: bool) -> Block:
-    curves = lines(family.rows, close=None) if apart else lines(family.rows)
+    curves = estimator_curves(family.rows, close=None) if apart else estimator_curves(family.rows)
     values = sorted({x for line in curves for x in line.at})
     labels = [line.label for line in curves]
     rows = []
@@ -160,10 +160,10 @@ def _in_markdown(cell: PivotCell) -> str:
 def _failures(table: Pivot, form: int) -> list[tuple[str, str]]:
     """Return the signs of failures and remarks that occur, with their meanings."""
     seen = {cell.failure for cell in table.cells()}
-    found = [(signs[form], f"{signs[2]}.") for status, signs in FAILURES.items() if status in seen]
+    meanings = [(signs[form], f"{signs[2]}.") for status, signs in FAILURES.items() if status in seen]
     if any(cell.noted and not cell.failure for cell in table.cells()):
-        found.append(("?", "the row has a remark, so its interval is doubtful: see the column reason of the CSV."))
-    return found
+        meanings.append(("?", "the row has a remark, so its interval is doubtful: see the column reason of the CSV."))
+    return meanings
 
 
 # ------------------------------------------------------------------------------------------------------- LaTeX

@@ -1,4 +1,4 @@
-"""Where each estimator wins and where it fails: relative errors with intervals, one column per problem."""
+"""Ranks estimators within each problem: relative errors with intervals, one column per problem."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ import pandas as pd
 from bench.experiment.experiment import Experiment
 from bench.report.tables import csv, plain_markdown
 from bench.report.text import number
+from bench.report.views import estimator_labels
 from bench.run.files import write_all
 
 LEAST = 3
-"""Estimators from which on the table is written: with fewer the main table shows it at a glance."""
+"""Fewest estimators for which the table is written: the main table is enough for fewer."""
 WORTHLESS = 0.99
-"""Relative RMSE from which on an estimate is no better than answering zero."""
+"""Relative RMSE at and above which an estimate counts as no better than the zero estimate."""
 MANY = 2.5
-"""Evaluations per sample from which on they are printed."""
+"""Evaluations per sample above which they are printed."""
 WINS, FAILS, BIASED = "wins", "fails", "biased"
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write the table as Markdown and CSV; nothing where few estimators ran, or something was swept."""
-    table = standing(rows)
+    """Write ``ranking`` (.md, .csv), unless few estimators ran or something was swept; returns the paths."""
+    table = rank_estimators(rows)
     if table.empty:
         return []
     texts = pd.DataFrame(
@@ -33,19 +34,19 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     )
     legend = (
         "\n\nRelative RMSE [95% interval] at equal samples, not at equal rollouts. *wins*: not distinguishable from the lowest "
-        "of its column. *fails*: no better than answering zero. *biased*: more than half of the error is bias. *(40x)*: it "
+        "of its column. *fails*: no better than the zero estimate. *biased*: more than half of the error is bias. *(40x)*: it "
         "evaluates 40 costs and gradients per sample, where others take one or two.\n"
     )
-    contents = {"standing.md": plain_markdown(texts) + legend + _best_text(best(table)), "standing.csv": csv(table)}
+    contents = {"ranking.md": plain_markdown(texts) + legend + _best_text(best(table)), "ranking.csv": csv(table)}
     return write_all(experiment.directory, contents)
 
 
 def best(table: pd.DataFrame) -> pd.DataFrame:
-    """Return, per estimator and problem, the setting of least error at equal evaluations, and how it stands.
+    """Return, per estimator and problem, the setting of least error at equal evaluations, and its verdict.
 
-    An estimate of as many evaluations (costs and gradients) as there are samples has the bias as measured, and the
-    variance times the evaluations per sample: fewer samples fit. Choosing the best of several settings flatters an
-    estimator by about its interval.
+    An estimate with as many evaluations (costs and gradients) as there are samples has the measured bias, and the measured
+    variance times the evaluations per sample. Choosing the best of several settings favours an estimator by about its
+    interval.
     """
     good = table[(table["status"] == "ok") & np.isfinite(table["equal"])]
     good = good.assign(estimator=good["label"].str.partition("[")[0])
@@ -54,8 +55,8 @@ def best(table: pd.DataFrame) -> pd.DataFrame:
     chosen = good.loc[good.groupby(["estimator", "problem"], sort=False)["equal"].idxmin()]
     lowest = chosen.groupby("problem")["equal_high"].min()
     wins = chosen["equal_low"].to_numpy() <= lowest.reindex(chosen["problem"]).to_numpy()
-    stands = np.select([chosen["equal"] >= WORTHLESS, wins], [FAILS, WINS], "")
-    return chosen.assign(stands=stands).reset_index(drop=True)
+    verdict = np.select([chosen["equal"] >= WORTHLESS, wins], [FAILS, WINS], "")
+    return chosen.assign(verdict=verdict).reset_index(drop=True)
 
 
 def _best_text(table: pd.DataFrame) -> str:
@@ -64,7 +65,7 @@ def _best_text(table: pd.DataFrame) -> str:
         return ""
     texts = {
         (row.estimator, row.problem): f"{number(row.equal)} [{number(row.equal_low)}, {number(row.equal_high)}]"
-        + (f" {row.stands}" if row.stands else "")
+        + (f" {row.verdict}" if row.verdict else "")
         + (f" ({row.label.partition('[')[2][:-1]})" if "[" in row.label else "")
         for row in table.itertuples()
     }
@@ -74,7 +75,7 @@ def _best_text(table: pd.DataFrame) -> str:
     )
     return (
         "\nEach estimator at its best setting (in parentheses), and at equal work: relative RMSE of an estimate of as many "
-        "costs and gradients together as there are samples, from the measured bias and variance; below, the same words.\n\n"
+        "costs and gradients together as there are samples, from the measured bias and variance. The words mean the same as above.\n\n"
         + plain_markdown(wide)
         + "\n"
     )
@@ -85,16 +86,14 @@ def _column(table: pd.DataFrame, problem: str) -> list[str]:
     return [part["text"].get(label, "") for label in dict.fromkeys(table["label"])]
 
 
-def standing(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per cell: estimator, problem, relative RMSE with its interval, and how it stands.
+def rank_estimators(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one row per cell: estimator, problem, relative RMSE with its interval, and its verdict.
 
-    Empty unless at least three estimators ran on each of several problems, once each. The interval combines those of
-    bias and variance: rmse^2 is their sum.
+    The table is empty unless at least three estimators ran on several problems, once each. The interval combines those of
+    bias and variance, since rmse^2 = bias^2 + variance.
     """
     rows = rows.assign(
-        label=np.where(
-            rows["estimator_params"] == "", rows["estimator"], rows["estimator"] + "[" + rows["estimator_params"] + "]"
-        ),
+        label=estimator_labels(rows),
         problem=np.where(rows["contact"] == "none", rows["scene"], rows["scene"] + ", " + rows["contact"]),
     )
     once = not rows.duplicated(["label", "problem"]).any()
@@ -112,24 +111,26 @@ def standing(rows: pd.DataFrame) -> pd.DataFrame:
     )  # fmt: skip
     good = table["status"] == "ok"
     lowest = table[good].groupby("problem")["high"].min()
-    table["stands"] = [_stands(row, lowest.get(row.problem, math.nan)) for row in table.itertuples()]
+    table["verdict"] = [_verdict(row, lowest.get(row.problem, math.nan)) for row in table.itertuples()]
     table["text"] = [_text(row) for row in table.itertuples()]
     return table.reset_index(drop=True)
 
 
-def _stands(row: object, lowest: float) -> str:
+def _verdict(row: object, lowest: float) -> str:
     status, low, share, rmse = (getattr(row, name) for name in ("status", "low", "share", "rmse_rel"))
     if status != "ok":
         return str(status)
     wins = low <= lowest
-    said = [WINS] if wins and rmse < WORTHLESS else [FAILS] if rmse >= WORTHLESS else []
-    return ", ".join([*said, *([BIASED] if share > 0.5 else [])])
+    outcome = [WINS] if wins and rmse < WORTHLESS else [FAILS] if rmse >= WORTHLESS else []
+    return ", ".join([*outcome, *([BIASED] if share > 0.5 else [])])
 
 
 def _text(row: object) -> str:
-    status, stands = getattr(row, "status"), getattr(row, "stands")  # noqa: B009, rows of a table have no type
+    status, verdict = getattr(row, "status"), getattr(row, "verdict")  # noqa: B009, rows of a table have no type
     if status != "ok":
         return str(status)
     middle, low, high = (number(float(getattr(row, name))) for name in ("rmse_rel", "low", "high"))
     times = float(getattr(row, "evaluations"))  # noqa: B009
-    return f"{middle} [{low}, {high}]" + (f" {stands}" if stands else "") + (f" ({times:.0f}x)" if times > MANY else "")
+    return (
+        f"{middle} [{low}, {high}]" + (f" {verdict}" if verdict else "") + (f" ({times:.0f}x)" if times > MANY else "")
+    )

@@ -1,4 +1,4 @@
-"""Sentences on what estimators report of themselves: a weight that is 0 switches a method off."""
+"""Sentences on the diagnostics that estimators report: a weight of 0 switches a method off."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ import json
 import pandas as pd
 
 from bench.report.text import counted, number
+from bench.report.views import estimator_label
 
 OFF = 0.5
-"""Share of exact zeros from which an auxiliary is said to switch its estimator off."""
+"""Share of exact zeros above which a diagnostic counts as switching its estimator off."""
 
 
 def sentences(rows: pd.DataFrame) -> list[str]:
-    """Return, per estimator and auxiliary, the range of its medians over cells, and in how many cells it is mostly 0."""
-    said = []
+    """Return a sentence per estimator and diagnostic: the range of its medians over cells, and the cells where it is mostly 0."""
+    texts = []
     good = rows[(rows["status"] == "ok") & (rows["auxiliaries"] != "")]
     for (estimator, params), group in good.groupby(["estimator", "estimator_params"], sort=False):
         tables = [json.loads(text) for text in group["auxiliaries"]]
@@ -22,12 +23,12 @@ def sentences(rows: pd.DataFrame) -> list[str]:
             values = [table[name] for table in tables if name in table]
             medians = sorted(value["median"] for value in values)
             off = sum(value["zero"] > OFF for value in values)
-            label = f"{estimator}[{params}]" if params else estimator
-            said.append(
+            label = estimator_label(estimator, params)
+            texts.append(
                 f"{label}: {name} is {number(medians[0])} to {number(medians[-1])} (medians of {counted(len(values), 'cell')})"
                 + (f", and 0 in most estimates of {off} of them: it does nothing there" if off else "")
             )
-    return said
+    return texts
 
 
 def show(rows: pd.DataFrame) -> None:

@@ -1,4 +1,4 @@
-"""One figure for five seconds: what each estimator needs for an error, scene by scene, and who is first."""
+"""The summary matrix: the cost of each estimator to reach an error, by problem, and the first estimator of each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bench.report.problems import ProblemRows
 from bench.report.style import plain
 from bench.report.text import counted, number
 from bench.studies.bias_variance.costs import ROLLOUTS, Cost
-from bench.studies.bias_variance.time_to_accuracy import TARGETS, Reached, lead, methods
+from bench.studies.bias_variance.time_to_accuracy import TARGETS, RequiredCost, lead, methods
 
 FIRST = "#009E73"
 SHADES = (
@@ -28,7 +28,7 @@ SHADES = (
 )
 """Largest factor over the first of a column, with the colours of cell and text."""
 WHY = {"never": "bias", "unknown": "bias?"}
-"""What stands in a cell without a number."""
+"""Texts of cells without a number."""
 LEGEND = (
     "Dark and bold: the first of its column; lighter: up to 3, and up to 30 times as much. Lead: the first over the next "
     "estimator, with its 95% interval; open where that reaches 1. bias: its bias is larger than the error. bias?: no bias known to be below the error."
@@ -36,24 +36,26 @@ LEGEND = (
 LEAD = "lead over the next"
 
 
-def glance(problems: Sequence[ProblemRows], costs: Sequence[Cost]) -> Figure:
+def draw_summary_matrix(problems: Sequence[ProblemRows], costs: Sequence[Cost]) -> Figure:
     """Draw, per cost and error, estimators down and problems across: the cost on the best backend, coloured by factor.
 
     The last row is the factor between the first and the second estimator, with its 95% interval.
     """
-    found = {
+    costs_by_target = {
         (cost, target): [_best(methods(problem, target, cost)) for problem in problems]
         for cost in costs
         for target in TARGETS
     }
-    names = list(dict.fromkeys(name for columns in found.values() for column in columns for name in column))
-    size = max(6.0, 1.5 + 0.93 * len(problems)), 0.9 + (0.45 + 0.27 * (len(names) + 1)) * len(found)
+    names = list(dict.fromkeys(name for columns in costs_by_target.values() for column in columns for name in column))
+    size = max(6.0, 1.5 + 0.93 * len(problems)), 0.9 + (0.45 + 0.27 * (len(names) + 1)) * len(costs_by_target)
     figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(rect=(0.01, 0.0, 0.98, 1.0)))
     FigureCanvasAgg(figure)
-    figure.suptitle(f"{_leader(found)}\nWhat one estimate needs, on its best backend", fontsize=9, fontweight="bold")
+    figure.suptitle(
+        f"{_title(costs_by_target)}\nWhat one estimate needs, on its best backend", fontsize=9, fontweight="bold"
+    )
     figure.supxlabel(textwrap.fill(LEGEND, int(19 * size[0])), fontsize=6.5)
-    panels = figure.subplots(len(found), 1, squeeze=False)[:, 0]
-    for panel, ((cost, target), columns) in zip(panels, found.items(), strict=True):
+    panels = figure.subplots(len(costs_by_target), 1, squeeze=False)[:, 0]
+    for panel, ((cost, target), columns) in zip(panels, costs_by_target.items(), strict=True):
         _matrix(panel, columns, names, cost)
         panel.set_title(f"{target:.0%} error: {cost.label}", fontsize=8, loc="left", fontweight="bold")
         panel.set_xticks(range(len(problems)), [plain(p.title().partition(",")[0]) for p in problems], fontsize=6.5)
@@ -61,29 +63,29 @@ def glance(problems: Sequence[ProblemRows], costs: Sequence[Cost]) -> Figure:
     return figure
 
 
-def _leader(found: Mapping[tuple[Cost, float], Sequence[Mapping[str, tuple[Reached, str]]]]) -> str:
+def _title(costs_by_target: Mapping[tuple[Cost, float], Sequence[Mapping[str, tuple[RequiredCost, str]]]]) -> str:
     """Write which estimator is first most often at the first cost and error."""
-    (cost, target), columns = next(iter(found.items()))
+    (cost, target), columns = next(iter(costs_by_target.items()))
     firsts = Counter(_first(column) for column in columns)
     unsure = firsts.pop(None, 0)
     if not firsts:
-        return f"Which estimator is first to {target:.0%} error cannot be told on any problem"
+        return f"Which estimator is first to {target:.0%} error is not distinguishable on any problem"
     name, times = firsts.most_common(1)[0]
     kind = "rollouts" if cost is ROLLOUTS else "time"
-    said = f"{name} is first to {target:.0%} error by {kind} on {times} of {counted(len(columns), 'problem')}"
-    return said + (f", open on {unsure}" if unsure else "")
+    title = f"{name} is first to {target:.0%} error by {kind} on {times} of {counted(len(columns), 'problem')}"
+    return title + (f", open on {unsure}" if unsure else "")
 
 
-def _first(column: Mapping[str, tuple[Reached, str]]) -> str | None:
+def _first(column: Mapping[str, tuple[RequiredCost, str]]) -> str | None:
     """Return the estimator that is first; None if there is none or its lead may be chance."""
     if _lead(column) in ("", "open"):
         return None
     return min((name for name in column if math.isfinite(column[name][0].cost)), key=lambda name: column[name][0].cost)
 
 
-def _best(reached: Mapping[str, Reached]) -> dict[str, tuple[Reached, str]]:
-    """Return what each estimator needs on its best backend, and that backend."""
-    best: dict[str, tuple[Reached, str]] = {}
+def _best(reached: Mapping[str, RequiredCost]) -> dict[str, tuple[RequiredCost, str]]:
+    """Return each estimator's cost on its best backend, and that backend."""
+    best: dict[str, tuple[RequiredCost, str]] = {}
     for name, way in reached.items():
         estimator, _, backend = name.partition(" on ")
         known = best.get(estimator)
@@ -92,7 +94,9 @@ def _best(reached: Mapping[str, Reached]) -> dict[str, tuple[Reached, str]]:
     return best
 
 
-def _matrix(panel: Any, columns: Sequence[Mapping[str, tuple[Reached, str]]], names: Sequence[str], cost: Cost) -> None:
+def _matrix(
+    panel: Any, columns: Sequence[Mapping[str, tuple[RequiredCost, str]]], names: Sequence[str], cost: Cost
+) -> None:
     panel.set_xlim(-0.5, len(columns) - 0.5)
     panel.set_ylim(len(names) + 0.5, -0.5)
     panel.tick_params(length=0)
@@ -101,7 +105,7 @@ def _matrix(panel: Any, columns: Sequence[Mapping[str, tuple[Reached, str]]], na
     for x, column in enumerate(columns):
         least = min((way.cost for way, _ in column.values() if math.isfinite(way.cost)), default=math.nan)
         for y, name in enumerate(names):
-            way, backend = column.get(name, (Reached("unknown"), ""))
+            way, backend = column.get(name, (RequiredCost("unknown"), ""))
             factor = way.cost / least
             back, front = ("white", "#595959")
             text = WHY.get(way.how, "-")
@@ -116,8 +120,8 @@ def _matrix(panel: Any, columns: Sequence[Mapping[str, tuple[Reached, str]]], na
         panel.text(x, len(names), _lead(column), ha="center", va="center", fontsize=5.5, linespacing=0.95)
 
 
-def _lead(column: Mapping[str, tuple[Reached, str]]) -> str:
-    """Return the factor between the first and the second, or that their intervals do not tell them apart."""
+def _lead(column: Mapping[str, tuple[RequiredCost, str]]) -> str:
+    """Return the factor between the first and the second with its interval, or ``open`` where the interval reaches 1."""
     ways = sorted((way for way, _ in column.values() if math.isfinite(way.cost)), key=lambda way: way.cost)
     if len(ways) < 2:
         return "alone" if ways else ""

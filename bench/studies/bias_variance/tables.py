@@ -17,7 +17,7 @@ from bench.experiment.parameters import number_problems
 from bench.measure.statistics import UNEXPLAINED, is_unexplained
 from bench.report.tables import csv, escape_markdown
 from bench.report.text import axis_value, number
-from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, arranged, bias_text, pareto, unsteady
+from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, arrange, bias_text, pareto, unsteady
 from bench.run.files import write_all
 from bench.studies.bias_variance import pivot
 
@@ -26,7 +26,7 @@ FOOTNOTES = [
     "0 (< u): the bias is not distinguishable from 0, its 95% interval reaches up to u. "
     f"{DOUBTED.strip()}: the estimator declares to be unbiased and the interval excludes 0, so {UNEXPLAINED}.",
     "relative bias and rel. RMSE: divided by the norm of the reference gradient. A relative RMSE above 1 is worse "
-    "than answering zero.",
+    "than the zero estimate.",
     "variance: trace of the covariance of one estimate. time: one estimate, steady state, without compilation. "
     f"{UNSTEADY}: the interquartile range of its calls is over 20% of it; something else ran beside them.",
 ]
@@ -34,7 +34,7 @@ FOOTNOTES = [
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``bias_variance`` (.csv, .md, .tex) and ``speed_accuracy.csv``; returns their paths."""
-    paper = pivot.pivot(experiment, arranged(experiment, rows))
+    paper = pivot.pivot(experiment, arrange(experiment, rows))
     return write_all(
         experiment.directory,
         {
@@ -73,7 +73,7 @@ def readable(experiment: Experiment, rows: pd.DataFrame) -> Readable:
     """Return the main table: identity and swept columns that vary, the results, status and reason of failures."""
     swept_axes = axes.axes(experiment.sweep, rows)
     swept = [axis.column for axis in swept_axes if axis.column not in rows and not _is_shown(rows, axis)]
-    rows = axes.relabelled(axes.with_axes(experiment, rows), swept_axes)
+    rows = axes.relabel(axes.with_axes(experiment, rows), swept_axes)
     varying, shared = _varying(rows, swept)
     reasons = {text: i + 1 for i, text in enumerate(dict.fromkeys(r for r in rows["reason"] if r))}
     status = ["status"] if reasons or (rows["status"] != "ok").any() else []

@@ -21,14 +21,15 @@ from bench.report.text import axis_value, duration, number, one_line
 from bench.report.views import (
     UNSTEADY,
     Curve,
-    arranged,
+    arrange,
     bias_text,
-    lines,
+    estimator_curves,
+    estimator_label,
+    is_bias_resolved,
     relative,
-    resolved,
     unsteady,
 )
-from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, EQUAL_TIME, at_equal_cost
+from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, EQUAL_TIME, with_errors_at_equal_cost
 from bench.studies.bias_variance.findings import TIE, lowest, problems, span, winners
 
 GOALS = (0.3, 0.1, 0.03)
@@ -49,7 +50,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
     console.print(f"{len(rows)} cells: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
-    parts = problems(arranged(experiment, at_equal_cost(rows)))
+    parts = problems(arrange(experiment, with_errors_at_equal_cost(rows)))
     condensed = len(rows) > FULL_ROWS
     for axis, group in parts:
         if condensed and axis is not None:
@@ -72,7 +73,7 @@ def _show_rows(console: Console, group: ProblemRows, axis: Axis | None, merge: b
         table.add_column(name, overflow="fold")
     for name in ("rel. bias [95%]", "variance", "rel. RMSE", "cosine", "time"):
         table.add_column(name, justify="right")
-    curves = lines(group.rows) if merge else lines(group.rows, close=None)
+    curves = estimator_curves(group.rows) if merge else estimator_curves(group.rows, close=None)
     best = lowest(curves)
     for x, line in ((x, line) for x in _values(curves) for line in curves if x in line.at):
         row = line.at[x]
@@ -81,7 +82,7 @@ def _show_rows(console: Console, group: ProblemRows, axis: Axis | None, merge: b
         if row["status"] != "ok":
             table.add_row(*cells, Text(row["status"], "red"), "-", "-", "-", "-")
             continue
-        bias = bias_text(row, row["reference_norm"]) + _noted(row)
+        bias = bias_text(row, row["reference_norm"]) + _remark_mark(row)
         times = _times(line) if merge else [duration(row["time_s"]) + UNSTEADY * bool(unsteady(row))]
         table.add_row(
             *cells, bias, number(row["variance"]), _rmse(row, best.get(x, math.nan)), number(row["cosine"], 3),
@@ -92,7 +93,7 @@ def _show_rows(console: Console, group: ProblemRows, axis: Axis | None, merge: b
 
 def _show_pivot(console: Console, group: ProblemRows, axis: Axis) -> None:
     """Print two lines per estimator and agreeing backends, a column per value of the axis."""
-    curves = lines(group.rows)
+    curves = estimator_curves(group.rows)
     best = lowest(curves)
     values = _values(curves)
     room = max(1, (console.width - 44) // 8)
@@ -112,13 +113,13 @@ def _show_pivot(console: Console, group: ProblemRows, axis: Axis) -> None:
 
 
 def _cell(row: dict[str, Any] | None, best: float) -> tuple[Text, Text]:
-    """Write bias and RMSE of a cell, or what became of it."""
+    """Return the texts of a cell's bias and RMSE, or its status if it failed."""
     if row is None or row["status"] != "ok":
         return Text("" if row is None else row["status"][:6], "red"), Text()
-    if resolved(row):
-        return Text(number(relative(row, "bias")) + _noted(row), "yellow"), _rmse(row, best)
+    if is_bias_resolved(row):
+        return Text(number(relative(row, "bias")) + _remark_mark(row), "yellow"), _rmse(row, best)
     high = relative(row, "bias_high")
-    return Text((f"<{number(high)}" if high > 0 else "0") + _noted(row), "dim"), _rmse(row, best)
+    return Text((f"<{number(high)}" if high > 0 else "0") + _remark_mark(row), "dim"), _rmse(row, best)
 
 
 def _table(title: str) -> Table:
@@ -128,7 +129,7 @@ def _table(title: str) -> Table:
     )  # fmt: skip
 
 
-def _noted(row: Any) -> str:
+def _remark_mark(row: Any) -> str:
     return "?" if row["reason"] else ""
 
 
@@ -165,20 +166,20 @@ def _show_legend(console: Console, condensed: bool) -> None:
     )
     console.print(
         f"\nbias: |mean - reference| / |grad J|, {bias} (95%). rmse: error of one estimate / |grad J|, above 1 worse than "
-        "answering zero; * lowest from as many samples, within 10%. A ? is explained below. Backends on one line agree to 1e-6, with ~ to 1%. "
+        "the zero estimate; * lowest from as many samples, within 10%. A ? is explained below. Backends on one line agree to 1e-6, with ~ to 1%. "
         f"A time marked {UNSTEADY} was unsteady: the interquartile range of its calls is over 20% of it."
         + (" Under each estimator: backends and their time per estimate. fail: cells not ok." if condensed else "")
     )
 
 
 def _show_reasons(console: Console, rows: pd.DataFrame) -> None:
-    """Print what failed or was refused, and why; reasons that differ only in numbers are merged."""
-    noted = rows[rows["reason"] != ""]
-    if noted.empty:
+    """Print the reasons of rows that failed, were refused or have a remark; reasons that differ in numbers alone are merged."""
+    remarked = rows[rows["reason"] != ""]
+    if remarked.empty:
         return
     console.print("\nFailed, refused or noted", style="bold")
-    kinds = noted["reason"].str.replace(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", regex=True)
-    for (status, _), part in sorted(noted.groupby(["status", kinds]), key=lambda item: -len(item[1])):
+    kinds = remarked["reason"].str.replace(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", regex=True)
+    for (status, _), part in sorted(remarked.groupby(["status", kinds]), key=lambda item: -len(item[1])):
         more = "" if part["reason"].nunique() == 1 else " (for example)"
         _print_wrapped(console, f"{len(part)} {status}: {one_line(part['reason'].iloc[0])}{more}", 2)
 
@@ -189,23 +190,23 @@ def _print_wrapped(console: Console, text: str, indent: int) -> None:
 
 
 def _show_verdict(console: Console, group: ProblemRows, axis: Axis | None) -> None:
-    """Print, for one problem, the estimators of lowest error, those whose error is bias, useless ones, and where."""
+    """Print one problem's verdict: the estimators of lowest error, the biased and the useless ones, each with its range."""
     console.print(f"  {group.title()}" + (f", by {axis.title}" if axis else ""), style="bold")
-    curves = lines(group.rows)
+    curves = estimator_curves(group.rows)
     ranked = {f"lowest error at equal {cost}": _winners(curves, error) for cost, error in COSTS.items()}
     for text, names in ranked.items():
         if names:
             _print_wrapped(console, f"{text}: {names}", 4)
     for text, test in (
-        ("mostly bias, more samples do not help", _biased),
-        (f"a bias where none is declared, {UNEXPLAINED}", _unexplained),
-        ("no better than answering zero", _useless),
+        ("mostly bias, more samples do not help", _is_mostly_bias),
+        (f"a bias where none is declared, {UNEXPLAINED}", _has_unexplained_bias),
+        ("no better than the zero estimate", _is_no_better_than_zero),
     ):
         where: dict[str, dict[float, bool]] = {}
         for line in curves:
-            there = where.setdefault(line.label, {})
+            holds_at = where.setdefault(line.label, {})
             for x, row in line.at.items():
-                there[x] = there.get(x, False) or (row["status"] == "ok" and test(row))
+                holds_at[x] = holds_at.get(x, False) or (row["status"] == "ok" and test(row))
         parts = [f"{label} {span(holds)}".strip() for label, holds in where.items() if any(holds.values())]
         if parts:
             _print_wrapped(console, f"{text}: {', '.join(parts)}", 4)
@@ -224,16 +225,16 @@ def _winners(curves: Sequence[Curve], error: str) -> str:
     return "; ".join(f"{where}: {text}" if where else text for text, where in ranges.items())
 
 
-def _biased(row: Any) -> bool:
-    found = resolved(row) and row["bias_rel"] > NEGLIGIBLE and row["bias"] ** 2 > row["rmse"] ** 2 / 2
-    return bool(found and not _unexplained(row))
+def _is_mostly_bias(row: Any) -> bool:
+    dominates = is_bias_resolved(row) and row["bias_rel"] > NEGLIGIBLE and row["bias"] ** 2 > row["rmse"] ** 2 / 2
+    return bool(dominates and not _has_unexplained_bias(row))
 
 
-def _unexplained(row: Any) -> bool:
+def _has_unexplained_bias(row: Any) -> bool:
     return is_unexplained(row["reason"])
 
 
-def _useless(row: Any) -> bool:
+def _is_no_better_than_zero(row: Any) -> bool:
     return bool(row["rmse_rel"] >= 1)
 
 
@@ -243,5 +244,5 @@ def _first(rows: pd.DataFrame, goal: float) -> str:
     if good.empty:
         return "none"
     row = good.loc[good["time_s"].idxmin()]
-    label = f"{row['estimator']}[{row['estimator_params']}]" if row["estimator_params"] else row["estimator"]
+    label = estimator_label(row["estimator"], row["estimator_params"])
     return f"{label} on {row['backend']} in {duration(row['time_s'])} with {row['x']:g} samples"

@@ -1,4 +1,4 @@
-"""Finds, for a given relative error, which estimator on which backend is fastest, and by what factor.
+"""Finds the estimator and backend that reach a given relative error fastest, and the factor over the next.
 
 The mean square error of an estimate from N samples is bias^2 + v / N. Between two measured N it is interpolated; beyond
 the largest one it is extrapolated by that law, and only to errors above what is known of the bias.
@@ -22,13 +22,13 @@ from bench.measure.statistics import is_unexplained
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import axis_value, counted, number
-from bench.report.views import Curve, arranged, lines
+from bench.report.views import Curve, arrange, estimator_curves
 from bench.run.files import write_all
-from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost, charged
+from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost, with_gradient_cost
 
 SAMPLES = Axis("samples", ("samples",))
 TARGETS = (0.1, 0.01)
-"""Relative errors asked for."""
+"""Relative errors to reach."""
 NOTES = (
     "cost: of the cheapest estimate that reaches the error, in seconds without compilation, or in rollouts, where a "
     "gradient counts as the rollouts that take as long (as measured at the most samples; as one where it was not). how: "
@@ -40,8 +40,8 @@ NOTES = (
 
 
 @dataclass(frozen=True)
-class Reached:
-    """What a method needs to reach an error, or why that is unknown."""
+class RequiredCost:
+    """The cost of a method to reach an error, or the reason why it is unknown."""
 
     how: str
     """``measured``, ``at once``, ``extrapolated``, ``never`` or ``unknown``."""
@@ -55,39 +55,39 @@ class Reached:
     """The interquartile range of times, over their median."""
 
 
-def reach(line: Curve, target: float, cost: Cost) -> Reached:
+def required_cost(line: Curve, target: float, cost: Cost) -> RequiredCost:
     """Return what the estimator on its backend needs for a relative RMSE of ``target``."""
     rows = cost.known(line.rows).sort_index()
     if rows.empty:
-        return Reached("unknown")
-    way = _reach(rows, target, cost)
+        return RequiredCost("unknown")
+    way = _required_cost(rows, target, cost)
     last = rows.iloc[-1]
     times = float(last["time_iqr_s"] / last["time_s"]) if cost is not ROLLOUTS else 0.0
     if not math.isfinite(way.cost) or "variance_high" not in rows:
         return replace(way, times=times)
-    least, most = (_reach(_at_end(rows, end), target, cost).cost for end in ("low", "high"))
+    least, most = (_required_cost(_at_interval_end(rows, end), target, cost).cost for end in ("low", "high"))
     if way.how == "at once":  # fewer samples may do, down to one
-        least = _of_one(rows, cost)
+        least = _cost_of_one_sample(rows, cost)
     down = max(0.0, math.log(way.cost / least)) if least > 0 else math.inf
     up = max(0.0, math.log(most / way.cost)) if math.isfinite(most) else math.inf
     return replace(way, down=down, up=up, times=times)
 
 
-def _of_one(rows: pd.DataFrame, cost: Cost) -> float:
+def _cost_of_one_sample(rows: pd.DataFrame, cost: Cost) -> float:
     """Return the cost of one sample, on the line through the costs of the two smallest batches."""
     n, price = rows.index.to_numpy(float)[:2], cost.of(rows).to_numpy(float)[:2]
     slope = (price[1] - price[0]) / (n[1] - n[0]) if len(n) > 1 else price[0] / n[0]
     return float(np.clip(price[0] - slope * (n[0] - 1.0), price[0] / n[0], price[0]))
 
 
-def _at_end(rows: pd.DataFrame, end: str) -> pd.DataFrame:
+def _at_interval_end(rows: pd.DataFrame, end: str) -> pd.DataFrame:
     """Return rows with variance, and bias where it is resolved, at an end of their 95% intervals."""
     bias = rows[f"bias_{end}"].where(rows["bias_low"] > 0, 0.0)
     error = np.hypot(bias, np.sqrt(rows[f"variance_{end}"])) / rows["reference_norm"]
     return rows.assign(bias=bias, variance=rows[f"variance_{end}"], rmse_rel=error)
 
 
-def lead(first: Reached, second: Reached, alike: bool = False) -> tuple[float, float, float]:
+def lead(first: RequiredCost, second: RequiredCost, alike: bool = False) -> tuple[float, float, float]:
     """Return how many times the cost of the first the second has, with its 95% interval; ``alike``: times alone differ."""
     factor = second.cost / first.cost
     noise = (first.times, second.times)
@@ -96,41 +96,41 @@ def lead(first: Reached, second: Reached, alike: bool = False) -> tuple[float, f
     return factor, factor * math.exp(-low), factor * math.exp(high)
 
 
-def _reach(rows: pd.DataFrame, target: float, cost: Cost) -> Reached:
+def _required_cost(rows: pd.DataFrame, target: float, cost: Cost) -> RequiredCost:
     n, error, price = (rows.index.to_numpy(float), rows["rmse_rel"].to_numpy(float), cost.of(rows).to_numpy(float))
     if not (error <= target).any():
-        return _beyond(rows.iloc[-1], n[-1], price[-1], target)
+        return _extrapolated_cost(rows.iloc[-1], n[-1], price[-1], target)
     # more samples may cost less: small batches are dominated by what a call costs at all
-    ways = [Reached("measured", price[i], n[i]) for i in range(1, len(n)) if error[i] <= target]
+    ways = [RequiredCost("measured", price[i], n[i]) for i in range(1, len(n)) if error[i] <= target]
     for i in range(1, len(n)):
         if error[i] <= target < error[i - 1]:
             share = math.log(error[i - 1] / target) / math.log(error[i - 1] / error[i])
             samples, needed = (math.exp((1 - share) * math.log(v[i - 1]) + share * math.log(v[i])) for v in (n, price))
-            ways.append(Reached("measured", needed, samples))
+            ways.append(RequiredCost("measured", needed, samples))
     if error[0] <= target:
-        ways.append(Reached("at once", price[0], n[0]))
+        ways.append(RequiredCost("at once", price[0], n[0]))
     return min(ways, key=lambda way: (way.cost, way.samples))
 
 
-def _beyond(row: Any, samples: float, price: float, target: float) -> Reached:
+def _extrapolated_cost(row: Any, samples: float, price: float, target: float) -> RequiredCost:
     """Extrapolate from the row with most samples: v is N times its variance, and the cost is proportional to N."""
     low, high, bias = (row[name] / row["reference_norm"] for name in ("bias_low", "bias_high", "bias"))
     if low >= target:
         # a bias that the method should not have may be tails that were not seen
-        return Reached("unknown" if is_unexplained(str(row.get("reason", ""))) else "never")
+        return RequiredCost("unknown" if is_unexplained(str(row.get("reason", ""))) else "never")
     if not high < target:
-        return Reached("unknown")
+        return RequiredCost("unknown")
     certain_bias = bias if low > 0 else 0.0
     needed = samples * row["variance"] / row["reference_norm"] ** 2 / (target**2 - certain_bias**2)
     factor = max(needed / samples, 1.0)
-    return Reached("extrapolated", price * factor, samples * factor)
+    return RequiredCost("extrapolated", price * factor, samples * factor)
 
 
 def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     """Return a line per problem, kind of cost and target; empty where samples were not swept."""
     if rows["samples"].nunique() < 2:
         return pd.DataFrame()
-    shown = arranged(experiment, charged(rows))
+    shown = arrange(experiment, with_gradient_cost(rows))
     costs = (("time", TIME), ("rollouts", ROLLOUTS))
     timed = bool(np.isfinite(shown.rows["time_s"]).any())
     entries = [
@@ -143,14 +143,14 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(entries)
 
 
-def methods(problem: ProblemRows, target: float, cost: Cost) -> dict[str, Reached]:
-    """Return what each method needs for an error: per estimator and backend in time, per estimator in rollouts."""
-    reached: dict[str, Reached] = {}
-    for curve in lines(problem.rows, close=None):
+def methods(problem: ProblemRows, target: float, cost: Cost) -> dict[str, RequiredCost]:
+    """Return each method's cost to reach an error: per estimator and backend in time, per estimator in rollouts."""
+    reached: dict[str, RequiredCost] = {}
+    for curve in estimator_curves(problem.rows, close=None):
         name = curve.label if cost is ROLLOUTS else f"{curve.label} on {curve.rows['backend'].iloc[0]}"
-        found = reach(curve, target, cost)
-        if name not in reached or found.cost < reached[name].cost or math.isnan(reached[name].cost):
-            reached[name] = found
+        needed = required_cost(curve, target, cost)
+        if name not in reached or needed.cost < reached[name].cost or math.isnan(reached[name].cost):
+            reached[name] = needed
     return reached
 
 
@@ -160,7 +160,7 @@ def estimator_of(method: str) -> str:
 
 
 def line(problem: ProblemRows, target: float, kind: str, cost: Cost) -> dict[str, Any]:
-    """Return the fastest method, the next one of another estimator if there is one, and those that are out."""
+    """Return a line of the table: the fastest method, the next one (of another estimator if possible), and the excluded ones."""
     reached = methods(problem, target, cost)
     ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
     entry: dict[str, Any] = {
@@ -208,7 +208,7 @@ def texts(best: pd.DataFrame) -> pd.DataFrame:
 
 
 def sentence(entry: Any) -> str:
-    """Return a line of the table as a sentence: who gets there first, and by what factor over the next."""
+    """Return a line of the table as a sentence: the first method, and its factor over the next."""
     what = f"to {entry['relative error']:.0%}"
     if entry["fastest"] == "-":
         never = "nobody, all have a larger bias"
@@ -221,17 +221,17 @@ def sentence(entry: Any) -> str:
     return f"{what}: {entry['fastest']}, {number(entry['factor'])} times ({low} to {high}) before {entry['next']}"
 
 
-def in_words(best: pd.DataFrame) -> list[str]:
-    """Return a sentence per problem: who reaches each error first in time (rollouts where no time is known)."""
+def sentences(best: pd.DataFrame) -> list[str]:
+    """Return a sentence per problem: the method that reaches each error first in time (in rollouts where no time is known)."""
     kind = "time" if (best["by"] == "time").any() else "rollouts"
     chosen = best[best["by"] == kind].to_dict("records")
-    told: dict[str, list[str]] = {}
+    by_problem: dict[str, list[str]] = {}
     for entry in chosen:
-        told.setdefault(entry["problem"], []).append(sentence(entry))
-    return [f"{problem}: {'; '.join(sentences)}." for problem, sentences in told.items()]
+        by_problem.setdefault(entry["problem"], []).append(sentence(entry))
+    return [f"{problem}: {'; '.join(sentences)}." for problem, sentences in by_problem.items()]
 
 
-def _certain(entry: Any) -> bool:
+def _is_clearly_first(entry: Any) -> bool:
     """Return whether the fastest method's estimator is certainly the first."""
     if entry["fastest"] == "-":
         return False
@@ -239,30 +239,30 @@ def _certain(entry: Any) -> bool:
     return alone or bool(entry["factor_low"] > 1.0)
 
 
-def leaders(entries: Sequence[Any]) -> str:
-    """Write who is certainly first on most problems: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
-    said: list[str] = []
+def summarise_leaders(entries: Sequence[Any]) -> str:
+    """Name the estimator that is certainly first on most problems: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
+    clauses: list[str] = []
     before = ""
     for target in dict.fromkeys(entry["relative error"] for entry in entries):
         asked = [entry for entry in entries if entry["relative error"] == target]
-        clear = [e["fastest"] for e in asked if _certain(e)]
+        clear = [e["fastest"] for e in asked if _is_clearly_first(e)]
         leader, count = Counter(map(estimator_of, clear)).most_common(1)[0] if clear else ("nobody", len(asked))
         ways = {method for method in clear if estimator_of(method) == leader}
         name = ways.pop() if len(ways) == 1 else leader
         who = "" if name == before else f"{name} is {'certainly ' * (not clear)}first "
-        error, among = " error" * (not said), f" of {counted(len(asked), 'problem')}" if name != before else ""
-        said.append(f"{who}to {target:.0%}{error} on {count}{among}")
+        error, among = " error" * (not clauses), f" of {counted(len(asked), 'problem')}" if name != before else ""
+        clauses.append(f"{who}to {target:.0%}{error} on {count}{among}")
         before = name
-    return ", ".join(said)
+    return ", ".join(clauses)
 
 
-def front(problems: Sequence[ProblemRows], cost: Cost) -> str:
-    """Write who is most accurate on most problems, who costs least, and on how many of those it is useless."""
+def summarise_accuracy_and_cost(problems: Sequence[ProblemRows], cost: Cost) -> str:
+    """Name the estimators that are most accurate and cheapest on most problems, and count where the cheapest is useless."""
     accurate: Counter[str] = Counter()
     cheap: Counter[str] = Counter()
     useless: Counter[str] = Counter()
     for problem in problems:
-        known = [(line.label, cost.known(line.rows)) for line in lines(problem.rows, close=None)]
+        known = [(line.label, cost.known(line.rows)) for line in estimator_curves(problem.rows, close=None)]
         rows = pd.concat([rows.assign(label=label, at=cost.of(rows)) for label, rows in known])
         best, first = (rows.sort_values(by, kind="stable").iloc[0] for by in ("rmse_rel", "at"))
         accurate[best["label"]] += 1
@@ -284,9 +284,9 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     return write_all(
         experiment.directory,
         {
-            "fastest.csv": best.to_csv(index=False, lineterminator="\n"),
-            "fastest.md": "\n\n".join(
-                [title, *map(escape_markdown, in_words(best)), plain_markdown(texts(best)), *NOTES]
+            "time_to_accuracy.csv": best.to_csv(index=False, lineterminator="\n"),
+            "time_to_accuracy.md": "\n\n".join(
+                [title, *map(escape_markdown, sentences(best)), plain_markdown(texts(best)), *NOTES]
             )
             + "\n",
         },

@@ -1,8 +1,8 @@
 """When may a first-order gradient be trusted? ``python -m bench.studies.bias_variance.trust results/standard`` counts.
 
-The rules use only what an estimate shows of itself, no reference: its spread between repeats and its mean. Each is judged
-by all stored cells of ``fobg`` (or of the estimators named after the folder): how many it lets pass, how many of those miss
-the reference by :data:`WRONG` of its norm or more, and how many right ones it holds back.
+The rules use an estimate's mean and its spread between repeats, and no reference. Each rule is scored on all stored cells of
+``fobg`` (or of the estimators named after the folder): how many cells it trusts, how many of those miss the reference by
+:data:`WRONG` of its norm or more, and how many accurate ones it does not trust.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bench.report.tables import plain_markdown
 from bench.report.text import number
 
 WRONG = 0.5
-"""Relative RMSE from which an estimate counts as wrong: half of the gradient."""
+"""Relative RMSE at and above which an estimate counts as wrong: half of the gradient."""
 SPREAD = 0.5
 """Standard deviation of one estimate, over the norm of the mean one, below which the rule trusts it."""
 
@@ -52,7 +52,7 @@ RULES: Mapping[str, Callable[[pd.DataFrame], Any]] = {
 }
 
 
-def judged(rows: pd.DataFrame) -> pd.DataFrame:
+def score_rules(rows: pd.DataFrame) -> pd.DataFrame:
     """Return a line per rule: cells trusted, wrong ones among them, and right ones that were not trusted."""
     wrong = rows["rmse_rel"] >= WRONG
     lines = []
@@ -72,7 +72,7 @@ def main(words: Sequence[str]) -> None:
     print(
         f"{', '.join(estimators)}: {len(rows)} cells, {(rows['rmse_rel'] >= WRONG).sum()} wrong by {WRONG:g} of the gradient or more\n"
     )
-    print(plain_markdown(judged(rows).astype(str)))
+    print(plain_markdown(score_rules(rows).astype(str)))
 
 
 if __name__ == "__main__":
