@@ -37,6 +37,7 @@ MODULES = {
     "bench.simulator.columns": ("bench.model.simulator.simulator",),
     "bench.simulator.layout": ("bench.model.simulator.tree",),
     "bench.simulator.source": ("bench.model.simulator.imports",),
+    "bench.claims.pieces": ("bench.claims.toolkit",),
     "bench.simulator": ("bench.model.simulator",),
     "bench.sweep.guardian": ("bench.run.reaper",),
     "bench.sweep.workers": ("bench.run.pool",),

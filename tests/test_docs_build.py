@@ -55,5 +55,5 @@ def test_gallery_needs_its_marks(build, tmp_path):
 
 
 def test_unknown_page_is_refused(build):
-    with pytest.raises(UserError, match="unknown page 'columsn' \\(allowed: gallery, columns, api, all\\)"):
-        build.main(["columsn"])
+    with pytest.raises(UserError, match="unknown page 'pages' \\(allowed: gallery, columns, api, all\\)"):
+        build.main(["pages"])

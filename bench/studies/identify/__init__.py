@@ -25,11 +25,11 @@ class Identify(Study):
     axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "optimizer")
     columns: ClassVar[Columns] = Columns.of(
         text("optimizer", "identity string of the optimizer"),
-        text("words", "parameters that are identifiable from the record, and those that are not"),
-        Column("rank", "number of identifiable directions of the parameters"),
-        Column("condition", "largest singular value of the information over the smallest identifiable one",
+        text("words", "what the record can and cannot tell"),
+        Column("rank", "directions of the parameters that the record sees"),
+        Column("condition", "largest singular value of the information over the smallest that is seen",
                comparison=ComparisonRule("exact", "condition number")),
-        Column("fits", "number of fitted records"),
+        Column("fits", "records that were fitted"),
         Column("step_shift", "largest relative change of an estimate when the model's step is halved, without noise"),
         text("step_note", "whether the estimate holds for its time step only"),
         numbers("unknowns", "names of the parameters"),

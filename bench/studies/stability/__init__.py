@@ -27,8 +27,8 @@ class Stability(Study):
     columns: ClassVar[Columns] = Columns.of(
         Column("first_bad_step", "first step at which the state diverged or was not finite"),
         Column("growth_factor", "measured growth of the state per step, where the motion is linear"),
-        Column("spectral_radius", "predicted spectral radius of one step on the cell's oscillator"),
-        Column("stiffness_limit", "stiffness above which the predicted spectral radius exceeds 1", "N/m"),
+        Column("spectral_radius", "of one step on the cell's oscillator, in theory"),
+        Column("stiffness_limit", "stiffness at which that radius leaves 1", "N/m"),
         Column(
             "relative_error",
             "norm of (gradient - truth) / norm of the truth",
@@ -37,17 +37,13 @@ class Stability(Study):
         Column("cosine", "cosine between gradient and truth"),
         Column("grad_norm", "norm of the gradient"),
         Column("truth_norm", "norm of the truth"),
-        Column("truth_error", "relative change of the truth in its last refinement"),
-        text(
-            "verdict",
-            "ok, or the fault of the gradient",
-            comparison=ComparisonRule("verdict", "verdict", order=WORST_FIRST),
-        ),
+        Column("truth_error", "relative change of the truth on its last refinement"),
+        text("verdict", "ok, or what is wrong", comparison=ComparisonRule("verdict", "verdict", order=WORST_FIRST)),
         text("truth", "how the truth was computed: physical or refined"),
-        text("cause", "cause of a finite but wrong gradient: step (or its differentiation), law, both or unknown"),
+        text("cause", "of a finite but wrong gradient: step (or how it is differentiated), law, both or unknown"),
         Column(
             "step_error",
-            "distance of the gradient from the law's own gradient, by differences of the cost at a far finer step, / norm of the truth",
+            "distance from the law's own gradient, which is differences of its cost at a far finer step, / norm of the truth",
         ),
         Column("law_error", "distance of the law's own gradient from the truth / norm of the truth"),
         numbers("state_at_first_bad_step", "the state at the first bad step"),
