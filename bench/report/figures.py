@@ -10,6 +10,7 @@ from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
+from PIL import Image
 
 from bench.report.plotted import plotted
 from bench.report.style import STYLE
@@ -38,7 +39,16 @@ def save(figure: Figure, stem: Path, formats: Sequence[str] = ("png",)) -> list[
     for suffix in formats:
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix, dpi=150, metadata=METADATA[suffix])
-        contents[suffix] = buffer.getvalue()
+        contents[suffix] = _with_palette(buffer) if suffix == "png" else buffer.getvalue()
     for suffix, content in contents.items():
         write_whole(stem.with_name(f"{stem.name}.{suffix}"), content)
     return [stem.with_name(f"{stem.name}.{suffix}") for suffix in (*formats, "plotted.csv")]
+
+
+def _with_palette(png: io.BytesIO) -> bytes:
+    """Return a PNG with a palette of 256 colours: a third as large, without a visible difference."""
+    image = Image.open(png).convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    image.putpalette([255 if value >= 253 else value for value in image.getpalette() or ()])  # white stays white
+    buffer = io.BytesIO()
+    image.save(buffer, "png", optimize=True)
+    return buffer.getvalue()

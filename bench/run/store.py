@@ -204,7 +204,7 @@ class Store:
         Returns False if another run has put its own ``rows.parquet`` there meanwhile, whose rows have to be read too.
         """
         buffer = io.BytesIO()
-        table.to_parquet(buffer, index=False)
+        table.to_parquet(buffer, index=False, compression="zstd")
         # the rows are in one new file before the old files are deleted, so a kill at any moment loses none
         part = self._write_pending("parquet", buffer.getvalue())
         for path in read:
