@@ -88,7 +88,7 @@ def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -
     The title names the problem where the error grows most and the problem where it grows least.
     """
     texts: list[tuple[float, str]] = []
-    for family, curves in parts:
+    for problem, curves in parts:
         named = winners(curves)
         first = named[min(named)][0] if named else ""
         line = next((line for line in curves if line.label == first), None)
@@ -100,8 +100,8 @@ def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -
             f"{what} up to {number(f)} times" for what, f in zip(("error", "time"), factors, strict=True) if f >= FACTOR
         ]
         text = f"{first} {' and '.join(grown)}" if grown else f"neither error nor time of {first} doubles"
-        kinds = [str(value) for name, value in family.identity.items() if name in CATEGORIES]
-        texts.append((factors[0], f"{kinds[-1] if kinds else family.title()}: {text}"))
+        kinds = [str(value) for name, value in problem.identity.items() if name in CATEGORIES]
+        texts.append((factors[0], f"{kinds[-1] if kinds else problem.title()}: {text}"))
     if not texts:
         return f"Error against time along {axis.column}"
     extremes = dict.fromkeys(text for _, text in (max(texts), min(texts)))

@@ -30,7 +30,7 @@ from bench.report.views import (
     unsteady,
 )
 from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, EQUAL_TIME, with_errors_at_equal_cost
-from bench.studies.bias_variance.findings import TIE, lowest, problems, span, winners
+from bench.studies.bias_variance.findings import TIE, lowest, problems_by_axis, span, winners
 
 GOALS = (0.3, 0.1, 0.03)
 """Relative RMSEs for which the fastest method is named."""
@@ -50,7 +50,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
     console.print(f"{len(rows)} cells: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
-    parts = problems(arrange(experiment, with_errors_at_equal_cost(rows)))
+    parts = problems_by_axis(arrange(experiment, with_errors_at_equal_cost(rows)))
     condensed = len(rows) > FULL_ROWS
     for axis, group in parts:
         if condensed and axis is not None:
