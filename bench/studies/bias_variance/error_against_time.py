@@ -69,17 +69,13 @@ def draw_error_against_time(problems: Sequence[ProblemRows], notes: Sequence[str
 
 
 def fastest(curves: Sequence[Curve]) -> list[Curve]:
-    """Return each estimator's line on the backend with the lowest median time; those without a time are left out."""
-    best: dict[str, Curve] = {}
+    """Return each estimator's curve on the backend with the lowest median time; curves without times are omitted."""
+    best: dict[str, tuple[float, Curve]] = {}
     for line in curves:
-        rows = TIME.known(line.rows)
-        if len(rows) and (line.label not in best or rows["time_s"].median() < _median(best[line.label])):
-            best[line.label] = line
-    return list(best.values())
-
-
-def _median(line: Curve) -> float:
-    return float(TIME.known(line.rows)["time_s"].median())
+        median = float(TIME.known(line.rows)["time_s"].median())
+        if math.isfinite(median) and (line.label not in best or median < best[line.label][0]):
+            best[line.label] = (median, line)
+    return [line for _, line in best.values()]
 
 
 def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -> str:

@@ -200,7 +200,7 @@ def _show_verdict(console: Console, group: ProblemRows, axis: Axis | None) -> No
     for text, test in (
         ("mostly bias, more samples do not help", _is_mostly_bias),
         (f"a bias where none is declared, {UNEXPLAINED}", _has_unexplained_bias),
-        ("no better than the zero estimate", _is_no_better_than_zero),
+        ("no better than the zero estimate", lambda row: bool(row["rmse_rel"] >= 1)),
     ):
         where: dict[str, dict[float, bool]] = {}
         for line in curves:
@@ -232,10 +232,6 @@ def _is_mostly_bias(row: Any) -> bool:
 
 def _has_unexplained_bias(row: Any) -> bool:
     return unexplained(row["reason"])
-
-
-def _is_no_better_than_zero(row: Any) -> bool:
-    return bool(row["rmse_rel"] >= 1)
 
 
 def _first(rows: pd.DataFrame, goal: float) -> str:
