@@ -524,7 +524,7 @@ def test_no_cell_is_lost_where_a_swept_value_is_the_default_of_one_scene(capsys,
     assert [sorted(family.rows["x"]) for family in split_by_problem(shown, named(shown, "damping"))] == [
         [0.0, 1.0, 10.0]
     ] * 2
-    found = findings.problems(shown)
+    found = findings.problems_by_axis(shown)
     assert [(axis.column, len(family.rows)) for axis, family in found] == [("damping", 3)] * 2
     terminal.show(swept, rows)
     digest = capsys.readouterr().out

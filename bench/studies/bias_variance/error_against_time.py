@@ -69,17 +69,13 @@ def draw_error_against_time(problems: Sequence[ProblemRows], notes: Sequence[str
 
 
 def fastest(curves: Sequence[Curve]) -> list[Curve]:
-    """Return each estimator's line on the backend with the lowest median time; those without a time are left out."""
-    best: dict[str, Curve] = {}
+    """Return each estimator's curve on the backend with the lowest median time; curves without times are omitted."""
+    best: dict[str, tuple[float, Curve]] = {}
     for line in curves:
-        rows = TIME.known(line.rows)
-        if len(rows) and (line.label not in best or rows["time_s"].median() < _median(best[line.label])):
-            best[line.label] = line
-    return list(best.values())
-
-
-def _median(line: Curve) -> float:
-    return float(TIME.known(line.rows)["time_s"].median())
+        median = float(TIME.known(line.rows)["time_s"].median())
+        if math.isfinite(median) and (line.label not in best or median < best[line.label][0]):
+            best[line.label] = (median, line)
+    return [line for _, line in best.values()]
 
 
 def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -> str:
@@ -88,7 +84,7 @@ def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -
     The title names the problem where the error grows most and the problem where it grows least.
     """
     texts: list[tuple[float, str]] = []
-    for family, curves in parts:
+    for problem, curves in parts:
         named = winners(curves)
         first = named[min(named)][0] if named else ""
         line = next((line for line in curves if line.label == first), None)
@@ -100,8 +96,8 @@ def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -
             f"{what} up to {number(f)} times" for what, f in zip(("error", "time"), factors, strict=True) if f >= FACTOR
         ]
         text = f"{first} {' and '.join(grown)}" if grown else f"neither error nor time of {first} doubles"
-        kinds = [str(value) for name, value in family.identity.items() if name in CATEGORIES]
-        texts.append((factors[0], f"{kinds[-1] if kinds else family.title()}: {text}"))
+        kinds = [str(value) for name, value in problem.identity.items() if name in CATEGORIES]
+        texts.append((factors[0], f"{kinds[-1] if kinds else problem.title()}: {text}"))
     if not texts:
         return f"Error against time along {axis.column}"
     extremes = dict.fromkeys(text for _, text in (max(texts), min(texts)))

@@ -26,7 +26,7 @@ NAMED = 2
 """Most problems that a title names one by one."""
 
 
-def problems(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
+def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
     """Return the problems to report, each with the longest axis along which it was swept; every cell that ran is in one."""
     swept = shown.swept()
     parts: list[tuple[Axis | None, ProblemRows]] = []
@@ -88,8 +88,8 @@ def headline(
     sound = [name for name in names if not any(any(where.values()) for where in bad[name])]
     useless = [name for name in names if all(all(where.values()) for where in bad[name])]
     broken = [name for name in names if name not in (*sound, *useless)]
-    families = [family for family, _ in parts]
-    clauses = [f"{broken[0]} fails {_failure_range(bad[broken[0]], families, axis, marks)}"] if broken else []
+    problems = [problem for problem, _ in parts]
+    clauses = [f"{broken[0]} fails {_failure_range(bad[broken[0]], problems, axis, marks)}"] if broken else []
     change = max((_error_ratio(line) for _, curves in parts for line in curves), default=math.inf)
     flat = not broken and change < FLAT
     if flat:
@@ -151,7 +151,7 @@ def _range_text(where: str, axis: Axis) -> str:
 
 
 def _failure_range(
-    bad: Sequence[Mapping[float, bool]], families: Sequence[ProblemRows], axis: Axis, marks: Mapping[str, float]
+    bad: Sequence[Mapping[float, bool]], problems: Sequence[ProblemRows], axis: Axis, marks: Mapping[str, float]
 ) -> str:
     """Write where along an axis something fails, and in which of several problems."""
     failing = [i for i, where in enumerate(bad) if any(where.values())]
@@ -165,13 +165,13 @@ def _failure_range(
     if beyond:
         text = f"beyond the {beyond[0]} ({axis.column} {axis_value(marks[beyond[0]])})"
     for key in ("scene", "contact", "integrator"):
-        mine = {str(families[i].identity.get(key, "")) for i in failing}
-        others = {str(f.identity.get(key, "")) for i, f in enumerate(families) if i not in failing and bad[i]}
+        mine = {str(problems[i].identity.get(key, "")) for i in failing}
+        others = {str(f.identity.get(key, "")) for i, f in enumerate(problems) if i not in failing and bad[i]}
         if others and not mine & others and not {"", "none"} & (mine | others):
             return f"{text} with {' and '.join(sorted(mine))}, not with {' and '.join(sorted(others))}".strip()
     n_run = sum(map(bool, bad))
     if not beyond and len(failing) < n_run and len(failing) <= NAMED:
-        return " and ".join(f"{_range_text(span(bad[i]), axis)} on {families[i].title()}" for i in failing)
+        return " and ".join(f"{_range_text(span(bad[i]), axis)} on {problems[i].title()}" for i in failing)
     if not text and len(spans) == 1:
         text = "everywhere"
     where = "" if len(failing) == n_run else f" in {len(failing)} of {n_run} problems"

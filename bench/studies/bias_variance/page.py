@@ -42,7 +42,7 @@ from bench.report.web.content import (
     titled,
 )
 from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, with_errors_at_equal_cost
-from bench.studies.bias_variance.findings import lowest, problems, span, winners
+from bench.studies.bias_variance.findings import lowest, problems_by_axis, span, winners
 from bench.studies.bias_variance.panels import FLOOR
 
 BIAS = PlotAxis(
@@ -78,7 +78,7 @@ EXCEPTIONS = 2
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the finding, the recommended estimators and the charts."""
     shown = arrange(experiment, with_errors_at_equal_cost(rows))
-    summaries = [ProblemSummary(axis, family) for axis, family in problems(shown)]
+    summaries = [ProblemSummary(axis, problem) for axis, problem in problems_by_axis(shown)]
     table_ = with_plotted_columns(rows)
     labelled = with_plotted_columns(shown.rows)
     charts = [
@@ -167,11 +167,11 @@ def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
     drawn = [BIAS.column, BIAS.low, BIAS.high, BIAS.limit, VARIANCE.column, VARIANCE.low, VARIANCE.high, RMSE.column]
     merged = rows["seed"].nunique() > 1
     parts = []
-    for family in split_by_problem(shown, axis, ("scene", "contact")):
-        part = family.rows[family.rows["status"] == "ok"]
+    for problem in split_by_problem(shown, axis, ("scene", "contact")):
+        part = problem.rows[problem.rows["status"] == "ok"]
         if part["x"].nunique() > 1:
             part = part.sort_values(["line", "x"], kind="stable").assign(
-                facet=family.title(), row=part["key"].map(place), series=estimator_labels(part)
+                facet=problem.title(), row=part["key"].map(place), series=estimator_labels(part)
             )
             parts.append(part[["row", "x", "facet", "series", "line", *(drawn if merged else [])]])
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
@@ -194,10 +194,10 @@ def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
 class ProblemSummary:
     """One problem along an axis: which estimators have the lowest error at equal rollouts, and where."""
 
-    def __init__(self, axis: axes.Axis | None, family: ProblemRows) -> None:
-        self.axis, self.title = axis, family.title()
-        self.kind = ", ".join(str(value) for name, value in family.identity.items() if name in CATEGORIES)
-        self.lines = estimator_curves(family.rows)
+    def __init__(self, axis: axes.Axis | None, problem: ProblemRows) -> None:
+        self.axis, self.title = axis, problem.title()
+        self.kind = ", ".join(str(value) for name, value in problem.identity.items() if name in CATEGORIES)
+        self.lines = estimator_curves(problem.rows)
         self.lowest = lowest(self.lines, EQUAL_ROLLOUTS)
         self.winners = winners(self.lines, EQUAL_ROLLOUTS)
 

@@ -19,7 +19,7 @@ from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.tables import escape_latex, escape_markdown
 from bench.report.text import axis_value, number
 from bench.report.views import Arranged, estimator_curves, rmse_interval
-from bench.studies.bias_variance.findings import problems
+from bench.studies.bias_variance.findings import problems_by_axis
 
 WIDTH = 504.0
 """Points of text width over two columns, 7 inches, as most journals and conferences have at least."""
@@ -78,12 +78,12 @@ class Pivot:
 
 def pivot(experiment: Experiment, shown: Arranged) -> Pivot:
     """Return the table of an experiment, along the axis that ``table.columns`` names or else the longest one."""
-    parts: Sequence[tuple[Axis | None, ProblemRows]] = problems(shown)
+    parts: Sequence[tuple[Axis | None, ProblemRows]] = problems_by_axis(shown)
     if experiment.table.columns:
         axis = _axis(experiment.table.columns, shown)
-        parts = [(axis, family) for family in split_by_problem(shown, axis)]
+        parts = [(axis, problem) for problem in split_by_problem(shown, axis)]
     apart = "backend" in experiment.table.rows
-    blocks = tuple(_block(axis, family, apart) for axis, family in parts)
+    blocks = tuple(_block(axis, problem, apart) for axis, problem in parts)
     return Pivot(f"{experiment.name}: relative RMSE of one estimate", blocks)
 
 
@@ -95,8 +95,8 @@ def _axis(name: str, shown: Arranged) -> Axis:
     return named[0]
 
 
-def _block(axis: Axis | None, family: ProblemRows, apart: bool) -> Block:
-    curves = estimator_curves(family.rows, close=None) if apart else estimator_curves(family.rows)
+def _block(axis: Axis | None, problem: ProblemRows, apart: bool) -> Block:
+    curves = estimator_curves(problem.rows, close=None) if apart else estimator_curves(problem.rows)
     values = sorted({x for line in curves for x in line.at})
     labels = [line.label for line in curves]
     rows = []
@@ -106,7 +106,7 @@ def _block(axis: Axis | None, family: ProblemRows, apart: bool) -> Block:
         others = [other for other in curves if other.label != line.label]
         rows.append((name, tuple(_cell(line.at.get(x), [other.at.get(x) for other in others]) for x in values)))
     across = tuple(axis_value(x) for x in values) if axis is not None else ("relative RMSE",)
-    return Block(family.title(), axis.title if axis is not None else "", across, tuple(rows))
+    return Block(problem.title(), axis.title if axis is not None else "", across, tuple(rows))
 
 
 def _cell(row: Mapping[str, Any] | None, others: Sequence[Mapping[str, Any] | None]) -> PivotCell:

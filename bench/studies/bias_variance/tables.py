@@ -15,8 +15,9 @@ from bench.experiment.columns import IDENTITY
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.measure.statistics import UNEXPLAINED, is_unexplained
+from bench.report.problems import value_text
 from bench.report.tables import csv, escape_markdown
-from bench.report.text import axis_value, number
+from bench.report.text import number
 from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, arrange, bias_text, pareto, unsteady
 from bench.run.files import write_all
 from bench.studies.bias_variance import pivot
@@ -80,7 +81,7 @@ def readable(experiment: Experiment, rows: pd.DataFrame) -> Readable:
     results = ["bias [95% interval]", "relative bias", "variance", "rel. RMSE", "cosine", "time [ms]"]
     body = []
     for row in rows.to_dict("records"):
-        cells = [_text(row[c]) for c in varying] + _results(row)
+        cells = [value_text(row[c]) for c in varying] + _results(row)
         note = f" ({reasons[row['reason']]})" if row["reason"] else ""
         body.append(cells + [row["status"] + note for _ in status])
     return Readable(
@@ -119,12 +120,8 @@ def _is_shown(rows: pd.DataFrame, axis: axes.Axis) -> bool:
 
 
 def _named(row: Any, columns: Sequence[str]) -> str:
-    texts = {c: _text(row[c]) for c in columns}
+    texts = {c: value_text(row[c]) for c in columns}
     return ", ".join(f"{c} {text}" for c, text in texts.items() if text not in ("", "none", "-"))
-
-
-def _text(value: Any) -> str:
-    return value if isinstance(value, str) else axis_value(value)
 
 
 def _results(row: Any) -> list[str]:

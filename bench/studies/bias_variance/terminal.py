@@ -30,7 +30,7 @@ from bench.report.views import (
     unsteady,
 )
 from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, EQUAL_TIME, with_errors_at_equal_cost
-from bench.studies.bias_variance.findings import TIE, lowest, problems, span, winners
+from bench.studies.bias_variance.findings import TIE, lowest, problems_by_axis, span, winners
 
 GOALS = (0.3, 0.1, 0.03)
 """Relative RMSEs for which the fastest method is named."""
@@ -50,7 +50,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
     console.print(f"{len(rows)} cells: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
-    parts = problems(arrange(experiment, with_errors_at_equal_cost(rows)))
+    parts = problems_by_axis(arrange(experiment, with_errors_at_equal_cost(rows)))
     condensed = len(rows) > FULL_ROWS
     for axis, group in parts:
         if condensed and axis is not None:
@@ -200,7 +200,7 @@ def _show_verdict(console: Console, group: ProblemRows, axis: Axis | None) -> No
     for text, test in (
         ("mostly bias, more samples do not help", _is_mostly_bias),
         (f"a bias where none is declared, {UNEXPLAINED}", _has_unexplained_bias),
-        ("no better than the zero estimate", _is_no_better_than_zero),
+        ("no better than the zero estimate", lambda row: bool(row["rmse_rel"] >= 1)),
     ):
         where: dict[str, dict[float, bool]] = {}
         for line in curves:
@@ -232,10 +232,6 @@ def _is_mostly_bias(row: Any) -> bool:
 
 def _has_unexplained_bias(row: Any) -> bool:
     return is_unexplained(row["reason"])
-
-
-def _is_no_better_than_zero(row: Any) -> bool:
-    return bool(row["rmse_rel"] >= 1)
 
 
 def _first(rows: pd.DataFrame, goal: float) -> str:
