@@ -172,7 +172,7 @@ def test_a_plugin_that_cannot_be_made_is_refused_in_one_line(tmp_path, capsys, f
     (tmp_path / "mine.py").write_text(made)
     assert main(["plan", *BASE, f"plugins=[{tmp_path}]", "estimators=[fobg,mine]"]) == 2
     said = capsys.readouterr().err.strip()
-    assert "estimator 'mine' cannot be made" in said
+    assert "estimator 'mine' cannot be built" in said
     assert len(said.splitlines()) == 1
 
 

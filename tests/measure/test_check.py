@@ -87,7 +87,7 @@ FAULTS = {
         "wrong_adjoint", lambda x: np.abs(x[0] - 0.3) + x[1:].sum(axis=0), lambda x: np.array([1.5, 1.0, 1.0])
     ),
     "clipped": ("saturated", lambda x: cost(clipped(x)), lambda x: gradient(clipped(x)) * [1.0, 1.0, x[2] > -0.695]),
-    "cost that is no number": ("nonfinite", lambda x: cost(x) * np.nan, gradient),
+    "cost that is not a number": ("nonfinite", lambda x: cost(x) * np.nan, gradient),
     "cost without a scale": ("unsettled", lambda x: np.modf(1e4 * np.sin(1e14 * x))[0].sum(axis=0), gradient),
 }  # fmt: skip
 """Name of a fault to the cause that it must get, and the cost and gradient that have it."""

@@ -270,7 +270,7 @@ def test_a_module_by_its_old_name_is_the_new_one(old, new):
     with pytest.warns(DeprecationWarning, match="is now called") as caught:  # of the package too
         assert importlib.import_module(old) is importlib.import_module(new)
     assert f"{old} is now called {new};" in messages(caught)
-    assert sources._file(old) == sources._file(new)
+    assert sources.file_of(old) == sources.file_of(new)
 
 
 def test_a_module_that_never_was_is_not_found():

@@ -118,7 +118,7 @@ def test_score_and_explicit_derivative_make_the_gradient(scene):
 
 def test_kit_finds_the_missing_term(monkeypatch):
     monkeypatch.setattr("bench.model.problem.Problem.explicit", lambda self, theta, w: np.zeros((self.dim, w.shape[1])))
-    with pytest.raises(Exception, match="standard errors from the mean difference"):
+    with pytest.raises(Exception, match="standard errors from the mean gradient"):
         score_gives_the_gradient(Gusts())
 
 

@@ -281,7 +281,7 @@ def test_contact_with_friction_has_the_force_of_its_law(cone):
 
 
 def test_force_of_unscaled_edges_fails_the_kit(monkeypatch):
-    monkeypatch.setattr(mjcf, "_edges", lambda model: np.ones(model.npair))
+    monkeypatch.setattr(mjcf, "_cone_factor", lambda model: np.ones(model.npair))
     with pytest.raises(Failed, match=r"63\.97 \(10\)"):
         backends.frictional_contact_has_the_force_of_its_law(Mujoco())
 

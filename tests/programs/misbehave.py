@@ -227,9 +227,9 @@ class Bank:
             self.find(f"the sound {kind} ended with {alone.returncode}: {alone.stderr[-500:]!r}")
             return
         for case in [case for case in cases if case.place == "construction" and case.fault in RAISES]:
-            cases.remove(case)  # it cannot be made, and the command that asks for it says so
+            cases.remove(case)  # it cannot be built, and the command that asks for it says so
             refused = self.bench("plan", *words, axis.format(f",{case.name}"), f"name={case.name}")
-            if refused.returncode != 2 or "cannot be made" not in refused.stderr:
+            if refused.returncode != 2 or "cannot be built" not in refused.stderr:
                 self.find(f"{case.name} ended with {refused.returncode}: {refused.stderr[-300:]!r}")
         names = "".join(f",{case.name}" for case in cases)
         done = self.bench(*words, axis.format(names), f"name={kind}")

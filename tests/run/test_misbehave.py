@@ -53,5 +53,5 @@ def test_a_plugin_that_cannot_be_made_again_for_the_page_leaves_a_line_without_i
 
     monkeypatch.setattr(Quadratic, "__init__", refuse)
     assert reproduce.commands(experiment, rows) == [[]]
-    with pytest.raises(UserError, match="scene 'quadratic' cannot be made"):
+    with pytest.raises(UserError, match="scene 'quadratic' cannot be built"):
         build(Quadratic, {})

@@ -382,7 +382,7 @@ def test_a_library_leaves_the_signals_of_its_program_alone():
 
 COLLECTED = """
 import gc, os, signal
-from bench.cli import _stopped_by_signals
+from bench.cli import _stop_on_signals
 from bench.model.guard import protect_process
 
 def struck(*_):
@@ -391,7 +391,7 @@ def struck(*_):
     for _ in range(10):
         pass
 
-with _stopped_by_signals():
+with _stop_on_signals():
     gc.callbacks.append(struck)
     try:
         with protect_process():

@@ -347,7 +347,7 @@ BAD = [
     (["pushing", "backends=[numpy]"], ["numpy", "no step Jacobians", "backends=[jax]"]),
     (["pushing", "contacts=[complementarity]"], ["jax has no root finder", "backends=[implicit]"]),
     (["pushing", "contacts=[penalty,softplus]"], ["2 problems", "one contact law"]),
-    (["pushing", "contacts=[impulse]", "integrators=[explicit_euler]"], ["explicit_euler has no place"]),
+    (["pushing", "contacts=[impulse]", "integrators=[explicit_euler]"], ["explicit_euler cannot apply the impulses"]),
     (["pushing", "scene.pushing.mas=2"], ["mas", "'mass'"]),
 ]
 
