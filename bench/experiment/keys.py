@@ -31,6 +31,7 @@ HARMLESS = {
     "bench.report": "shows rows",
     "bench.run.files": "writes files as they are given",
     "bench.studies.bias_variance.columns": "names, units and meanings of columns",
+    "bench.studies.gradient_check.columns": "names, units and meanings of columns",
     "bench.studies.growth.columns": "names, units and meanings of columns",
     "bench.studies.three_errors.columns": "names, units and meanings of columns",
 }
