@@ -91,7 +91,7 @@ def load(directory: str | Path) -> pd.DataFrame:
     from bench.experiment.columns import Columns
     from bench.experiment.defaults import completed_rows
     from bench.experiment.study import Study
-    from bench.report.views import latest
+    from bench.report.views import newest_rows
     from bench.run.store import Store
 
     directory = Path(directory).expanduser()
@@ -100,7 +100,7 @@ def load(directory: str | Path) -> pd.DataFrame:
         raise UserError(f"no rows are stored in '{directory}': run an experiment first, its folder is results_dir/name")
     study = registry.entries()["studies"].get(str(rows["study"].iloc[0]))
     columns = study.plugin.columns if study and study.plugin and issubclass(study.plugin, Study) else Columns.of()
-    rows = completed_rows(latest(columns.typed(rows)))
+    rows = completed_rows(newest_rows(columns.typed(rows)))
     try:
         sweep = json.loads((directory / "run.json").read_text())["config"]["sweep"]
     except (OSError, ValueError, KeyError, TypeError):

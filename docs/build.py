@@ -27,7 +27,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.study import Study, study_of
 from bench.model import registry
 from bench.report.tables import escape_markdown
-from bench.report.views import latest
+from bench.report.views import newest_rows
 from bench.report.web import content
 from bench.run.execute import store_of
 from bench.run.files import write_whole
@@ -67,7 +67,7 @@ def gallery_entry(experiment: Experiment, folder: Path) -> str:
 
     Paths of pictures are relative to ``folder``.
     """
-    rows = latest(store_of(experiment).load())
+    rows = newest_rows(store_of(experiment).load())
     if rows.empty:
         return ""
     finding = escape_markdown(content(experiment, rows).finding)

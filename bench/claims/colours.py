@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.report.colours import ink
+from bench.report.colours import estimator_colour
 from bench.report.style import GREY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["GREY", "bars", "ink"]
+__all__ = ["GREY", "bars", "estimator_colour"]
 
 
 def bars(axes: Axes, x: Sequence[float], measured: Sequence[tuple[float, float]], **look: Any) -> None:

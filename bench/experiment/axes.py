@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     import numpy as np
     import pandas as pd
 
-parsed = parse
-"""The name under which the studies use :func:`~bench.experiment.parameters.parse`."""
-
 
 @dataclass(frozen=True)
 class Axis:

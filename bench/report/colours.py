@@ -19,7 +19,3 @@ def estimator_marker(estimator: str, variant: int = 0) -> str:
 def _place(estimator: str) -> int:
     names = sorted(registry.entries()["estimators"])
     return names.index(estimator) if estimator in names else len(names)
-
-
-ink, stamp = estimator_colour, estimator_marker
-"""The names under which the studies and claims use these functions."""

@@ -19,9 +19,10 @@ from rich.table import Table
 from bench.experiment.axes import Axis, table
 from bench.experiment.experiment import Experiment
 from bench.report.page import WIDTH, columns
+from bench.report.problems import part_columns, problem_numbers
 from bench.report.text import counted, number
 from bench.report.views import Arranged
-from bench.report.web.content import columns_of, distinguishing_columns, grouped
+from bench.report.web.content import distinguishing_columns
 from bench.run.files import write_all
 
 TERMINAL_WIDTH = 180
@@ -57,7 +58,9 @@ def label_columns(
     them.
     """
     rows = shown.rows if rows is None else rows
-    return distinguishing_columns(rows, grouped(rows, parts, without), columns_of(shown, parts, without), always)
+    return distinguishing_columns(
+        rows, problem_numbers(rows, parts, without), part_columns(shown, parts, without), always
+    )
 
 
 def write_tables(

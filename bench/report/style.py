@@ -152,10 +152,6 @@ def width_in_inches(text: str) -> float:
     return float(width / 72)
 
 
-inches = width_in_inches
-"""The name under which the studies use :func:`width_in_inches`."""
-
-
 def wrapped(parts: Sequence[str], width: float, between: str = ", ") -> str:
     """Join parts by ``between``, in lines of at most ``width`` inches unless one part is longer."""
     out = ""

@@ -257,7 +257,3 @@ def bias_text(row: Any, norm: float = 1.0, interval: bool = True) -> str:
         return f"0 (< {number(high, 3)})" if high > 0 else "0"
     text = number(value, 3)
     return f"{text} [{number(low, 3)}, {number(high, 3)}]" if interval and math.isfinite(low + high) else text
-
-
-along, arranged, latest = rows_along, arrange, newest_rows
-"""The names under which the other studies and commands use these functions."""

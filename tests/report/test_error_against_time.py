@@ -69,7 +69,7 @@ def test_a_title_names_the_few_problems_that_fail():
         row(scene=scene, contact=law, sigma=s, estimator="fobg", rmse_rel=9.0 if scene == "one" or (law == "penalty" and s > 0.1) else 0.1)
         for scene, law in places for s in (0.03, 0.1, 0.3, 1.0)
     ]  # fmt: skip
-    shown = views.arranged(experiment(sweep={"sigma": [0.03, 0.1, 0.3, 1.0]}, marks={}), table(made))
+    shown = views.arrange(experiment(sweep={"sigma": [0.03, 0.1, 0.3, 1.0]}, marks={}), table(made))
     axis = next(axis for axis in shown.swept() if axis.column == "sigma")
     parts = [(part, views.estimator_curves(part.rows)) for part in split_by_problem(shown, axis)]
     assert findings.headline(parts, axis) == "fobg fails everywhere on one and from sigma 0.3 on two, penalty"

@@ -160,7 +160,7 @@ def test_terminal_output_fits_and_says_what_matters(rows, capsys, monkeypatch):
 
 def families(rows, column, **given):
     """The problems of rows along the axis of that column."""
-    shown = views.arranged(experiment(**given), rows)
+    shown = views.arrange(experiment(**given), rows)
     return split_by_problem(shown, named(shown, column))
 
 
@@ -309,8 +309,8 @@ def test_a_parameter_in_an_identity_string_is_an_axis():
     sweep = {"ratio": [3.0, 1.5, 10.0]}
     rows = table([row(estimator="alpha_order", estimator_params=p) for p in ("", "ratio=3", "delta=0.3,ratio=10")])
     rows = pd.concat([rows, table([row()])], ignore_index=True)
-    shown = views.arranged(experiment(sweep=sweep), rows)
-    found = views.along(shown, named(shown, "ratio"))
+    shown = views.arrange(experiment(sweep=sweep), rows)
+    found = views.rows_along(shown, named(shown, "ratio"))
     assert list(found["x"]) == [1.5, 3.0, 10.0]
     assert list(found["estimator_params"]) == ["", "", "delta=0.3"]
     assert "bias_variance_ratio" in drawn(rows, ["ratio"], sweep=sweep)
@@ -442,7 +442,7 @@ def test_best_is_told_only_where_its_interval_is_apart_from_every_other_estimato
 def paper(rows, **settings):
     """The table of a paper from rows."""
     found = experiment(**settings)
-    return pivot.pivot(found, views.arranged(found, rows))
+    return pivot.pivot(found, views.arrange(found, rows))
 
 
 def fitted(made):
@@ -478,7 +478,7 @@ def test_columns_and_rows_of_the_papers_table_can_be_chosen(tmp_path, capsys):
         (["table.rows=[estimator,backend]"], ("10", "100", "1000"), 2),
     ):
         given, cells = loaded(*words, *more)
-        made = pivot.pivot(given, views.arranged(given, rows_of(given, cells)))
+        made = pivot.pivot(given, views.arrange(given, rows_of(given, cells)))
         assert {block.values for block in made.blocks} == {across}
         assert {len(block.rows) for block in made.blocks} == {names}
     for word, said in (
@@ -518,8 +518,8 @@ def test_no_cell_is_lost_where_a_swept_value_is_the_default_of_one_scene(capsys,
     """Damping 1 is what wall_penalty_1d asks of its law, and 0 what bouncing_ball leaves it: no identity string shows either."""
     swept, cells = loaded(*FEW, "scenes=[wall_penalty_1d,bouncing_ball]", "sweep.damping=[0,1,10]")
     rows = rows_of(swept, cells)
-    shown = views.arranged(swept, rows)
-    along = views.along(shown, named(shown, "damping"))
+    shown = views.arrange(swept, rows)
+    along = views.rows_along(shown, named(shown, "damping"))
     assert sorted(along["x"]) == [0.0, 0.0, 1.0, 1.0, 10.0, 10.0]
     assert [sorted(family.rows["x"]) for family in split_by_problem(shown, named(shown, "damping"))] == [
         [0.0, 1.0, 10.0]
@@ -538,7 +538,7 @@ def test_a_law_parameter_that_happens_to_equal_another_keeps_its_problem():
     """Stiffness 10 stays stiffness 10 where damping is 10 as well."""
     swept, cells = loaded(*FEW, "scenes=[pushing]", "sweep.stiffness=[10,100]", "sweep.damping=[1,10]")
     rows = rows_of(swept, cells)
-    shown = views.arranged(swept, rows)
+    shown = views.arrange(swept, rows)
     for column in ("stiffness", "damping"):
         found = split_by_problem(shown, named(shown, column))
         assert [len(family.rows) for family in found] == [2, 2]
@@ -568,8 +568,8 @@ def test_cells_that_differ_in_a_scene_parameter_named_like_one_of_the_law_are_al
 def test_rows_of_a_version_that_stored_no_parameters_are_told_apart_and_make_way_for_new_ones():
     new = table([row(stiffness=k) for k in (1.0, 2.0, 3.0)])
     old = new.assign(parameters="", study="", key="old" + new["key"], bias=7.0)
-    assert len(views.latest(old)) == 3
-    found = views.latest(pd.concat([old, new[:2]], ignore_index=True))
+    assert len(views.newest_rows(old)) == 3
+    found = views.newest_rows(pd.concat([old, new[:2]], ignore_index=True))
     assert list(found["stiffness"]) == [3.0, 1.0, 2.0]
     assert list(found["bias"] == 7.0) == [True, False, False]
     assert len(views.merge_seeds(pd.concat([old, old.assign(seed=1.0)], ignore_index=True))) == 3
@@ -590,7 +590,7 @@ def test_a_swept_scene_parameter_is_a_number_in_every_table_and_title_at_its_def
     assert found.numeric[place]
     assert sorted(line[place] for line in found.body) == ["0.1", "0.1", "0.2", "0.2"]
     assert "| stiffness | mass | " in (swept.directory / "bias_variance.md").read_text()
-    shown = views.arranged(swept, rows)
+    shown = views.arrange(swept, rows)
     titles = [family.title() for family in split_by_problem(shown, named(shown, "stiffness"))]
     assert titles == ["mass=0.1", "mass=0.2"]
     with styled():
@@ -605,7 +605,7 @@ def test_the_axis_of_zipped_parameters_names_all_of_them():
     for name, other in (("stiffness", "dt"), ("dt", "stiffness")):
         labels = [panel.get_xlabel() for panel in figures[f"bias_variance_{name}"].axes]
         assert any(other in label for label in labels)
-    shown = views.arranged(experiment(sweep=sweep), rows)
+    shown = views.arrange(experiment(sweep=sweep), rows)
     assert axis_name(named(shown, "stiffness")) == "stiffness $k$ [N/m], dt with it"
     assert [axis.title for axis in shown.axes] == ["stiffness [N/m], with dt", "dt [s], with stiffness"]
 
@@ -681,7 +681,7 @@ def test_titles_say_where_the_best_estimator_fails_and_what_never_does():
             for k in (10.0, 1e3, 1e5)
         ]
         given = experiment(sweep={"stiffness": [10.0, 1e3, 1e5]}, marks={"stiffness": marks})
-        shown = views.arranged(given, table(made))
+        shown = views.arrange(given, table(made))
         axis = named(shown, "stiffness")
         parts = [(part, views.estimator_curves(part.rows)) for part in split_by_problem(shown, axis)]
         return findings.headline(parts, axis, marks)

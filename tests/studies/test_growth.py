@@ -15,7 +15,7 @@ from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import Jacobians, compose
-from bench.report.views import arranged
+from bench.report.views import arrange
 from bench.run.store import Store
 from bench.studies.growth import report
 from bench.studies.growth.columns import COLUMNS
@@ -112,7 +112,7 @@ def test_every_singular_value_and_the_gain_are_drawn():
             "gain_low": [0.5, 2.0], "gain_high": [2.0, 9.0], "gain_of": "states", "singular_values": values[row["scene"]],
             **{f"{order}_order_variance{end}": t for order in ("first", "zeroth") for end in ("", "_low", "_high")},
         })  # fmt: skip
-    drawn = report.figure(arranged(given, pd.DataFrame(lines)))
+    drawn = report.figure(arrange(given, pd.DataFrame(lines)))
     assert drawn is not None
     panels = np.array(drawn.axes).reshape(4, 2)
     shown = [{float(line.get_ydata()[0]) for line in panel.lines} for panel in panels[1]]

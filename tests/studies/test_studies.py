@@ -20,9 +20,9 @@ from bench.measure.gradcheck import EPS
 from bench.model import registry
 from bench.report import reproduce, web
 from bench.report.plotted import plotted
-from bench.report.problems import split_by_problem
-from bench.report.views import along, arranged
-from bench.report.web.content import Content, grouped, looks, problems
+from bench.report.problems import problem_names, problem_numbers, split_by_problem
+from bench.report.views import arrange, rows_along
+from bench.report.web.content import Content, looks
 from bench.report.web.document import data
 from bench.run.files import make_directory
 from bench.studies.gradient_check import matrix
@@ -116,7 +116,7 @@ def checked(*words):
 
 def test_two_integrators_are_two_lines_of_the_gradient_check():
     given, rows = checked("scenes=[pendulum]", "integrators=[semi_implicit_euler,rk4]", "sweep.horizon=[1,10]")
-    found = table_of(gradient_check.markdown(arranged(given, rows)))
+    found = table_of(gradient_check.markdown(arrange(given, rows)))
     assert list(found["integrator"]) == ["semi_implicit_euler", "rk4"] * 2
     assert list(found["horizon"]) == ["1", "1", "10", "10"]
     assert set(found["backends"]) == {"jax, torch"}
@@ -124,7 +124,7 @@ def test_two_integrators_are_two_lines_of_the_gradient_check():
 
 def test_a_swept_parameter_keeps_lines_of_the_gradient_check_apart():
     given, rows = checked("scenes=[mass_spring]", "sweep.mass_spring.damping=[0,1,10]", "sweep.horizon=[2]")
-    shown = arranged(given, rows)
+    shown = arrange(given, rows)
     found = table_of(gradient_check.markdown(shown))
     assert list(found["damping"]) == ["0", "1", "10"]
     assert set(found["scene"]) == {"mass_spring"}
@@ -137,9 +137,9 @@ def test_a_swept_parameter_keeps_lines_of_the_gradient_check_apart():
 
 def test_the_gradient_check_says_how_far_from_a_switch_it_looked():
     given, rows = checked("scenes=[pendulum]", "study=gradient_check[aside=0.002]")
-    assert "2e-3" in gradient_check.markdown(arranged(given, rows))
+    assert "2e-3" in gradient_check.markdown(arrange(given, rows))
     given, rows = checked("scenes=[pendulum]")
-    assert "1e-4" in gradient_check.markdown(arranged(given, rows))
+    assert "1e-4" in gradient_check.markdown(arrange(given, rows))
 
 
 def test_the_long_table_keeps_its_columns_and_adds_swept_ones(tmp_path):
@@ -164,7 +164,7 @@ def erring(*words):
 
 
 def lines_of(given, rows):
-    shown = arranged(given, rows)
+    shown = arrange(given, rows)
     return {part.heading: three_errors.readable(shown, part) for part in three_errors.sections(shown)}
 
 
@@ -175,7 +175,7 @@ def test_three_errors_of_two_integrators_are_twice_as_many_lines():
     assert heading == "Along dt [s]"
     assert len(found) == 2 * 2 * 3
     assert found.groupby(["contact", "integrator"], sort=False).ngroups == 4
-    shown = arranged(given, rows)
+    shown = arrange(given, rows)
     assert three_errors.figure(shown).axes[0].get_legend() is None
     labels = {text.get_text() for text in three_errors.figure(shown).legends[0].get_texts()}
     assert {"impulse, semi_implicit_euler", "impulse, event_driven", "penalty, event_driven"} <= labels
@@ -285,9 +285,9 @@ def test_growth_keeps_noises_apart_and_joins_what_steps_with_the_horizon():
     words = ["study=growth", "scenes=[double_integrator]", "estimators=[fobg]", "sweep.sigma=[0.1,0.2]"]
     given, rows = made(*words, "sweep.zip.horizon=[10,20]", "sweep.zip.dt=[0.1,0.05]")
     rows = rows.assign(gradient_median=1.0, time_horizon=rows["horizon"] * rows["dt"])
-    names = growth.problem_of(arranged(given, rows))
+    names = growth.problem_of(arrange(given, rows))
     assert dict(names.value_counts()) == {"double_integrator, sigma=0.1": 2, "double_integrator, sigma=0.2": 2}
-    assert list(growth.readable(arranged(given, rows))["sigma"]) == ["0.1", "0.1", "0.2", "0.2"]
+    assert list(growth.readable(arrange(given, rows))["sigma"]) == ["0.1", "0.1", "0.2", "0.2"]
 
 
 def test_twins_of_a_swept_scene_are_panels_of_their_own():
@@ -297,13 +297,13 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
     own = [list(np.zeros(int(h) + 1)) for h in rows["horizon"]]
     away = [[0.0] * int(h) + [1e-3] for h in rows["horizon"]]
     rows = rows.assign(state_difference=1e-3, state_difference_rel=1e-3, path=away, own_path=own)
-    figure = twins.figure(arranged(given, rows))
+    figure = twins.figure(arrange(given, rows))
     titles = [panel.get_title().splitlines()[0] for panel in figure.axes]
     assert titles == ["pendulum, horizon=2", "pendulum, horizon=3"]
     drawn = plotted(figure)
     assert set(drawn["y"]) == {twins.SMALL, 1e-3}, "the difference over time, and 0 at the lower edge"
     assert "pendulum, horizon=2 (0.0010)" in figure.get_suptitle().replace("\n", " ")
-    assert list(twins.readable(arranged(given, rows))["horizon"]) == ["2", "2", "3", "3"]
+    assert list(twins.readable(arrange(given, rows))["horizon"]) == ["2", "2", "3", "3"]
     table_ = table(given, rows)
     assert "own_path" not in table_
     assert list(table_)[-2:] == ["study", "parameters"]
@@ -314,10 +314,10 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
 
 def test_a_parameter_that_two_scenes_lend_to_their_law_keeps_every_row():
     given, rows = made("scenes=[wall_penalty_1d,bouncing_ball]", "estimators=[fobg]", "sweep.damping=[0,1,10]")
-    shown = arranged(given, rows)
+    shown = arrange(given, rows)
     assert len(shown.rows) == len(rows) == 6
     (axis,) = shown.axes
-    found = along(shown, axis)
+    found = rows_along(shown, axis)
     assert len(found) == 6
     assert [len(family.rows) for family in split_by_problem(shown, axis)] == [3, 3]
     assert list(shown.rows["damping"]) == [0.0, 0.0, 1.0, 1.0, 10.0, 10.0]
@@ -326,8 +326,8 @@ def test_a_parameter_that_two_scenes_lend_to_their_law_keeps_every_row():
 def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     words = [f"plugins=['{own}']", "scenes=[sprung]", "contacts=[penalty]", "estimators=[fobg]"]
     given, rows = made(*words, "sweep.sprung.stiffness=[1,10,100]")
-    assert grouped(rows, ["scene"]).nunique() == 3
-    shown = arranged(given, rows)
+    assert problem_numbers(rows, ["scene"]).nunique() == 3
+    shown = arrange(given, rows)
     (axis,) = shown.axes
     assert sorted(shown.rows[axis.column]) == [1.0, 10.0, 100.0]
     assert axis.unit == "N/m"
@@ -340,11 +340,11 @@ def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
 
 def test_a_swept_scene_parameter_is_a_numeric_column_and_its_default_is_named():
     given, rows = made("scenes=[pushing]", "estimators=[fobg]", "sweep.pushing.mass=[0.1,0.2]", "sweep.horizon=[2,3]")
-    shown = arranged(given, rows)
+    shown = arrange(given, rows)
     assert pd.api.types.is_numeric_dtype(shown.rows["mass"])
     assert set(shown.rows["scene"]) == {"pushing"}
     default = registry.find("scenes", "pushing").plugin().mass
-    names = problems(shown, ["scene"], [axis for axis in shown.axes if axis.column == "horizon"])
+    names = problem_names(shown, ["scene"], [axis for axis in shown.axes if axis.column == "horizon"])
     assert set(names) == {"pushing, mass=0.1", "pushing, mass=0.2"}
     assert default in (0.1, 0.2), "the default is one of the swept values, and left out of identity strings"
     assert list(table(given, rows))[-3:] == ["mass", "study", "parameters"]

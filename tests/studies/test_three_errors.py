@@ -16,7 +16,7 @@ from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import compose
-from bench.report.views import arranged
+from bench.report.views import arrange
 from bench.run.store import Store
 from bench.studies.three_errors import measure
 from bench.studies.three_errors.columns import COLUMNS
@@ -137,7 +137,7 @@ def test_a_trap_is_exact_convergent_and_turned_away_or_no_nearer_at_every_step(t
     rows = pd.DataFrame([cell.columns() for cell in cells(given)]).assign(status="ok", reason="")
     values = {"program_error_rel": [1e-12, 1e-13], "model_cosine": [-0.5, -0.4], "forward_error_rel": [0.4, 0.1]}
     values |= {"model_error_rel": [1.5, 0.5]}
-    assert len(traps(arranged(given, rows.assign(**(values | change))))) == trapped
+    assert len(traps(arrange(given, rows.assign(**(values | change))))) == trapped
 
 
 def test_rounding_has_no_sign():

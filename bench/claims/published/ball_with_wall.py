@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import GREY, ink
+from bench.claims.colours import GREY, estimator_colour
 from bench.claims.toolkit import centre, estimator, expectation, problem, rule, stochastic_descent
 from bench.model import Array, FunctionScene, Problem, param
 
@@ -149,10 +149,10 @@ class ThrownBall(Claim):
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both gradients and the ends of the descents."""
         axes.plot(series["x"], series["truth"], color=GREY, label="true")
-        axes.plot(series["x"], series["first"], color=ink("fobg"), label="first-order mean")
+        axes.plot(series["x"], series["first"], color=estimator_colour("fobg"), label="first-order mean")
         axes.axhline(0.0, color=GREY, linewidth=0.6)
-        axes.plot([series["first_end"]], [0], "o", color=ink("fobg"), label="first order ends")
-        axes.plot([series["zeroth_end"]], [0], "s", color=ink("reinforce"), label="zeroth order ends")
+        axes.plot([series["first_end"]], [0], "o", color=estimator_colour("fobg"), label="first order ends")
+        axes.plot([series["zeroth_end"]], [0], "s", color=estimator_colour("reinforce"), label="zeroth order ends")
 
 
 def _exact_descent(at: Problem) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import bars, ink
+from bench.claims.colours import bars, estimator_colour
 from bench.claims.toolkit import centre, estimator, problem
 
 if TYPE_CHECKING:
@@ -65,7 +65,19 @@ class Directions(Claim):
         """Draw both errors against the number of samples."""
         axes.set(xscale="log", yscale="log")
         bars(
-            axes, series["n"], series["gauss"], fmt="o-", color=ink("randomized_smoothing"), label="Gaussian: (n + 1)/N"
+            axes,
+            series["n"],
+            series["gauss"],
+            fmt="o-",
+            color=estimator_colour("randomized_smoothing"),
+            label="Gaussian: (n + 1)/N",
         )
-        bars(axes, series["n"], series["sphere"], fmt="s--", color=ink("sphere_smoothing"), label="sphere: (n - 1)/N")
+        bars(
+            axes,
+            series["n"],
+            series["sphere"],
+            fmt="s--",
+            color=estimator_colour("sphere_smoothing"),
+            label="sphere: (n - 1)/N",
+        )
         axes.set_xticks(series["n"], [f"{n:g}" for n in series["n"]])

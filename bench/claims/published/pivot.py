@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import GREY, ink
+from bench.claims.colours import GREY, estimator_colour
 from bench.claims.toolkit import centre, expectation, problem, stochastic_descent
 from bench.model import Array, FunctionScene, param
 
@@ -82,5 +82,5 @@ class FallingPivot(Claim):
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both gradients around the edge."""
         axes.plot(series["x"], series["truth"], color=GREY, label="true")
-        axes.plot(series["x"], series["first"], color=ink("fobg"), label="first-order mean")
+        axes.plot(series["x"], series["first"], color=estimator_colour("fobg"), label="first-order mean")
         axes.axvline(math.pi / 4, color=GREY, linestyle=":", linewidth=0.8, label="edge")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import bars, ink
+from bench.claims.colours import bars, estimator_colour
 from bench.claims.toolkit import estimator, problem, spread, terms
 
 if TYPE_CHECKING:
@@ -95,8 +95,10 @@ class SmoothedPush(Claim):
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both variances against the sharpness."""
         axes.set(xscale="log", yscale="log")
-        bars(axes, series["beta"], series["first"], fmt="o-", color=ink("fobg"), label="first order")
-        bars(axes, series["beta"], series["zeroth"], fmt="s-", color=ink("reinforce"), label="zeroth order")
+        bars(axes, series["beta"], series["first"], fmt="o-", color=estimator_colour("fobg"), label="first order")
+        bars(
+            axes, series["beta"], series["zeroth"], fmt="s-", color=estimator_colour("reinforce"), label="zeroth order"
+        )
 
 
 class StiffPush(Claim):
@@ -148,9 +150,23 @@ class StiffPush(Claim):
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw the variances against the stiffness."""
         axes.set(xscale="log", yscale="log")
-        bars(axes, series["k"], series["coarse"], fmt="o-", color=ink("fobg"), label="first order, step 5 ms")
-        bars(axes, series["k"], series["fine"], fmt="o--", color=ink("fobg"), label="first order, step 0.25 ms")
-        bars(axes, series["k"], series["zeroth"], fmt="s-", color=ink("reinforce"), label="zeroth order")
+        bars(
+            axes,
+            series["k"],
+            series["coarse"],
+            fmt="o-",
+            color=estimator_colour("fobg"),
+            label="first order, step 5 ms",
+        )
+        bars(
+            axes,
+            series["k"],
+            series["fine"],
+            fmt="o--",
+            color=estimator_colour("fobg"),
+            label="first order, step 0.25 ms",
+        )
+        bars(axes, series["k"], series["zeroth"], fmt="s-", color=estimator_colour("reinforce"), label="zeroth order")
 
 
 def _heavy(what: str, text: str, measured: float, error: float, count: int) -> Figure:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import GREY, ink
+from bench.claims.colours import GREY, estimator_colour
 from bench.claims.toolkit import centre, estimator, moments, problem
 
 if TYPE_CHECKING:
@@ -94,6 +94,6 @@ class Ramp(Claim):
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both variances against the width."""
-        axes.loglog(series["width"], series["first"], color=ink("fobg"), label="first order")
-        axes.loglog(series["width"], series["zeroth"], color=ink("reinforce"), label="zeroth order")
+        axes.loglog(series["width"], series["first"], color=estimator_colour("fobg"), label="first order")
+        axes.loglog(series["width"], series["zeroth"], color=estimator_colour("reinforce"), label="zeroth order")
         axes.axvline(1.517, color=GREY, linewidth=0.6, label="published crossing")

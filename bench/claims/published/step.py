@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import ink
+from bench.claims.colours import estimator_colour
 from bench.claims.toolkit import estimator, moments, problem
 
 if TYPE_CHECKING:
@@ -55,5 +55,7 @@ class Step(Claim):
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both means along theta."""
-        axes.plot(series["theta"], series["zeroth"], color=ink("reinforce"), label="zeroth order: the slope")
-        axes.plot(series["theta"], series["first"], color=ink("fobg"), label="first order: 0 everywhere")
+        axes.plot(
+            series["theta"], series["zeroth"], color=estimator_colour("reinforce"), label="zeroth order: the slope"
+        )
+        axes.plot(series["theta"], series["first"], color=estimator_colour("fobg"), label="first order: 0 everywhere")

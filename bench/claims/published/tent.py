@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import bars, ink
+from bench.claims.colours import bars, estimator_colour
 from bench.claims.toolkit import estimator, problem, spread, terms
 from bench.model import Array, FunctionScene, param
 
@@ -92,5 +92,7 @@ class Chaos(Claim):
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw both variances against the horizon."""
         axes.set_yscale("log")
-        bars(axes, series["steps"], series["first"], fmt="o-", color=ink("fobg"), label="first order: 4^T")
-        bars(axes, series["steps"], series["zeroth"], fmt="s-", color=ink("reinforce"), label="zeroth order")
+        bars(axes, series["steps"], series["first"], fmt="o-", color=estimator_colour("fobg"), label="first order: 4^T")
+        bars(
+            axes, series["steps"], series["zeroth"], fmt="s-", color=estimator_colour("reinforce"), label="zeroth order"
+        )

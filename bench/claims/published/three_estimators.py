@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import bars, ink
+from bench.claims.colours import bars, estimator_colour
 from bench.claims.toolkit import estimator, hermite, moments, problem, spread, terms
 from bench.model import Array, FunctionScene, param
 
@@ -126,7 +126,7 @@ class ThreeEstimators(Claim):
         """Draw the variances against the frequency."""
         axes.set(xscale="log", yscale="log")
         for name, method in (("pathwise", "fobg"), ("score", "reinforce"), ("measure-valued", "measure_valued")):
-            bars(axes, series["k"], series[name], fmt="o-", color=ink(method), label=name)
+            bars(axes, series["k"], series[name], fmt="o-", color=estimator_colour(method), label=name)
         axes.set_xticks(series["k"], [f"{k:g}" for k in series["k"]])
 
 

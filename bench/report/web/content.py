@@ -12,15 +12,10 @@ import pandas as pd
 from bench.experiment import axes as sweep
 from bench.experiment.columns import IDENTITY
 from bench.report.problems import (
-    axes_of,
     distinguishing_columns,
-    part_columns,
-    problem_names,
-    problem_numbers,
-    value_text,
 )
 from bench.report.style import MARKERS, VARIANTS, colour, marker
-from bench.report.views import attempted, is_logarithmic
+from bench.report.views import attempted
 
 __all__ = ["distinguishing_columns"]
 SYMBOLS = dict(
@@ -150,8 +145,3 @@ def no_result_sentence(rows: pd.DataFrame) -> str:
 def finite(value: float) -> bool:
     """Return whether a value is a finite number."""
     return isinstance(value, int | float) and math.isfinite(value)
-
-
-columns_of, grouped, problems, shown_as, together = part_columns, problem_numbers, problem_names, value_text, axes_of
-logarithmic, nothing_ran = is_logarithmic, no_result_sentence
-"""The names under which the studies use these functions."""

@@ -17,7 +17,7 @@ from bench.report.page import WIDTH
 from bench.report.study_tables import titled_figure
 from bench.report.style import PALETTE, plain
 from bench.report.text import counted
-from bench.report.views import Arranged, arranged
+from bench.report.views import Arranged, arrange
 from bench.run.files import write_whole
 from bench.studies.gradient_check.points import POINTS, is_trusted
 from bench.studies.gradient_check.report import by_point, problem_of
@@ -37,7 +37,7 @@ ROW = 0.17
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Draw the matrix as ``gradient_check``, unless nothing was checked; the plotted data have a line per cell of it."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     table = by_point(rows)
     if table.empty:
         return []

@@ -6,21 +6,11 @@ import pandas as pd
 
 from bench.experiment.experiment import Experiment
 from bench.measure.gradcheck import UNTRUSTED, VERDICTS
+from bench.report.problems import axes_of, problem_names
 from bench.report.style import PALETTE
 from bench.report.text import counted, number
-from bench.report.views import Arranged, arranged
-from bench.report.web.content import (
-    STATUS,
-    Chart,
-    Content,
-    PlotAxis,
-    TableColumn,
-    identity_columns,
-    look,
-    problems,
-    titled,
-    together,
-)
+from bench.report.views import Arranged, arrange
+from bench.report.web.content import STATUS, Chart, Content, PlotAxis, TableColumn, identity_columns, look, titled
 from bench.studies.gradient_check.points import POINTS
 from bench.studies.gradient_check.report import PROBLEM, by_point, long_table, untrusted
 
@@ -33,7 +23,7 @@ LOOKS = {
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the finding, a table of verdicts and a chart of errors against the step of the differences."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     chart = Chart(
         "Error against the step of the differences",
         "The error of a right gradient falls with eps^2 until rounding dominates; that of a wrong one stays constant.",
@@ -66,8 +56,8 @@ def checks(shown: Arranged) -> pd.DataFrame:
     parts = [*PROBLEM, "backend"]
     rows = shown.rows.assign(
         row=range(len(shown.rows)),
-        problem=problems(shown, parts, together(shown, "horizon"), parts),
-        cell=problems(shown, ["scene"], always=["horizon"]),
+        problem=problem_names(shown, parts, axes_of(shown, "horizon"), parts),
+        cell=problem_names(shown, ["scene"], always=["horizon"]),
     )
     long = long_table(rows)
     long = long[long["eps"].notna()]

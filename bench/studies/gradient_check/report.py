@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.experiment.axes import parsed, with_axes
+from bench.experiment.axes import with_axes
 from bench.experiment.columns import IDENTITY
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import parse
 from bench.measure.gradcheck import VERDICTS
+from bench.report.problems import axes_of, problem_names, problem_numbers, value_text
 from bench.report.study_tables import label_columns, open_console
 from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import counted, number
-from bench.report.views import Arranged, arranged
-from bench.report.web.content import grouped, problems, shown_as, together
+from bench.report.views import Arranged, arrange
 from bench.run.files import write_all
 from bench.studies.gradient_check.columns import COLUMNS
 from bench.studies.gradient_check.points import POINTS, is_trusted
@@ -35,7 +36,7 @@ PROBLEM = ("scene", "contact", "integrator")
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``gradient_check`` (.csv, .md) and ``gradient_components.csv``; return the files' paths."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     table = long_table(with_axes(experiment, rows))
     contents = {
         "gradient_check.csv": table.to_csv(index=False, lineterminator="\n"),
@@ -98,7 +99,7 @@ def by_point(rows: pd.DataFrame) -> pd.DataFrame:
     """
     lines = []
     shown = ("scene", "contact", "integrator", "backend", "horizon", "dtype", "key", "command")
-    for row, i, verdict in checks(rows.assign(row=range(len(rows)), problem=grouped(rows, PROBLEM))):
+    for row, i, verdict in checks(rows.assign(row=range(len(rows)), problem=problem_numbers(rows, PROBLEM))):
         cell = {name: row[name] for name in (*shown, "row", "problem")}
         result = {"verdict": verdict, "error": row["check_error"][i], "eps": row["check_eps"][i]}
         lines.append(cell | {"point": row["point"][i], "rank": VERDICTS.index(verdict)} | result)
@@ -119,7 +120,7 @@ def markdown(shown: Arranged) -> str:
     for _, group in summary.groupby(["problem", "point", "verdict"], sort=False):
         worst = group.loc[group["error"].idxmax()] if group["error"].notna().any() else group.iloc[0]
         backends = ", ".join(dict.fromkeys(group["backend"]))
-        cells = [shown_as(rows[name].iloc[worst["row"]]) for name in labels]
+        cells = [value_text(rows[name].iloc[worst["row"]]) for name in labels]
         lines.append(
             [*cells, worst["point"], backends, worst["verdict"], number(worst["error"]), f"{worst['eps']:.0e}"]
         )
@@ -150,7 +151,7 @@ def markdown(shown: Arranged) -> str:
 
 def distance(rows: pd.DataFrame) -> str:
     """Write how far before and after a switch of contact mode rows were checked: their studies' ``aside``."""
-    distances = dict.fromkeys(given["study"]["aside"] for given in parsed(rows) if given)
+    distances = dict.fromkeys(given["study"]["aside"] for given in parse(rows) if given)
     return " or ".join(_power(value) for value in distances)
 
 
@@ -163,7 +164,7 @@ def _power(value: float) -> str:
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     """Print the counts of verdicts of each problem, and the command that repeats each fault."""
     open_console(experiment, rows)
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     names = problem_of(shown)
     summary = by_point(rows)
     for name, part in summary.groupby(names.to_numpy()[summary["row"].astype(int)], sort=False):
@@ -197,4 +198,4 @@ def count_reasons(rows: pd.DataFrame) -> list[tuple[str, int]]:
 
 def problem_of(shown: Arranged) -> pd.Series:
     """Return, per row, the name of its problem, the same at every horizon."""
-    return problems(shown, PROBLEM, together(shown, "horizon"), ("scene", "contact"))
+    return problem_names(shown, PROBLEM, axes_of(shown, "horizon"), ("scene", "contact"))

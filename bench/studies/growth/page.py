@@ -8,7 +8,7 @@ import pandas as pd
 from bench.experiment.experiment import Experiment
 from bench.report.style import PALETTE
 from bench.report.text import axis_value, number
-from bench.report.views import Arranged, arranged
+from bench.report.views import Arranged, arrange
 from bench.report.web.content import (
     STATUS,
     Chart,
@@ -18,7 +18,7 @@ from bench.report.web.content import (
     identity_columns,
     look,
     looks,
-    nothing_ran,
+    no_result_sentence,
 )
 from bench.studies.growth.report import headline, problem_of
 
@@ -38,7 +38,7 @@ CROSSING = "zeroth order has less variance"
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the finding, charts of norms, variances and gains, and the table."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     problem = problem_of(shown)
     table = shown.rows.assign(series=problem, problem=problem)
     norms = Chart(
@@ -74,7 +74,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         line="line",
     )
     return Content(
-        finding=nothing_ran(rows) or finding(answers(shown)),
+        finding=no_result_sentence(rows) or finding(answers(shown)),
         rows=table,
         columns=[*identity_columns(table, [axis.column for axis in shown.axes]), *RESULTS, *STATUS],
         charts=[norms, variances, gains],

@@ -16,9 +16,10 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
 
 from bench.experiment.experiment import Experiment
-from bench.report.colours import ink
+from bench.report.colours import estimator_colour
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
+from bench.report.problems import axes_of, problem_names, value_text
 from bench.report.scales import log_axis
 from bench.report.study_tables import (
     interval,
@@ -32,8 +33,7 @@ from bench.report.study_tables import (
 from bench.report.style import PALETTE, plain
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, number
-from bench.report.views import Arranged, arranged, attempted
-from bench.report.web.content import problems, shown_as, together
+from bench.report.views import Arranged, arrange, attempted
 
 NORM: dict[str, Any] = {"color": "#000000", "marker": "o"}
 SINGULAR: tuple[dict[str, Any], ...] = (
@@ -61,14 +61,17 @@ NOTES = (
 def variances() -> dict[str, tuple[str, dict[str, Any]]]:
     """Return, by column, the name and the style of each curve of variance."""
     return {
-        "first_order": ("fobg", {"color": ink("fobg"), "marker": "D"}),
-        "zeroth_order": ("zeroth order", {"color": ink("reinforce"), "marker": "P", "linestyle": (0, (4, 1.5))}),
+        "first_order": ("fobg", {"color": estimator_colour("fobg"), "marker": "D"}),
+        "zeroth_order": (
+            "zeroth order",
+            {"color": estimator_colour("reinforce"), "marker": "P", "linestyle": (0, (4, 1.5))},
+        ),
     }
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``growth`` (.csv, .md) and the chart."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     texts = [f"# {experiment.name}: growth of gradients with the horizon", plain_markdown(readable(shown)), *NOTES]
     paths = write_tables(experiment, rows, "growth", texts)
     with styled():
@@ -83,16 +86,16 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 def problem_of(shown: Arranged, rows: pd.DataFrame | None = None) -> pd.Series:
     """Return, per row, the name of its problem, the same at every horizon."""
-    return problems(shown, PROBLEM, together(shown, "horizon"), rows=rows)
+    return problem_names(shown, PROBLEM, axes_of(shown, "horizon"), rows=rows)
 
 
 def readable(shown: Arranged) -> pd.DataFrame:
     """Return a table of texts, a line per cell in order of scene and horizon."""
     lines = []
-    columns = [name for name in label_columns(shown, PROBLEM, together(shown, "horizon")) if name != "horizon"]
+    columns = [name for name in label_columns(shown, PROBLEM, axes_of(shown, "horizon")) if name != "horizon"]
     rows = shown.rows.assign(place=shown.rows["scene"].map({s: i for i, s in enumerate(shown.rows["scene"].unique())}))
     for row in rows.sort_values(["place", "time_horizon"], kind="stable").to_dict("records"):
-        line = {name: shown_as(row[name]) for name in columns} | {"steps": axis_value(row["horizon"])}
+        line = {name: value_text(row[name]) for name in columns} | {"steps": axis_value(row["horizon"])}
         line["T [s]"] = axis_value(row["time_horizon"])
         line["|grad| [5%, 95%]"] = interval(row, "gradient_median", "gradient_low", "gradient_high")
         for kind in ("stretch", "spectral"):
@@ -118,7 +121,7 @@ def _ends(values: Sequence[float]) -> str:
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     """Print the table, and the reasons of cells without numbers."""
     console = open_console(experiment, rows)
-    texts = readable(arranged(experiment, rows))
+    texts = readable(arrange(experiment, rows))
     print_table(console, texts, right=set(texts) - {*PROBLEM, "growth", "status"})
     print_reasons(console, rows)
     console.print(*NOTES)

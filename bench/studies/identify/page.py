@@ -7,20 +7,20 @@ from dataclasses import replace
 import pandas as pd
 
 from bench.experiment.experiment import Experiment
-from bench.report.views import arranged
+from bench.report.views import arrange
 from bench.report.web import generic
-from bench.report.web.content import Content, nothing_ran
+from bench.report.web.content import Content, no_result_sentence
 from bench.studies.identify.report import failures, findings, flatten, readable
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the failures, a chart of any two numbers, and the table of fits."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     lines = flatten(shown)
     sentences = failures(lines) if len(lines) else findings(shown)
     return replace(
         generic.content(experiment, rows),
-        finding=nothing_ran(rows) or " ".join(sentences),
+        finding=no_result_sentence(rows) or " ".join(sentences),
         answers=readable(lines),
         answers_title="Identifiable parameters, and precision of the fits",
     )

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from bench.experiment.experiment import Experiment
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
+from bench.report.problems import problem_names
 from bench.report.study_tables import (
     interval,
     open_console,
@@ -23,8 +24,7 @@ from bench.report.study_tables import (
 from bench.report.style import MARKERS, PALETTE, plain
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted, number
-from bench.report.views import Arranged, arranged, attempted
-from bench.report.web.content import problems
+from bench.report.views import Arranged, arrange, attempted
 
 PARTS = ("scene", "contact", "integrator")
 STATISTICS = (
@@ -42,7 +42,7 @@ NOTES = (
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``identify`` (.csv, .md) and the chart."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     lines = flatten(shown)
     texts = [f"# {experiment.name}: which parameters are identifiable from a record?", *findings(shown)]
     paths = write_tables(experiment, rows, "identify", [*texts, plain_markdown(readable(lines)), *NOTES])
@@ -56,7 +56,7 @@ def flatten(shown: Arranged) -> pd.DataFrame:
     """Return one line per problem, optimizer, seed and shooting method."""
     rows = attempted(shown.rows)
     rows = rows[rows["status"] == "ok"]
-    names = problems(shown, PARTS, rows=rows)
+    names = problem_names(shown, PARTS, rows=rows)
     names = names + (", " + rows["optimizer"] if rows["optimizer"].nunique() > 1 else "")
     lines = []
     for index, name, row in zip(rows.index, names, rows.to_dict("records"), strict=True):
@@ -137,7 +137,7 @@ def failures(lines: pd.DataFrame) -> list[str]:
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     """Print the findings, the table, and reasons of cells without a result."""
     console = open_console(experiment, rows)
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     console.print(*findings(shown), sep="\n")
     print_table(console, readable(flatten(shown)))
     print_reasons(console, rows)

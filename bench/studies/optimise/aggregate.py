@@ -17,9 +17,9 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import flatten, swept_columns
 from bench.measure import performance
 from bench.model.parameters import remember
+from bench.report.problems import problem_names
 from bench.report.text import axis_value
-from bench.report.views import arranged, attempted
-from bench.report.web.content import problems
+from bench.report.views import arrange, attempted
 
 PARTS = ("scene", "contact", "integrator", "backend")
 TARGETS = (10.0, 100.0, 1000.0)
@@ -110,11 +110,11 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
 
 
 def _collect(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     runs = attempted(shown.rows)
     runs = runs[np.isfinite(runs["start_cost"])]
     tuned_axes = tuple(axis for axis in shown.axes if _is_tuned(axis, runs))
-    names = problems(shown, PARTS, tuned_axes, rows=runs).astype(str)
+    names = problem_names(shown, PARTS, tuned_axes, rows=runs).astype(str)
     runs = runs.assign(problem=names, method=_method_names(runs), tuning=_tuning_labels(runs, tuned_axes))
     best_known, status = _best_known_cost(runs)
     start, final = runs["start_cost"], runs["final_cost"]

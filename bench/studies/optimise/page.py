@@ -18,7 +18,7 @@ from bench.report.web.content import (
     TableColumn,
     identity_columns,
     look,
-    nothing_ran,
+    no_result_sentence,
 )
 from bench.studies.optimise import aggregate, findings
 from bench.studies.optimise.report import default_ratio, looks, methods
@@ -38,7 +38,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the findings, the charts and the table of searches."""
     runs, default = aggregate.collect_runs(experiment, rows), default_ratio(experiment)
     if not len(runs.rows):
-        return Content(nothing_ran(rows), rows, [*identity_columns(rows), *STATUS], [])
+        return Content(no_result_sentence(rows), rows, [*identity_columns(rows), *STATUS], [])
     table = rows.assign(**{name: runs.rows[name] for name in ("problem", "method", "tuning", "best_known", "score")})
     table["score"], table["best_known"] = table["score"].astype(float), table["best_known"].astype(float)
     table = table.fillna({"problem": "", "method": "", "tuning": ""}).assign(series=lambda t: t["method"])

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from bench.experiment.experiment import Experiment
-from bench.report.colours import ink, stamp
+from bench.report.colours import estimator_colour, estimator_marker
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH, columns
 from bench.report.scales import log_axis
@@ -30,7 +30,7 @@ from bench.report.study_tables import (
     titled_figure,
     write_tables,
 )
-from bench.report.style import DEVIANT, MARKERS, VARIANTS, inches, plain, wrapped
+from bench.report.style import DEVIANT, MARKERS, VARIANTS, plain, width_in_inches, wrapped
 from bench.report.tables import plain_markdown
 from bench.report.text import number
 from bench.studies.optimise import aggregate, findings
@@ -159,7 +159,11 @@ def looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
         uses[name] += 1
         grey, dashes = CONTEXT[turn % len(CONTEXT)]
         styles[method] = (
-            {"color": ink(name), "marker": stamp(name, turn), "linestyle": VARIANTS[turn % len(VARIANTS)]}
+            {
+                "color": estimator_colour(name),
+                "marker": estimator_marker(name, turn),
+                "linestyle": VARIANTS[turn % len(VARIANTS)],
+            }
             if name
             else {"color": grey, "marker": MARKERS[turn % len(MARKERS)], "linestyle": dashes}
         )
@@ -168,7 +172,7 @@ def looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 def _legend(drawn: Figure, names: dict[str, dict[str, Any]], extra: tuple[Any, ...] = ()) -> None:
     handles = [*(Line2D([], [], label=plain(name), **style) for name, style in names.items()), *extra]
-    longest = max(0.6 + inches(str(handle.get_label())) for handle in handles)
+    longest = max(0.6 + width_in_inches(str(handle.get_label())) for handle in handles)
     across = max(1, min(3, int(drawn.get_figwidth() / longest)))
     drawn.legend(handles=handles, loc="outside lower center", ncols=across, columnspacing=1.2)
 

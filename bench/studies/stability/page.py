@@ -4,21 +4,12 @@ from __future__ import annotations
 
 import pandas as pd
 
-from bench.experiment.axes import parsed
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import parse
+from bench.report.problems import axes_of, problem_names
 from bench.report.text import counted
 from bench.report.views import Arranged, attempted
-from bench.report.web.content import (
-    STATUS,
-    Chart,
-    Content,
-    PlotAxis,
-    TableColumn,
-    identity_columns,
-    look,
-    problems,
-    together,
-)
+from bench.report.web.content import STATUS, Chart, Content, PlotAxis, TableColumn, identity_columns, look
 from bench.studies.stability.report import (
     LOST,
     PLACES,
@@ -45,11 +36,11 @@ RESULTS = [
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the finding, the shares of right gradients, and the maps over step size and stiffness."""
     shown = arrange_maps(experiment, rows)
-    over = together(shown, *PLACES)
+    over = axes_of(shown, *PLACES)
     has_verdict = (rows["verdict"] != "").any()
     table = shown.rows.assign(
-        problem=problems(shown, ["scene", "contact"], over, always=("scene", "contact")),
-        panel=problems(shown, STEP, over, always=STEP),
+        problem=problem_names(shown, ["scene", "contact"], over, always=("scene", "contact")),
+        panel=problem_names(shown, STEP, over, always=STEP),
         series=rows["verdict"],
     )
     share = Chart(
@@ -89,8 +80,8 @@ def shares(shown: Arranged) -> pd.DataFrame:
     Scenes are grouped by name. Laws and integrators keep the parameters that distinguish them.
     """
     cells = with_verdict(shown.rows)
-    step = problems(shown, ["contact", "integrator"], together(shown, *PLACES), ("contact", "integrator"), cells)
-    scene = [name_of(given.get("scene")) for given in parsed(cells)]
+    step = problem_names(shown, ["contact", "integrator"], axes_of(shown, *PLACES), ("contact", "integrator"), cells)
+    scene = [name_of(given.get("scene")) for given in parse(cells)]
     table = pd.crosstab([scene, step], cells["verdict"], normalize="index")
     table = table.reindex(columns=[name for name in VERDICTS if name], fill_value=0.0).rename_axis(["scene", "step"])
     return table.reset_index().sort_values(["scene", "ok"], ascending=[True, False], kind="stable")

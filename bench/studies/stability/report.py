@@ -22,17 +22,19 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from bench.experiment.axes import Axis, parsed
+from bench.experiment.axes import Axis
 from bench.experiment.columns import COMMON
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import parse
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH, columns
+from bench.report.problems import axes_of, part_columns, problem_names, problem_numbers, value_text
 from bench.report.study_tables import open_console, print_table, titled_figure, write_tables
 from bench.report.style import PALETTE, axis_name, plain
 from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import axis_value
-from bench.report.views import Arranged, arranged, attempted
-from bench.report.web.content import columns_of, distinguishing_columns, grouped, problems, shown_as, together
+from bench.report.views import Arranged, arrange, attempted
+from bench.report.web.content import distinguishing_columns
 
 BLUE, BLACK, RED, GREEN, PINK, ORANGE, SKY, _ = PALETTE
 VERDICTS = {
@@ -157,7 +159,7 @@ def colour_legend(rows: pd.DataFrame) -> list[Patch]:
 
 def arrange_maps(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
     """Arrange rows for reading, with each cell's stored step size and stiffness, and a cause for older rows without."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     cause = rows["cause"].fillna("") if "cause" in rows else ""
     return replace(shown, rows=shown.rows.assign(**{name: rows[name] for name in PLACES}, cause=cause))
 
@@ -168,14 +170,14 @@ def panels(shown: Arranged) -> list[Panel]:
     A map has all rows with equal parameters of scene, contact law and integrator, except step size and stiffness.
     Backends with equal maps share one, and backends that support no cell of a map are left out.
     """
-    over = together(shown, *PLACES)
+    over = axes_of(shown, *PLACES)
     rows = shown.rows.assign(
-        map=grouped(shown.rows, STEP, over),
+        map=problem_numbers(shown.rows, STEP, over),
         kind=[
             tuple(name_of(given.get(part)) for part in ("integrator", "scene", "contact"))
-            for given in parsed(shown.rows)
+            for given in parse(shown.rows)
         ],
-        machine=problems(shown, ["backend"], always=["backend"]),
+        machine=problem_names(shown, ["backend"], always=["backend"]),
     )
     labels = label_columns_of(shown, over)
     maps: list[Panel] = []
@@ -192,7 +194,7 @@ def panels(shown: Arranged) -> list[Panel]:
                 equal[1].append(str(backend))
         first = part.iloc[0]
         integrator, scene, contact = (str(first[name]) for name in ("integrator", "scene", "contact"))
-        values = {name: shown_as(first[name]) for name in labels}
+        values = {name: value_text(first[name]) for name in labels}
         maps += [
             Panel(integrator, scene, contact, values, first["kind"], tuple(names), table) for table, names in groups
         ]
@@ -203,10 +205,10 @@ def panels(shown: Arranged) -> list[Panel]:
 def label_columns_of(shown: Arranged, over: Sequence[Axis]) -> list[str]:
     """Return the columns, besides integrator, scene and law, that distinguish the maps."""
     basic = ("integrator", "scene", "contact")
-    names = [*basic, *(name for name in columns_of(shown, STEP, over) if name not in (*basic, *PLACES, "horizon"))]
+    names = [*basic, *(name for name in part_columns(shown, STEP, over) if name not in (*basic, *PLACES, "horizon"))]
     return [
         name
-        for name in distinguishing_columns(shown.rows, grouped(shown.rows, STEP, over), names, basic)
+        for name in distinguishing_columns(shown.rows, problem_numbers(shown.rows, STEP, over), names, basic)
         if name not in basic
     ]
 
@@ -218,7 +220,7 @@ def name_of(part: Any) -> str:
 
 def limits(rows: pd.DataFrame) -> dict[str, str]:
     """Return the limits of the rows' studies as texts: ``{"inaccurate": "10%"}``, or ``10% or 20%`` where they differ."""
-    texts = dict.fromkeys(given["study"]["inaccurate"] for given in parsed(rows) if given)
+    texts = dict.fromkeys(given["study"]["inaccurate"] for given in parse(rows) if given)
     return {"inaccurate": " or ".join(f"{100 * limit:g}%" for limit in texts)}
 
 
@@ -258,7 +260,7 @@ def shares(maps: Sequence[Panel]) -> dict[str, float]:
 
 def markdown(shown: Arranged, maps: Sequence[Panel]) -> str:
     """Return the report as Markdown: a line per map with shares of the verdicts and both stability limits, and notes."""
-    labels = ["integrator", "scene", "contact", *label_columns_of(shown, together(shown, *PLACES)), "backends"]
+    labels = ["integrator", "scene", "contact", *label_columns_of(shown, axes_of(shown, *PLACES)), "backends"]
     results = ["cells", *(name for name in VERDICTS if name), "unstable", "dt", "theory", "measured", "agree"]
     lines = []
     for panel in maps:

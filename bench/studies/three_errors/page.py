@@ -5,8 +5,9 @@ from __future__ import annotations
 import pandas as pd
 
 from bench.experiment.experiment import Experiment
+from bench.report.problems import problem_names
 from bench.report.text import counted, number
-from bench.report.views import Arranged, arranged
+from bench.report.views import Arranged, arrange, is_logarithmic
 from bench.report.web.content import (
     STATUS,
     Chart,
@@ -14,11 +15,9 @@ from bench.report.web.content import (
     PlotAxis,
     TableColumn,
     identity_columns,
-    logarithmic,
     looks,
-    nothing_ran,
+    no_result_sentence,
     numeric_axis,
-    problems,
 )
 
 ERRORS = {
@@ -34,10 +33,10 @@ AGREES, WRONG = 1e-3, 0.1
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the finding, charts of the errors, and the table of gradients that are right for the program only."""
-    shown = arranged(experiment, rows)
-    laws = problems(shown, ["contact", "integrator"], shown.axes, ("contact", "integrator"))
-    table = shown.rows.assign(series=laws, problem=problems(shown, ["scene"], shown.axes))
-    swept = [numeric_axis(axis, axis.column, logarithmic(table[axis.column])) for axis in shown.swept()]
+    shown = arrange(experiment, rows)
+    laws = problem_names(shown, ["contact", "integrator"], shown.axes, ("contact", "integrator"))
+    table = shown.rows.assign(series=laws, problem=problem_names(shown, ["scene"], shown.axes))
+    swept = [numeric_axis(axis, axis.column, is_logarithmic(table[axis.column])) for axis in shown.swept()]
     charts = [
         Chart(
             "The errors against each other",
@@ -57,7 +56,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
         )
         charts.insert(0, along)
     return Content(
-        finding=nothing_ran(rows) or finding(rows),
+        finding=no_result_sentence(rows) or finding(rows),
         rows=table,
         columns=[
             *identity_columns(table, [axis.column for axis in shown.axes]),
@@ -96,7 +95,7 @@ def answers(shown: Arranged) -> pd.DataFrame:
     """Return the problems with misleading gradients, and the range of each error over the swept parameters."""
     wrong = misleading(shown.rows)
     lines = []
-    for problem, part in wrong.groupby(problems(shown, PROBLEM, shown.axes, PROBLEM, wrong), sort=False):
+    for problem, part in wrong.groupby(problem_names(shown, PROBLEM, shown.axes, PROBLEM, wrong), sort=False):
         errors = {
             text: f"{number(part[name].min())} to {number(part[name].max())}"
             for name, text in ERRORS.items()

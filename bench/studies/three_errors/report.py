@@ -19,13 +19,13 @@ from bench.experiment.axes import Axis
 from bench.experiment.experiment import Experiment
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
+from bench.report.problems import problem_names, problem_numbers, value_text
 from bench.report.scales import log_axis
 from bench.report.study_tables import label_columns, open_console, print_table, titled_figure, write_tables
 from bench.report.style import GREY, MARKERS, SHADE, axis_name, colour, plain, symbol
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, number
-from bench.report.views import Arranged, along, arranged, attempted, merge_seeds
-from bench.report.web.content import grouped, problems, shown_as
+from bench.report.views import Arranged, arrange, attempted, merge_seeds, rows_along
 
 FLOOR, CEILING = 1e-14, 1e3
 """Relative errors outside this range are drawn at its ends."""
@@ -64,7 +64,7 @@ NOTES = (
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``three_errors`` (.csv, .md) and the chart along the time step, or else the first swept axis."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     parts = sections(shown)
     texts = [f"## {part.heading}\n\n{plain_markdown(readable(shown, part), HEADERS)}" for part in parts]
     title = f"# {experiment.name}: program, model and estimator error"
@@ -96,17 +96,17 @@ def sections(shown: Arranged) -> list[Section]:
     parts: list[Section] = []
     for axis in independent_axes(shown):
         joint = joint_axes(shown, axis)
-        part = attempted(along(shown, axis))
+        part = attempted(rows_along(shown, axis))
         for other in shown.axes:
             if other not in joint and other.column != "seed" and not part.empty:
                 part = part[_is_most_common(part, other, shown)]
         if part.empty:
             continue
-        varies = part.groupby(grouped(part, PROGRAM, joint))["x"].transform("nunique") > 1
+        varies = part.groupby(problem_numbers(part, PROGRAM, joint))["x"].transform("nunique") > 1
         if varies.any():
             parts.append(Section(axis, part[varies].sort_values("x", kind="stable")))
     rest = attempted(merge_seeds(shown.rows)).assign(x=0.0)
-    programs = grouped(rest, PROGRAM, shown.axes)
+    programs = problem_numbers(rest, PROGRAM, shown.axes)
     listed = {key for part in parts for key in part.rows["key"]}
     rest = rest[~programs.isin(programs[rest["key"].isin(listed)])]
     return parts + ([] if rest.empty else [Section(None, rest)])
@@ -128,7 +128,7 @@ def joint_axes(shown: Arranged, axis: Axis | None) -> list[Axis]:
 
 def _is_most_common(rows: pd.DataFrame, axis: Axis, shown: Arranged) -> pd.Series:
     """Return a mask of the rows without a value of an axis, or with the most common one for their scene and law."""
-    laws = grouped(rows, ("scene", "contact"), shown.axes)
+    laws = problem_numbers(rows, ("scene", "contact"), shown.axes)
     mode = rows.groupby(laws)[axis.column].transform(lambda v: v.mode().iloc[0] if v.notna().any() else np.nan)
     return (rows[axis.column] == mode) | rows[axis.column].isna()
 
@@ -140,18 +140,18 @@ def readable(shown: Arranged, part: Section) -> pd.DataFrame:
     """Return a table of texts with a line per program and value of the axis: the errors, and a bias per estimator."""
     rows, axis = part.rows, part.axis
     without = joint_axes(shown, axis)
-    programs = grouped(rows, PROGRAM, without)
+    programs = problem_numbers(rows, PROGRAM, without)
     names = label_columns(shown, PROGRAM, without, rows=rows)
     labels = rows["estimator"].where(
         rows["estimator_params"] == "", rows["estimator"] + "[" + rows["estimator_params"] + "]"
     )
-    laws = grouped(rows, ("scene", "contact"), without)
+    laws = problem_numbers(rows, ("scene", "contact"), without)
     place = {law: i for i, law in enumerate(laws.unique())}
     rows = rows.assign(program=programs, label=labels, place=laws.map(place))
     lines = []
     for _, group in rows.groupby(["place", "program", "x"], sort=False):
         row = group.iloc[0]
-        line = {name: shown_as(row[name]) for name in names}
+        line = {name: value_text(row[name]) for name in names}
         line |= {} if axis is None else {replace(axis, moves=()).title: axis_value(row["x"])}
         line |= {name: number(row[name]) for name in RESULTS}
         line |= {f"bias {name}": _bias(estimates.iloc[0]) for name, estimates in group.groupby("label", sort=False)}
@@ -169,7 +169,7 @@ def _bias(row: Any) -> str:
 
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     """Print the tables and the traps."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     console = open_console(experiment, rows)
     for part in sections(shown):
         texts = readable(shown, part)
@@ -234,7 +234,7 @@ def traps(shown: Arranged) -> list[Trap]:
 def programs_of(shown: Arranged, part: Section, parts: Sequence[str] = PROGRAM) -> pd.Series:
     """Return, per row of a section, the name of its program, the same along the axis: ``bounce_once, penalty``."""
     always = [name for name in ("scene", "contact") if name in parts]
-    return problems(shown, parts, joint_axes(shown, part.axis), always, part.rows)
+    return problem_names(shown, parts, joint_axes(shown, part.axis), always, part.rows)
 
 
 # ------------------------------------------------------------------------------------------------------- charts
@@ -257,7 +257,7 @@ def _figure(shown: Arranged, part: Section, trap_names: Set[str]) -> Figure:
         panel=panels,
         law=_laws(shown, part, panels),
         trap=programs_of(shown, part).isin(trap_names if part.axis.column == STEP else ()),
-        label=problems(shown, ["estimator"], shown.axes, ["estimator"], part.rows),
+        label=problem_names(shown, ["estimator"], shown.axes, ["estimator"], part.rows),
     )
     scenes, laws, estimators = (list(dict.fromkeys(rows[name])) for name in ("panel", "law", "label"))
     looks = {law: {"color": _colour(i), "marker": MARKERS[i % len(MARKERS)]} for i, law in enumerate(laws)}

@@ -10,12 +10,12 @@ import pandas as pd
 from bench.experiment.experiment import Experiment
 from bench.report.text import duration, number
 from bench.report.web import generic
-from bench.report.web.content import Content, nothing_ran
+from bench.report.web.content import Content, no_result_sentence
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
     """Return the finding, a chart of any two numbers, and the table."""
-    return replace(generic.content(experiment, rows), finding=nothing_ran(rows) or finding(rows))
+    return replace(generic.content(experiment, rows), finding=no_result_sentence(rows) or finding(rows))
 
 
 def finding(rows: pd.DataFrame) -> str:

@@ -13,13 +13,13 @@ from matplotlib.lines import Line2D
 
 from bench.experiment.experiment import Experiment
 from bench.report.figures import save, styled
+from bench.report.problems import problem_names, value_text
 from bench.report.scales import log_axis
 from bench.report.study_tables import label_columns, open_console, panel_grid, print_table, write_tables
 from bench.report.style import colour, plain
 from bench.report.tables import plain_markdown
 from bench.report.text import number
-from bench.report.views import Arranged, arranged, attempted
-from bench.report.web.content import problems, shown_as
+from bench.report.views import Arranged, arrange, attempted
 
 SMALL = 1e-17
 """Smaller differences, 0 included, are drawn at this value."""
@@ -45,7 +45,7 @@ NOTES = (
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     """Write ``twins`` (.csv, .md) and the chart."""
-    shown = arranged(experiment, rows)
+    shown = arrange(experiment, rows)
     title = f"# {experiment.name}: engines compared with the scenes' own programs"
     paths = write_tables(experiment, rows, "twins", [title, plain_markdown(readable(shown), HEADERS), *NOTES])
     if (rows["status"] == "ok").any():
@@ -63,15 +63,15 @@ def readable(shown: Arranged) -> pd.DataFrame:
         numbers = {name: number(row[name], 3) for name in HEADERS}
         if row["status"] != "ok":
             numbers = dict.fromkeys(HEADERS, "") | {"state_difference": row["status"]}
-        lines.append({name: shown_as(row[name]) for name in labels} | numbers)
+        lines.append({name: value_text(row[name]) for name in labels} | numbers)
     return pd.DataFrame(lines, columns=[*labels, *HEADERS])
 
 
 def figure(shown: Arranged) -> Figure:
     """Draw, in a panel per problem, the largest difference of any coordinate from the own program's over time."""
     rows = shown.rows[shown.rows["status"] == "ok"]
-    rows = rows.assign(engine=problems(shown, ["backend"], always=["backend"], rows=rows))
-    titles = problems(shown, ["scene", "contact", "integrator"], rows=rows)
+    rows = rows.assign(engine=problem_names(shown, ["backend"], always=["backend"], rows=rows))
+    titles = problem_names(shown, ["scene", "contact", "integrator"], rows=rows)
     parts = list(rows.groupby(titles, sort=False))
     engines = list(dict.fromkeys(rows["engine"]))
     drawn, panels = panel_grid(len(parts), 2, 1.9, headline(rows, titles), margin=0.5, sharey=True)
@@ -121,7 +121,7 @@ def _draw(panel: Axes, title: str, rows: pd.DataFrame, engines: list[str]) -> No
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     """Print the table, and the reason of each cell without numbers."""
     console = open_console(experiment, rows)
-    texts = readable(arranged(experiment, rows))
+    texts = readable(arrange(experiment, rows))
     labels = [name for name in texts if name not in HEADERS and name != "contact"]
     print_table(console, texts[[*labels, *PRINTED]], HEADERS)
     for row in rows[rows["status"] != "ok"].to_dict("records"):
