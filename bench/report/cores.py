@@ -16,7 +16,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from functools import partial
 from typing import Any, TypeVar
 
-from bench.model import blocks
+from bench.model import blocks, guard
 
 UNSAFE = ("jaxlib", "torch._C")
 """Modules whose threads do not survive a fork."""
@@ -89,4 +89,5 @@ def _run(place: int) -> bytes:
         outcome: tuple[Any, Exception | None] = (_tasks[place](), None)
     except Exception as error:
         outcome = (None, error)
+    guard.kill_children()  # of a plugin, which nobody would find once this process has ended
     return pickle.dumps(outcome)

@@ -187,3 +187,18 @@ except ChildProcessError:
     print("no child")
 """
     assert ran(code) == "interrupted True\nno child"
+
+
+@linux
+def test_processes_that_a_task_leaves_running_end_with_it():
+    code = """
+import subprocess
+import psutil
+def leave():
+    time.sleep(0.2)
+    return subprocess.Popen(["sleep", "613"], start_new_session=True).pid
+left = run_tasks([leave, leave])
+time.sleep(0.2)
+print(sum(psutil.pid_exists(pid) and psutil.Process(pid).status() != "zombie" for pid in left))
+"""
+    assert ran(code) == "0"
