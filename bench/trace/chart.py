@@ -12,10 +12,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from bench.report.figures import save, styled
 from bench.report.page import WIDTH
+from bench.report.scales import log_axis
 from bench.report.style import GREY, PALETTE, SHADE, STYLE, plain, wrapped
 from bench.run.files import make_directory, write_whole
 from bench.trace.sentences import three_digits
@@ -141,7 +142,9 @@ def _norm(ax: Axes, table: pd.DataFrame, name: str) -> None:
     for k in np.flatnonzero(spikes(table[name])):
         ax.plot(time[k : k + 2], values.to_numpy()[k : k + 2], **SPIKED)
     if values.notna().any():
-        _logarithmic(ax, float(values.min()), float(values.max()))
+        low, high = float(values.min()), float(values.max())
+        middle = np.sqrt(low * high)  # at least a decade is shown around it
+        log_axis(ax, "y", min(low / 1.3, middle / 3.2), max(high * 1.6, middle * 3.2))
     alignment = align(table[name], table["switch"])
     if alignment.spikes and table["switch"].any():
         _note(
@@ -178,20 +181,6 @@ def _line(ax: Axes, table: pd.DataFrame, values: pd.Series, colour: str, **look:
     elif ax.get_yscale() == "linear":
         ax.yaxis.set_major_locator(MaxNLocator(nbins=3))
         ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.6g}"))
-
-
-def _logarithmic(ax: Axes, low: float, high: float) -> None:
-    """Set a log scale over at least a decade, with whole numbers as labels if there are few decades."""
-    ax.set_yscale("log")
-    middle = np.sqrt(low * high)
-    ax.set_ylim(min(low / 1.3, middle / 3.2), max(high * 1.6, middle * 3.2))
-    if ax.get_ylim()[1] / ax.get_ylim()[0] < 1e3:
-        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0), numticks=6))
-    else:
-        ax.yaxis.set_major_locator(LogLocator(numticks=5))
-    if high < 1e6 and low > 1e-4:
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: three_digits(value)))
-    ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _note(ax: Axes, text: str) -> None:

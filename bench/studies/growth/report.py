@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
 
 from bench.experiment.experiment import Experiment
 from bench.report.colours import estimator_colour
@@ -240,12 +238,8 @@ ROWS = (
 
 
 def _decades(panels: Any) -> None:
-    """Set one logarithmic scale for a row of panels, labelled every few decades."""
+    """Set one logarithmic scale for a row of panels, with few labels."""
     for panel in panels:
         panel.set_yscale("log")
-    low, high = np.log10(panels[0].get_ylim())
-    every = max(1, math.ceil((high - low) / 7))
-    ticks = 10.0 ** np.arange(math.ceil(low / every) * every, high, every)
     for panel in panels:
-        panel.yaxis.set_major_locator(FixedLocator(list(ticks)) if len(ticks) > 1 else LogLocator())
-        panel.yaxis.set_minor_locator(NullLocator())
+        log_axis(panel, "y", *panels[0].get_ylim())
