@@ -27,7 +27,7 @@ from bench.run.files import write_all
 
 TERMINAL_WIDTH = 180
 """Fewest characters of a line where the output is not a terminal."""
-TITLE_WIDTH = 92
+TITLE_WIDTH = 86
 """Characters of a line of a figure's title, in a figure of full width."""
 
 
