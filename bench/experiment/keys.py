@@ -16,7 +16,7 @@ from typing import Any
 
 from bench.model import CallableScene
 from bench.model.parameters import Plugin, remember, values
-from bench.model.sources import code_of, file_of, hash_of, hash_of_tree, imports_of_tree
+from bench.model.sources import code_of, file_of, hash_of, hash_of_tree, imports_of_tree, is_below
 
 HARMLESS = {
     "bench.deprecated": "old names of the same things",
@@ -114,7 +114,7 @@ def _file(module: str) -> Path:
 
 def _class_hash(study: type[Plugin]) -> str:
     """Return the hash of the modules that define a study, without what only shows rows."""
-    return "".join(hash_of_tree(_measuring(module)) for module in _defining(study) if module in code(module))
+    return "".join(hash_of_tree(_measuring(module)) for module in _defining(study) if not is_below(module, HARMLESS))
 
 
 def _measuring(module: str) -> ast.Module:

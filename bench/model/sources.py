@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import importlib.machinery
 import importlib.util
+import sys
 from collections.abc import Collection, Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -126,9 +128,18 @@ def _passed_on(package: str) -> dict[str, list[str]]:
 
 @remember
 def file_of(module: str) -> Path | None:
-    """Return the Python file of a module; None where there is none."""
+    """Return the Python file of a module; None where there is none. Imports nothing."""
+    parent = module.rpartition(".")[0]
     try:
-        spec = importlib.util.find_spec(module)
+        if parent and parent not in sys.modules:
+            path = file_of(parent)
+            if path is None or path.name != "__init__.py":
+                return None
+            spec = importlib.machinery.PathFinder.find_spec(module, [str(path.parent)])
+        elif parent and not hasattr(sys.modules[parent], "__path__"):
+            return None
+        else:
+            spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):
         return None
     origin = spec.origin if spec is not None else None
