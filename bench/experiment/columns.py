@@ -133,12 +133,12 @@ class Columns:
 
     @classmethod
     def of(cls, *own: Column) -> Columns:
-        """Return the columns that identify a cell, status and reason, then the study's own columns."""
+        """Return the columns of a study: cell identity, status, reason, its ``own``, versions, key and hidden columns."""
         return cls((*FIRST, DIM, *STATUS, *own, *LAST, *HIDDEN))
 
     @classmethod
     def ordered(cls, names: Sequence[str], *own: Column) -> Columns:
-        """Return columns in the order of ``names``; the other columns follow."""
+        """Return the common and the ``own`` columns, first ``names`` in this order, then the others."""
         by_name = COMMON | {column.name: column for column in own}
         rest = [column for name, column in by_name.items() if name not in names]
         return cls((*(by_name[name] for name in names), *rest))
@@ -191,7 +191,7 @@ class Columns:
 
 
 def _typed(values: pd.Series | None, kind: Kind, count: int) -> Any:
-    """Return a column converted to the type of its kind; without a column, ``count`` missing values."""
+    """Return a column converted to the type of its kind; ``count`` missing values if there is no column."""
     import pandas as pd
 
     if values is None:

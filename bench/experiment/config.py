@@ -30,14 +30,14 @@ def config_dir() -> Path:
 
 
 def experiments(config_dirs: Sequence[Path] = ()) -> list[str]:
-    """Return the names of the experiments that come with the package, and of those in the user's folders."""
+    """Return the sorted names of the package's experiments and of the user's experiments in ``config_dirs``."""
     return sorted(
         {path.stem for folder in (config_dir(), *config_dirs) for path in (folder / "experiment").glob("*.yaml")}
     )
 
 
 def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experiment:
-    """Load the experiment that Hydra composes from overrides; raises :class:`UserError` if one of them is invalid.
+    """Return the experiment that Hydra composes from overrides; raises :class:`UserError` if an override is invalid.
 
     ``config_dirs`` are folders with the user's own experiments, as ``experiment/NAME.yaml``.
     """
@@ -135,7 +135,7 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
 
 
 def explain_sweep(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
-    """Return a sentence on how the sweeps of file and command line combine; none unless both give a sweep."""
+    """Return one sentence on how the sweeps of file and command line combine; empty unless both have a sweep."""
     import yaml
 
     split = [(key.lstrip("+"), value) for key, _, value in (word.partition("=") for word in overrides)]
@@ -391,7 +391,7 @@ def _choice(kind: str, text: Any) -> Choice:
     name, values = parse_identity(text)
     entry = registry.find(kind, name)
     if entry.plugin is not None:
-        # a plugin that leaves the working folder would take relative paths with it
+        # a plugin that changes the working folder would break relative paths
         with guard.capture_output(f"{singular(kind)} {name}"), guard.protect_process():
             build(entry.plugin, values)
     return Choice(entry, tuple(sorted(values.items())))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class Study(Plugin):
     """Measures each cell, and turns rows into tables, charts and a page.
 
-    A study is registered like any plugin: as a folder under ``bench/studies``, in a folder of the user's own, or by an
+    A study is registered like any plugin: as a folder under ``bench/studies``, in a plugin folder of the user, or by an
     entry point.
     """
 
@@ -55,7 +55,7 @@ class Study(Plugin):
         """Print a summary of the rows for the terminal."""
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return a :class:`bench.report.web.content.Content`; None for a table and a chart of any two numbers."""
+        """Return the page's :class:`bench.report.web.content.Content`; None for a table and a chart of any two numbers."""
         return None
 
     def chart(self, experiment: Experiment, rows: pd.DataFrame) -> Sequence[str]:

@@ -243,7 +243,7 @@ class Pool:
             self._reaper = None
 
     def run(self, groups: Sequence[Sequence[Any]]) -> Iterator[list[Answer]]:
-        """Yield answers as they arrive, one per item, and an empty list at least every :data:`TICK`.
+        """Yield answers as they arrive, one per item, and an empty list if none arrive within :data:`TICK`.
 
         The items of a group go to one worker, in order, unless another worker is idle.
         """
