@@ -337,7 +337,10 @@ def _check(words: list[str]) -> int:
 
 
 def _split_scenes(words: Sequence[str], verb: str) -> tuple[list[str], list[str]]:
-    """Return the scenes named first, as a word ``scenes=[...]``, and the other words. Raises :class:`UserError` without."""
+    """Return the scenes named first, as a word ``scenes=[...]``, and the settings after them.
+
+    Raises :class:`UserError` if no scene is named.
+    """
     scenes = list(itertools.takewhile(lambda word: "=" not in word.partition("[")[0] and word[0] != "-", words))
     settings = list(words[len(scenes) :])
     if not scenes and not any(word.lstrip("+").startswith("scenes=") for word in settings):

@@ -20,7 +20,7 @@ SIZES = (1_000, 10_000, 100_000, 1_000_000)
 QUICK_SIZES = (64, 512)
 MEMORY_SIZES = SIZES[1:]
 SECONDS, CALLS = 1.0, 100
-"""Time that the timed calls of one row should fill [s], and a third of the largest number of calls."""
+"""Least total time of the timed calls of one row [s], and largest number of repeats of each of its three calls."""
 LONGEST = 20.0
 """Time per call [s] above which larger batches are skipped."""
 AGREEMENT = 1e-9

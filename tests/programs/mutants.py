@@ -335,7 +335,7 @@ def killed(fault: Fault, folder: Path) -> bool:
         try:
             import pytest
 
-            # a fault may loop or fill the memory: that is noticed too
+            # a fault may loop or fill the memory: the limits make its tests fail
             resource.setrlimit(resource.RLIMIT_CPU, (CPU, CPU))
             resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
             os.chdir(folder)
@@ -363,7 +363,7 @@ def main(words: list[str]) -> int:
     chosen = [fault for fault in FAULTS if not words or any(word in f"{fault.path} {fault.old}" for word in words)]
     if lost := stale(chosen):
         raise SystemExit("\n".join(lost))
-    # loaded once, before forking
+    # imported once, before forking
     import pandas  # noqa: F401
     import pytest  # noqa: F401
     import scipy.special

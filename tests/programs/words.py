@@ -88,7 +88,7 @@ def violations(paths: list[Path], contributing: str) -> dict[str, list[Place]]:
 
 
 def main(arguments: list[str]) -> int:
-    """Print the rules that are broken more often than their ceilings allow; returns the exit status."""
+    """Print the rules broken more often than their ceilings allow, with places; returns the exit status."""
     paths = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
     broken = violations(paths, (ROOT / "CONTRIBUTING.md").read_text())
     ceilings = json.loads(CEILINGS.read_text())

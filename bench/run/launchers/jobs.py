@@ -86,7 +86,7 @@ def read_message(task: Task, message: dict[str, Any], kind: str) -> Answer:
 
 
 class Losses:
-    """Counts lost jobs; a task that is the first of ``limit`` lost jobs counts as crashed."""
+    """Counts lost jobs. A task that is the first unanswered task of ``limit`` lost jobs counts as crashed."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
