@@ -43,7 +43,7 @@ class Figure:
     error: float = 0.0
     """Standard error of the measured number."""
     spread: float = 0.0
-    """Half the range that the source gives or allows."""
+    """Half the range that the source states or allows."""
     factor: float = 0.0
     """Largest ratio at which numbers from heavy-tailed samples agree; 0 to compare by the difference instead."""
 

@@ -174,7 +174,7 @@ def markdown(results: Results) -> str:
 def latex(results: Results) -> str:
     """Return a LaTeX table across both columns of a paper: per claim the verdict and one figure.
 
-    The figure is the most sensitive of those that disagree or, if all agree, of all.
+    The figure is the most sensitive figure that disagrees or, if all figures agree, the most sensitive figure.
     """
     lines = [
         r"\begin{table*}\centering\footnotesize\setlength{\tabcolsep}{3pt}",

@@ -111,7 +111,7 @@ def _unpaired(rows: Mapping[Key, Row], others: Mapping[Key, Row], side: str) -> 
     """Return the cells of ``rows`` that ``others`` lack, each with a phrase: the differences of the nearest cell.
 
     The nearest unpaired cell of ``others``, the side called ``side``, has the same plugins and differs in the fewest
-    parameters. The phrase is empty if there is no such cell.
+    parameters. The phrase is empty without such a cell.
     """
     candidates: dict[Hashable, list[dict[str, Any]]] = {}
     for key, row in others.items():

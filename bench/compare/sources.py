@@ -39,7 +39,7 @@ class Results:
     busy: str = ""
     """The machine's load, if it was more than BUSY per core."""
     n_outdated: int = 0
-    """Number of rows left out, since an older version wrote them without their parameters."""
+    """Number of omitted rows, which an older version wrote without their parameters."""
 
     @property
     def columns(self) -> Columns:

@@ -34,11 +34,11 @@ from bench.model.parameters import parameters, singular
 from bench.model.program import OWN
 
 VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype")
-"""Plugin parameters that have a column of their own and are therefore omitted from identity strings."""
+"""Plugin parameters with their own columns, which are therefore omitted from identity strings."""
 
 
 def labels(parts: Mapping[str, Plugin | None], without: Mapping[str, Collection[str]] | None = None) -> dict[str, str]:
-    """Return identity strings by column, without the parameters in :data:`VIEWS` and those in ``without``."""
+    """Return identity strings by column, without the parameters in :data:`VIEWS` and, by axis, in ``without``."""
     without = without or {}
     scene, law = parts.get("scene"), parts.get("contact")
     scene_values = dict(scene.contact_values) if isinstance(scene, MechanicalScene) else {}
@@ -160,7 +160,7 @@ class Cell:
         return _ranked[self.program_key]
 
     def smoothing(self) -> Smoothing | None:
-        """Return the smoothing that the estimator is measured against; None for J_sigma."""
+        """Return the smoothing of the objective that the estimator is compared with; None for J_sigma."""
         estimator = self.parts.get("estimator")
         try:
             return estimator.smoothing(self.program()) if isinstance(estimator, Estimator) else None

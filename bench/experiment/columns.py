@@ -191,7 +191,7 @@ class Columns:
 
 
 def _typed(values: pd.Series | None, kind: Kind, count: int) -> Any:
-    """Return a column converted to the type of its kind; ``count`` missing values if there is no column."""
+    """Return a column converted to the type of its kind; ``count`` missing values if ``values`` is None."""
     import pandas as pd
 
     if values is None:

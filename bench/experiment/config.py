@@ -335,7 +335,7 @@ CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
 
 
 def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
-    """Validate the settings of all launchers and return those of the chosen one."""
+    """Return the settings of the chosen launcher, after validating the settings of all launchers."""
     settings: dict[str, dict[str, Any]] = {name: {} for name in CLUSTERS}
     for name, types in CLUSTERS.items():
         given = _mapping(config, name) if types else {}

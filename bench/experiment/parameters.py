@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 PROBLEM = ("scene", "contact", "integrator")
 """The parts of the grid that decide the simulation, and so the gradient that estimates are compared with."""
 NOT_PLUGINS = ("study", "theta", "reference")
-"""Entries of a row's parameters that are not a plugin on an axis of the grid."""
+"""Entries of a row's parameters that are not plugins on an axis of the grid."""
 VIEWS = ("noise", "horizon", "dt", "stiffness", "sigma", "smoothing")
 """Identity columns that show a problem's parameters; they identify the problem of rows without parameters."""
 

@@ -40,7 +40,7 @@ class Study(Plugin):
         """Return status, reason and the study's columns for one cell. An exception becomes status and reason."""
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
-        """Return a cell's plugins by axis, without those that do not affect its results; by default all."""
+        """Return a cell's plugins by axis, without plugins that do not affect its results; by default all of ``given``."""
         return given
 
     def unsupported_reason(self, cell: Cell) -> str | None:

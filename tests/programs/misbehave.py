@@ -1,9 +1,9 @@
-"""A bank of misbehaving plugins, faults x places: ``python tests/programs/misbehave.py COUNT [SEED]``.
+"""Runs misbehaving plugins, every fault at every place: ``python tests/programs/misbehave.py COUNT [SEED]``.
 
-Each is a file of its own in one folder of plugins, drawn so that faults and places come equally often. Looked for are: a
-listing or a row of its own for each, with a status and a reason of one line where it did harm; sound cells beside them
-with the same numbers as without them; no traceback, no escape characters, and no process left. Prints a line for each
-finding and one of counts; status 1 for any finding.
+Each plugin is a file in one folder. Cases are drawn so that faults and places are equally frequent. Each plugin must be
+listed or have its own row, with a status and a reason of one line if it did harm. Cells of sound plugins must have the same
+numbers as without the misbehaving plugins. Tracebacks, escape characters and remaining processes are findings. Prints a line
+per finding and one of counts; the exit status is 1 for any finding.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ENDS = {
     "closes_descriptors": "os.closerange(0, 256); ctypes.string_at(0)",
     "stops": "os.kill(os.getpid(), signal.SIGSTOP)",
 }
-"""What ends or holds the process, and cannot be caught in it."""
+"""Faults that end or block the process, and cannot be caught inside it."""
 RAISES = {
     "exits": "sys.exit(0)",
     "raises": "raise ValueError('no\\x1b[31m | estimate\\ntoday')",
@@ -60,7 +60,7 @@ HARMLESS = {
     "warns": "warnings.warn('loudly')",
     "catches_signals": "signal.signal(signal.SIGTERM, signal.SIG_IGN) if threading.current_thread() is threading.main_thread() else None",
 }
-"""Bad manners after which the numbers may be right: ``ok`` is a row of its own."""
+"""Side effects that leave the numbers right: the plugin's rows may be ``ok``."""
 LIES = {
     "lies_in_shape": "np.vstack([value, value])",
     "lies_in_length": "value[..., :-1]",
@@ -74,7 +74,7 @@ LIES = {
     "gives_infinity": "value + np.inf",
     "gives_a_generator": "(one for one in value)",
 }
-"""Values of another kind than promised; some of them can be meant (an array of objects holds the same numbers)."""
+"""Results of a wrong shape, type or value; rows may be ``ok``, since some may be intended (an array of objects)."""
 DECLARES = {
     "no_name": "name = None",
     "odd_name": "name = 'a b[c]'",
@@ -86,7 +86,7 @@ DECLARES = {
     "list_parameter": "much: list = ()",
     "missing_library": "requires = ('a_library_of_no_one',)",
 }
-"""Declarations that nothing can be done with: each is listed with its reason."""
+"""Invalid declarations: each plugin must be listed as unavailable, with the reason."""
 KINDS = {
     "estimators": ("fobg", "Fobg", "scenes=[quadratic] backends=[numpy]", "estimators=[fobg{}]", ("terms", "estimate"), ("unsupported_reason",)),
     "scenes": ("quadratic", "Quadratic", "estimators=[fobg,reinforce] backends=[numpy]", "scenes=[quadratic{}]", ("cost",), ("theta0", "closed_form_gradient", "breakpoints")),
@@ -94,8 +94,8 @@ KINDS = {
     "contacts": ("penalty", "Penalty", "scenes=[bounce_once] backends=[numpy] estimators=[fobg] integrators=[semi_implicit_euler]", "contacts=[penalty{}]", ("force",), ("spring",)),
     "integrators": ("semi_implicit_euler", "SemiImplicitEuler", "scenes=[mass_spring] backends=[numpy] estimators=[fobg]", "integrators=[semi_implicit_euler{}]", ("step",), ("transition",)),
 }  # fmt: skip
-"""By kind: a sound plugin and its class, the rest of a sweep, its own axis, calls of a worker, calls of the plan."""
-# both are ten times what sound plugins take on an idle machine: nothing that is busy is taken for something that hangs
+"""By kind: module and class of a sound plugin, other axes, own axis, methods called by workers, methods called by plan."""
+# limits are ten times what sound plugins take on an idle machine, so that a busy plugin does not count as hanging
 WORDS = ["samples=8", "repeats=3", "timing=false", "workers=2", "timeout=45s", "memory=700m", "reference.samples=4096", "formats=[png]", "--quiet"]  # fmt: skip
 START = "import runpy; from bench.model import trial; trial.TIMEOUT_S = 30.0; runpy.run_module('bench', run_name='__main__')"
 SAID = re.compile(r"Traceback|[\x00-\x08\x0b-\x1f]")

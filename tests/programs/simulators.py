@@ -57,8 +57,8 @@ def swing(x, steps=100, dt=0.02):
 def landing(x, damper=True, contact=True, steps=150, dt=2e-3, slope=False):
     """Return the cost of a ball on a spring floor or, with ``slope``, its derivative by height and speed.
 
-    The floor's damper acts on the way in and out. The derivative neglects it unless ``damper``, and all contact unless
-    ``contact``.
+    The floor's damper acts on the way in and out. The derivative omits the damper's term in speed unless ``damper``, and
+    all contact terms unless ``contact``.
     """
     q, v, dq, dv = x[0], x[1], np.array([1.0, 0.0]), np.array([0.0, 1.0])
     for _ in range(steps):

@@ -1,5 +1,6 @@
-"""Counts steps of the tossed box in MuJoCo whose finite difference spans a contact switch: `tests/programs/straddled.py`.
+"""Counts MuJoCo steps whose finite difference spans a contact switch: `python tests/programs/straddled.py`.
 
+The scene is the tossed box.
 The Jacobians of single steps from differences of 1e-6, 1e-7 and 1e-8 are compared with Jacobians from 1e-8, and the gradients
 with differences of whole rollouts.
 """

@@ -1,4 +1,4 @@
-"""C15: a ball that misses has no gradient, and contacts from distance give it one."""
+"""C15: a ball that misses has gradient 0, and contact forces at a distance make the gradient nonzero."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class SoftWall(Claim):
     labels = ("time step [s]", "mean error of df/dq0")
 
     def measure(self) -> Outcome:
-        """Average the error over starts that are 0.05 away from the physics' kink."""
+        """Average the error over starts that are more than 0.05 away from the exact solution's kink."""
         figures, errors = [], []
         # multiples of the golden ratio cover all phases of a step evenly, evenly spaced starts only some phases
         every = np.arange(STARTS) * GOLDEN % 1.0
@@ -72,7 +72,7 @@ class SoftWall(Claim):
 
 
 def _mean_error(dt: float, shares: np.ndarray) -> float:
-    """Return the mean error of df/dq0 over starts at these shares of [0.02, 1.5], without those near the kink."""
+    """Return the mean error of df/dq0 over starts 0.02 + 1.48 ``shares``, without the starts near the kink."""
     start = 0.02 + 1.48 * shares
     start = start[np.abs(start - KINK) > 0.05]
     truth = np.where(start < KINK, -SPEED, SPEED)

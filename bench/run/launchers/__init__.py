@@ -9,7 +9,7 @@ from bench.run.launchers.launcher import Launcher, local_launcher
 def launcher_of(experiment: Experiment, timed: bool = False, kind: str = "") -> Launcher:
     """Return the experiment's launcher.
 
-    Timed tasks run one at a time on a machine of their own, and all machines are of the given ``kind`` or, if it is
+    Timed tasks run one at a time on an otherwise unused machine, and all machines are of the given ``kind`` or, if it is
     empty, of the first machine's kind. Other tasks run in parallel, each on one thread.
     """
     match experiment.execution.launcher:
