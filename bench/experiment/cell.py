@@ -144,7 +144,7 @@ class Cell:
 
     @property
     def reference_backends(self) -> tuple[Backend, ...]:
-        """The backends able to run the program for a reference, best first, the cell's own last.
+        """The backends that can run the program for a reference, best first, the cell's own backend last.
 
         A backend with physics of its own runs its own program, so only it can compute that program's reference.
         """

@@ -23,8 +23,9 @@ class ComparisonRule:
 
     - ``interval``: estimated, with columns ``<name>_low`` and ``<name>_high``; changed if the intervals do not overlap.
     - ``spread``: changed if the intervals do not overlap and the ratio is large enough to matter (a variance).
-    - ``paired``: an error estimated from noise that is the same in both results; changed if the mean estimate in the
-      column ``mean`` moved by more than rounding, relative to its previous distance from the gradient in ``reference``.
+    - ``paired``: an error estimated with the same noise in both results; changed if the mean estimate in the column
+      ``mean`` or the variance in the column ``variance`` moved by more than rounding; worse or better by the root mean
+      squared error about the previous gradient in the column ``reference``.
     - ``exact``: computed without noise; changed by a ratio that matters and by more than rounding.
     - ``time``: seconds, compared on request only, and relative to the spread between runs.
     - ``verdict``: one of ``order``, which starts with the worst.
@@ -173,7 +174,7 @@ class Columns:
         return [column.name for column in self.all if column.kind == kind]
 
     def named(self, kind: Kind) -> list[str]:
-        """Call :meth:`of_kind` by its old name."""
+        """Return :meth:`of_kind`; this is its old name."""
         deprecated.warn("Columns.named", "Columns.of_kind")
         return self.of_kind(kind)
 

@@ -162,7 +162,7 @@ def _split(value: str) -> list[str]:
 
 
 def _quote_identities(value: str) -> str:
-    """Quote each identity string of a list: Hydra needs quotes around brackets, and a shell removes them."""
+    """Return a list with its identity strings quoted: Hydra needs quotes around brackets, and a shell removes them."""
     inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
     items, depth = [""], 0
     for character in inner:
@@ -358,7 +358,7 @@ def _one_of(key: str, value: Any, allowed: Sequence[str]) -> str:
 
 
 def _amount(key: str, value: Any, units: Mapping[str, float], example: str) -> float | None:
-    """Return a positive number with one of the units, or None for no limit."""
+    """Return an amount such as ``10m`` as a number of base units, greater than 0, or None for no limit."""
     if value is None:
         return None
     text = str(value).strip().lower()

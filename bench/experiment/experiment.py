@@ -40,7 +40,7 @@ class Execution:
     stop: bool = False
     """Whether the first failed cell ends the run."""
     versions: str = "warn"
-    """How to treat stored rows made with other library versions: ``ignore``, ``warn`` or ``rerun``."""
+    """How to treat stored rows computed with other library versions: ``ignore``, ``warn`` or ``rerun``."""
     retry: tuple[str, ...] = ()
     """Statuses of stored rows that are run again."""
     launcher: str = "local"

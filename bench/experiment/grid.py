@@ -128,7 +128,7 @@ def expand(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _join(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return one point that has the axes of all parts; raises :class:`UserError` for an axis in two of them."""
+    """Return one point with the axes of all parts; raises :class:`UserError` if two parts have the same axis."""
     point = dict(itertools.chain(*(part.items() for part in parts)))
     if len(point) < sum(map(len, parts)):
         name = next(name for name in point if sum(name in part for part in parts) > 1)
@@ -175,7 +175,7 @@ def coerce_finite(values: Any, name: str) -> tuple[float, ...]:
 def applies(axis: str, kind: str, plugin: str, known: Mapping[str, Any]) -> str | None:
     """Return the parameter of a plugin that a sweep axis names, or None.
 
-    ``known`` are the plugin's parameters by name. ``gamma``, ``alpha_order.gamma`` and
+    ``known`` are the plugin's parameters by name. ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and
     ``estimator.alpha_order.gamma`` name the same parameter.
 
     >>> applies("alpha_order.gamma", "estimators", "alpha_order", {"gamma": 1.0})

@@ -4,8 +4,8 @@ Rows that finish together are one small JSON file under ``pending/``. At the end
 into ``rows.parquet``. Every file is written completely under a unique name and then renamed into place, and is deleted only
 by a run that has read it and written its rows into another file. So nothing is locked, a run can be killed at any
 moment, and several runs can write to one directory: the stored rows are the newest row of each key in all files. The newest
-row has the largest ``sequence``, a counter that only grows. Clocks would not do: they differ between machines, and may be
-wrong for an hour.
+row has the largest ``sequence``, a counter that only grows. Clocks are not used, since they differ between machines and may
+be wrong for an hour.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Store:
                 self._claim.unlink()
 
     def _refuse_other_studies(self, studies: Iterable[str]) -> None:
-        """Raise :class:`UserError` if one of ``studies`` is not this store's."""
+        """Raise :class:`UserError` if ``studies`` contains another study than this store's."""
         others = sorted(set(studies) - {"", self._study}) if self._study else []
         if others:
             raise UserError(

@@ -55,7 +55,7 @@ class TaskHandler:
                 self._session.problems.of(item.backend, item.cell)
             except KeyboardInterrupt:
                 raise
-            except BaseException:  # the error is raised again, and reported, when the cell is measured
+            except BaseException:  # the error is reported when the cell is measured
                 return
 
     def __call__(self, item: Task) -> dict[str, Any]:
