@@ -1,6 +1,6 @@
 """The Python interface: run an experiment, load stored rows, compile a problem, estimate a gradient.
 
-Names and settings are those of the command line.
+Names and settings are the same as on the command line.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def run(experiment: str | Sequence[str] = (), **overrides: Any) -> pd.DataFrame:
 
     ``experiment`` is the name of an experiment, or a list of command-line words. ``overrides`` are settings:
     ``run("stiffness_sweep", samples=32, sweep={"stiffness": [1e2, 1e4]}, results_dir="out")``. Parameters of plugins are
-    nested dictionaries: ``scene={"pushing": {"mass": 0.2}}``. Raises :class:`bench.UserError` for bad input.
+    nested dictionaries: ``scene={"pushing": {"mass": 0.2}}``. Raises :class:`bench.UserError` for invalid input.
     """
     from bench.experiment import config
     from bench.experiment.axes import with_axes
@@ -81,9 +81,8 @@ def _hydra_value(value: Any, quoted: bool = True) -> str:
 def load(directory: str | Path) -> pd.DataFrame:
     """Load an experiment's stored rows, one per cell, with a numeric column per axis that its last run swept.
 
-    The column ``parameters`` has every parameter of every plugin as JSON, with the present default of any that a row
-    lacks. Raises :class:`bench.UserError` if no rows are
-    stored.
+    The column ``parameters`` contains every parameter of every plugin as JSON, with present defaults for parameters that
+    a row lacks. Raises :class:`bench.UserError` if no rows are stored.
     """
     import pandas as pd
 
@@ -121,8 +120,8 @@ def problem(
 
     ``problem.value(theta, w)``, ``.grad`` and ``.score`` take ``theta (d,)`` or ``(d, B)`` and noise ``w (n_w, B)``.
     ``problem.program.theta0`` is the point at which gradients are taken. ``theta`` names float parameters of the scene
-    and the contact law as the decision variable in place of the scene's own. Raises :class:`bench.UserError` for a bad
-    name or value, and :class:`bench.Unsupported` for a combination that cannot run or a library that is not installed.
+    and the contact law as the decision variable in place of the scene's own. Raises :class:`bench.UserError` for an
+    invalid name or value, and :class:`bench.Unsupported` if the combination cannot run or a library is not installed.
     """
     at = None if theta0 is None else tuple(map(float, theta0))
     return compile_problem(scene, contact, integrator, backend, Decision(tuple(theta), at))
@@ -164,10 +163,11 @@ def estimate(
     reference_samples: int = 1 << 18,
     tolerance: float = 0.005,
 ) -> Estimates:
-    """Compute R independent estimates of grad J_sigma at ``theta0`` from N samples each, with bias and variance.
+    """Compute R = ``repeats`` independent estimates of grad J_sigma at ``theta0``, with their bias and variance.
 
-    The noise is the same as in the cells of an experiment with this seed. The reference gradient is the closed form,
-    quadrature or long sampling of the same problem, with up to ``reference_samples`` samples. Raises
+    Each estimate uses N = ``samples`` samples. The noise is the same as in the cells of an experiment with this seed. The
+    reference gradient is the closed form, quadrature or long sampling of the same problem, with up to
+    ``reference_samples`` samples, until its relative standard error is at most ``tolerance``. Raises
     :class:`bench.Unsupported` if the estimator cannot be used on the problem.
     """
     from bench.measure import noise, reference, statistics

@@ -1,4 +1,4 @@
-"""The commands of the command line: a thin layer over the modules below."""
+"""The commands of ``python -m bench``: parses their words and calls the modules that do the work."""
 
 from __future__ import annotations
 
@@ -93,9 +93,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _stop_on_signals() -> Iterator[None]:
     """Make SIGTERM and SIGHUP stop a command like Ctrl-C, and a second signal end it immediately without a message.
 
-    Nothing is lost then: finished rows are on disk, and workers end with their run. In a finaliser or a callback of the
-    garbage collector, Python would print the exception and go on. There it stays silent, ``INTERRUPTED`` is set, and the
-    run stops after the cell.
+    No finished row is lost, since rows are on disk and workers end with their run. In a finaliser or a callback of the
+    garbage collector, Python would print the KeyboardInterrupt and continue: it is not printed there, and since
+    ``INTERRUPTED`` is set, the run stops after the current cell.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -116,7 +116,7 @@ def _stop_on_signals() -> Iterator[None]:
     sys.unraisablehook = hide_interrupt
     handlers = {name: signal.getsignal(name) for name in names}
     for name in names:
-        if handlers[name] not in (signal.SIG_IGN, None):  # as under nohup
+        if handlers[name] not in (signal.SIG_IGN, None):  # ignored signals stay ignored, as under nohup
             signal.signal(name, stop)
     try:
         yield
@@ -169,7 +169,7 @@ def _print_overview() -> None:
 
 
 def _load(words: Sequence[str], notes: bool = True) -> Experiment:
-    """Load the experiment that the words describe. Prints notes about them on stderr if ``notes``."""
+    """Return the experiment that the words describe. With ``notes``, prints on stderr how their sweeps combine."""
     from bench.experiment import config
 
     overrides, folders = [], []
@@ -337,7 +337,10 @@ def _check(words: list[str]) -> int:
 
 
 def _split_scenes(words: Sequence[str], verb: str) -> tuple[list[str], list[str]]:
-    """Return the scenes named first and the settings after them. Raises :class:`UserError` if no scene is named."""
+    """Return the scenes named first, as a word ``scenes=[...]``, and the settings after them.
+
+    Raises :class:`UserError` if no scene is named.
+    """
     scenes = list(itertools.takewhile(lambda word: "=" not in word.partition("[")[0] and word[0] != "-", words))
     settings = list(words[len(scenes) :])
     if not scenes and not any(word.lstrip("+").startswith("scenes=") for word in settings):
@@ -349,12 +352,12 @@ def _split_scenes(words: Sequence[str], verb: str) -> tuple[list[str], list[str]
 
 
 def _sets_horizon(word: str) -> bool:
-    """Return whether a word of the command line sets the horizon of a scene, as a setting or in brackets."""
+    """Return whether a word of the command line sets a scene's horizon, as a setting or in an identity string."""
     return re.match(r"scene\.\w+\.horizon=|[^=]*\[(.*,)?horizon=|\+?scenes=.*[\[,]horizon=", word) is not None
 
 
 def _gradcheck(words: list[str]) -> int:
-    """Run ``gradient_check`` on the scenes named first. Returns 1 also if a gradient is wrong."""
+    """Run ``gradient_check`` on the scenes named first. Returns 1 if a cell has an error or a gradient is wrong."""
     from dataclasses import replace
 
     from bench.experiment.study import study_of
@@ -393,7 +396,7 @@ def _trace(words: list[str]) -> int:
 
 
 def _main_of(module: str) -> Callable[[list[str]], int]:
-    """Return the function ``main`` of a module, which is imported when the function is called."""
+    """Return a function that imports a module when it is called, and calls the module's ``main``."""
 
     def call(words: list[str]) -> int:
         status: int = importlib.import_module(module).main(words)

@@ -1,6 +1,6 @@
-"""Build the generated pages of the documents: ``python docs/build.py [gallery|columns|api|all]``.
+"""Write the generated pages of the documents: ``python docs/build.py [gallery|columns|api|all]``.
 
-- ``gallery``: the part of ``docs/gallery.md`` between its marks, from the rows in ``results/standard``.
+- ``gallery``: the part of ``docs/gallery.md`` between two marks, from the rows in ``results/standard``.
 - ``columns``: ``docs/columns.md``, from the columns that each study declares.
 - ``api``: ``docs/api.md``, from the signatures and docstrings of all public names.
 """
@@ -44,8 +44,8 @@ MARKS = "<!-- gallery -->", "<!-- end of gallery -->"
 def gallery_page(page: Path, results: Path) -> str:
     """Return the text of a gallery page with the entries of all experiments that have rows in a results directory.
 
-    The entries replace the text between the two marks. An experiment without stored rows keeps its present entry. Raises
-    :class:`UserError` if the page has no marks or there is no entry to write.
+    The entries replace the text between :data:`MARKS`. The entry of an experiment without stored rows is unchanged.
+    Raises :class:`UserError` if the page has no marks or there is no entry to write.
     """
     text = page.read_text()
     match = re.search(f"{MARKS[0]}(.*?){MARKS[1]}", text, re.DOTALL)
@@ -170,7 +170,7 @@ def api_page() -> str:
 
 
 def group_of(name: str) -> str:
-    """Return the heading under which a public name stands."""
+    """Return the title of the group, a key of :data:`GROUPS`, that a public name belongs to."""
     value = getattr(bench, name)
     if not isinstance(definition(name).node, ast.FunctionDef | ast.ClassDef):
         return "Types and constants"
@@ -182,7 +182,7 @@ def group_of(name: str) -> str:
 
 
 def entry_of(name: str) -> str:
-    """Return heading, signature, docstring and table of members of a public name."""
+    """Return the Markdown entry of a public name: heading, signature, docstring and table of members."""
     tree = definition(name)
     signature, members = name, []
     if isinstance(tree.node, ast.FunctionDef):
@@ -203,7 +203,7 @@ def entry_of(name: str) -> str:
 
 
 def members_of(node: ast.ClassDef) -> Iterator[tuple[str, str]]:
-    """Yield head and first paragraph of each public field, class variable, property and method that a class defines."""
+    """Yield signature and meaning of each public field, class variable, property and method that a class defines."""
     for member, doc in zip(node.body, [*(docstring_after(later) for later in node.body[1:]), ""], strict=True):
         if isinstance(member, ast.AnnAssign) and isinstance(member.target, ast.Name):
             if not member.target.id.startswith("_"):
@@ -217,7 +217,7 @@ def members_of(node: ast.ClassDef) -> Iterator[tuple[str, str]]:
 
 
 def docstring_after(node: ast.stmt) -> str:
-    """Return the string that an expression statement consists of, or an empty string."""
+    """Return the string if the statement is only a string, as after an assignment; otherwise an empty string."""
     value = node.value if isinstance(node, ast.Expr) else None
     return value.value if isinstance(value, ast.Constant) and isinstance(value.value, str) else ""
 
@@ -259,7 +259,7 @@ def markdown(text: str) -> str:
 
 
 def definition(name: str) -> Definition:
-    """Return the definition of a public name of ``bench``, followed through the modules that import it."""
+    """Return the definition of a public name of ``bench``, in the module that defines it."""
     return find_definition("bench", name)
 
 
@@ -302,7 +302,7 @@ PAGES: dict[str, tuple[str, Callable[[], str]]] = {
 
 
 def main(names: Sequence[str]) -> None:
-    """Write the named pages, all of them without names, and print their paths."""
+    """Write the named pages, or all pages if ``names`` is empty, and print their paths."""
     if unknown := [name for name in names if name not in (*PAGES, "all")]:
         raise UserError(f"unknown page '{unknown[0]}' (allowed: {', '.join([*PAGES, 'all'])})")
     for name, (file, build) in PAGES.items():

@@ -62,7 +62,7 @@ class Page:
         return answer["result"].get("value")
 
     def wait(self, condition: str, seconds: float = 60.0) -> Any:
-        """Wait until a JavaScript condition holds, and return its value."""
+        """Wait until a JavaScript condition is true, and return its value; raises AssertionError after ``seconds``."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             value = self.do(condition)

@@ -9,8 +9,8 @@ from bench.model import registry, trial
 QUICK = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true"
 )
-"""Tests compile hundreds of programs and run each for milliseconds: without optimisation and fused loops XLA compiles in a
-quarter of the time, to the same numbers but for rounding. Processes that a test starts inherit the setting."""
+"""Tests compile hundreds of programs and run each for milliseconds. Without optimisation and fused loops, XLA compiles in a
+quarter of the time, and numbers are equal up to rounding. Processes that a test starts inherit the setting."""
 
 
 def pytest_configure(config):
@@ -29,9 +29,9 @@ BACKENDS = [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for na
 
 @pytest.fixture(params=BACKENDS)
 def backend(request):
-    """Return a backend with its default parameters, for each registered one that can run a scene's own program.
+    """Return a backend with default parameters: each registered backend that can run a scene's own program.
 
-    A test marked ``needs("root")`` is skipped on backends that provide no root finder; one marked ``needs("physics")`` runs
+    A test marked ``needs("root")`` is skipped on backends without a root finder. A test marked ``needs("physics")`` runs
     on physics engines, which step a model of their own.
     """
     entry = registry.find("backends", request.param)
@@ -51,7 +51,7 @@ def backend(request):
 
 @pytest.fixture(autouse=True)
 def untried(monkeypatch):
-    """Plugin files are imported without a trial in a process of their own; tests of the trial replace this fixture."""
+    """Import plugin files without a trial in a separate process; tests of the trial override this fixture."""
     monkeypatch.setattr(trial, "find_fatal_modules", lambda *_: {})
 
 

@@ -32,14 +32,14 @@ SPEED = {"jax": 2e-4, "torch": 8e-3, "numpy": 3e-3, "implicit": 6e-4}
 VIEWS = {"scene": ("horizon", "dt", "sigma", "noise"), "contact": ("stiffness",), "backend": ("dtype",)}
 """The columns that show a parameter of the plugin on an axis."""
 WHO = (*IDENTITY, "experiment", "dim", "key", "study", "parameters")
-"""The columns that rows of failed cells have too."""
+"""The columns that are also filled in rows of failed cells."""
 
 
 # ------------------------------------------------------------------------------------------------ made-up results
 
 
 def results(stiffness: float, sigma: float, samples: int, repeats: int, seed: int, estimator: str, backend: str, contact: str) -> dict[str, Any]:  # fmt: skip
-    """Return made-up results of a cell: stiff contact makes first-order estimates biased and noisy, and no others."""
+    """Return made-up results of a cell: stiff contact makes only first-order estimates biased and noisy."""
     k, n = stiffness, samples
     stiff = max(k, 1.0) / 3e3 if math.isfinite(k) else 0.1
     first = estimator in ("fobg", "alpha_order", "inverse_variance")
@@ -76,7 +76,7 @@ def loaded(*words: str) -> tuple[Experiment, list[Cell]]:
 
 
 def rows_of(made: Experiment, of: Sequence[Cell]) -> pd.DataFrame:
-    """Return rows of real cells with made-up results. Cells that a run would refuse have its status and reason."""
+    """Return rows of real cells with made-up results. Cells that a run would refuse have the refusal's status and reason."""
     rows = []
     for cell in of:
         row = blank_row(made, cell)
@@ -95,7 +95,7 @@ def rows_of(made: Experiment, of: Sequence[Cell]) -> pd.DataFrame:
 
 
 def row(**values: Any) -> dict[str, Any]:
-    """Return a row with these columns and the ``parameters`` they imply. Its plugins need not exist."""
+    """Return a made-up row with these columns and the ``parameters`` they imply. Its plugins need not exist."""
     given = {
         "scene": "pushing", "contact": "penalty", "integrator": "semi_implicit_euler", "backend": "jax",
         "estimator": "fobg", "noise": "action", "horizon": 20, "dt": 0.01, "stiffness": 1e3, "sigma": 0.1,
@@ -134,7 +134,7 @@ def described_by(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _parsed(axis: str, given: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return name and parameters of an identity string. An identity of no registered plugin is a name as a whole."""
+    """Return name and parameters of an identity string. Without such a plugin, the whole string is the name."""
     params = given["estimator_params"] if axis == "estimator" else ""
     try:
         name, own = parse_identity(f"{given[axis]}[{params}]" if params else given[axis])
@@ -148,7 +148,7 @@ def _plain(value: Any) -> Any:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Return a table of rows, as loading a store does."""
+    """Return rows as a typed table, as loading a store does."""
     return COLUMNS.typed(pd.DataFrame(rows))
 
 
@@ -158,7 +158,7 @@ def stiffness_rows(
     estimators: Sequence[str] = NAMES,
     backends: Sequence[str] = BACKENDS,
 ) -> pd.DataFrame:
-    """Return made-up rows of 4 backends, 6 estimators, 2 contact laws, 7 stiffnesses and 2 sigmas, or as given."""
+    """Return made-up rows: by default 4 backends, 6 estimators, 7 stiffnesses and 2 sigmas, under 2 contact laws."""
     rows = []
     for sigma, k, contact, backend, estimator in itertools.product(
         sigmas, stiffness, ("penalty", "complementarity"), backends, estimators

@@ -1,4 +1,4 @@
-"""A copy of the code, in which tests add plugins and edit files, and commands that run in it."""
+"""Commands that run in a copy of the code, or with default signal handlers."""
 
 from __future__ import annotations
 
@@ -51,6 +51,6 @@ os.execv(sys.argv[1], sys.argv[1:])
 def hearing_signals(*words: str) -> list[str]:
     """Return the command line of ``python -m bench`` with default signal handlers.
 
-    A shell ignores SIGINT in background jobs, nohup ignores SIGHUP, and their child processes inherit that.
+    A shell ignores SIGINT in background jobs, nohup ignores SIGHUP, and child processes inherit ignored signals.
     """
     return [sys.executable, "-c", DEFAULT_SIGNALS, sys.executable, "-m", "bench", *words]

@@ -14,7 +14,7 @@ from bench.experiment.words import parse_flag, parse_words
 
 
 def main(words: Sequence[str]) -> int:
-    """Measure, write and print. ``quick=true`` runs small sizes, ``results_dir=`` sets the output folder."""
+    """Measure speeds, write files and print the table. Returns 0. ``quick=true`` runs small sizes."""
     names, settings, _ = parse_words(words, "bench-self", {"quick": "false", "results_dir": "results"})
     if names:
         raise UserError(f"bench-self takes quick=true|false and results_dir=FOLDER, not '{names[0]}'")

@@ -15,7 +15,7 @@ FACTORS = (0.5, 1.0, 2.0)
 
 
 def count_compilations(settings: Mapping[str, Any]) -> Iterator[SpeedRow]:
-    """Yield the number of programs that a sweep of parameters compiles. The target is the number of shapes."""
+    """Yield one row: the number of programs that a sweep compiles, with the number of distinct shapes as target."""
     backend, swept = settings["subjects"][0]["backend"], settings["sweep"]
     points = list(itertools.product(FACTORS, repeat=len(swept["parameters"])))
     compilations = Compilations()

@@ -25,7 +25,7 @@ SMALL = ("scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "samples
 
 
 def measure_commands(quick: bool) -> Iterator[SpeedRow]:
-    """Time the commands of the harness, each in a process of its own, as a user runs it."""
+    """Time the commands of the harness, each in a separate process, as for a user."""
     with tempfile.TemporaryDirectory() as folder:
         side = QUICK_SIDE if quick else SIDE
         sweep = [

@@ -20,15 +20,15 @@ SIZES = (1_000, 10_000, 100_000, 1_000_000)
 QUICK_SIZES = (64, 512)
 MEMORY_SIZES = SIZES[1:]
 SECONDS, CALLS = 1.0, 100
-"""Time that the timed calls of one row should fill [s], and a third of the largest number of calls."""
+"""Least total time of the timed calls of one row [s], and largest number of repeats of each of its three calls."""
 LONGEST = 20.0
 """Time per call [s] above which larger batches are skipped."""
 AGREEMENT = 1e-9
-"""Largest allowed relative difference between the native gradient and that of the first subject."""
+"""Largest allowed relative difference between the native gradient and the gradient of the first subject."""
 NATIVE_COLUMNS = 1024
 COMPARED_SIZES = (1_000, 100_000)
 CPU = "cpu"
-"""The device of a problem that does not name one."""
+"""The device of a problem without an attribute ``device``."""
 
 
 def problem(
@@ -89,7 +89,7 @@ def measure_backends(settings: Mapping[str, Any], quick: bool) -> Iterator[Speed
 
 
 def _caller_mb(w: np.ndarray, gradient: bool, dim: int) -> float:
-    """Return the memory of the noise and the result, which the caller keeps [MB]."""
+    """Return the memory of the noise and the result, which the caller holds, in MB of 2^20 bytes."""
     return float(w.nbytes + w.shape[1] * 8 * (dim if gradient else 1)) / 2**20
 
 
@@ -116,7 +116,7 @@ def measure_baselines(settings: Mapping[str, Any], quick: bool) -> Iterator[Spee
     rival = settings["native"]["rival"]
     other = problem(settings, rival, subject["contact"]) if registry.find("backends", rival).available else None
     if other is not None:
-        other.threads = 1  # like the kernel, since two threads may share a core
+        other.threads = 1  # one thread like the kernel, since two threads may share a core
     for count in sizes:
         w = batch(compiled, count)
         columns = blocks.block_size(count, NATIVE_COLUMNS, native.LANES, 1)

@@ -16,7 +16,7 @@ from bench.run.record import machine
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """One measured number, which should be at most ``target``. NaN: no target."""
+    """One measured number, which should be at most ``target`` (NaN for no target)."""
 
     what: str
     value: float
@@ -33,7 +33,7 @@ class SpeedRow:
 
 
 def format_rows(rows: Sequence[SpeedRow]) -> list[dict[str, str]]:
-    """Return the rows as printed, by column."""
+    """Return the rows as printed, each as strings by column."""
     return [
         {
             "what": row.what,

@@ -1,4 +1,4 @@
-"""``python -m bench claims``: runs published results about gradients through simulators again, each with a verdict."""
+"""``python -m bench claims``: repeats published results on gradients through simulators, with a verdict on each."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OPTIONS = ("--list", "--quick", "--again")
 
 
 def main(words: Sequence[str]) -> int:
-    """Run the named claims, or all. Returns 1 if one of them is not reproduced or its code fails."""
+    """Run the named claims, or all, and print verdicts. Returns 1 if a claim is not reproduced or its code fails."""
     from bench.claims import discovery, results, tables
     from bench.experiment.words import parse_words
     from bench.report.text import counted

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 STANDARD_ERRORS = 3.5
-"""Standard errors by which a measured figure may differ from a published one. With fewer, one in twenty runs of all claims,
-which have some hundred figures, would fail by chance."""
+"""Standard errors by which a measured figure may differ from a published one. All claims together have about a hundred
+figures, so about one run of all claims in twenty fails by chance, and more would with a smaller number."""
 
 SENSITIVITY = 0.05
-"""Relative error of a published number that a figure should detect. A figure that cannot states the reason."""
+"""Relative error of a published number that a figure should detect; otherwise :attr:`Figure.limitation` is the reason."""
 
 REPRODUCED = "reproduced"
 RESERVED = "reproduced with a reservation"
@@ -29,10 +29,10 @@ VERDICTS = (REPRODUCED, RESERVED, NOT_REPRODUCED, UNDECIDED)
 
 @dataclass(frozen=True)
 class Figure:
-    """One published number beside the measured one.
+    """A published number and the measured number.
 
-    They agree if they differ by at most the sum of half the last published digit, the source's own ``spread`` and 3.5
-    standard errors of the measurement. With ``factor`` they agree if each is at most that many times the other.
+    The two agree if they differ by at most the sum of half the last published digit, the source's own ``spread`` and 3.5
+    standard errors of the measurement. With ``factor``, they agree if each is at most ``factor`` times the other.
     """
 
     what: str
@@ -43,9 +43,9 @@ class Figure:
     error: float = 0.0
     """Standard error of the measured number."""
     spread: float = 0.0
-    """Half the range that the source gives or allows."""
+    """Half the range that the source states or allows."""
     factor: float = 0.0
-    """Largest ratio at which two numbers with heavy tails agree. 0: the difference decides."""
+    """Largest ratio at which numbers from heavy-tailed samples agree; 0 to compare by the difference instead."""
 
     @property
     def value(self) -> float:
@@ -54,7 +54,7 @@ class Figure:
 
     @property
     def tolerance(self) -> float:
-        """Largest difference at which the two agree. With ``factor``, the largest difference upwards."""
+        """Largest difference at which the two numbers agree. With ``factor``, the largest difference upwards."""
         if self.factor:
             return (self.factor - 1.0) * abs(self.value)
         return last_digit(self.published) / 2 * (1 + 1e-9) + self.spread + STANDARD_ERRORS * self.error
@@ -71,7 +71,7 @@ class Figure:
 
     @property
     def detectable_error(self) -> float:
-        """Smallest relative error of the published number that would be detected: the two would no longer agree."""
+        """Smallest relative error of the published number with which the two numbers would no longer agree."""
         if self.value == 0.0:
             return 0.0 if self.tolerance < 1.0 else math.inf
         if self.factor:
@@ -85,7 +85,7 @@ class Figure:
 
     @property
     def limitation(self) -> str:
-        """The main reason why an error of 5% is not detected. Empty if it is."""
+        """The main reason why an error of 5% is not detected; empty if it is detected."""
         if self.is_sensitive:
             return ""
         if self.factor:
@@ -126,7 +126,7 @@ class Outcome:
 
 
 def verdict(figures: Sequence[Figure], reservation: str = "") -> str:
-    """Return one of :data:`VERDICTS`. It is a reservation, too, if no figure detects an error of 5%."""
+    """Return one of :data:`VERDICTS`. The verdict has a reservation, too, if no figure detects an error of 5%."""
     if any(not figure.agrees for figure in figures):
         return NOT_REPRODUCED
     if not any(figure.can_fail for figure in figures):
@@ -135,7 +135,7 @@ def verdict(figures: Sequence[Figure], reservation: str = "") -> str:
 
 
 class Claim(Plugin):
-    """A published result that a few figures decide. ``name`` is short: ``C1``.
+    """A published result, verified by a few figures. ``name`` is short, such as ``C1``.
 
     Claims are plugins of the kind ``claims``: the files of ``bench/claims/published``, files in a folder ``plugins=DIR``,
     and classes or modules that an entry point of the group ``bench.claims`` names.

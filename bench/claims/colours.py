@@ -17,7 +17,7 @@ __all__ = ["GREY", "bars", "estimator_colour"]
 
 
 def bars(axes: Axes, x: Sequence[float], measured: Sequence[tuple[float, float]], **look: Any) -> None:
-    """Draw points with 95% intervals. ``measured`` has pairs of a mean and its standard error.
+    """Draw points with 95% intervals. ``measured`` contains pairs of a mean and its standard error.
 
     On a logarithmic axis an interval that reaches 0 ends at a tenth of its mean.
     """

@@ -1,4 +1,4 @@
-"""Finds claims through the plugin registry, and puts them in the order of the course."""
+"""Finds claims through the plugin registry, and sorts them by lesson."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ LESSONS = {
     "Chaos": "Beyond the horizon of chaos derivatives are right and useless.",
     "Windows and objectives": "Shorter problems have tamer gradients, of another objective.",
 }
-"""The lessons in the order of the course, each in a sentence. Other claims may bring lessons of their own."""
+"""The lessons in order, each with a summary of one sentence. Claims of other packages may add lessons."""
 
 
 def claims() -> dict[str, type[Claim]]:
-    """Return all claims by name, in the order of the course. A plugin that cannot be used is reported on stderr."""
+    """Return all claims by name, sorted by lesson. A plugin that cannot be used is reported on stderr."""
     entries = registry.entries_with("claims", PUBLISHED).values()
     others = (entry for kind, table in registry.entries().items() if kind != "claims" for entry in table.values())
     for entry in (*entries, *others):
@@ -53,9 +53,9 @@ def _position(claim: type[Claim]) -> tuple[int, str, int]:
 
 
 def select(claims: Mapping[str, type[Claim]], names: Sequence[str], quick: bool) -> list[type[Claim]]:
-    """Return the claims of these names, or all, and of those only the quick ones with ``quick``.
+    """Return the named claims, or all if ``names`` is empty; with ``quick``, only the quick claims among them.
 
-    Names count without regard to case. Raises :class:`UserError` for one that does not exist.
+    Names are case-insensitive. Raises :class:`UserError` for an unknown name.
     """
     by_lower = {name.lower(): name for name in claims}
     for name in names:

@@ -67,7 +67,7 @@ def measure(claim: type[Claim]) -> ClaimResult:
 
 
 def key_of(claim: type[Claim], used: tuple[tuple[str, str], ...]) -> str:
-    """Return the hash of the claim's code, of what claims are made of, and of the plugins used."""
+    """Return the hash of the code of the claim, the toolkit of claims, and the plugins used."""
     digest = hashlib.sha256(module_hash(claim.__module__, toolkit.__name__).encode())
     for kind, name in used:
         digest.update(plugin_hash(registry.usable(kind, name)).encode())
@@ -75,7 +75,7 @@ def key_of(claim: type[Claim], used: tuple[tuple[str, str], ...]) -> str:
 
 
 def path_of(directory: Path, name: str) -> Path:
-    """Return the path of a claim's result."""
+    """Return the path of a claim's stored result."""
     return directory / f"{name}.json"
 
 

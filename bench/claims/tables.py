@@ -1,4 +1,4 @@
-"""Writes the results of claims: a chart each, one page, and tables in Markdown, CSV and LaTeX."""
+"""Writes the results of claims: a chart per claim, one page, and tables in Markdown, CSV and LaTeX."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bench.run.files import write_all
 
 Results = Sequence[tuple[type[Claim], ClaimResult]]
 WIDE = 26
-"""Largest length of a label [characters] with which two fit beside each other below a chart."""
+"""Length of the longest label [characters] for which a legend below a chart has two columns."""
 BOLD_WIDTH, SMALL_WIDTH = 48, 54
 """Characters of a bold and of a small line above a chart 3.5 inches wide."""
 CSS = """body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
@@ -98,7 +98,7 @@ def detectable_text(figure: Figure) -> str:
 
 
 def insensitive_text(figures: Sequence[Figure]) -> str:
-    """Return how many figures cannot detect an error of 5%, and why, as text. Empty if all can."""
+    """Return a sentence on how many figures cannot detect an error of 5%, and why; empty if all can."""
     limits = [figure.limitation for figure in figures if figure.limitation]
     if not limits:
         return ""
@@ -107,7 +107,7 @@ def insensitive_text(figures: Sequence[Figure]) -> str:
 
 
 def readable_figures(figures: Sequence[Figure]) -> pd.DataFrame:
-    """Return the table of figures that people read: a row per figure, every value as text."""
+    """Return the table of figures for readers: one row per figure, with every value as text."""
     return pd.DataFrame(
         {
             "figure": figure.what,
@@ -122,7 +122,7 @@ def readable_figures(figures: Sequence[Figure]) -> pd.DataFrame:
 
 
 def figures_table(results: Results) -> pd.DataFrame:
-    """Return one row per figure, with every digit."""
+    """Return the table of figures for programs: one row per figure, with every digit."""
     rows = [
         {
             "claim": claim.name, "lesson": claim.lesson, "source": claim.source, "figure": figure.what,
@@ -138,7 +138,7 @@ def figures_table(results: Results) -> pd.DataFrame:
 
 
 def by_lesson(results: Results) -> Iterator[tuple[str, str, Results]]:
-    """Yield each lesson in the order of the course, with its summary and its claims."""
+    """Yield each lesson, in order, with its summary and its claims."""
     names = dict.fromkeys([*LESSONS, *(claim.lesson for claim, _ in results)])
     for lesson in names:
         own = [(claim, result) for claim, result in results if claim.lesson == lesson]
@@ -172,7 +172,10 @@ def markdown(results: Results) -> str:
 
 
 def latex(results: Results) -> str:
-    """Return a LaTeX table across both columns of a paper: per claim its most sensitive figure and the verdict."""
+    """Return a LaTeX table across both columns of a paper: per claim the verdict and one figure.
+
+    The figure is the most sensitive figure that disagrees or, if all figures agree, the most sensitive figure.
+    """
     lines = [
         r"\begin{table*}\centering\footnotesize\setlength{\tabcolsep}{3pt}",
         r"\begin{tabular}{@{}lp{3.7cm}p{5cm}rrp{2.7cm}@{}}",
@@ -227,7 +230,7 @@ def page(results: Results, charts: dict[str, Path]) -> str:
 
 
 def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> Iterator[str]:
-    """Yield the lines that the terminal shows for one claim."""
+    """Yield the lines printed for one claim."""
     origin = ", as stored" if is_stored else ""
     yield f"{claim.name:<4} {result.verdict:<29} {duration(result.seconds):>7}{origin}  {claim.statement}"
     for figure in result.figures:

@@ -1,4 +1,4 @@
-"""Building blocks of claims: problems by plugin name or scene, exact and sampled moments, gradient descent."""
+"""Building blocks of claims: problems from identity strings, exact and sampled moments, gradient descent."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from bench.model import Estimator, Problem, Scene
 from bench.model.identity import parse_identity
 
 used: set[tuple[str, str]] = set()
-"""Kind and name of the plugins made since the set was cleared. The numbers of a claim depend on them."""
+"""Kind and name of the plugins built since the set was cleared. The numbers of a claim depend on them."""
 WIDTH = 9.0
 """Range of the quadrature rules [standard deviations]. A normal variable is outside with probability 2e-19."""
 
 
 def plugin(kind: str, identity: str, defaults: Mapping[str, Any] | None = None) -> Any:
-    """Return a plugin by its identity string, ``penalty[stiffness=1e4]``, over the values ``defaults`` of a scene.
+    """Return the plugin of an identity string, ``penalty[stiffness=1e4]``; ``defaults`` are a scene's own values.
 
-    Raises :class:`Unsupported` if a library that it needs is not installed.
+    Raises :class:`Unsupported` if a library that the plugin needs is not installed.
     """
     used.add((kind, parse_identity(identity)[0]))
     return make(kind, identity, defaults)
@@ -38,7 +38,7 @@ def problem(
 ) -> Problem:
     """Compile a scene, given by its identity string or as an object.
 
-    The contact law and the integrator count if the scene has contacts and a motion. Raises :class:`Unsupported` for a
+    The contact law counts if the scene has contacts, the integrator if it has motion. Raises :class:`Unsupported` for a
     combination that cannot run here.
     """
     return compile_problem(scene, contact, integrator, backend, make=plugin)
@@ -73,7 +73,7 @@ def hermite(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 
 def expectation(function: Callable[[np.ndarray], np.ndarray], count: int = 400_000) -> tuple[float, float]:
-    """Return E function(w) for one standard normal variable, and its difference from a rule with other nodes.
+    """Return E function(w) for one standard normal variable, and its error: the difference from a rule with other nodes.
 
     ``function`` maps ``(1, B)`` to ``(B,)``. If it jumps, the error is about the weight of one node times the jump.
     """

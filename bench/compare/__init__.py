@@ -20,14 +20,14 @@ from bench.experiment.words import parse_flag, parse_words
 
 @dataclass(frozen=True)
 class Request:
-    """What to compare, from the command line."""
+    """The two results to compare and the options, from the command line."""
 
     before: str
     after: str
     out: Path
     timings: bool = False
     again: tuple[str, ...] = ()
-    """Further runs of before, which show how much times differ between runs."""
+    """Further runs of ``before``, which show how much times differ between runs."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -75,7 +75,7 @@ def compare(
 
 
 def row_remarks(old: Results, new: Results) -> list[str]:
-    """Return which rows are left out, and which parameters are missing on one side and assumed to have their default."""
+    """Return remarks on omitted rows, and on parameters that one side lacks, so that their present default is assumed."""
     remarks = [
         f"{results.n_outdated} rows {when} were made by an older version and are left out"
         for when, results in (("before", old), ("after", new))
@@ -90,7 +90,7 @@ def row_remarks(old: Results, new: Results) -> list[str]:
 
 
 def machine_remarks(old: Results, new: Results, timings: bool) -> list[str]:
-    """Return how different machines affect the comparison, and why times are doubtful if they are judged."""
+    """Return remarks on different machines and, if times are compared, on reasons to doubt them."""
     remarks: list[str] = []
     machines = f"{old.machine or 'unknown'}; {new.machine or 'unknown'}"
     is_same = bool(old.machine) and old.machine == new.machine

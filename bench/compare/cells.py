@@ -17,12 +17,12 @@ from bench.experiment.defaults import completed, missing_parameters
 
 OUTCOMES = ("worse", "better", "changed", "same")
 COUNTS = ("samples", "repeats", "seed")
-"""What identifies a cell besides the parameters of its plugins."""
+"""Columns that identify a cell, besides the parameters of its plugins."""
 FIRST = ("outcome", "change", *IDENTITY, "status_before", "status_after")
-"""The first columns of a comparison. Those of :func:`both_sides` follow, then :data:`LAST`."""
+"""The first columns of a comparison. The columns of :func:`both_sides` follow, then :data:`LAST`."""
 LAST = ("parameters",)
 WORSE_IN = "worse_in"
-"""A column that no file shows: the subjects of the changes for the worse, as a list of :attr:`Change.subject`."""
+"""Internal column, not written to files: the list of :attr:`Change.subject` of the changes for the worse."""
 MAX_CANDIDATES = 50
 """Largest number of unpaired cells that are searched for the one nearest to another unpaired cell."""
 
@@ -30,7 +30,7 @@ Key = tuple[str, ...]
 
 
 def both_sides(columns: Sequence[Column]) -> list[str]:
-    """Return the columns that show judged columns of both sides: ``bias_before``, ``bias_after``."""
+    """Return the names of judged columns on both sides: ``bias_before``, ``bias_after``."""
     return [f"{column.name}_{when}" for column in columns for when in ("before", "after")]
 
 
@@ -40,8 +40,8 @@ def compare_cells(
     """Return one line per cell of either side, with its identity and outcome, and remarks on times.
 
     Two rows are of one cell if all their parameters, samples, repeats and seed are equal. A parameter that a stored row
-    lacks has its present default. Times are judged with ``timed``, and ``again`` are further runs of before that show the
-    spread between runs.
+    lacks has its present default. With ``timed``, times are judged too; ``again`` are further runs of before, which show
+    the spread between runs.
     """
     old, new = rows_by_cell(before), rows_by_cell(after)
     time_changes: dict[Hashable, list[Change]] = {}
@@ -65,7 +65,7 @@ def compare_cells(
 
 
 def rows_by_cell(rows: pd.DataFrame) -> dict[Key, Row]:
-    """Return the rows by the identity of their cell. Of several rows of one cell, the last counts."""
+    """Return the rows by the identity of their cell. If a cell has several rows, the last counts."""
     records = [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
     return {
         (canonical_parameters(row["parameters"]), *(repr(float(row[name])) for name in COUNTS)): row for row in records
@@ -78,7 +78,7 @@ def canonical_parameters(parameters: str) -> str:
 
 
 def assumed_defaults(rows: pd.DataFrame) -> dict[str, Any]:
-    """Return the parameters that some row lacks, with the default that counts in their place: ``{"pushing.hold": 1}``."""
+    """Return the parameters missing from some row, with the defaults assumed for them: ``{"pushing.hold": 1}``."""
     by_names = {}
     for text in rows["parameters"].unique():
         given = json.loads(text)
@@ -98,7 +98,7 @@ def flat_parameters(row: Row) -> dict[str, Any]:
 
 
 def differing_parameters(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the names in which some :func:`flat_parameters` differ."""
+    """Return the names of the parameters that differ between ``rows``, each of :func:`flat_parameters`."""
     names = dict.fromkeys(name for row in rows for name in row)
     return [name for name in names if any(row.get(name) != rows[0].get(name) for row in rows)]
 
@@ -108,9 +108,10 @@ def _succeeded(rows: Mapping[Key, Row]) -> dict[Hashable, Row]:
 
 
 def _unpaired(rows: Mapping[Key, Row], others: Mapping[Key, Row], side: str) -> dict[Key, str]:
-    """Return the cells of ``rows`` that the other side lacks, each with how the nearest unpaired cell there differs.
+    """Return the cells of ``rows`` that ``others`` lack, each with a phrase: the differences of the nearest cell.
 
-    The nearest cell is of the same plugins and differs in the fewest parameters. The string is empty if there is none.
+    The nearest unpaired cell of ``others``, the side called ``side``, has the same plugins and differs in the fewest
+    parameters. The phrase is empty without such a cell.
     """
     candidates: dict[Hashable, list[dict[str, Any]]] = {}
     for key, row in others.items():
@@ -132,7 +133,7 @@ def _unpaired(rows: Mapping[Key, Row], others: Mapping[Key, Row], side: str) -> 
 
 
 def _plugins(row: Row) -> Hashable:
-    """Return what an unpaired cell has in common with the cells that it may be compared with: its plugins."""
+    """Return the plugins of a row by axis. Unpaired cells are only compared with cells of the same plugins."""
     given = json.loads(row["parameters"])
     return tuple(
         sorted((axis, part["name"]) for axis, part in given.items() if isinstance(part, Mapping) and "name" in part)
@@ -158,7 +159,7 @@ def _line(old: Row | None, new: Row | None, columns: Columns, changes: Sequence[
 
 
 def _changes(old: Row, new: Row, columns: Columns) -> list[Change]:
-    """Return the changes of everything except times."""
+    """Return the changes of status and of all compared columns except times."""
     if old["status"] != new["status"]:
         return [_status_change(old, new)]
     if old["status"] != "ok":

@@ -22,7 +22,7 @@ def count_outcomes(table: pd.DataFrame) -> dict[str, int]:
 
 
 def as_json(title: str, table: pd.DataFrame, names: Sequence[str], remarks: Sequence[str]) -> str:
-    """Return the verdict, counts, remarks and changed cells as JSON. ``names`` has the name of each cell."""
+    """Return the verdict, counts, remarks and changed cells as JSON. ``names`` are the cells' names, in table order."""
     result = {
         "comparison": title,
         "worse": bool((table["outcome"] == "worse").any()),

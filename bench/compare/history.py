@@ -1,4 +1,4 @@
-"""Follows results over versions: a chart and a table of each estimator's error and failures."""
+"""Compares results of several versions: a chart and a table of each estimator's error and failures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 7.16, 2.4
 """Size of the chart [inches]."""
 ERRORS = ("paired", "interval", "exact")
-"""Comparison rules of columns that hold an error. History follows the first such column of a study."""
+"""Comparison rules of columns that contain an error. The history uses the first such column of a study."""
 NOT_RUN = ("unsupported", "unavailable")
 """Statuses of cells that never ran, which do not count as failures."""
 LONGEST = 18
@@ -46,7 +46,7 @@ class History:
 
 
 def main(words: Sequence[str]) -> int:
-    """Write the history of the results named in ``words``, the oldest first. Raises :class:`UserError`."""
+    """Write the history of the results named in ``words``, the oldest first. Returns 0. Raises :class:`UserError`."""
     names, settings, _ = parse_words(words, "history", {"out": "runs/history"})
     if len(names) < 2:
         raise UserError("name two results or more, the oldest first: python -m bench history DIR DIR ... [out=DIR]")
@@ -59,7 +59,7 @@ def main(words: Sequence[str]) -> int:
 
 
 def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results]]) -> History:
-    """Return the history of the experiments that all results have. Raises :class:`UserError` if there are none."""
+    """Return the history of the experiments in all results. Raises :class:`UserError` if there are none."""
     shared = [name for name in results[0] if all(name in other for other in results)]
     if not shared:
         raise UserError(f"{', '.join(names)} have no experiment in common")
@@ -86,7 +86,7 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
 def _mean_ratio(
     columns: Columns, pairs: Sequence[tuple[Mapping[str, object], Mapping[str, object]]]
 ) -> tuple[float, int]:
-    """Return the geometric mean of the error's ratios over pairs of rows, and the number of pairs that have one."""
+    """Return the geometric mean of the error ratios of pairs of rows, and the number of pairs with a ratio."""
     column = _error_column(columns)
     if column is None:
         return math.nan, 0

@@ -2,7 +2,7 @@
 
 The study names the rule of each column (:class:`bench.experiment.columns.ComparisonRule`):
 
-- ``paired``: the cells of both sides have the same seed and noise, so unchanged code gives the same mean estimate. The
+- ``paired``: the cells of both sides have the same seed and noise, so unchanged code produces the same mean estimate. The
   estimate changed if the mean or the variance differ by more than ROUNDING. It got worse or better if the root mean
   squared error changed by a factor of at least PAIRED, with both sides measured against the reference of *before*.
 - ``interval``: the two 95% intervals do not overlap.
@@ -65,7 +65,7 @@ class Change(NamedTuple):
     text: str
     """The change in a few words."""
     subject: str = ""
-    """What changed: a column as a reader calls it, ``status``, or ``gone`` and ``new`` for a whole cell."""
+    """The changed column by its name in sentences, or ``status``, or ``gone`` or ``new`` for a whole cell."""
 
 
 def judge(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
@@ -224,7 +224,7 @@ def _size_change(column: Column, old: Row, new: Row) -> Change:
 
 
 def value(row: Row, name: str) -> float:
-    """Return a number of a row, NaN if it has none of that name."""
+    """Return the number in column ``name`` of a row; NaN if there is none."""
     return float(row.get(name, math.nan))
 
 

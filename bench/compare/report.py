@@ -30,11 +30,11 @@ from bench.report.web.document import assemble
 from bench.run.files import make_directory, write_all
 
 PRINTED = 30
-"""Largest number of changes that are printed. The files have all of them."""
+"""Largest number of printed changes. The files contain all changes."""
 LISTED = 100
 """Largest number of changes in the Markdown file, which CI servers show above a run."""
 PHRASES = {"gone": "gone", "status": "no longer ok"}
-"""How the summary names changes that are not of one column."""
+"""Phrases of the summary for changes that are not of one column."""
 LOOKS = dict(
     zip(
         OUTCOMES,
@@ -174,7 +174,7 @@ def _name_part(name: str, value: Any) -> str:
 
 
 def page(comparison: Comparison) -> str:
-    """Return the comparison as a page like that of an experiment."""
+    """Return the comparison as an HTML page in the layout of an experiment's page."""
     table = _worst_first(comparison.table).reset_index(drop=True)
     rows = table.drop(columns=WORSE_IN).assign(
         series=table["outcome"], status=table["status_after"], reason=table["change"]

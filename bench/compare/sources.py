@@ -22,9 +22,9 @@ from bench.model import registry
 STANDARD = "standard"
 """The folder of committed results inside the results folder."""
 CELLS = {*IDENTITY, "status"}
-"""Columns of every table that has one row per cell, also if an older version wrote it."""
+"""Columns of every table with one row per cell, including tables of older versions."""
 NEEDED = {*CELLS, "key", "study", "parameters"}
-"""Columns without which rows cannot be compared."""
+"""Columns that a comparison needs."""
 BUSY = 1.5
 """Load per core above which a machine counts as busy."""
 
@@ -39,7 +39,7 @@ class Results:
     busy: str = ""
     """The machine's load, if it was more than BUSY per core."""
     n_outdated: int = 0
-    """Number of rows left out, since an older version wrote them without their parameters."""
+    """Number of omitted rows, which an older version wrote without their parameters."""
 
     @property
     def columns(self) -> Columns:
@@ -96,7 +96,7 @@ def _extract(name: str, revision: str, path: str, target: Path) -> None:
 
 
 def _read_all(directory: Path, name: str) -> dict[str, Results]:
-    """Return every experiment at or below a directory that has stored rows or a committed table of them."""
+    """Return the results of every experiment with stored rows or a CSV table of rows in a directory or below it."""
     folders = sorted({path.parent for path in directory.rglob("*") if path.suffix in (".parquet", ".csv")})
     own = [folder for folder in folders if STANDARD not in folder.relative_to(directory).parts]
     results = _read_folders(own, name) or _read_folders(folders, name)
@@ -150,7 +150,7 @@ def _stores_identity(rows: pd.DataFrame) -> pd.Series:
 
 
 def _read_rows(folder: Path) -> pd.DataFrame | None:
-    """Read ``rows.parquet`` of a folder, else its table with every value as a string, else return None."""
+    """Return the rows of a folder: of ``rows.parquet``, else of a CSV table with every value as a string, else None."""
     stored = folder / "rows.parquet"
     if stored.exists():
         try:

@@ -27,11 +27,11 @@ EFFECT = 1.5
 FAR = 6.0
 """Distance from the median ratio of the backend's cells, in robust standard deviations, above which a cell differs."""
 LEAST_SPREAD = 0.05
-"""Smallest standard deviation of a logarithmic time between runs that is assumed."""
+"""Lower bound of the assumed standard deviation of a logarithmic time between runs."""
 ALPHA = 1e-3
 """Significance level on each side."""
 FEW = 8
-"""Smallest number of cells with which a backend has a median of its own."""
+"""Smallest number of cells for which a backend's own median is used."""
 RUNS = 3
 """Smallest number of runs of before, the first included, from which a spread is computed."""
 NOTE = (
@@ -46,9 +46,10 @@ Runs = Mapping[Hashable, Row]
 def judge_times(
     name: str, called: str, before: Runs, after: Runs, again: Sequence[Runs]
 ) -> tuple[dict[Hashable, Change], list[str]]:
-    """Return the changes of the time column ``name`` by cell, and remarks. Rows are given by cell.
+    """Return the changes of the time column ``name`` by cell, and remarks.
 
-    ``again`` are further runs of before. ``called`` is the column's name in the messages.
+    ``before``, ``after`` and each further run of before in ``again`` are rows by cell. ``called`` is the column's name in
+    messages.
     """
     keys = [key for key in before if key in after and value(before[key], name) > 0 and value(after[key], name) > 0]
     if not keys:
@@ -78,7 +79,7 @@ def judge_times(
 
 
 def _by_runs(runs: np.ndarray, complete: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return each cell's mean logarithmic time before, and whether the time after is outside the spread between runs."""
+    """Return each cell's mean logarithmic time before, and whether the time after is outside its prediction interval."""
     from scipy.special import stdtrit
 
     count = runs.shape[1]
@@ -91,7 +92,7 @@ def _by_runs(runs: np.ndarray, complete: np.ndarray, now: np.ndarray) -> tuple[n
 def _by_cells(was: np.ndarray, now: np.ndarray, backends: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Return each cell's expected logarithmic time, whether the time after is far from it, and remarks.
 
-    Expected is the time before plus the median change of the cells of its backend.
+    The expected time is the time before plus the median change of the cells of its backend.
     """
     ratios = now - was
     names = np.array(backends)

@@ -1,4 +1,4 @@
-"""Reads the swept axes of stored rows as numeric columns, and rebuilds the plugins of a row, from its own parameters."""
+"""Reads the swept axes of stored rows as numeric columns, and rebuilds a row's plugins from its parameters."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Axis:
-    """One swept quantity: the column that holds it, its meaning, and the names in the sweep that it gathers.
+    """One swept quantity: its column, unit and meaning, and its names in the sweep.
 
     Names that mean the same parameter of different plugins (``mass_spring.damping``, ``penalty.damping``) are one axis.
     """
@@ -33,7 +33,7 @@ class Axis:
     unit: str = ""
     doc: str = ""
     moves: tuple[str, ...] = ()
-    """Columns of other axes that step together with this one (a zip)."""
+    """Columns of the axes that step together with this axis (a zip)."""
 
     @property
     def short(self) -> str:
@@ -64,7 +64,7 @@ def values_of(axis: Axis, rows: pd.DataFrame) -> np.ndarray:
 
 
 def shown_by(view: str, axis: Axis, rows: pd.DataFrame) -> np.ndarray:
-    """Return, per row, whether the column ``stiffness`` or ``smoothing`` shows an axis: a parameter of its contact law."""
+    """Return, per row, whether the column ``view`` (``stiffness`` or ``smoothing``) shows the axis for its contact law."""
     import numpy as np
 
     table = flatten(rows)
@@ -89,8 +89,8 @@ def smoothing_of(law: str) -> str:
 def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
     """Return the axes of a sweep whose values are numbers, in its order.
 
-    An axis takes the name of its parameter, unless that column means something else in some row, as when scene and
-    contact law both have a ``stiffness``: then the axis keeps its full name.
+    An axis is named after its parameter. If the column of that name means something else in some row, the axis has its
+    full name: for example, scene and contact law may both have a ``stiffness``.
     """
     import numpy as np
 
@@ -130,7 +130,7 @@ def _has_value(name: str, table: pd.DataFrame) -> np.ndarray:
 
 
 def _varying_coordinates(table: pd.DataFrame) -> tuple[str, ...]:
-    """Return the names of theta0's coordinates that differ between rows; ``theta0`` where it has but one."""
+    """Return the names of theta0's coordinates that differ between rows; ``theta0`` if it has only one."""
     coordinates = [column for column in table if is_theta_axis(column)]
     if len(coordinates) < 2:
         return (THETA,)
@@ -157,7 +157,7 @@ def _zipped_names(sweep: Mapping[str, Any]) -> list[frozenset[str]]:
 
 
 def _unit_and_doc(names: Iterable[str], table: pd.DataFrame) -> tuple[str, str]:
-    """Return unit and meaning of a parameter, as its plugins declare them; empty where their units differ."""
+    """Return unit and meaning of a parameter, as its plugins declare them; empty strings if their units differ."""
     meanings = {}
     for name in names:
         for column, mask in swept_columns(name, table).items():
@@ -170,18 +170,18 @@ def _unit_and_doc(names: Iterable[str], table: pd.DataFrame) -> tuple[str, str]:
 
 
 def declared_parameters(kind: str, name: str) -> Mapping[str, Parameter]:
-    """Return the parameters that a plugin declares, by name; none where it is not installed."""
+    """Return the parameters that a plugin declares, by name; empty if it is not installed."""
     entry = registry.entries().get(kind, {}).get(name)
     return parameters(entry.plugin) if entry is not None and entry.plugin is not None else {}
 
 
 def with_axes(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
-    """Add to rows a numeric column for every swept axis that is not a column already."""
+    """Return rows with a numeric column added for every swept axis that is not a column already."""
     return rows.assign(**{a.column: values_of(a, rows) for a in axes(experiment.sweep, rows) if a.column not in rows})
 
 
 def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with the columns of the CSV: the study's table, the swept axes, then the cell's whole identity."""
+    """Return rows with the columns of the CSV: the study's table, the swept axes, ``study`` and ``parameters``."""
     extra = [axis.column for axis in axes(experiment.sweep, rows) if axis.column not in rows]
     wide = with_axes(experiment, rows)
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
@@ -206,7 +206,7 @@ def build_plugins(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
 
 
 def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
-    """Return rows whose identity strings omit the parameters of swept axes, which have columns of their own.
+    """Return rows whose identity strings omit the parameters of swept axes, since these have their own columns.
 
     Rows whose plugins are not installed keep their identity strings.
     """

@@ -1,4 +1,4 @@
-"""Makes plugins and compiles problems by the names used on the command line."""
+"""Builds plugins and compiles problems from the identity strings of the command line."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from bench.model.parameters import build, parameters
 
 
 def make(kind: str, identity: str, defaults: Mapping[str, Any] | None = None) -> Any:
-    """Return a plugin by its identity string: ``make("contacts", "penalty[stiffness=1e4]")``.
+    """Return the plugin of an identity string: ``make("contacts", "penalty[stiffness=1e4]")``.
 
-    ``defaults`` are a scene's own values of parameters. Raises :class:`bench.UserError` for a bad name or value and
+    ``defaults`` are a scene's own values of parameters. Raises :class:`bench.UserError` for an invalid name or value and
     :class:`bench.Unsupported` if a library that the plugin needs is not installed.
     """
     name, values = parse_identity(identity)
@@ -43,10 +43,10 @@ def compile_problem(
     decision: Decision | None = None,
     make: Callable[..., Any] = make,
 ) -> Problem:
-    """Compile a scene on a backend, under a contact law and an integrator if the scene has contacts and a motion.
+    """Compile a scene on a backend; the contact law counts if the scene has contacts, the integrator if it has motion.
 
-    Each part is an identity string or a plugin. ``make`` makes plugins from identity strings. Raises what :func:`make`
-    raises, and :class:`bench.Unsupported` for a combination that cannot run.
+    Each part is an identity string or a plugin. ``make`` builds plugins from identity strings. Raises the errors of
+    :func:`make`, and :class:`bench.Unsupported` for a combination that cannot run.
     """
     given_scene: Scene = make("scenes", scene) if isinstance(scene, str) else scene
     law: ContactLaw | None = None

@@ -1,4 +1,4 @@
-"""A cell, one point of a sweep: its plugins and counts, its identity as JSON and as a hash, and why it cannot run."""
+"""A cell, one point of a sweep: its plugins and counts, its identity as JSON and as a hash, and reasons for refusal."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from bench.model.parameters import parameters, singular
 from bench.model.program import OWN
 
 VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype")
-"""Plugin parameters that have a column of their own and are therefore omitted from identity strings."""
+"""Plugin parameters with their own columns, which are therefore omitted from identity strings."""
 
 
 def labels(parts: Mapping[str, Plugin | None], without: Mapping[str, Collection[str]] | None = None) -> dict[str, str]:
-    """Return identity strings by column, without the parameters in :data:`VIEWS` and those in ``without``."""
+    """Return identity strings by column, without the parameters in :data:`VIEWS` and, by axis, in ``without``."""
     without = without or {}
     scene, law = parts.get("scene"), parts.get("contact")
     scene_values = dict(scene.contact_values) if isinstance(scene, MechanicalScene) else {}
@@ -61,7 +61,7 @@ def labels(parts: Mapping[str, Plugin | None], without: Mapping[str, Collection[
 
 
 _ranked: dict[str, tuple[Backend, ...]] = {}
-"""Backends for references by the key of the program."""
+"""Cache of the backends that can compute references, best first, by program key."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,9 @@ class Cell:
         """Hash of everything that decides the cell's numbers, except library versions, which have a column."""
         counts = [self.samples, self.repeats, self.seed, self.timing]
         reference = None if self.budget is None else [self.reference_key, module_hash(REFERENCE)]
-        best = fingerprint(next(iter(self.ranked_backends), None))  # any study may ask it beside the cell's own
+        best = fingerprint(
+            next(iter(self.ranked_backends), None)
+        )  # a study may use this backend besides the cell's own
         return hashed(
             {axis: fingerprint(part) for axis, part in self.parts.items()}, counts, reference, best, self._budget(),
             self._theta(), fingerprint(self.study), module_hash(PROGRAM),
@@ -142,7 +144,7 @@ class Cell:
 
     @property
     def reference_backends(self) -> tuple[Backend, ...]:
-        """The backends able to run the program for a reference, best first, the cell's own last.
+        """The backends that can run the program for a reference, best first, the cell's own backend last.
 
         A backend with physics of its own runs its own program, so only it can compute that program's reference.
         """
@@ -158,7 +160,7 @@ class Cell:
         return _ranked[self.program_key]
 
     def smoothing(self) -> Smoothing | None:
-        """Return the smoothing that the estimator is measured against; None for J_sigma."""
+        """Return the smoothing of the objective that the estimator is compared with; None for J_sigma."""
         estimator = self.parts.get("estimator")
         try:
             return estimator.smoothing(self.program()) if isinstance(estimator, Estimator) else None
@@ -201,7 +203,7 @@ class Cell:
         }
 
     def _view(self, name: str, *parts: Plugin | None, default: float = math.nan) -> float:
-        """Return the parameter of that name from the first part that has one."""
+        """Return the parameter ``name`` of the first part that has it, or ``default``."""
         for part in parts:
             if part is not None and name in parameters(type(part)):
                 return float(getattr(part, name)) if name != "horizon" else int(getattr(part, name))
@@ -222,7 +224,7 @@ class Cell:
         return compose(self.scene, self.contact, self.integrator, self.decision)
 
     def refusal(self) -> tuple[str, str] | None:
-        """Return status and reason if this cell cannot run, or None; an error of a plugin is a reason."""
+        """Return status and reason if this cell cannot run, or None; an error raised by a plugin is a reason."""
         try:
             return self._incompatibility()
         except KeyboardInterrupt:

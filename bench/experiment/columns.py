@@ -23,8 +23,9 @@ class ComparisonRule:
 
     - ``interval``: estimated, with columns ``<name>_low`` and ``<name>_high``; changed if the intervals do not overlap.
     - ``spread``: changed if the intervals do not overlap and the ratio is large enough to matter (a variance).
-    - ``paired``: an error estimated from noise that is the same in both results; changed if the mean estimate in the
-      column ``mean`` moved by more than rounding, relative to its previous distance from the gradient in ``reference``.
+    - ``paired``: an error estimated with the same noise in both results; changed if the mean estimate in the column
+      ``mean`` or the variance in the column ``variance`` moved by more than rounding; worse or better by the root mean
+      squared error about the previous gradient in the column ``reference``.
     - ``exact``: computed without noise; changed by a ratio that matters and by more than rounding.
     - ``time``: seconds, compared on request only, and relative to the spread between runs.
     - ``verdict``: one of ``order``, which starts with the worst.
@@ -133,12 +134,12 @@ class Columns:
 
     @classmethod
     def of(cls, *own: Column) -> Columns:
-        """Return the columns that identify a cell, status and reason, then the study's own columns."""
+        """Return the columns of a study: cell identity, status, reason, its ``own``, versions, key and hidden columns."""
         return cls((*FIRST, DIM, *STATUS, *own, *LAST, *HIDDEN))
 
     @classmethod
     def ordered(cls, names: Sequence[str], *own: Column) -> Columns:
-        """Return columns in the order of ``names``; the other columns follow."""
+        """Return the common and the ``own`` columns, first ``names`` in this order, then the others."""
         by_name = COMMON | {column.name: column for column in own}
         rest = [column for name, column in by_name.items() if name not in names]
         return cls((*(by_name[name] for name in names), *rest))
@@ -173,7 +174,7 @@ class Columns:
         return [column.name for column in self.all if column.kind == kind]
 
     def named(self, kind: Kind) -> list[str]:
-        """Call :meth:`of_kind` by its old name."""
+        """Return :meth:`of_kind`; this is its old name."""
         deprecated.warn("Columns.named", "Columns.of_kind")
         return self.of_kind(kind)
 
@@ -191,7 +192,7 @@ class Columns:
 
 
 def _typed(values: pd.Series | None, kind: Kind, count: int) -> Any:
-    """Return a column converted to the type of its kind; without a column, ``count`` missing values."""
+    """Return a column converted to the type of its kind; ``count`` missing values if ``values`` is None."""
     import pandas as pd
 
     if values is None:

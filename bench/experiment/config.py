@@ -30,14 +30,14 @@ def config_dir() -> Path:
 
 
 def experiments(config_dirs: Sequence[Path] = ()) -> list[str]:
-    """Return the names of the experiments that come with the package, and of those in the user's folders."""
+    """Return the sorted names of the package's experiments and of the user's experiments in ``config_dirs``."""
     return sorted(
         {path.stem for folder in (config_dir(), *config_dirs) for path in (folder / "experiment").glob("*.yaml")}
     )
 
 
 def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experiment:
-    """Load the experiment that Hydra composes from overrides; raises :class:`UserError` if one of them is invalid.
+    """Return the experiment that Hydra composes from overrides; raises :class:`UserError` if an override is invalid.
 
     ``config_dirs`` are folders with the user's own experiments, as ``experiment/NAME.yaml``.
     """
@@ -135,7 +135,7 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
 
 
 def explain_sweep(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
-    """Return a sentence on how the sweeps of file and command line combine; none unless both give a sweep."""
+    """Return one sentence on how the sweeps of file and command line combine; empty unless both have a sweep."""
     import yaml
 
     split = [(key.lstrip("+"), value) for key, _, value in (word.partition("=") for word in overrides)]
@@ -162,7 +162,7 @@ def _split(value: str) -> list[str]:
 
 
 def _quote_identities(value: str) -> str:
-    """Quote each identity string of a list: Hydra needs quotes around brackets, and a shell removes them."""
+    """Return a list with its identity strings quoted: Hydra needs quotes around brackets, and a shell removes them."""
     inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
     items, depth = [""], 0
     for character in inner:
@@ -335,7 +335,7 @@ CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
 
 
 def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
-    """Validate the settings of all launchers and return those of the chosen one."""
+    """Return the settings of the chosen launcher, after validating the settings of all launchers."""
     settings: dict[str, dict[str, Any]] = {name: {} for name in CLUSTERS}
     for name, types in CLUSTERS.items():
         given = _mapping(config, name) if types else {}
@@ -358,7 +358,7 @@ def _one_of(key: str, value: Any, allowed: Sequence[str]) -> str:
 
 
 def _amount(key: str, value: Any, units: Mapping[str, float], example: str) -> float | None:
-    """Return a positive number with one of the units, or None for no limit."""
+    """Return an amount such as ``10m`` as a number of base units, greater than 0, or None for no limit."""
     if value is None:
         return None
     text = str(value).strip().lower()
@@ -391,7 +391,7 @@ def _choice(kind: str, text: Any) -> Choice:
     name, values = parse_identity(text)
     entry = registry.find(kind, name)
     if entry.plugin is not None:
-        # a plugin that leaves the working folder would take relative paths with it
+        # a plugin that changes the working folder would break relative paths
         with guard.capture_output(f"{singular(kind)} {name}"), guard.protect_process():
             build(entry.plugin, values)
     return Choice(entry, tuple(sorted(values.items())))

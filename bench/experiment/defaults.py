@@ -1,9 +1,9 @@
-"""Fills in parameters that stored rows lack, so that a parameter added with a default orphans no row.
+"""Adds missing parameters to stored rows, so that rows remain usable when a plugin gains a parameter with a default.
 
-A stored row keeps every parameter of its plugins and of its study as JSON. Where a plugin has gained a parameter since,
-the row was made with that parameter's present default. Whatever compares, groups or shows rows by their parameters reads
-them through :func:`completed`, :func:`completed_json` or :func:`completed_rows`: ``compare``, ``plan``, ``report``,
-``index`` and :func:`bench.load`. :func:`missing_parameters` names what was filled in, for messages.
+A stored row contains every parameter of its plugins and of its study as JSON. If a plugin has gained a parameter since,
+the row counts as computed with that parameter's present default. All code that compares, groups or shows rows by their
+parameters reads them through :func:`completed`, :func:`completed_json` or :func:`completed_rows`: ``compare``, ``plan``,
+``report``, ``index`` and :func:`bench.load`. :func:`missing_parameters` lists the added parameters, for messages.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ RECORDS = {"theta": Decision, "reference": Budget}
 def completed(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return a row's parameters with today's defaults where a plugin, the study, theta or the reference lacks one.
 
-    Parameters stand in the order in which they are declared today. Those that are no longer declared follow, and a
-    plugin that is not installed keeps the parameters it has. Rows without parameters have none afterwards.
+    Parameters are in the order in which they are declared today, followed by parameters that are no longer declared. The
+    parameters of a plugin that is not installed are unchanged. The result is empty if ``given`` is.
     """
     if not given:
         return {}
@@ -41,7 +41,7 @@ def completed(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def missing_parameters(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters that :func:`completed` fills in, with their values: ``{"pushing.hold": 1}``."""
+    """Return the parameters that :func:`completed` adds, with their values: ``{"pushing.hold": 1}``."""
     return {
         f"{part.get('name', axis)}.{name}": value
         for axis, part in given.items()
@@ -52,13 +52,13 @@ def missing_parameters(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def completed_json(text: str) -> str:
-    """Return the JSON of :func:`completed` parameters, written as new rows have it; text that is not JSON as it is."""
+    """Return :func:`completed` parameters as JSON in the format of new rows; other strings are returned unchanged."""
     return _completed_json(text, registry.folders())
 
 
 @lru_cache(maxsize=50_000)
 def _completed_json(text: str, folders: tuple[Path, ...]) -> str:
-    """Complete JSON, once per text and set of plugin ``folders``, since a folder that is added may bring a plugin."""
+    """Return completed JSON, cached by ``text`` and plugin ``folders``, since an added folder may define a plugin."""
     try:
         given = json.loads(text)
     except (TypeError, ValueError):
@@ -69,15 +69,15 @@ def _completed_json(text: str, folders: tuple[Path, ...]) -> str:
 
 
 def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows whose column ``parameters`` is completed, so that rows stored before and after a change are alike."""
+    """Return rows with the column ``parameters`` completed, so that rows stored before and after a change agree."""
     return rows.assign(parameters=rows["parameters"].map(completed_json)) if "parameters" in rows else rows
 
 
 def defaults_of(axis: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return today's defaults of the entry that stands at ``axis`` of a row's parameters, as JSON-like values.
+    """Return today's defaults, as JSON-like values, of the entry ``axis`` of a row's parameters.
 
     The scene's own values of contact parameters take precedence over the contact law's. Parameters without a default
-    are left out. There are none where the entry is empty or its plugin is not installed.
+    are omitted. The result is empty if the entry is empty or its plugin is not installed.
     """
     part = given.get(axis)
     if not isinstance(part, Mapping):

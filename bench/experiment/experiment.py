@@ -18,7 +18,7 @@ from bench.model.registry import Entry
 
 @dataclass(frozen=True)
 class Choice:
-    """A plugin chosen on an axis, with the parameters that its identity string set."""
+    """A plugin chosen on an axis, with the parameters of its identity string."""
 
     entry: Entry
     values: tuple[tuple[str, Any], ...] = ()
@@ -40,13 +40,13 @@ class Execution:
     stop: bool = False
     """Whether the first failed cell ends the run."""
     versions: str = "warn"
-    """How to treat stored rows made with other library versions: ``ignore``, ``warn`` or ``rerun``."""
+    """How to treat stored rows computed with other library versions: ``ignore``, ``warn`` or ``rerun``."""
     retry: tuple[str, ...] = ()
     """Statuses of stored rows that are run again."""
     launcher: str = "local"
     """Where cells run: ``local``, ``ray`` or ``slurm``."""
     cluster: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of that launcher."""
+    """Settings of the launcher."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,9 @@ class TableLayout:
     """The layout of the table for a paper. It affects no number."""
 
     columns: str = ""
-    """The swept axis whose values are columns; empty for the axis with most values."""
+    """The swept axis whose values are columns; empty for the axis with the most values."""
     rows: tuple[str, ...] = ("estimator",)
-    """``estimator``, where backends that agree share a row, or also ``backend`` for a row per backend."""
+    """``estimator``, so that backends that agree share a row, or ``estimator`` and ``backend``."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Experiment:
     columns: Columns
     """The columns of its rows, as the study declares them."""
     choices: Mapping[str, Sequence[Choice]]
-    """By axis (``scene``, ...), in the order of the study's axes."""
+    """The chosen plugins by axis (``scene``, ...), in the order of the study's axes."""
     values: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
     """Parameters set for plugins by axis, plugin name and parameter."""
     sweep: Mapping[str, Any] = field(default_factory=dict)
@@ -98,14 +98,14 @@ class Experiment:
     """File formats of the charts."""
     table: TableLayout = TableLayout()
     average: tuple[str, ...] = ()
-    """Swept axes over which averages are written; the rows do not depend on it."""
+    """Swept axes over which averages are written; the rows do not depend on this setting."""
     reference: Budget = Budget()
     compile_cache: Path | None = None
     """Folder in which compiled programs are cached between runs."""
     plugins: tuple[Path, ...] = ()
     """Folders with the user's own plugins."""
     timing: bool = False
-    """Whether cells are timed, one at a time on the machine."""
+    """Whether cells are timed, and therefore run one at a time on a machine."""
     execution: Execution = Execution()
 
     @property

@@ -17,7 +17,7 @@ from bench.model.parameters import build, coerce, parameters, singular
 from bench.model.program import OWN
 
 MAX_CELLS = 1_000_000
-"""Cells of the largest sweep; planning it takes minutes."""
+"""Largest number of cells in a sweep; planning that many takes minutes."""
 COUNTS = ("samples", "repeats", "seed")
 """Settings that a sweep can vary besides plugin parameters and :data:`THETA`."""
 THETA = "theta0"
@@ -128,7 +128,7 @@ def expand(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _join(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return one point that has the axes of all parts; raises :class:`UserError` for an axis in two of them."""
+    """Return one point with the axes of all parts; raises :class:`UserError` if two parts have the same axis."""
     point = dict(itertools.chain(*(part.items() for part in parts)))
     if len(point) < sum(map(len, parts)):
         name = next(name for name in point if sum(name in part for part in parts) > 1)
@@ -175,7 +175,7 @@ def coerce_finite(values: Any, name: str) -> tuple[float, ...]:
 def applies(axis: str, kind: str, plugin: str, known: Mapping[str, Any]) -> str | None:
     """Return the parameter of a plugin that a sweep axis names, or None.
 
-    ``known`` are the plugin's parameters by name. ``gamma``, ``alpha_order.gamma`` and
+    ``known`` are the plugin's parameters by name. ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and
     ``estimator.alpha_order.gamma`` name the same parameter.
 
     >>> applies("alpha_order.gamma", "estimators", "alpha_order", {"gamma": 1.0})
@@ -245,7 +245,7 @@ class _Expansion:
         try:
             scene, contact, integrator = (parts.get(axis) for axis in ("scene", "contact", "integrator"))
             at = compose(scene, contact, integrator, decision).theta0.tolist()  # type: ignore[arg-type]
-        except (Unsupported, UserError):  # the cell reports it in its row
+        except (Unsupported, UserError):  # the cell reports the error in its row
             return decision
         for name, values in given.items():
             coordinate = int(name.partition(".")[2])
@@ -285,7 +285,7 @@ class _Expansion:
         key = (id(choice), repr([point[axis] for axis, _ in axes] + [given]))
         if key not in self._plugins:
             values = {k: v for k, v in (given or {}).items() if k in parameters(plugin)}
-            # later ones win: the scene's contact values, settings, identity string, sweep
+            # later values replace earlier ones: the scene's contact values, settings, identity string, sweep
             values |= self._experiment.values.get(group, {}).get(plugin.name, {})
             values |= dict(choice.values) | {parameter: point[axis] for axis, parameter in axes}
             self._plugins[key] = _build(plugin, sorted(values.items()))
@@ -303,7 +303,7 @@ _built: dict[tuple[type[Plugin], str], Plugin] = {}
 
 
 def _build(plugin: type[Plugin], values: Sequence[tuple[str, Any]]) -> Plugin:
-    """Return the instance with these values, built once. 1, 1.0 and True differ: a parameter may accept one only."""
+    """Return the plugin with these values, built once. 1, 1.0 and True differ: a parameter may accept only one."""
     key = (plugin, repr(values))
     if key not in _built:
         _built[key] = build(plugin, dict(values))

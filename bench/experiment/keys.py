@@ -1,7 +1,7 @@
-"""Decides when two results are the same: hashes of plugins, of their parameters, and of all code behind their numbers.
+"""Hashes plugins, their parameters, and all code behind their numbers, to identify equal results.
 
-All code that a plugin, its base classes, the reference or a study's ``measure`` imports counts, from its own package and
-from bench, unless :data:`HARMLESS` lists it.
+The code includes all modules that a plugin, its base classes, the reference or a study's ``measure`` import from the
+plugin's own package and from bench, except the modules in :data:`HARMLESS`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ HARMLESS = {
     "bench.studies.growth.columns": "names, units and meanings of columns",
     "bench.studies.three_errors.columns": "names, units and meanings of columns",
 }
-"""Modules and packages that decide no number though code that does imports them, each with the reason."""
+"""Imported modules and packages that are not hashed since they decide no number, each with the reason."""
 REFERENCE = "bench.run.references"
 """The module that computes reference gradients."""
 PROGRAM = "bench.model.program"
@@ -44,7 +44,7 @@ DISPLAY = ("write", "show", "page", "chart", "faults")
 """Methods of a study that only show its rows."""
 
 _fingerprints: dict[int, tuple[Plugin, str]] = {}
-"""Hashes by identity of the plugin, since equal plugins may differ in their numbers: -0.0 equals 0.0, and False 0."""
+"""Plugins and their hashes by ``id``, since equal plugins may produce different numbers: -0.0 == 0.0, False == 0."""
 
 
 def fingerprint(plugin: Plugin | None) -> str:
@@ -58,23 +58,23 @@ def fingerprint(plugin: Plugin | None) -> str:
             *([files_hash(plugin.files())] if isinstance(plugin, CallableScene) else []),
         ]
         text = json.dumps([plugin.kind, plugin.name, parameters, hashes], default=repr)
-        # the plugin is kept alive, so that its id is not given to another object
+        # the plugin is stored too, so that no other object gets its id
         _fingerprints[id(plugin)] = (plugin, hashlib.sha256(text.encode()).hexdigest())
     return _fingerprints[id(plugin)][1]
 
 
 def hashed(*parts: Any) -> str:
-    """Return a short hash of JSON-like values."""
+    """Return a hash of JSON-like values, as 32 hexadecimal digits."""
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
 def code(*modules: str) -> dict[str, Path]:
-    """Return the files that decide numbers among modules and all that they import, by module name."""
+    """Return the files of modules and of all their imports, by module name, except :data:`HARMLESS` modules."""
     return code_of(modules, HARMLESS)
 
 
 def files_hash(files: Iterable[Path]) -> str:
-    """Return the hash of a user's files and of what they import from bench."""
+    """Return the hash of a user's files and of the modules that they import from bench."""
     paths = list(files)
     modules = [name for path in paths for name in imports_of_tree(ast.parse(path.read_bytes()), path.stem, path)]
     return hash_of([*paths, *code(*(name for name in modules if name.startswith("bench."))).values()])
@@ -82,18 +82,18 @@ def files_hash(files: Iterable[Path]) -> str:
 
 @remember
 def module_hash(*modules: str) -> str:
-    """Return the hash of the code of modules and of all that they import, as far as it decides numbers."""
+    """Return the hash of the code of modules and of all their imports, except :data:`HARMLESS` modules."""
     return hash_of(code(*modules).values())
 
 
 @remember
 def plugin_hash(plugin: type[Plugin]) -> str:
-    """Return the hash of the code behind a plugin: its own, that of its base classes, and all that these import."""
+    """Return the hash of the code behind a plugin: its module, the modules of its base classes, and their imports."""
     return hash_of(plugin_code(plugin).values()) + (_class_hash(plugin) if plugin.kind == "studies" else "")
 
 
 def plugin_code(plugin: type[Plugin]) -> dict[str, Path]:
-    """Return the files that decide a plugin's numbers, by module name; of a study's own module, only what it imports."""
+    """Return the files that decide a plugin's numbers, by module name; for a study, without the study's own modules."""
     modules = _defining(plugin)
     if plugin.kind != "studies":
         return code(*modules)
@@ -101,7 +101,7 @@ def plugin_code(plugin: type[Plugin]) -> dict[str, Path]:
 
 
 def _defining(plugin: type[Plugin]) -> list[str]:
-    """Return the modules that define a plugin's class and its base classes, without those of Python itself."""
+    """Return the modules that define a plugin's class and its base classes, without standard-library modules."""
     modules = dict.fromkeys(cls.__module__ for cls in plugin.__mro__)
     return [m for m in modules if m.partition(".")[0] not in sys.stdlib_module_names and file_of(m) is not None]
 

@@ -1,8 +1,9 @@
-"""Flattens the parameters of stored rows into typed columns, and says which of them make rows the same problem.
+"""Flattens the parameters of stored rows into typed columns, and identifies the problem of each row.
 
-A row keeps its plugins' parameters as JSON. :func:`flatten` turns them into columns once; swept axes, tables, charts and
-pages read those columns. A **problem** is what rows have in common whose errors and costs may be compared: the parameters
-of some parts of the grid (by default :data:`PROBLEM`), those of the study, and theta, see :func:`problem_columns`.
+A row contains its plugins' parameters as JSON. :func:`flatten` turns them into columns once; swept axes, tables, charts
+and pages read these columns. Errors and costs may be compared between rows of one **problem**: rows with the same
+parameters of some parts of the grid (by default :data:`PROBLEM`) and of the study, and the same theta, see
+:func:`problem_columns`.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PROBLEM = ("scene", "contact", "integrator")
-"""The parts of the grid that decide what is simulated, and so the gradient that estimates are compared with."""
+"""The parts of the grid that decide the simulation, and so the gradient that estimates are compared with."""
 NOT_PLUGINS = ("study", "theta", "reference")
-"""Entries of a row's parameters that are not a plugin on an axis of the grid."""
+"""Entries of a row's parameters that are not plugins on an axis of the grid."""
 VIEWS = ("noise", "horizon", "dt", "stiffness", "sigma", "smoothing")
 """Identity columns that show a problem's parameters; they identify the problem of rows without parameters."""
 
 
 def parse(rows: pd.DataFrame) -> list[Mapping[str, Any]]:
-    """Return each row's parameters by axis, with today's defaults where the row lacks one; empty where it has none."""
+    """Return each row's parameters by axis, with today's defaults for missing ones; empty if the row stores none."""
     if "parameters" not in rows:
         return [{}] * len(rows)
     return [_parsed(text, registry.folders()) for text in rows["parameters"]]
@@ -47,8 +48,8 @@ def flatten(rows: pd.DataFrame) -> pd.DataFrame:
 
     Columns are ``scene.mass`` for a plugin's parameter, ``scene.name`` for its name, ``theta.names`` for the parameters
     that theta names, and ``theta0.2`` for a coordinate of the point at which gradients are taken. Numbers are float64,
-    infinite ones included; other values are objects. A value is missing where the row's plugin has no such parameter, and
-    where the parameter is null.
+    including infinities; other values are objects. A value is missing if the row's plugin has no such parameter or the
+    parameter is null.
     """
     import pandas as pd
 
@@ -100,10 +101,10 @@ def as_number(value: Any) -> float:
 
 
 def swept_columns(name: str, table: pd.DataFrame) -> dict[str, pd.Series]:
-    """Return the columns of a flattened ``table`` that a name in a sweep means, each with a mask of the rows where it does.
+    """Return the columns of a flattened ``table`` that a sweep's ``name`` refers to, each with a mask of its rows.
 
-    ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and ``estimator.alpha_order.gamma`` mean the same parameter;
-    ``theta0`` means its only coordinate, and nothing where theta has several.
+    ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and ``estimator.alpha_order.gamma`` name the same parameter.
+    ``theta0`` refers to its only coordinate, and to no column in rows where theta has several.
     """
     import pandas as pd
 
@@ -129,8 +130,8 @@ def problem_columns(
 ) -> pd.DataFrame:
     """Return the columns that identify the problem of each row: equal rows are the same problem.
 
-    They are all parameters of the axes ``parts`` of the grid and of the study, and theta, except the swept names
-    ``without``. Rows without parameters, which older versions stored, are distinguished by their identity columns.
+    The columns are all parameters of the axes ``parts`` and of the study, and theta, except the swept names ``without``.
+    Rows without parameters, which older versions stored, are distinguished by their identity columns.
     """
     table = flatten(rows)
     wanted = [f"{part}." for part in (*parts, "study", "theta", THETA)]

@@ -1,4 +1,4 @@
-"""Chooses the backends that can compute the reference gradient of a program, and those that can run it at all."""
+"""Selects the backends that can run a program, compute its reference gradient, or provide its step Jacobians."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def capable_backends(program: Program, for_references: bool = False) -> list[Bac
             continue
         if (
             for_references and entry.plugin.reference_rank is None
-        ):  # not asked, since a backend may have to trace the program
+        ):  # checked first, since `incompatibility` may have to trace the program
             continue
-        with suppress(Exception):  # a backend that fails at this question cannot run the program
+        with suppress(Exception):  # a backend that fails here cannot run the program
             backend = _default(entry.plugin)
             if backend.incompatibility(program) is None:
                 backends.append(backend)
@@ -36,5 +36,5 @@ def _default(plugin: type[Backend]) -> Backend:
 
 
 def backends_with_jacobians(program: Program) -> list[str]:
-    """Return the names of the available backends whose problems give step Jacobians for a program."""
+    """Return the names of the available backends whose problems provide step Jacobians of a program."""
     return [b.name for b in capable_backends(program) if type(b.compile(program)).jacobians is not Problem.jacobians]

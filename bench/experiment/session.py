@@ -1,4 +1,4 @@
-"""What a study uses to measure a cell: problems compiled once for all cells of a run, and reference gradients."""
+"""The session that a study measures cells with: compiled problems and reference gradients, shared by a run's cells."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bench.model import Backend, Compilations, Problem
 
 
 class Problems:
-    """The problems compiled last, shared by cells with one program and backend, and the count of compilations."""
+    """The problems used last, shared by cells with the same program and backend, and the count of compilations."""
 
     KEPT = 4
 
@@ -22,7 +22,7 @@ class Problems:
         self._kept: dict[tuple[str, str], Problem] = {}
 
     def of(self, backend: Backend, cell: Cell) -> Problem:
-        """Return the cell's program, compiled on a backend."""
+        """Return the problem of the cell's program on ``backend``, compiled if it is not cached."""
         key = (fingerprint(backend), cell.program_key)
         problem = self._kept.pop(key, None)
         if problem is None:
@@ -38,7 +38,7 @@ class ReferenceSource(Protocol):
     """Reference gradients by cell."""
 
     def of(self, cell: Cell) -> Reference:
-        """Return the reference gradient of a cell, computed or stored; raises what its computation raises."""
+        """Return the reference gradient of a cell, computed or stored; raises the errors of its computation."""
 
 
 class Session(Protocol):

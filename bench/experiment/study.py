@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class Study(Plugin):
     """Measures each cell, and turns rows into tables, charts and a page.
 
-    A study is registered like any plugin: as a folder under ``bench/studies``, in a folder of the user's own, or by an
+    A study is registered like any plugin: as a folder under ``bench/studies``, in a plugin folder of the user, or by an
     entry point.
     """
 
@@ -40,7 +40,7 @@ class Study(Plugin):
         """Return status, reason and the study's columns for one cell. An exception becomes status and reason."""
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
-        """Return a cell's plugins by axis, without those that do not affect its results; by default all."""
+        """Return a cell's plugins by axis, without plugins that do not affect its results; by default all of ``given``."""
         return given
 
     def unsupported_reason(self, cell: Cell) -> str | None:
@@ -55,7 +55,7 @@ class Study(Plugin):
         """Print a summary of the rows for the terminal."""
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return a :class:`bench.report.web.content.Content`; None for a table and a chart of any two numbers."""
+        """Return the page's :class:`bench.report.web.content.Content`; None for a table and a chart of any two numbers."""
         return None
 
     def chart(self, experiment: Experiment, rows: pd.DataFrame) -> Sequence[str]:

@@ -14,7 +14,7 @@ def parse_words(
 ) -> tuple[list[str], dict[str, str], set[str]]:
     """Return the names, the settings (``key=value``) and the options (``--quick``) among a command's words.
 
-    ``defaults`` has every setting that the command takes, with its default. Each command also takes ``plugins=DIR``,
+    ``defaults`` contains every setting of the command with its default. Each command also accepts ``plugins=DIR``,
     which registers the plugins of that folder. Raises :class:`UserError` for an unknown setting or option.
     """
     names, settings, given = [], dict(defaults), set()

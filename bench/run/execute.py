@@ -28,7 +28,7 @@ class Finished:
 
     @property
     def keys(self) -> list[str]:
-        """The keys of its cells, in order."""
+        """Cell keys, in sweep order."""
         return [item.cell.key for item in self.planned]
 
 
@@ -38,7 +38,7 @@ def store_of(experiment: Experiment) -> Store:
 
 
 def execute(experiment: Experiment, quiet: bool = True) -> Finished:
-    """Run the missing cells of an experiment and fold their rows into ``rows.parquet``.
+    """Run the missing cells of an experiment and merge their rows into ``rows.parquet``.
 
     Raises :class:`runner.Stopped` after a failed cell in an experiment with ``on_error=stop``, KeyboardInterrupt if
     interrupted (every cell finished by then is stored), and :class:`UserError` if the study supports no cell.
@@ -63,7 +63,7 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
 
 
 def _refuse_without_supported_cells(experiment: Experiment, planned: Sequence[Planned]) -> None:
-    """Raise :class:`UserError` if the study supports no cell: then the experiment is wrong, and no single cell."""
+    """Raise :class:`UserError` with the reasons if the study supports no cell of the experiment."""
     if any(item.refusal is None for item in planned):
         return
     study = study_of(experiment)
@@ -76,7 +76,7 @@ def _refuse_without_supported_cells(experiment: Experiment, planned: Sequence[Pl
 
 
 def _compact(store: Store, planned: Sequence[Planned]) -> None:
-    """Fold the small files. A failure is only printed: it must not hide why a run ended, and no row depends on it."""
+    """Merge the small files. A failure is only printed: it loses no row, and an error would hide why the run ended."""
     try:
         store.compact([item.cell.key for item in planned])
     except StorageError as error:

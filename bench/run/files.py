@@ -1,4 +1,4 @@
-"""Writes files atomically: after a kill or a power failure a file is the old one or the new one, never a part."""
+"""Writes files atomically: after a kill or a power failure a file has its old or its new content, never a part."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from bench.errors import StorageError
 from bench.model.parameters import remember
 
 STALE_S = 3600.0
-"""Age in seconds at which a half-written file of another machine belongs to no run."""
+"""Age in seconds after which a half-written file of another machine is removed."""
 AT_FDCWD, RENAME_NOREPLACE = -100, 1
-"""Constants of renameat2(2), Linux: paths start at the working folder, and nothing is overwritten."""
+"""Constants of renameat2(2), Linux: paths are relative to the working folder, and nothing is overwritten."""
 RENAME_EXCL = 4
 """Constant of renamex_np(2), macOS: nothing is overwritten."""
 TEMPORARY = re.compile(r"\..+-bench-([0-9a-f]{8})-(\d+)-[0-9a-f]{32}")
-"""Names of files that are being written: a machine, a process id, and a random number."""
+"""Names of files being written, with machine, process id and a random number."""
 
 
 def temporary(path: Path) -> Path:
-    """Return a hidden path beside ``path`` to write to, which names machine and process for :func:`remove_stale`."""
+    """Return a hidden temporary path beside ``path``, with machine and process id in its name for :func:`remove_stale`."""
     return path.with_name(f".{path.name[:100]}-bench-{_machine()}-{os.getpid()}-{uuid.uuid4().hex}")
 
 
@@ -66,7 +66,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def write_all(directory: Path, contents: dict[str, str]) -> list[Path]:
-    """Write strings to files in a directory, given by file name; returns the paths."""
+    """Write ``contents``, strings by file name, to files in a directory; returns the paths."""
     for name, text in contents.items():
         write_whole(directory / name, text.encode())
     return [directory / name for name in contents]
@@ -99,9 +99,9 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 def link_exclusively(path: Path, name: Path) -> None:
-    """Give a file a new name; raises FileExistsError, and changes nothing, if the name exists.
+    """Link or rename a file to ``name``; raises FileExistsError, and changes nothing, if ``name`` exists.
 
-    If the file system has hard links, the file keeps its old name as well.
+    On file systems with hard links, ``path`` remains a name of the file.
     """
     try:
         os.link(path, name)
@@ -112,14 +112,14 @@ def link_exclusively(path: Path, name: Path) -> None:
 
 
 def _rename_exclusively(path: Path, name: Path) -> None:
-    """Rename a file unless the new name exists, in one step if the system can. ``os.rename`` would overwrite."""
+    """Rename a file unless the new name exists, atomically if the system can. ``os.rename`` would overwrite."""
     system, names = ctypes.CDLL(None, use_errno=True), (os.fsencode(path), os.fsencode(name))
     failed = errno.ENOSYS
     if hasattr(system, "renameat2"):
         failed = ctypes.get_errno() if system.renameat2(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_NOREPLACE) else 0
     elif hasattr(system, "renamex_np"):
         failed = ctypes.get_errno() if system.renamex_np(*names, RENAME_EXCL) else 0
-    if failed in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):  # the file system cannot: check first, then rename
+    if failed in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):  # not supported here: check first, then rename
         failed = errno.EEXIST if os.path.lexists(name) else 0
         if not failed:
             os.rename(path, name)

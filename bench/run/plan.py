@@ -33,12 +33,13 @@ class Planned:
     cell: Cell
     stored: bool
     refusal: tuple[str, str] | None
+    """Status and reason if the cell cannot run."""
     other_versions: str = ""
     """Library versions of the stored row, if they differ from the installed ones."""
     machine: str = ""
     """The kind of machine that timed the stored row."""
     by_older_code: bool = False
-    """Whether the cell has to run although it is stored, since code that decides its numbers has changed."""
+    """Whether older code has stored the cell, so that it has to run again."""
     added: tuple[str, ...] = ()
     """Parameters added since the row of older code was stored, as ``plugin.parameter``."""
 
@@ -49,7 +50,7 @@ class Planned:
 
 
 def plan(experiment: Experiment, store: Store) -> list[Planned]:
-    """Return every cell of the experiment in order, with its state; raises :class:`UserError` for an invalid one."""
+    """Return the experiment's cells in sweep order, each with its state; raises :class:`UserError` for invalid values."""
     rows = store.load()
     facts = zip(rows["status"], rows["versions"], rows["machine"], strict=True)
     stored = dict(zip(rows["key"], facts, strict=True))
@@ -78,10 +79,10 @@ def _planned(
 
 
 def _rows_of_older_code(experiment: Experiment, rows: pd.DataFrame, keys: set[str]) -> dict[Identity, str]:
-    """Return the parameters, as stored, of the rows under other keys than ``keys``, by the identity of their cells.
+    """Return the stored parameters (JSON) of the rows whose key is not in ``keys``, by cell identity.
 
-    A parameter that a row lacks counts as its present default. Rows that are timed while the experiment is not, or the
-    reverse, are other cells.
+    A parameter missing from a row takes its present default. Successful rows are omitted if they are timed and the
+    experiment is not, or the reverse.
     """
     rows = rows[~rows["key"].isin(keys) & (rows["parameters"] != "")]
     seconds = [column.name for column in experiment.columns.all if column.measured and column.kind == "number"]

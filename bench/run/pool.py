@@ -1,8 +1,8 @@
-"""Runs items in worker processes that can be killed, one item at a time, with limits on its time and memory.
+"""Runs items in worker processes, one item at a time, with limits on the time and memory of each item.
 
-A worker is a process in a session of its own. It builds a handler once and then handles items as they arrive, so that
-imports and compilations are paid for once. It answers in JSON, and its printed output arrives through a separate pipe:
-nothing that a worker sends is executed here. (Pools of the standard library lose all their items when one worker dies.)
+A worker is a process in its own session. It builds a handler once and then handles items as they arrive, so that imports
+and compilations happen once. It answers in JSON, and its printed output arrives through a separate pipe: nothing that a
+worker sends is executed here. (Pools of the standard library lose all their items when one worker dies.)
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ from bench.run.reaper import MARK, Reaper, kill_marked_processes
 from bench.run.worker import Channel, ConnectionLost, Handler, MalformedMessage, command, first_message
 
 TICK = 0.05
-"""Seconds between checks of the time and memory that items take."""
+"""Seconds between checks of the items' time and memory."""
 AHEAD_S = 0.05
-"""Seconds of work that a worker is sent ahead, so that it does not wait while results are written."""
+"""Seconds of work sent to a worker in advance, so that it does not wait while results are written."""
 MAX_AHEAD = 16
-"""Most items that a worker is sent ahead."""
+"""Largest number of items sent to a worker in advance."""
 MAX_UNSENT = 1 << 16
-"""Bytes that may wait to be sent to a worker before it is sent no more items ahead."""
+"""Unsent bytes for a worker above which no items are sent in advance."""
 STEAL_S = 5.0
-"""Seconds of work that a worker must have left before an idle worker takes half of it and compiles again."""
+"""Seconds of queued work above which an idle worker takes half of a queue, although it has to compile again."""
 START_S = 60.0
-"""Seconds that a worker may take to start, and to import an item's libraries, beyond the item's own time."""
+"""Seconds allowed for starting a worker and importing an item's libraries, in addition to the item's time limit."""
 TAIL = 16000
-"""Bytes of a worker's printed output that are kept."""
+"""Bytes stored of the end of a worker's printed output."""
 EXIT_S = 5.0
-"""Seconds that a process may take to end once it has closed its connection."""
+"""Seconds allowed for a process to end after it has closed its connection."""
 MAX_FAILED_STARTS = 3
-"""Workers in a row that may be killed while they start; after as many, the run ends with an error."""
+"""Number of consecutive workers killed during their start after which the run ends with an error."""
 SINGLE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "NPROC": "1",
 }
-"""Environment variables that keep numerical libraries to one thread, if set before these are imported."""
+"""Environment variables that limit numerical libraries to one thread, if set before the libraries are imported."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Answer:
     output: str = ""
     """The last lines printed while the item was handled."""
     machine: str = ""
-    """The kind of machine that handled it; empty for this one."""
+    """Kind of the machine that handled the item; empty for this machine."""
     stored: bool = False
     """Whether that machine has stored the row."""
 
@@ -90,15 +90,15 @@ class _Worker:
     process: subprocess.Popen[bytes]
     channel: Channel
     output: int
-    """Descriptor from which its printed output is read."""
+    """Descriptor for reading the worker's printed output."""
     usage: psutil.Process
     mark: str
     queue: deque[Any] = field(default_factory=deque)
-    """Items that will be sent to it."""
+    """Items to send to the worker."""
     sent: deque[Any] = field(default_factory=deque)
-    """Items that were sent to it and are not answered; it works on the first."""
+    """Items sent to the worker and not answered; it works on the first."""
     since: float = field(default_factory=time.monotonic)
-    """When the first item was sent, or when its own time began."""
+    """Monotonic time in seconds at which the first item was sent or, once its imports are done, was started."""
     is_ready: bool = False
     """Whether it has built its handler."""
     is_prepared: bool = False
@@ -108,17 +108,17 @@ class _Worker:
     printed: bytes = b""
     n_answered: int = 0
     fault: ConnectionLost | MalformedMessage | None = None
-    """Why it can answer no more items."""
+    """Fault that ended the connection to the worker."""
 
     @property
     def capacity(self) -> int:
-        """Number of items that may still be sent to it."""
+        """Number of items that may be sent to the worker now."""
         if self.sent and self.channel.n_unsent > MAX_UNSENT:
             return 0
         return 1 + min(MAX_AHEAD, int(AHEAD_S / max(self.pace, 1e-6))) - len(self.sent)
 
     def send_next(self) -> Answer | None:
-        """Send the next item of the queue; returns its answer at once if it cannot be pickled."""
+        """Send the next item of the queue; returns an answer with the failure if the item cannot be pickled."""
         item = self.queue.popleft()
         try:
             message = pickle.dumps(item)
@@ -132,7 +132,7 @@ class _Worker:
         return None
 
     def read_output(self) -> None:
-        """Read what it has printed, and keep the end of it."""
+        """Read the worker's new output, and store the last :data:`TAIL` bytes of all its output."""
         with suppress(OSError):
             while chunk := os.read(self.output, 1 << 16):
                 self.printed = (self.printed + chunk)[-TAIL:]
@@ -140,7 +140,7 @@ class _Worker:
                     return
 
     def take_output(self) -> str:
-        """Return the last lines printed since the last call, or the first of Python's dump of a crash, on one line."""
+        """Return the last lines printed since the last call, or the first lines of Python's crash dump, joined by ``|``."""
         _, crash, dump = self.printed.decode(errors="replace").rpartition("(most recent call first):")
         self.printed = b""
         printable = ("".join(c for c in line if c.isprintable()).strip() for line in dump.split("\n"))
@@ -148,7 +148,7 @@ class _Worker:
         return " | ".join(lines[:3] if crash else lines[-4:])[-600:]
 
     def receive(self) -> list[Answer]:
-        """Return the answers that have arrived. A fault of the connection or of a message is kept in ``fault``."""
+        """Return the answers that have arrived. A fault of the connection or of a message is stored in ``fault``."""
         answers: list[Answer] = []
         try:
             while self.fault is None and self.sent and (messages := self.channel.receive()):
@@ -160,7 +160,7 @@ class _Worker:
         return answers
 
     def _read(self, message: bytes) -> list[Answer]:
-        """Return the answer in a message, if it is one; raises :class:`MalformedMessage` and :class:`StorageError`."""
+        """Return the answers in a message, one or none; raises :class:`MalformedMessage` and :class:`StorageError`."""
         try:
             content = json.loads(message)
             match content["event"]:
@@ -186,7 +186,7 @@ class _Worker:
         return [answer]
 
     def kill(self) -> None:
-        """Kill the worker and everything that it has started."""
+        """Kill the worker and all processes that it has started."""
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.kill()
@@ -205,9 +205,9 @@ class _Worker:
 
 
 class Pool:
-    """Workers that share groups of items: a context manager that leaves no process behind.
+    """Workers that share groups of items: a context manager that ends all its processes on exit.
 
-    ``make(argument)`` builds the handler in each worker, which imports plugins from ``folders`` too. With
+    ``make(argument)`` builds the handler in each worker, with the plugins in ``folders`` available. With
     ``single_thread``, numerical libraries use one thread.
     """
 
@@ -243,7 +243,7 @@ class Pool:
             self._reaper = None
 
     def run(self, groups: Sequence[Sequence[Any]]) -> Iterator[list[Answer]]:
-        """Yield answers as they arrive, each item once, and an empty list every now and then.
+        """Yield answers as they arrive, one per item, and an empty list if none arrive within :data:`TICK`.
 
         The items of a group go to one worker, in order, unless another worker is idle.
         """
@@ -263,7 +263,7 @@ class Pool:
         return [worker.sent[0] for worker in self._workers if worker.sent]
 
     def _assign(self, waiting: deque[deque[Any]]) -> None:
-        """Give work to every idle worker, and start more workers while groups are waiting."""
+        """Assign work to every idle worker, and start more workers while groups are waiting."""
         for worker in self._workers:
             if not worker.queue and not worker.sent:
                 worker.queue = waiting.popleft() if waiting else self._take_half()
@@ -279,7 +279,7 @@ class Pool:
                     self._unpicklable.append(answer)
 
     def _take_half(self) -> deque[Any]:
-        """Take the second half of the longest queue away from its worker, if it is long enough, and return it."""
+        """Remove and return the second half of the slowest queue; empty if that queue takes less than :data:`STEAL_S`."""
         longest = max(self._workers, key=lambda worker: len(worker.queue) * worker.pace)
         half: deque[Any] = deque()
         if len(longest.queue) * longest.pace > STEAL_S:
@@ -300,7 +300,7 @@ class Pool:
             stdout=printed, stderr=printed, start_new_session=True,
             env=os.environ | {MARK: mark} | (SINGLE_THREAD if self._single_thread else {}),
         )  # fmt: skip
-        # a socket reports its end only when every copy of the other side is closed, this one too
+        # a socket reports its end only when every copy of the other side is closed, including this copy
         theirs.close()
         os.close(printed)
         worker = _Worker(process, Channel(ours), output, psutil.Process(process.pid), mark)
@@ -332,23 +332,23 @@ class Pool:
             twice = ", in two workers" if id(item) in self._crashed else ""
             status = "timeout" if kind == "timeout" else "crashed"
             answers.append(Answer(item, {"status": status, "reason": reason + twice}, seconds, worker.take_output()))
-        # the items behind that one have not run
+        # the items queued behind the failed item have not run
         rest = deque([*worker.sent, *worker.queue])
         if rest:
             waiting.appendleft(rest)
         return answers
 
     def _may_retry(self, worker: _Worker, item: Any, kind: str) -> bool:
-        """Return whether an item gets a second worker before the worker's death counts as the item's result.
+        """Return whether to retry an item in a new worker before the worker's death counts as the item's result.
 
-        An earlier item, or someone outside, may have killed the worker; earlier items may hold the memory.
+        An earlier item or another program may have killed the worker, and earlier items may have used the memory.
         """
         if id(item) in self._crashed or kind == "timeout":
             return False
         return kind != "memory" or worker.n_answered > 0
 
     def _check(self, worker: _Worker) -> tuple[Literal["crashed", "stopped", "timeout", "memory"], str] | None:
-        """Return why a worker has to be replaced, as a kind and a reason; None if it goes on."""
+        """Return why a worker has to be replaced, as a kind and a reason; None if it can continue."""
         code = worker.process.poll()
         if code is None and isinstance(worker.fault, ConnectionLost):
             with suppress(subprocess.TimeoutExpired):
@@ -372,7 +372,7 @@ class Pool:
 
 
 def describe_exit(code: int) -> str:
-    """Return in words how a process ended, from its exit code; negative codes are signals."""
+    """Describe how a process ended, from its exit code; negative codes are signals."""
     if code >= 0:
         return f"the process ended with exit status {code}"
     name = signal.Signals(-code).name
@@ -380,7 +380,7 @@ def describe_exit(code: int) -> str:
 
 
 def _wait(workers: Sequence[_Worker], seconds: float) -> None:
-    """Wait until a worker sends or prints something, or can take more of the bytes that wait to be sent."""
+    """Wait at most ``seconds`` until a worker sends a message, prints output or accepts unsent bytes."""
     poll = select.poll()
     for worker in workers:
         poll.register(worker.channel, select.POLLIN | (select.POLLOUT if worker.channel.n_unsent else 0))

@@ -1,4 +1,4 @@
-"""Prints the plan of a run and its progress, as plain text, since names may contain markup of a terminal or of rich."""
+"""Prints the plan of a run and its progress as plain text, since names may contain terminal codes or rich markup."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Progress:
         self.show()
 
     def show(self) -> None:
-        """Show the present state of the run."""
+        """Show the current state of the run; shows nothing in this class."""
 
     def _counts(self) -> str:
         failed = "".join(f", {count} {status}" for status, count in self._failed.items())
@@ -88,7 +88,7 @@ class Bar(Progress):
         self._task = bars.add_task(name, total=self._n_cells, completed=self._n_stored, note="")
 
     def working(self, tasks: str) -> None:
-        """Set the names of the tasks being worked on; the bar is drawn again only if they have changed."""
+        """Set the names of the tasks being worked on; redraws the bar only if they have changed."""
         if tasks != self._current:
             super().working(tasks)
 
@@ -118,7 +118,7 @@ def show_progress(name: str, planned: Sequence[Planned], quiet: bool = False) ->
 
 
 def print_versions(planned: Sequence[Planned], policy: str) -> None:
-    """Print how many stored rows were made with other library versions, and whether they are run again."""
+    """Print how many stored rows were computed with other library versions, and whether they are run again."""
     counts = Counter(item.other_versions for item in planned if item.other_versions)
     for versions, count in counts.most_common():
         action = (
@@ -128,7 +128,7 @@ def print_versions(planned: Sequence[Planned], policy: str) -> None:
 
 
 def print_machines(planned: Sequence[Planned], launcher: str) -> None:
-    """Print how many stored times are from another kind of machine than the times that will be measured here."""
+    """Print how many stored rows were timed on another kind of machine, if this run measures times here."""
     this = record.kind_of_machine()
     others = Counter(item.machine for item in planned if item.machine not in ("", this))
     if launcher == "local" and others and any(item.runs and item.cell.timing for item in planned):
@@ -158,7 +158,7 @@ def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.Data
 
 
 def _older_code(runs: Sequence[Planned]) -> str:
-    """Return how many of the cells are stored by older code, in brackets, and the parameters that have been added."""
+    """Return, in brackets, how many cells older code has stored, and the parameters added since; empty if none."""
     count = sum(item.by_older_code for item in runs)
     added = sorted({name for item in runs for name in item.added})
     return f" ({count} stored by older code{', without ' if added else ''}{', '.join(added)})" if count else ""

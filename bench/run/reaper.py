@@ -1,7 +1,7 @@
-"""A process that kills the processes a run has started once the run has ended, for any reason.
+"""The reaper: a process that waits until a run ends, for any reason, and then kills all processes the run has started.
 
 A worker cannot do this itself: a plugin may hold the interpreter lock, or the worker may be stopped. On Linux the
-kernel kills the workers of a run that has ended, but not the processes that they have started.
+kernel kills the workers when the run ends, but not the processes that the workers have started.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ import time
 from contextlib import suppress
 
 MARK = "BENCH_WORKER"
-"""Environment variable that marks a worker and every process it starts, also those that leave its session."""
+"""Environment variable that marks a worker and every process it starts, even in another session."""
 PASSES, PAUSE_S = 5, 0.2
-"""Number of searches for marked processes, since one may start another meanwhile, and seconds after each."""
+"""Number of searches for marked processes, which may start others meanwhile, and pause in seconds after each search."""
 PROGRAM = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.reaper import main; main()"
 
 
 class Reaper:
-    """Kills every process marked with ``mark`` when this process ends, also if it is killed.
+    """Starts a reaper, which kills every process marked with ``mark`` when this process ends, even if it is killed.
 
-    The reaper's process waits on a pipe that the system closes when this process ends.
+    The reaper waits on a pipe that the system closes when this process ends.
     """
 
     def __init__(self, mark: str) -> None:
@@ -35,7 +35,7 @@ class Reaper:
         )  # fmt: skip
 
     def close(self) -> None:
-        """End the reaper's process. The workers have to be ended before."""
+        """End the reaper's process. End the workers first."""
         self._process.kill()
         self._process.wait()
         assert self._process.stdin is not None

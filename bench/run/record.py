@@ -1,4 +1,4 @@
-"""``run.json``, the record of a run: configuration, versions, machine and counts; and the kind of this machine."""
+"""Writes ``run.json``, the record of a run, and identifies the kind of this machine."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LIBRARIES = ("numpy", "scipy", "jax", "jaxlib", "torch", "optimistix", "lineax",
 def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds: float, simulated: bool) -> Path:
     """Write ``run.json``: configuration, versions, machine, counts of rows by status, and duration.
 
-    A run that simulated nothing keeps the existing record if that has the same configuration.
+    A run that simulated nothing does not replace a record with the same configuration.
     """
     content: dict[str, Any] = {
         "command": " ".join(["python -m bench", *words]),
@@ -75,14 +75,14 @@ def machine() -> dict[str, Any]:
 
 @remember
 def kind_of_machine() -> str:
-    """Return processor, available cores and system: times of one kind can share a table. It contains no host name."""
+    """Return the kind of this machine: processor, cores and system, no host name. Times of one kind are comparable."""
     facts = timing.conditions()
     n_cores = len(facts["affinity"] or ()) or os.cpu_count() or 1
     return f"{printable(facts['processor']) or platform.machine()}, {n_cores} cores, {platform.system()}"
 
 
 def _compilations(rows: pd.DataFrame) -> dict[str, int]:
-    """Return the total number of compilations in the rows, and of distinct compiled structures and shapes."""
+    """Return the numbers of compilations and of distinct compiled structures and shapes in the rows; empty if unknown."""
     if "compilations" not in rows:
         return {}
     shapes = {shape for text in rows["shapes"] for shape in text.split()}

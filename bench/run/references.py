@@ -1,4 +1,4 @@
-"""Reference gradients: each is computed once, stored beside the experiments, and shared by all cells that need it."""
+"""Computes each reference gradient once, stores it beside the experiments, and shares it among all cells that need it."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class References:
     def _compute(self, cell: Cell) -> Reference:
         """Compute the reference on the first backend that can; raises the error of the first backend if none can.
 
-        A backend may accept a program and then fail to run it, at a branch on a traced value for example. Then the next
-        one is used.
+        A backend may accept a program and then fail to run it, for example at a branch on a traced value. Then the next
+        backend is used.
         """
         failed: list[tuple[str, Exception]] = []
         for backend in {fingerprint(b): b for b in cell.reference_backends}.values():
@@ -65,7 +65,7 @@ class References:
         raise failed[0][1]
 
     def _compute_on(self, backend: Backend, cell: Cell) -> Reference:
-        """Compute the reference on one backend: of J_sigma, or of the smoothed objective that the estimator needs."""
+        """Compute the reference of J_sigma, or of the smoothed objective that the estimator needs, on one backend."""
         budget, smoothing = (self._budget.samples, self._budget.tolerance), cell.smoothing()
         if smoothing is None:
             problem = self._problems.of(backend, cell)
@@ -81,9 +81,10 @@ class References:
         return self._directory / f"{cell.reference_key}.parquet"
 
     def _physical_gradient(self, cell: Cell) -> np.ndarray | None:
-        """Return the exact gradient at w = 0 that the program's gradient approximates, if the scene knows it.
+        """Return the exact gradient at w = 0 that the program's gradient approximates, shape (d,); None if unknown.
 
-        If it does not, and the cell's backend has physics of its own, return the gradient of the scene's own program.
+        The scene may declare it. Otherwise, if the cell's backend has physics of its own, it is the gradient of the
+        scene's own program.
         """
         program = cell.program()
         physical = program.physical_gradient()
@@ -115,7 +116,7 @@ def save(reference: Reference, path: Path) -> None:
 
 
 def load(path: Path) -> Reference | None:
-    """Load a stored reference; return None if there is none or it cannot be read."""
+    """Load a stored reference; returns None if the file is missing or unreadable."""
     import pandas as pd
 
     if not path.exists():

@@ -1,4 +1,4 @@
-"""Turns cells into rows: a finished cell is stored before it is shown and before anything depends on it."""
+"""Runs cells and stores their rows. A row is stored before it is reported."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ def run(
 ) -> None:
     """Run the missing cells and store their rows.
 
-    ``on_finished`` is called with every cell and row that was stored, and ``on_progress`` now and then with the names
-    of the tasks being worked on. Raises :class:`Stopped` after a failed cell if the experiment has ``on_error=stop``.
+    ``on_finished`` is called with every cell and its stored row, and ``on_progress`` repeatedly with the names of the
+    tasks being worked on. Raises :class:`Stopped` after a failed cell if the experiment has ``on_error=stop``.
     """
     store.prepare()
     _Run(experiment, store, on_finished, on_progress).run_all(planned)
 
 
 class _Run:
-    """One run: first the references, on all workers, then the cells, timed ones one at a time."""
+    """One run: computes references on all workers, then measures cells, one at a time if they are timed."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class _Run:
         with (
             guard.capture_output("a plugin"),
             guard.protect_process(),
-        ):  # backends are asked whether they can compute references
+        ):  # this calls backends, to find out which can compute references
             references = self._missing_references(cells)
         if not self._experiment.timing:
             with launcher_of(self._experiment) as launcher:
@@ -75,16 +75,16 @@ class _Run:
             self._measure(cells, launcher)
 
     def _missing_references(self, cells: list[Cell]) -> list[Cell]:
-        """Return one cell for each reference to compute; closed forms are computed with the cells themselves."""
+        """Return one cell for each reference to compute; closed forms are computed when their cells are measured."""
         if self._experiment.budget is None:
             return []
         references = Session(self._experiment).references
-        # reversed twice, to keep the first cell of each key and the planned order
+        # reversed twice, so that the first cell of each key remains, in the planned order
         first = {cell.reference_key: cell for cell in reversed(cells)}
         return [cell for cell in reversed(first.values()) if not references.stored(cell) and not _has_closed_form(cell)]
 
     def _compute_references(self, cells: list[Cell], references: list[Cell], launcher: Launcher) -> list[Cell]:
-        """Compute references and return the cells left to measure; the cells of a failed reference get its status."""
+        """Compute references and return the cells to measure; cells whose reference failed are stored with its status."""
         tasks = [Task(cell, reference=True) for cell in references]
         failed: dict[str, dict[str, Any]] = {}
         for answer in itertools.chain.from_iterable(self._answers(tasks, launcher)):
@@ -110,7 +110,7 @@ class _Run:
             self._on_progress("; ".join(str(item) for item in launcher.current))
 
     def _finish(self, results: list[Result], stored: bool = False) -> None:
-        """Store rows, unless the machine that made them has stored them, then report them."""
+        """Store rows, unless the machine that measured them has, and report them; raises :class:`Stopped` if due."""
         rows = [row_of(self._experiment, cell, result) for cell, result in results]
         if rows and not stored:
             self._store.append(*rows)

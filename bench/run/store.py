@@ -1,11 +1,11 @@
 """Stores rows on disk.
 
-Rows that finish together are one small JSON file under ``pending/``. At the end of a run the small files are folded
+Rows that finish together are one small JSON file under ``pending/``. At the end of a run the small files are merged
 into ``rows.parquet``. Every file is written completely under a unique name and then renamed into place, and is deleted only
 by a run that has read it and written its rows into another file. So nothing is locked, a run can be killed at any
-moment, and several can write to one directory: the stored rows are the union of all files, the newest row of each key.
-The newest row is the one with the largest ``sequence``, a count that only grows. Clocks may be wrong on one of several
-machines, or for an hour.
+moment, and several runs can write to one directory: the stored rows are the newest row of each key in all files. The newest
+row has the largest ``sequence``, a counter that only grows. Clocks are not used, since they differ between machines and may
+be wrong for an hour.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PATIENCE_S = 60.0
-"""Seconds for which a directory is read again while other runs change it."""
+"""Seconds for which reads and writes are retried while other runs change the directory."""
 MAX_PAUSE_S = 0.05
-"""Longest pause between two attempts; pauses are random, so that runs that disturb each other get out of step."""
+"""Longest pause in seconds between two attempts. Pauses are random, so that two runs do not disturb each other again."""
 MAX_SEQUENCE = 2.0**53
 """Larger counts are not exact as float64, so no run has written them."""
 FileId = tuple[int, int]
-"""Inode and time of modification, which distinguish a file from another one of the same name."""
+"""Inode and modification time in ns, which distinguish files of the same name."""
 
 
 class Store:
@@ -65,7 +65,7 @@ class Store:
     def _claim_directory(self) -> None:
         """Reserve the directory for this study before it has rows; raises :class:`UserError` if another study has it.
 
-        The claim is a file that is created in one step, and removed once there are rows, which name their study.
+        The claim is a file that is created atomically. It is removed once rows are stored, since rows name their study.
         """
         part = temporary(self._pending / "study")
 
@@ -100,7 +100,7 @@ class Store:
                 self._claim.unlink()
 
     def _refuse_other_studies(self, studies: Iterable[str]) -> None:
-        """Raise :class:`UserError` if one of ``studies`` is not this store's."""
+        """Raise :class:`UserError` if ``studies`` contains another study than this store's."""
         others = sorted(set(studies) - {"", self._study}) if self._study else []
         if others:
             raise UserError(
@@ -109,7 +109,7 @@ class Store:
             )
 
     def append(self, *rows: dict[str, Any]) -> None:
-        """Store finished cells. When this returns, their rows survive a power failure."""
+        """Store the rows of finished cells. On return, the rows survive a power failure."""
         if self._sequence is None:
             self.load()
         assert self._sequence is not None
@@ -118,11 +118,11 @@ class Store:
         self._write_pending("json", json.dumps(stamped).encode())
 
     def load(self) -> pd.DataFrame:
-        """Load all stored rows, the newest of each key; those of ``rows.parquet`` come first."""
+        """Return the newest stored row of each key; rows of ``rows.parquet`` come first."""
         return self._read_all()[0]
 
     def compact(self, order: Sequence[str] = ()) -> None:
-        """Fold the small files into ``rows.parquet``; rows of the keys in ``order`` come last, in that order."""
+        """Merge the small files into ``rows.parquet``; rows of the keys in ``order`` come last, in that order."""
         for _ in _attempts():
             table, files = self._read_all()
             table_id = files.pop(self._table, None)
@@ -131,18 +131,18 @@ class Store:
         remove_stale(self._pending)
         if self._table.exists():
             self._release_claim()
-        with suppress(OSError):  # it is not empty
+        with suppress(OSError):  # the folder is not empty
             self._pending.rmdir()
 
     # ------------------------------------------------------------------------------------------- reading
 
     def _list_files(self) -> dict[Path, FileId]:
-        """Return the files that contain rows."""
+        """Return the files that contain rows, by path, with their ids."""
         names: list[str] = []
         try:
             names = sorted(name for name in os.listdir(self._pending) if not name.startswith("."))
         except (FileNotFoundError, NotADirectoryError):
-            pass  # another run removes it when it is empty
+            pass  # another run has removed the empty folder
         except OSError as error:
             raise StorageError(f"'{self._pending}' cannot be read: {error.strerror}") from None
         files = {}
@@ -152,7 +152,7 @@ class Store:
         return files
 
     def _read_all(self) -> tuple[pd.DataFrame, dict[Path, FileId]]:
-        """Read all rows, and return the files they came from; reads again if another run folds files meanwhile."""
+        """Return all rows and the files that contain them; reads again if another run merges files meanwhile."""
         for _ in _attempts():
             files = self._list_files()
             try:
@@ -165,7 +165,7 @@ class Store:
         raise StorageError(f"'{self.directory}' changes faster than it can be read: too many runs write to it")
 
     def _merge(self, frames: list[pd.DataFrame]) -> pd.DataFrame:
-        """Return the newest row of each key, and take note of the largest ``sequence``."""
+        """Return the newest row of each key, and store the largest ``sequence`` for :meth:`append`."""
         import pandas as pd
 
         if not frames:
@@ -175,7 +175,7 @@ class Store:
         self._refuse_other_studies(table["study"])
         sequence = table["sequence"].where(table["sequence"].between(0, MAX_SEQUENCE), 0.0)
         self._sequence = max(self._sequence or 0, int(sequence.max()))
-        # rows of older versions have no count: among them the clock decides, and any counted row is newer
+        # rows of older versions have no sequence: the clock orders them, and any row with a sequence is newer
         age = table.assign(sequence=sequence)[["sequence", "stored_at"]]
         newest_last = age.sort_values(["sequence", "stored_at"], kind="stable", na_position="first").index
         table = table.loc[newest_last].drop_duplicates("key", keep="last")
@@ -189,7 +189,7 @@ class Store:
         return path
 
     def _in_pending(self, write: Callable[[], Any], failed: str) -> Any:
-        """Write in ``pending/``, a folder that another run may be removing because it is empty."""
+        """Return ``write()``, which writes in ``pending/``; tries again if another run removes the folder meanwhile."""
         for is_last in _attempts():
             try:
                 self._pending.mkdir(parents=True, exist_ok=True)
@@ -199,9 +199,9 @@ class Store:
                     raise StorageError(f"{failed}: {error.strerror}") from None
 
     def _fold(self, table: pd.DataFrame, read: list[Path], table_id: FileId | None) -> bool:
-        """Write the rows of the small files that were read into one file, and make it ``rows.parquet``.
+        """Replace ``rows.parquet`` by ``table``, and delete the small files that were read.
 
-        Returns False if another run has put its own ``rows.parquet`` there meanwhile, whose rows have to be read too.
+        Returns False if another run has replaced ``rows.parquet`` meanwhile, so that its rows have to be read first.
         """
         buffer = io.BytesIO()
         table.to_parquet(buffer, index=False, compression="zstd")
@@ -219,7 +219,7 @@ class Store:
             link_exclusively(part, self._table)
             sync_directory(self.directory)
         except (FileExistsError, FileNotFoundError):
-            return False  # another run was faster, or has folded this very file into its own
+            return False  # another run was faster, or has merged this file into its own
         except OSError as error:
             raise StorageError(
                 f"'{self._table}' cannot be written: {error.strerror}; its rows are in '{part}'"
@@ -247,9 +247,9 @@ def _attempts() -> Iterator[bool]:
 
 
 def _was_removed(error: OSError, folder: Path) -> bool:
-    """Return whether an error means that a folder was removed between two steps, so that they can be tried again.
+    """Return whether an error means that a folder was removed between two steps, so that the steps can be retried.
 
-    ``mkdir`` reports that a folder exists although it may be removed before ``mkdir`` checks that it is a folder.
+    ``mkdir`` raises FileExistsError if the folder exists and is then removed before ``mkdir`` checks that it is one.
     """
     gone = isinstance(error, FileNotFoundError) or (isinstance(error, FileExistsError) and not os.path.lexists(folder))
     return gone and folder.parent.is_dir()
@@ -258,8 +258,8 @@ def _was_removed(error: OSError, folder: Path) -> bool:
 def _is_complete(before: Mapping[Path, FileId], after: Mapping[Path, FileId]) -> bool:
     """Return whether the files listed before reading contained all rows, given the files listed after reading.
 
-    A listing is not a snapshot: rows that were folded meanwhile may be missed in the small files and in the table. In
-    that case a file has gone, or there is a new table. Small files that are new contain rows stored since.
+    A listing is not a snapshot: rows merged while reading may be missing from both the small files and the table. In that
+    case a file was removed or replaced, or there is a new Parquet file. New JSON files only contain rows stored since.
     """
     added = after.keys() - before.keys()
     return before.items() <= after.items() and not any(path.suffix == ".parquet" for path in added)
@@ -273,7 +273,7 @@ def _file_id(path: Path) -> FileId:
 def _with_types(columns: Columns, frame: pd.DataFrame, path: Path) -> pd.DataFrame:
     """Return the frame with typed columns; raises :class:`StorageError` if it is not a table of rows.
 
-    A value that is not a number would become a missing one, and be written back as missing.
+    A value of a numeric column that is not a number is an error too, since it would be stored again as missing.
     """
     if "key" not in frame or not frame["key"].map(lambda key: isinstance(key, str) and bool(key)).all():
         raise StorageError(f"'{path}' has no keys, so its rows belong to no cell; move it away to start afresh")

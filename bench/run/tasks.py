@@ -1,4 +1,4 @@
-"""Tasks, each a cell to measure or a reference to compute: how they are handled and grouped, and the rows they give."""
+"""Tasks (cells to measure, references to compute): handles them, groups them, and turns their results into rows."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from bench.run.record import kind_of_machine
 from bench.run.session import Session
 
 MAX_REASON = 2000
-"""Characters of a reason that are kept."""
+"""Length of the longest stored reason, in characters."""
 FAILED = ("error", "crashed", "timeout")
-"""Statuses of cells in which something went wrong."""
+"""Statuses of cells that failed."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class TaskHandler:
                 self._session.problems.of(item.backend, item.cell)
             except KeyboardInterrupt:
                 raise
-            except BaseException:  # the error is raised again, and reported, when the cell is measured
+            except BaseException:  # the error is reported when the cell is measured
                 return
 
     def __call__(self, item: Task) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
 
 
 def group_by_program(tasks: list[Task]) -> list[list[Task]]:
-    """Group tasks that share a compilation, in the order in which the first of each group was planned."""
+    """Return groups of tasks that share a compilation, in the order of their first tasks."""
     groups: dict[Any, list[Task]] = defaultdict(list)
     for task in tasks:
         groups[fingerprint(task.backend), repr(task.cell.program().structure)].append(task)
@@ -106,7 +106,7 @@ def result_of(answer: Answer, prefix: str = "") -> dict[str, Any]:
 
 
 def row_of(experiment: Experiment, cell: Cell, result: dict[str, Any]) -> dict[str, Any]:
-    """Return the row of a result; its reason is one line of at most 2000 characters, whatever a plugin reports."""
+    """Return the row of a result, with the reason cut to one line of at most 2000 characters."""
     row = blank_row(experiment, cell) | result
     reason = printable(row["reason"])
     if len(reason) > MAX_REASON:

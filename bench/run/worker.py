@@ -1,4 +1,4 @@
-"""The worker process, which builds a handler once and then answers one item after another, and its message channel."""
+"""The worker process, which builds a handler once and then handles items one by one, and its message channel."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CHUNK = 1 << 18
 MAX_MESSAGE = 1 << 30
 """Bytes of the longest valid message."""
 PROGRAM = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.worker import main; main()"
-"""The program of a worker: it has the import path of its run, and does not import the run's own script."""
+"""The program of a worker. It has the import path of its run, and does not import the run's main script."""
 DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of prctl(2)."""
 
@@ -43,9 +43,8 @@ class MalformedMessage(Exception):
 class Channel:
     """One end of a socket for messages, each preceded by its length. The worker's end is ``blocking``.
 
-    The run's end never waits. Bytes that do not fit into the socket are kept here until there is room, so a worker that
-    reads nothing delays neither the other workers nor the clock. The socket is a descriptor of its own: output that a
-    plugin prints does not reach it.
+    The run's end never blocks. Bytes that do not fit into the socket are buffered here, so a worker that reads nothing
+    delays neither the other workers nor the checks of time limits. Output that a plugin prints does not reach the socket.
     """
 
     def __init__(self, connection: socket.socket, blocking: bool = False) -> None:
@@ -60,7 +59,7 @@ class Channel:
 
     @property
     def n_unsent(self) -> int:
-        """Number of bytes that are still to be sent."""
+        """Number of buffered bytes, to be sent."""
         return len(self._unsent)
 
     def send(self, message: bytes) -> None:
@@ -69,7 +68,7 @@ class Channel:
         self.flush()
 
     def flush(self) -> None:
-        """Send the bytes that are kept: all of them if the socket blocks, otherwise as many as fit."""
+        """Send the buffered bytes: all of them if the socket blocks, otherwise as many as fit."""
         while self._unsent:
             try:
                 n_sent = self._connection.send(self._unsent)
@@ -125,7 +124,7 @@ class Handler(Protocol):
 
 
 def command(descriptor: int) -> list[str]:
-    """Return the command that starts a worker, which talks to its run over the socket ``descriptor``."""
+    """Return the command that starts a worker connected to its run by the socket ``descriptor``."""
     return [sys.executable, "-c", PROGRAM, str(descriptor), str(os.getpid()), chr(0x1F).join(sys.path)]
 
 
@@ -135,7 +134,7 @@ def first_message(make: Callable[[Any], Handler], argument: bytes, folders: tupl
 
 
 def main() -> None:
-    """Answer items until the run closes the channel; called with a descriptor and the run's process id as arguments."""
+    """Handle items until the run closes the channel; ``sys.argv`` contains a descriptor and the run's process id."""
     descriptor, run = map(int, sys.argv[1:3])
     _die_with(run)
     # Ctrl-C reaches the run, which ends its workers
@@ -147,7 +146,7 @@ def main() -> None:
 
 
 def _die_with(run: int) -> None:
-    """Have the kernel kill this process when its run ends, even in the middle of an item (Linux; see the reaper)."""
+    """Make the kernel kill this process when its run ends, even during an item (Linux; elsewhere see the reaper)."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None, use_errno=True).prctl(DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != run:

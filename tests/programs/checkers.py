@@ -1,11 +1,11 @@
-"""Other gradient checkers on the bank's cases: whether they complain, and what that took.
+"""Runs another gradient checker on the cases of `simulators.py`, and reports its complaints, calls and seconds.
 
     python tests/programs/checkers.py gradcheck|check_grads|tesseract
 
-prints a line per case and one of sums. Each checker has its own default steps and tolerances, and gets a cost in its own
-library as it is; others as a function with a gradient of its own: `torch.autograd.Function`, `jax.custom_vjp`, or the
-endpoints `apply` and `jacobian` of a tesseract. The simulator's own noise is one fixed draw. Nothing of `bench` is
-imported, so that tesseract-core can have an environment of its own.
+prints a line per case and a summary. Each checker has its default steps and tolerances. A cost in the checker's own
+library is passed unchanged; others are wrapped as a function with a custom gradient: `torch.autograd.Function`,
+`jax.custom_vjp`, or the endpoints `apply` and `jacobian` of a tesseract. A simulator's own noise is one fixed draw. Nothing
+of `bench` is imported, so that tesseract-core can have its own environment.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ class Counted:
         self.noise = (np.random.default_rng(0).standard_normal(length),) if length else ()
 
     def cost(self, x: Any) -> Any:
-        """The cost as the case has it, in its own library."""
+        """Return the cost in the case's own library."""
         self.calls += 1
         return self.case.cost(x, *self.noise)
 
     def value(self, x: np.ndarray) -> float:
-        """The cost of an array."""
+        """Return the cost of an array as a float."""
         if self.case.library == "torch":
             import torch
 
@@ -45,7 +45,7 @@ class Counted:
         return float(self.cost(np.array(x)))
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
-        """The case's gradient at an array."""
+        """Return the case's gradient at an array, shape (d,)."""
         if self.case.grad == "torch":
             import torch
 
@@ -63,7 +63,7 @@ class Counted:
 
 
 def gradcheck(counted: Counted) -> bool:
-    """Whether `torch.autograd.gradcheck` complains."""
+    """Return whether `torch.autograd.gradcheck` complains."""
     import torch
 
     function = counted.cost
@@ -85,7 +85,7 @@ def gradcheck(counted: Counted) -> bool:
 
 
 def check_grads(counted: Counted) -> bool:
-    """Whether `jax.test_util.check_grads` complains."""
+    """Return whether `jax.test_util.check_grads` complains."""
     import jax
     import jax.numpy as jnp
     from jax.test_util import check_grads as check
@@ -107,7 +107,7 @@ def check_grads(counted: Counted) -> bool:
 
 
 def tesseract(counted: Counted) -> bool:
-    """Whether tesseract-core's `check-gradients` complains about endpoints `apply` and `jacobian`."""
+    """Return whether tesseract-core's `check-gradients` complains about endpoints `apply` and `jacobian`."""
     from pydantic import BaseModel
     from tesseract_core.runtime import Array, Differentiable, Float64
     from tesseract_core.runtime.testing.finite_differences import check_gradients
@@ -124,7 +124,7 @@ def tesseract(counted: Counted) -> bool:
     def jacobian(inputs: InputSchema, jac_inputs: set[str], jac_outputs: set[str]):
         return {"cost": {"theta": counted.gradient(np.asarray(inputs.theta))}}
 
-    for function in (apply, jacobian):  # the types are those of this call, not names in a module
+    for function in (apply, jacobian):  # types local to this call, not names in a module
         function.__annotations__ |= {"inputs": InputSchema}
     apply.__annotations__["return"] = OutputSchema
     jacobian.__annotations__ |= {"jac_inputs": set[str], "jac_outputs": set[str]}
@@ -143,13 +143,13 @@ CHECKERS: dict[str, Callable[[Counted], bool]] = {
 
 
 def complains(checker: str, case: simulators.Case) -> tuple[bool, int, float, str]:
-    """Return whether a checker complains about a case, its calls and seconds, and what it raised."""
+    """Return whether a checker complains about a case, its calls and seconds, and the error it raised, if any."""
     counted, began, raised = Counted(case), time.perf_counter(), ""
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         try:
             found = CHECKERS[checker](counted)
-        except Exception as error:  # it may raise instead of returning a verdict: that is a complaint
+        except Exception as error:  # an error counts as a complaint
             found, raised = True, f"{type(error).__name__}: {error}".splitlines()[0]
     return found, counted.calls, time.perf_counter() - began, raised
 

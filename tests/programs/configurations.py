@@ -1,11 +1,12 @@
-"""Random configurations that mean something: ``python tests/programs/configurations.py COUNT [SEED]``.
+"""Runs random valid and spoilt configurations: ``python tests/programs/configurations.py COUNT [SEED]``.
 
-Studies, plugins, parameters within their bounds, sweeps and settings are drawn from what the registry declares; then a word
-of every fourth configuration is spoilt. Each is run in this process, tiny, into a folder that others have filled before it.
-Then every cell that was planned has a row, every row that was ever stored is there with the same bits, a run of the same
-words finds nothing to do, and now and then: the run was interrupted in between, the same cells in another order in an empty
-folder give the same bits, and tables, charts and page are written. What is refused has one line of reason and has changed
-nothing. Prints what went wrong and one line of counts; status 1 for any fault.
+Studies, plugins, parameters within their bounds, sweeps and settings are drawn from the declarations in the registry. Then
+one word of every fourth configuration is spoilt. Each configuration is run in this process, with few samples, into a folder
+that contains results of earlier ones. After the run, every planned cell must have a row, every row ever stored must still be
+there with the same bits, and a second plan must have nothing to run. Some runs are interrupted first, some are repeated
+with the cells in another order in an empty folder, where rows must have the same bits, and some write tables, charts and
+page. A refused configuration must have a reason of one line and change nothing. Prints the faults and one line of counts;
+the exit status is 1 for any fault.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ SEASON = 25
 """Configurations that share a folder."""
 TINY = ["samples=2", "repeats=2", "timing=false", "workers=0", "--quiet", "reference.samples=256", "reference.tolerance=9"]  # fmt: skip
 SPOILT, INTERRUPTED, AGAIN, WRITTEN = 0.25, 0.1, 0.2, 0.005
-"""Shares of the configurations that are spoilt, interrupted, run again elsewhere, and written with charts and page."""
+"""Shares of the configurations that are spoilt, interrupted, repeated in another folder, and run with charts and page."""
 ODD = ["nan", "-1", "[]", "[[1]]", "{a:1}", "null", "1e400", "'x'", "${x}", "0x1", "~", "a[b=", "[1,1]", "true", "\u00fc", "3.5"]  # fmt: skip
 LONGEST = 4
 """Steps of the longest rollout."""
@@ -53,7 +54,7 @@ LONGEST = 4
 
 
 def value(dice: random.Random, parameter: Parameter) -> str | None:
-    """Return a value within a parameter's bounds, or None where nothing but its name is known of it."""
+    """Return a random value within a parameter's bounds as a string, or None for a type without a rule."""
     union = typing.get_args(parameter.type) if isinstance(parameter.type, types.UnionType) else (parameter.type,)
     if type(None) in union and dice.random() < 0.2:
         return "null"
@@ -75,7 +76,7 @@ def value(dice: random.Random, parameter: Parameter) -> str | None:
 
 
 def settable(kind: str, name: str) -> dict[str, Parameter]:
-    """Return the parameters of a plugin that a value can be drawn for."""
+    """Return the parameters of a plugin for which :func:`value` returns a value, by name."""
     plugin = registry.find(kind, name).plugin
     known = parameters(plugin) if plugin is not None else {}
     return {one: known[one] for one in known if value(random.Random(0), known[one]) is not None}
@@ -83,17 +84,17 @@ def settable(kind: str, name: str) -> dict[str, Parameter]:
 
 @cache
 def usually() -> dict[str, Any]:
-    """Return the defaults of every run."""
+    """Return the default settings of a run, from ``config.yaml``."""
     return dict(yaml.safe_load((config.config_dir() / "config.yaml").read_text()))
 
 
 def few(dice: random.Random, among: list[str]) -> list[str]:
-    """Return one of them, at times two."""
+    """Return one random item of ``among``, or two with probability 0.3."""
     return dice.sample(among, min(len(among), 1 if dice.random() < 0.7 else 2))
 
 
 def identity(dice: random.Random, kind: str, name: str) -> str:
-    """Return a plugin by its name, at times with parameters in brackets."""
+    """Return a plugin's identity string: its name, in 40% of the draws with one or two parameters in brackets."""
     known = settable(kind, name)
     if not known or dice.random() < 0.6:
         return name
@@ -102,7 +103,7 @@ def identity(dice: random.Random, kind: str, name: str) -> str:
 
 
 def axis(dice: random.Random, kind: str, name: str, count: int) -> tuple[str, list[str]] | None:
-    """Return a parameter to sweep, by its own or its full name, and values."""
+    """Return a random parameter to sweep, by its own or its full name, and ``count`` values; None without parameters."""
     known = {one: p for one, p in settable(kind, name).items() if p.choices is None}
     if not known:
         return None
@@ -112,7 +113,7 @@ def axis(dice: random.Random, kind: str, name: str, count: int) -> tuple[str, li
 
 
 def sweep(dice: random.Random, chosen: dict[str, list[str]]) -> list[str]:
-    """Return words of a sweep of few points."""
+    """Return the command-line words of a random sweep with few points."""
     kinds = [kind for kind in chosen if kind != "backends"]
     count = dice.randint(1, 3)
     found = [axis(dice, kind, dice.choice(chosen[kind]), count) for kind in dice.sample(kinds, min(2, len(kinds)))]
@@ -132,7 +133,7 @@ def sweep(dice: random.Random, chosen: dict[str, list[str]]) -> list[str]:
 
 
 def drawn(dice: random.Random) -> list[str]:
-    """Return the words of a configuration, the name of its folder last."""
+    """Return the words of a random configuration; the last word is the folder's ``name=``."""
     studies = sorted(name for name, one in registry.entries()["studies"].items() if one.available)
     study = "bias_variance" if dice.random() < 0.6 else dice.choice(studies)
     plugin = registry.find("studies", study).plugin
@@ -171,7 +172,7 @@ def drawn(dice: random.Random) -> list[str]:
 
 
 def spoil(dice: random.Random, words: list[str]) -> list[str]:
-    """Return the words with one of them spoilt, except the name of the folder."""
+    """Return the words with one random word spoilt, other than :data:`TINY` and the folder's name."""
     place = dice.randrange(len(TINY), len(words) - 1)
     key, _, given = words[place].partition("=")
     how = dice.randrange(4)
@@ -189,7 +190,7 @@ def spoil(dice: random.Random, words: list[str]) -> list[str]:
 
 
 def turn(given: str) -> str:
-    """Return a list of identity strings from the last to the first."""
+    """Return a bracketed list of identity strings in reverse order; any other string unchanged."""
     parts, depth = [""], 0
     for letter in given[1:-1]:
         depth += (letter == "[") - (letter == "]")
@@ -204,7 +205,7 @@ def turn(given: str) -> str:
 
 
 class Interrupted:
-    """Interrupts a run in this process after so many stored answers."""
+    """Context manager that interrupts a run in this process after ``after`` calls that store rows."""
 
     def __init__(self, after: int) -> None:
         self._left, self._real = after, runner._Run._finish
@@ -223,7 +224,7 @@ class Interrupted:
 
 
 class Ledger:
-    """All configurations so far: what they stored, and what went wrong."""
+    """Runs configurations, and records their rows and faults."""
 
     def __init__(self, place: Path, seed: int) -> None:
         self.place, self.dice = place, random.Random(seed)
@@ -236,12 +237,12 @@ class Ledger:
         self.folder = place / "0"
 
     def fault(self, kind: str, words: list[str], more: object = "") -> None:
-        """Count a fault, and say what it was."""
+        """Count a fault, and print it."""
         self.faults[kind] += 1
         print(f"{kind}: {words[len(TINY) :]!r}: {str(more)[:1500]}", flush=True)
 
     def command(self, words: list[str], folder: Path, charts: bool = False) -> tuple[Any, str]:
-        """Run words into a folder; returns status and what it said, a traceback included."""
+        """Run words into a folder; returns the exit status (None after an exception) and stderr with any traceback."""
         write, load, out, err = finish.write, config.load, io.StringIO(), io.StringIO()
 
         def loaded(*given: Any) -> Any:
@@ -260,12 +261,12 @@ class Ledger:
             finish.write, config.load = write, load
 
     def stored(self, name: str, folder: Path) -> dict[str, dict[str, Any]]:
-        """Return the rows of a folder with their bits."""
+        """Return the rows stored under ``name`` in a folder, by key, as :func:`exact.bits`."""
         columns = registry.usable("studies", name.rpartition("_")[0]).columns
         return by_key(Store(folder / name, columns).load())
 
     def check(self, words: list[str], charts: bool = False) -> None:
-        """Run a configuration, and look for what was lost or changed."""
+        """Run a configuration, and count lost or changed rows and other faults."""
         if self.dice.random() < INTERRUPTED:
             with Interrupted(self.dice.randint(1, 3)):
                 self.command(words, self.folder)
@@ -281,7 +282,7 @@ class Ledger:
             self.whole(words, status, charts)
 
     def look(self, words: list[str], name: str) -> None:
-        """See that all rows that a folder ever had are there and have not changed."""
+        """Count a fault if rows that a folder had before are lost or changed."""
         if not (self.folder / name).is_dir():
             if name in self.held:
                 self.fault("lost", words, f"all rows of {name}")
@@ -294,7 +295,7 @@ class Ledger:
         self.held[name] = now
 
     def whole(self, words: list[str], status: int, charts: bool) -> None:
-        """Look at a run that came to its end."""
+        """Verify a run that ended by itself: a row per planned cell, a reason per failure, and nothing left to run."""
         experiment, name = self.loaded[0], words[-1].removeprefix("name=")
         with contextlib.redirect_stderr(io.StringIO()):
             planned = plan.plan(experiment, store_of(experiment))
@@ -317,7 +318,7 @@ class Ledger:
             self.again(words, name, rows)
 
     def again(self, words: list[str], name: str, rows: dict[str, dict[str, Any]]) -> None:
-        """Run the same cells in another order in an empty folder."""
+        """Run the same cells in another order in an empty folder, and count a fault if their rows differ."""
         self.done["run again elsewhere"] += 1
         split = [word.partition("=") for word in words]
         turned = [f"{key}{equals}{turn(given) if key in registry.kinds() else given}" for key, equals, given in split]
@@ -333,7 +334,7 @@ class Ledger:
         shutil.rmtree(elsewhere, ignore_errors=True)
 
     def next_folder(self) -> None:
-        """Begin an empty folder; the old one still has all rows and no half file."""
+        """Verify that the folder has all its rows and no temporary file, then start an empty folder."""
         for name in list(self.held):
             self.look([], name)
         for path in self.folder.rglob(".*") if self.folder.exists() else ():
@@ -343,7 +344,7 @@ class Ledger:
 
 
 def search(count: int, seed: int) -> Ledger:
-    """Draw and run so many configurations."""
+    """Draw and run ``count`` configurations, and return their rows and faults."""
     backend = registry.find("backends", "numpy").plugin
     assert backend is not None
     before = backend.reference_rank  # type: ignore[attr-defined]
@@ -368,7 +369,7 @@ def search(count: int, seed: int) -> Ledger:
 
 
 def show(count: int, seed: int) -> int:
-    """Search, print the counts, and return the status."""
+    """Run ``count`` configurations, print the counts, and return the exit status."""
     started = time.process_time()
     ledger = search(count, seed)
     valid = sum(number for status, number in ledger.statuses.items() if status in (0, 1))

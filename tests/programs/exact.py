@@ -1,4 +1,4 @@
-"""Compares stored rows to the last bit, whichever kind of file they came from."""
+"""Compares stored rows to the last bit, from files of any kind."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 
 WHERE = ("stored_at", "sequence", "wall_s")
-"""Columns that record when and how fast a row was made, which differ between runs."""
+"""Columns that record when and how fast a row was computed, which differ between runs."""
 
 
 def bits(value: Any) -> Any:
-    """Return a value in the one form that shows each of its bits; a missing value is missing in any kind of column."""
+    """Return a value as exact strings (hexadecimal for numbers), ``missing`` for None and NaN; lists by element."""
     if isinstance(value, np.ndarray | list | tuple):
         return [bits(one) for one in value]
     if value is None or value != value:
@@ -22,7 +22,7 @@ def bits(value: Any) -> Any:
 
 
 def by_key(rows: pd.DataFrame, without: tuple[str, ...] = WHERE) -> dict[str, dict[str, Any]]:
-    """Return the values of each row under its key; raises ValueError where a key has two rows."""
+    """Return the exact values of each row by key and column; raises ValueError if a key has two rows."""
     if not rows["key"].is_unique:
         raise ValueError("two rows of one key")
     names = [name for name in rows if name not in without]
@@ -30,7 +30,7 @@ def by_key(rows: pd.DataFrame, without: tuple[str, ...] = WHERE) -> dict[str, di
 
 
 def differences(rows: Mapping[str, Mapping[str, Any]], truth: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return where rows differ from the right ones, value by value; rows that are not there yet are no difference."""
+    """Return a line per value in which ``rows`` differ from ``truth``; rows missing from ``rows`` are not reported."""
     lines = []
     for key, row in rows.items():
         right = truth.get(key)

@@ -1,8 +1,9 @@
-"""Checks right gradients of smooth scenes, at many thetas and horizons up to 2,000: how often the check blames one.
+"""Counts false alarms: how often the gradient check reports a fault in correct gradients of smooth scenes.
 
     python tests/programs/false_alarms.py 5000
 
-prints the counts of verdicts, every gradient blamed, and the seconds of a check, the first of each program with its compilation.
+runs 5,000 checks at random thetas and horizons up to 2,000, and prints the counts of verdicts, every reported fault, and the
+seconds per check. The first check of a program includes its compilation.
 """
 
 import sys
@@ -22,11 +23,11 @@ SCENES = (
 HORIZONS = (1, 30, 300, 1000, 2000)
 INTEGRATORS = ("semi_implicit_euler", "rk4")
 SPREAD = 0.3
-"""Standard deviation of the thetas around a scene's own, in units of their scale."""
+"""Standard deviation of theta around the scene's theta0, relative to each component (absolute where theta0 is 0)."""
 
 
 def programs():
-    """Every smooth scene at every horizon that its length of theta allows, under both integrators."""
+    """Yield name and program of every smooth scene, at every horizon and with every integrator if it has time steps."""
     for name in SCENES:
         entry = registry.entries()["scenes"].get(name)
         if entry is None:
@@ -40,7 +41,7 @@ def programs():
 
 
 def run(count, only=None):
-    """Return verdicts by count, the blamed ``(name, seed, sentence)``, and the seconds of each check; ``count`` checks."""
+    """Run ``count`` checks; returns counts by verdict, false alarms ``(name, seed, sentence)``, and seconds per check."""
     chosen = [(name, program) for name, program in programs() if only is None or only(name)]
     verdicts, blamed, seconds = Counter(), [], []
     unit, search = float(np.finfo(np.float64).eps), measure.SwitchSearch(2, 16, 2.0, 1e-4)

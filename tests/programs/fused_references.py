@@ -1,7 +1,7 @@
-"""Measures from how many references of one program on ``fused`` would be faster than ``jax``.
+"""Measures the number of references of one program from which ``fused`` is faster than ``jax``.
 
 ``python tests/programs/fused_references.py`` prints, for each scene that bench-self compares, the seconds of the first
-reference, which compiles with nothing kept on disk, and of the next one, on both backends.
+reference, which includes compilation without a cache on disk, and of the second reference, on both backends.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SAMPLES, TOLERANCE = 131_072, 0.005
 
 
 def seconds(settings: dict[str, Any], scene: dict[str, Any], backend: str) -> tuple[float, float]:
-    """Return the seconds of the first reference and of the next."""
+    """Return the seconds of the first reference, with compilation, and of the second."""
     own = {**settings, "scene": scene["scene"], "values": scene.get("values", {})}
     provides = registry.find("backends", backend).plugin.provides  # type: ignore[union-attr]
     since = time.perf_counter()
@@ -37,7 +37,7 @@ def main() -> None:
     """Print a line per scene."""
     settings = yaml.safe_load((Path(__file__).parents[2] / "conf" / "bench_self.yaml").read_text())
     for name in ("jax", "fused"):
-        seconds(settings, {"scene": "double_integrator"}, name)  # imports
+        seconds(settings, {"scene": "double_integrator"}, name)  # so that the imports are not timed
     for scene in settings["compared"]["scenes"]:
         (first, after), (fused_first, fused_after) = (seconds(settings, scene, name) for name in ("jax", "fused"))
         start, saved = (fused_first - fused_after) - (first - after), after - fused_after

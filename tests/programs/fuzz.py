@@ -1,7 +1,8 @@
-"""Random configurations in this process: ``python tests/programs/fuzz.py COUNT [SEED]``; one in fifty is run, the rest planned.
+"""Runs random command lines in this process, to find crashes: ``python tests/programs/fuzz.py COUNT [SEED]``.
 
-Every word is either a setting with a value of a random kind, a setting of the defaults with a letter changed, or noise.
-Prints what went wrong and one line of counts; status 1 for a traceback, a status that is none, or a message of two lines.
+Every word is a setting with a random value, a setting with a character of its key changed, or noise. One configuration in
+fifty is run, the others are planned. Prints the faults and one line of counts. Faults are a traceback, an exit status other
+than 0, 1 and 2, an error message that is not one line, and escape characters. The exit status is 1 for any fault.
 """
 
 import contextlib

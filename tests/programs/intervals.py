@@ -1,9 +1,9 @@
-"""How often the intervals of bias and variance hold the truth: `python tests/programs/intervals.py [seeds a cell]`.
+"""Measures the coverage of the intervals of bias and variance: `python tests/programs/intervals.py [SEEDS [STRIDE]]`.
 
-Cells are the ridges of the bank, whose bias is known for every estimator: none for those that are unbiased, the slopes
-of the jumps for first order, the difference of two smoothings for another radius. Their variance is that of a million
-other terms. None was used to choose a constant of the intervals. Estimates are judged as rows of a study are, with what
-the estimator declares and with the sums of its terms; cells with remarks are counted apart.
+Cells are the ridges of the bank. The bias of every estimator is known there: 0 for unbiased estimators, the slopes of the
+jumps for first order, the difference of two smoothings for another radius. The true variance is computed from a million
+independent terms. No cell was used to choose a constant of the intervals. Intervals are computed as in a study, from the
+estimates, the sums of their terms and the estimator's declarations. Sets of estimates with remarks are counted separately.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from bench.model.estimator import columns, per_repeat
 
 LEAST, MOST = 0.91, 0.99
 ROUNDING = 1e-9
-"""Share of the gradient that the differences of the numpy backend leave."""
+"""Relative error of the numpy backend's gradients, which are differences."""
 PRECISE, PART = 1 << 20, 1 << 16
-"""Samples that give the variance which intervals are held to, and how many at a time."""
+"""Number of samples for the true variance, and of samples per batch."""
 WIDE = 1.5
-"""Deviation of these samples, weighted accordingly, so that tails are met often."""
+"""Standard deviation of these samples, which are importance-weighted, so that tails are sampled often."""
 SIZES = ((16, 16), (16, 100), (64, 16), (64, 100))
 """Repeats and samples of the cells, in turn."""
 
@@ -48,14 +48,14 @@ class Cell:
 
     @property
     def smooth(self) -> bank.Ridge:
-        """The scene without its jumps, whose derivative is that of the scene wherever there is one."""
+        """The scene without its jumps; it has the same derivative wherever the scene has a derivative."""
         kept = [(p, a) for p, a in zip(self.scene.pieces, self.scene.along, strict=True) if "step" not in p.name]
         pieces, along = zip(*kept, strict=True) if kept else ((bank.power(1, 0.0),), self.scene.along[:1])
         return bank.Ridge(pieces, along, self.scene.start, self.scene.sigma)
 
     @property
     def rare(self) -> bool:
-        """Whether something begins 2.4 standard deviations away, which an interval of what occurred cannot know."""
+        """Whether a kink or jump is more than 2.4 standard deviations away, so that samples rarely reach it."""
         places = [
             p.name.split("(")[1].split(",")[0]
             for p in self.scene.pieces
@@ -65,7 +65,7 @@ class Cell:
 
 
 def cells() -> list[Cell]:
-    """Every pair of ridge and estimator whose bias has a closed form."""
+    """Return every pair of ridge and estimator whose bias has a closed form, as cells."""
     return [
         Cell(case.label, case.program.scene, estimator, bias, *SIZES[i % len(SIZES)])
         for i, (case, estimator, bias) in enumerate(_pairs())
@@ -93,7 +93,7 @@ def _pairs() -> Iterator[tuple[bank.Case, SampleMean, float]]:
 
 @dataclass(frozen=True)
 class Held:
-    """Whether one set of estimates had the truth in its intervals, and what its row remarks."""
+    """Whether each interval of one set of estimates contains the true value, and the remark of its row."""
 
     bias: bool
     variance: bool
@@ -102,9 +102,9 @@ class Held:
 
 
 def variance_of_a_term(cell: Cell) -> float:
-    """Return the trace of the covariance of one term, from samples drawn wider and weighted."""
+    """Return the trace of the covariance of one term, by importance sampling with standard deviation :data:`WIDE`."""
     theta, d = cell.scene.start, cell.scene.start.size
-    # a difference across a jump is no derivative
+    # a difference across a jump is not a derivative
     problem = Numpy().compile(compose(cell.smooth if isinstance(cell.estimator, Fobg) else cell.scene))
     draw = np.random.default_rng([8, d, len(cell.label)])
     mean, square, weight, centre = np.zeros(d), 0.0, 0.0, None
@@ -112,7 +112,7 @@ def variance_of_a_term(cell: Cell) -> float:
         w = WIDE * draw.standard_normal((d, PART))
         weights = WIDE**d * np.exp((w * w).sum(axis=0) * (0.5 / WIDE**2 - 0.5))
         terms = cell.estimator.terms(problem, theta, w)
-        # else the variance of terms that hardly differ is a difference of large numbers
+        # without centring, the variance of terms that hardly differ would be a difference of large numbers
         centre = terms @ weights / weights.sum() if centre is None else centre
         terms = terms - centre[:, None]
         mean += terms @ weights
@@ -122,14 +122,14 @@ def variance_of_a_term(cell: Cell) -> float:
 
 
 def estimates(cell: Cell, problem: Problem, noise: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return the estimates, and sums and squares of their terms less those of the first repeat, as a study takes them."""
+    """Return the estimates ``(R, d)``, and sums and squares of their terms minus the first repeat's mean, as in a study."""
     terms = per_repeat(cell.estimator.terms(problem, cell.scene.start, columns(noise)), noise)
     rest = terms - terms[0].mean(axis=0)
     return terms.mean(axis=1), (rest.sum(axis=1), np.einsum("rnd,rnd->r", rest, rest))
 
 
 def covered(cell: Cell, seeds: int) -> list[Held]:
-    """Return what each of ``seeds`` sets of estimates held."""
+    """Return the coverage of each of ``seeds`` sets of estimates."""
     problem = Numpy().compile(compose(cell.scene))
     d = cell.scene.start.size
     draw = np.random.default_rng([7, d, cell.repeats, cell.samples, len(cell.label)])
@@ -144,7 +144,7 @@ def covered(cell: Cell, seeds: int) -> list[Held]:
     for _ in range(seeds):
         rows, terms = estimates(cell, problem, draw.standard_normal((cell.repeats, cell.samples, d)))
         found = summarise(rows, truth, cell.samples, terms, unbiased)
-        # terms that differ by the rounding of a difference only have no variance
+        # terms that differ only by the rounding of a difference have variance 0
         rounding = slack**2 * max(1.0, cell.samples)
         every.append(
             Held(
@@ -158,13 +158,13 @@ def covered(cell: Cell, seeds: int) -> list[Held]:
 
 
 def shares(held: list[Held]) -> tuple[float, float, float]:
-    """Return the shares of bias, variance and variance per sample that were held."""
+    """Return the shares of sets whose intervals contain the true bias, variance and variance per sample."""
     bias, variance, each = np.mean([(one.bias, one.variance, one.per_sample) for one in held], axis=0).tolist()
     return bias, variance, each
 
 
 def main(seeds: int = 40, stride: int = 1) -> int:
-    """Print the coverage without and with remarks, and the cells worst covered; return 1 where it is not 91 to 99%."""
+    """Print coverage and the cells with the lowest; return 1 unless coverage without remarks is within 91% to 99%."""
     total: dict[str, list[Held]] = defaultdict(list)
     worst = []
     every = cells()[::stride]
@@ -172,7 +172,7 @@ def main(seeds: int = 40, stride: int = 1) -> int:
         held = covered(cell, seeds)
         plain = [one for one in held if not one.note]
         total["without remark"] += plain
-        # their own bias decides whether sets of unbiased estimators are remarked on, so these are counted together too
+        # the measured bias decides whether an unbiased estimator gets a remark, so such sets are also counted together
         total["without remark, or declared unbiased and not found so"] += [
             one for one in held if not one.note or one.note.startswith("declared unbiased")
         ]

@@ -1,9 +1,9 @@
-"""Kills runs at random moments of every phase and looks for what is lost: ``python tests/programs/kill.py COUNT [SEED]``.
+"""Kills runs at random moments of every phase, and counts losses: ``python tests/programs/kill.py COUNT [SEED]``.
 
-A round starts in an empty folder and goes through the phases of a run: its references, its cells, its tables, its page, and
-then a comparison with the sweep that nobody killed. In each it is killed a few times and started again. A kill takes a
-victim (the run, a child of it, its process group), a signal and a moment that is drawn within the phase, and counts if it
-found its victim alive; by the phase that the run was in then. Prints one line; status 1 for any loss.
+A round starts in an empty folder and consists of the phases of a run (references, cells, tables, page) and a comparison with
+a sweep that was never killed. In each phase the run is killed a few times and started again. Each kill has a random victim
+(the run, a child process, the process group), a random signal and a random moment within the phase. It counts if the victim
+was alive, for the phase in which the run was at that moment. Prints the faults and counts; the exit status is 1 for any fault.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from bench.run.store import Store
 from bench.studies.bias_variance.columns import COLUMNS
 
 KILLS = {"references": 4, "cells": 6, "tables": 2, "page": 3, "compare": 3}
-"""Kills of each phase in a round."""
+"""Number of kills per phase in a round."""
 CELLS = 64
 WORDS = [
     "scenes=[soft_heaviside,pushing]", "backends=[numpy]", "estimators=[fobg,reinforce]", "repeats=4", "samples=1024",
@@ -70,11 +70,11 @@ try:
 finally:
     mark("end")
 """
-"""The command, which notes when it comes to a phase and is else what it always is."""
+"""The command ``python -m bench``, which also writes the start of each phase to the file ``PHASES``."""
 
 
 class Run:
-    """A command in a folder, and the phase that it is in."""
+    """A command running in a folder, and the phases that it has started."""
 
     def __init__(self, folder: Path, *words: str) -> None:
         self.folder, self._phases = folder, folder.with_name("phases.txt")
@@ -85,12 +85,12 @@ class Run:
         )  # fmt: skip
 
     def phases(self) -> list[tuple[str, float]]:
-        """Return the phases that it came to, and when."""
+        """Return the phases that the command has started, each with its time [s since 1970]."""
         lines = [line.split() for line in self._phases.read_text().splitlines()]
         return [(line[0], float(line[1])) for line in lines if len(line) == 2]
 
     def reaches(self, phase: str) -> bool:
-        """Wait for a phase; False if the command ends without it."""
+        """Wait until a phase starts; returns False if the command ends without it."""
         while phase not in dict(self.phases()):
             if self.process.poll() is not None:
                 return phase in dict(self.phases())
@@ -98,7 +98,7 @@ class Run:
         return True
 
     def end(self) -> str:
-        """Wait for its end; returns what it said."""
+        """Wait until the command ends; returns its stderr."""
         return self.process.communicate(timeout=600)[1]
 
 
@@ -122,7 +122,7 @@ def rows_of(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def broken(path: Path) -> bool:
-    """Whether a file is not the whole of one."""
+    """Return whether a file is incomplete or unreadable; False if it does not exist."""
     ends = {".png": b"IEND\xaeB\x60\x82", ".html": b"</html>", ".csv": b"\n", ".md": b"\n"}
     try:
         content = path.read_bytes()
@@ -139,7 +139,7 @@ def broken(path: Path) -> bool:
 
 
 class Kills:
-    """Kills so many times and counts what went wrong."""
+    """Runs rounds of kills, and counts kills and faults."""
 
     def __init__(self, place: Path, seed: int) -> None:
         self.whole, self.cut, self.dice = place / "whole", place / "cut", random.Random(seed)
@@ -160,23 +160,23 @@ class Kills:
         assert len(self.truth) == CELLS
 
     def fault(self, what: str, more: str) -> None:
-        """Count a fault and say what it was."""
+        """Count a fault and print it."""
         self.faults[what] += 1
         print(f"{what}: {more[-1500:]}", flush=True)
 
     def compare(self, rows: dict[str, dict[str, Any]], what: str) -> None:
-        """Count a fault if rows are not to the last bit those of the sweep that nobody killed."""
+        """Count a fault if rows differ in any bit from the rows of the sweep that was never killed."""
         if found := differences(rows, self.truth):
             self.fault("changed", f"{what}: {len(found)} values, {found[:5]}")
 
     def round(self, count: int) -> None:
-        """Kill in every phase, then see that the sweep comes to what it is without."""
+        """Kill in every phase, then finish the sweep and verify that it equals the sweep that was never killed."""
         self.cut.mkdir()
         for phase, times in KILLS.items():
             for _ in range(times):
                 if self.done.total() < count:
                     self.kill(phase)
-        for phase in ("cells", "compare"):  # folds, and tidies what a kill has left
+        for phase in ("cells", "compare"):  # merges files, and removes those that kills have left
             run = Run(self.cut, *words_of(phase))
             said = run.end()
             if run.process.returncode not in (0, 1):
@@ -191,13 +191,13 @@ class Kills:
         self.rounds += 1
 
     def room_for(self, phase: str) -> None:
-        """Have the command come to a phase again where a run that outlived its kill has done all of it."""
+        """Remove the results of a phase that a surviving run has finished, so that the next run has the phase again."""
         if phase in ("references", "cells") and len(rows_of(self.cut)) == CELLS:
             for name in ("references", "sweep") if phase == "references" else ("sweep",):
                 shutil.rmtree(self.cut / name, ignore_errors=True)
 
     def kill(self, phase: str) -> None:
-        """Kill once, if the command comes to the phase."""
+        """Start the command, kill once during the phase, and count faults in the results."""
         self.room_for(phase)
         run = Run(self.cut, *words_of(phase))
         if run.reaches(phase):

@@ -1,9 +1,9 @@
-"""A bank of misbehaving plugins, faults x places: ``python tests/programs/misbehave.py COUNT [SEED]``.
+"""Runs misbehaving plugins, every fault at every place: ``python tests/programs/misbehave.py COUNT [SEED]``.
 
-Each is a file of its own in one folder of plugins, drawn so that faults and places come equally often. Looked for are: a
-listing or a row of its own for each, with a status and a reason of one line where it did harm; sound cells beside them
-with the same numbers as without them; no traceback, no escape characters, and no process left. Prints a line for each
-finding and one of counts; status 1 for any finding.
+Each plugin is a file in one folder. Cases are drawn so that faults and places are equally frequent. Each plugin must be
+listed or have its own row, with a status and a reason of one line if it did harm. Cells of sound plugins must have the same
+numbers as without the misbehaving plugins. Tracebacks, escape characters and remaining processes are findings. Prints a line
+per finding and one of counts; the exit status is 1 for any finding.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ENDS = {
     "closes_descriptors": "os.closerange(0, 256); ctypes.string_at(0)",
     "stops": "os.kill(os.getpid(), signal.SIGSTOP)",
 }
-"""What ends or holds the process, and cannot be caught in it."""
+"""Faults that end or block the process, and cannot be caught inside it."""
 RAISES = {
     "exits": "sys.exit(0)",
     "raises": "raise ValueError('no\\x1b[31m | estimate\\ntoday')",
@@ -60,7 +60,7 @@ HARMLESS = {
     "warns": "warnings.warn('loudly')",
     "catches_signals": "signal.signal(signal.SIGTERM, signal.SIG_IGN) if threading.current_thread() is threading.main_thread() else None",
 }
-"""Bad manners after which the numbers may be right: ``ok`` is a row of its own."""
+"""Side effects that leave the numbers right: the plugin's rows may be ``ok``."""
 LIES = {
     "lies_in_shape": "np.vstack([value, value])",
     "lies_in_length": "value[..., :-1]",
@@ -74,7 +74,7 @@ LIES = {
     "gives_infinity": "value + np.inf",
     "gives_a_generator": "(one for one in value)",
 }
-"""Values of another kind than promised; some of them can be meant (an array of objects holds the same numbers)."""
+"""Results of a wrong shape, type or value; rows may be ``ok``, since some may be intended (an array of objects)."""
 DECLARES = {
     "no_name": "name = None",
     "odd_name": "name = 'a b[c]'",
@@ -86,7 +86,7 @@ DECLARES = {
     "list_parameter": "much: list = ()",
     "missing_library": "requires = ('a_library_of_no_one',)",
 }
-"""Declarations that nothing can be done with: each is listed with its reason."""
+"""Invalid declarations: each plugin must be listed as unavailable, with the reason."""
 KINDS = {
     "estimators": ("fobg", "Fobg", "scenes=[quadratic] backends=[numpy]", "estimators=[fobg{}]", ("terms", "estimate"), ("unsupported_reason",)),
     "scenes": ("quadratic", "Quadratic", "estimators=[fobg,reinforce] backends=[numpy]", "scenes=[quadratic{}]", ("cost",), ("theta0", "closed_form_gradient", "breakpoints")),
@@ -94,8 +94,8 @@ KINDS = {
     "contacts": ("penalty", "Penalty", "scenes=[bounce_once] backends=[numpy] estimators=[fobg] integrators=[semi_implicit_euler]", "contacts=[penalty{}]", ("force",), ("spring",)),
     "integrators": ("semi_implicit_euler", "SemiImplicitEuler", "scenes=[mass_spring] backends=[numpy] estimators=[fobg]", "integrators=[semi_implicit_euler{}]", ("step",), ("transition",)),
 }  # fmt: skip
-"""By kind: a sound plugin and its class, the rest of a sweep, its own axis, calls of a worker, calls of the plan."""
-# both are ten times what sound plugins take on an idle machine: nothing that is busy is taken for something that hangs
+"""By kind: module and class of a sound plugin, other axes, own axis, methods called by workers, methods called by plan."""
+# limits are ten times what sound plugins take on an idle machine, so that a busy plugin does not count as hanging
 WORDS = ["samples=8", "repeats=3", "timing=false", "workers=2", "timeout=45s", "memory=700m", "reference.samples=4096", "formats=[png]", "--quiet"]  # fmt: skip
 START = "import runpy; from bench.model import trial; trial.TIMEOUT_S = 30.0; runpy.run_module('bench', run_name='__main__')"
 SAID = re.compile(r"Traceback|[\x00-\x08\x0b-\x1f]")
@@ -103,7 +103,7 @@ SAID = re.compile(r"Traceback|[\x00-\x08\x0b-\x1f]")
 
 @dataclass(frozen=True)
 class Case:
-    """One misbehaving plugin."""
+    """One misbehaving plugin: its kind, and the fault at one place of its file or class."""
 
     kind: str
     place: str
@@ -111,16 +111,16 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Its name, and its file's."""
+        """The name of the plugin and of its file."""
         return f"{self.kind[:4]}_{self.place}_{self.fault}"
 
     @property
     def harmful(self) -> bool:
-        """Whether no row of it can be ``ok``."""
+        """Whether none of its rows may be ``ok``."""
         return self.fault not in HARMLESS | LIES
 
     def text(self) -> str:
-        """Its file."""
+        """Return the source of the plugin's file."""
         module, base, *_ = KINDS[self.kind]
         lines = [HEAD, f"from bench.plugins.{self.kind}.{module} import {base}"]
         act = (ENDS | RAISES | HARMLESS).get(self.fault, "pass")
@@ -142,7 +142,7 @@ class Case:
 
 
 def bank() -> list[Case]:
-    """Return every case there is."""
+    """Return every possible case."""
     cases = []
     for kind, (*_, work, planned) in KINDS.items():
         loud = ENDS | RAISES | HARMLESS
@@ -153,7 +153,7 @@ def bank() -> list[Case]:
 
 
 def drawn(count: int, seed: int) -> list[Case]:
-    """Return so many cases, taking each time from the place and the fault that came least often."""
+    """Return ``count`` random cases, so that faults and places are about equally frequent."""
     dice, left, chosen = random.Random(seed), bank(), []
     seen: dict[object, int] = {}
     dice.shuffle(left)
@@ -168,7 +168,7 @@ def drawn(count: int, seed: int) -> list[Case]:
 
 @dataclass
 class Bank:
-    """The cases in a folder, and what was found."""
+    """Runs the cases in a folder, and collects the findings."""
 
     root: Path
     cases: list[Case]
@@ -180,16 +180,16 @@ class Bank:
             (self.root / "mine" / f"{case.name}.py").write_text(case.text())
 
     def find(self, what: str) -> None:
-        """Keep a finding, and print it."""
+        """Store a finding, and print it."""
         self.findings.append(what)
         print(what, flush=True)
 
     def bench(self, *words: str) -> subprocess.CompletedProcess[str]:
-        """Run a command on the folder."""
+        """Run ``python -m bench`` with the plugins of the folder; forbidden output is a finding."""
         environment = {
             **os.environ, "XDG_CACHE_HOME": str(self.root / "cache"), "PYTHONPATH": os.pathsep.join(map(str, sys.path)),
         }  # fmt: skip
-        # into files: a process that a plugin has left would hold a pipe open
+        # into files: a process that a plugin has started would keep a pipe open
         with open(self.root / "out.txt", "w+") as out, open(self.root / "err.txt", "w+") as err:
             done = subprocess.run(
                 [sys.executable, "-c", START, *words, f"plugins={self.root / 'mine'}"],
@@ -201,7 +201,7 @@ class Bank:
         return done
 
     def listed(self) -> dict[str, str]:
-        """Look at the listing; returns the line of each case that cannot be used."""
+        """Run ``list``; returns the line of each case that is listed as unavailable, by name."""
         done = self.bench("list")
         if done.returncode or "fobg" not in done.stdout:
             self.find(f"list ended with {done.returncode}: {done.stderr[-500:]!r}")
@@ -218,7 +218,7 @@ class Bank:
         return found
 
     def run(self, kind: str, cases: list[Case]) -> None:
-        """Run the cases of a kind beside the sound one."""
+        """Run the cases of a kind together with a sound plugin, and verify all rows."""
         _, _, rest, axis, *_ = KINDS[kind]
         words = [*rest.split(), *WORDS, "results_dir=out"]
         alone = self.bench(*words, axis.format(""), f"name={kind}-alone")
@@ -227,7 +227,7 @@ class Bank:
             self.find(f"the sound {kind} ended with {alone.returncode}: {alone.stderr[-500:]!r}")
             return
         for case in [case for case in cases if case.place == "construction" and case.fault in RAISES]:
-            cases.remove(case)  # it cannot be built, and the command that asks for it says so
+            cases.remove(case)  # the plugin cannot be built, and a command that names it must report that
             refused = self.bench("plan", *words, axis.format(f",{case.name}"), f"name={case.name}")
             if refused.returncode != 2 or "cannot be built" not in refused.stderr:
                 self.find(f"{case.name} ended with {refused.returncode}: {refused.stderr[-300:]!r}")
@@ -236,7 +236,7 @@ class Bank:
         rows = self.rows(kind)
         if done.returncode not in (0, 1):
             self.find(f"run of {kind} ended with {done.returncode}: {done.stderr[-700:]!r}")
-            if len(cases) > 1:  # which one was it?
+            if len(cases) > 1:  # run each case separately to find the cause
                 for case in cases:
                     one = self.bench(*words, axis.format(f",{case.name}"), f"name={case.name}")
                     if one.returncode not in (0, 1):
@@ -257,11 +257,11 @@ class Bank:
                 self.find(f"the sound rows of {kind} have another {column}")
 
     def rows(self, name: str) -> pd.DataFrame:
-        """Return stored rows."""
+        """Return the stored rows of an experiment, sorted by key."""
         return Store(self.root / "out" / name, COLUMNS).load().sort_values("key").reset_index(drop=True)
 
     def left(self) -> list[str]:
-        """Return the processes that are still there: those in the folder, and those that the plugins have started."""
+        """Return the command lines of processes that the commands or the plugins have started and that still run."""
         found = []
         for process in psutil.process_iter():
             try:
@@ -274,12 +274,12 @@ class Bank:
 
 
 def main(count: int, seed: int = 0) -> int:
-    """Run a bank of so many and return the status."""
+    """Run ``count`` random cases and return the exit status."""
     with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR")) as place:
         made = Bank(Path(place), drawn(count, seed))
         unavailable, statuses = made.listed(), {}
         for case in made.cases:
-            if case.name in unavailable and case.fault in ENDS:  # each would be tried again by every command
+            if case.name in unavailable and case.fault in ENDS:  # otherwise every command would try to import it again
                 (made.root / "mine" / f"{case.name}.py").unlink()
         for kind in KINDS:
             cases = [case for case in made.cases if case.kind == kind and case.name not in unavailable]

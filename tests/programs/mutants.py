@@ -1,7 +1,7 @@
-"""Plants one-line faults in the core and reports which of them a test notices: `python tests/programs/mutants.py [WORD ...]`.
+"""Plants one-line faults in the core and reports which of them a test detects: `python tests/programs/mutants.py [WORD ...]`.
 
-Each fault whose file or text contains a word is planted in a copy of the tree, in a process forked after the libraries are
-loaded, and the tests named beside it run until one fails. Run by hand: all faults take half an hour.
+Each fault whose file or text contains a word is planted in a copy of the tree. Its tests run until one fails, in a process
+forked after the libraries are loaded. Run by hand: all faults take half an hour.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 CPU, MEMORY = 40, 6 << 30
-"""CPU seconds and bytes that the tests of one fault may use."""
+"""Limits for the tests of one fault: CPU seconds, and bytes of address space."""
 ROOT = Path(__file__).resolve().parents[2]
 COPIED = ("bench", "plugins", "conf", "tests", "docs", "README.md", "CONTRIBUTING.md", "pyproject.toml")
 
@@ -318,8 +318,8 @@ FAULTS = [
     Fault("bench/model/estimator.py", "derivative = program.continuous and not program.surrogate", "derivative = program.continuous", OF_ESTIMATORS + " tests/plugins/test_surrogate.py"),
     Fault("bench/model/estimator.py", "if \"score\" in self.needs and program.explicit:", "if False:", OF_SCORES),
 ]  # fmt: skip
-"""Faults one by one. Those that change no number are left out, such as a faster search, or a quadrature that may stop below
-its least number of points: the second level, before which it never stops, has that many."""
+"""The planted faults. Faults that change no number are omitted, such as in code that only speeds up a search, or a quadrature
+that may stop below its least number of points: it never stops before the second level, which has that many."""
 
 
 def killed(fault: Fault, folder: Path) -> bool:
@@ -335,7 +335,7 @@ def killed(fault: Fault, folder: Path) -> bool:
         try:
             import pytest
 
-            # a fault may loop or fill the memory: that is noticed too
+            # a fault may loop or fill the memory: the limits make its tests fail
             resource.setrlimit(resource.RLIMIT_CPU, (CPU, CPU))
             resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
             os.chdir(folder)
@@ -363,7 +363,7 @@ def main(words: list[str]) -> int:
     chosen = [fault for fault in FAULTS if not words or any(word in f"{fault.path} {fault.old}" for word in words)]
     if lost := stale(chosen):
         raise SystemExit("\n".join(lost))
-    # loaded once, before forking
+    # imported once, before forking
     import pandas  # noqa: F401
     import pytest  # noqa: F401
     import scipy.special

@@ -1,7 +1,7 @@
-"""Planted faults for the gate: which are caught, on which scenes? ``python tests/programs/planted.py`` prints the table.
+"""Prints which planted faults ``compare`` detects, by scene: ``python tests/programs/planted.py [SCENE ...]``.
 
-Every cell runs in this process on the NumPy backend, twice: as it is, and with the fault in the program that both the
-estimates and the reference use, as in a simulator whose next version is broken.
+Every cell runs in this process on the NumPy backend, without and with each fault. The fault is in the problem that both the
+estimates and the reference use, as if the next version of a simulator were broken.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from bench.run import tasks
 from bench.run.session import Session
 
 SHORT = ("pushing", "cartpole", "double_pendulum", "pendulum", "hopper", "friction_block", "tossed_box", "mass_spring", "ground_wall", "bouncing_ball")  # fmt: skip
-"""Scenes whose rollouts are cut to ten steps where they have a horizon."""
+"""Scenes whose horizon is set to ten steps."""
 WORDS = (
     "contacts=[penalty]", "backends=[numpy]", "estimators=[fobg]", "sweep.sigma=[0.1]",
     "samples=16", "repeats=16", "reference.samples=4096", "reference.tolerance=0.1", "timing=false",
@@ -58,7 +58,7 @@ FAULTS = ("none", *GRADIENTS, "sigma * 1.05")
 
 @contextmanager
 def planted(fault: str) -> Iterator[None]:
-    """Plant a fault into every problem."""
+    """Plant a fault in every problem while the context is open."""
     grad, value = Problem.grad, Problem.value
     stretch = 1.05 if fault.startswith("sigma") else 1.0
     change = GRADIENTS.get(fault, lambda gradient: gradient)
@@ -77,7 +77,7 @@ def planted(fault: str) -> Iterator[None]:
 
 
 def rows(scene: str, fault: str) -> tuple[Any, pd.DataFrame]:
-    """Return the columns and the rows of a scene's cells, run with a fault."""
+    """Return the study's columns, and the rows of a scene's runnable cells with a fault."""
     more = [f"scene.{scene}.horizon=10"] if scene in SHORT else []
     made, found = loaded(f"scenes=[{scene}]", *WORDS, *more)
     with planted(fault):
@@ -91,7 +91,7 @@ def rows(scene: str, fault: str) -> tuple[Any, pd.DataFrame]:
 
 
 def judged(scene: str, faults: Sequence[str] = FAULTS) -> pd.DataFrame:
-    """Return a line per fault and estimator: what the comparison says about it."""
+    """Return the line of the comparison for each fault and cell of a scene; empty if no cell can run."""
     columns, before = rows(scene, "none")
     if before.empty:
         return before
@@ -103,7 +103,7 @@ def judged(scene: str, faults: Sequence[str] = FAULTS) -> pd.DataFrame:
 
 
 def main() -> None:
-    """Print, per scene and fault, the outcome on fobg."""
+    """Print, per scene and fault, the outcome of the comparison for the estimator fobg."""
     for scene in sys.argv[1:] or sorted(registry.entries()["scenes"]):
         found = judged(scene)
         if found.empty:

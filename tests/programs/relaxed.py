@@ -1,6 +1,7 @@
-"""Measures how far the central path at ``kappa`` is from the spring it relaxes: ``python tests/programs/relaxed.py 1e-6``.
+"""Measures the error of the central path's gradient at ``kappa``: ``python tests/programs/relaxed.py 1e-6``.
 
-Per stiffness of ``stiffness_sweep``: the mean gradient of ``pushing`` over the same draws, beside that at ``kappa`` / 1000.
+Prints, per stiffness of ``stiffness_sweep``, the relative difference between the mean gradients of ``pushing`` at ``kappa``
+and at ``kappa`` / 1000, over the same draws.
 """
 
 import sys
@@ -14,7 +15,7 @@ SIGMA, DRAWS = 0.1, 512
 
 
 def mean_gradient(stiffness, kappa, draws=DRAWS):
-    """Return the mean gradient ``(d,)`` under the law, over draws that depend on nothing else."""
+    """Return the mean gradient ``(d,)`` under the law, over draws that are the same for all arguments."""
     law = registry.make("contacts", "complementarity", {"stiffness": stiffness, "kappa": kappa})
     step = registry.make("integrators", "semi_implicit_euler", {})
     program = compose(registry.make("scenes", "pushing", {"sigma": SIGMA}), law, step)

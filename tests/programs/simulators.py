@@ -1,9 +1,9 @@
-"""Planted faults and right gradients in NumPy, torch and JAX simulators, and the table of what each checker finds.
+"""Runs `bench.examine` on planted faults and correct gradients in NumPy, torch and JAX simulators, and prints a table.
 
-    python tests/programs/simulators.py [numpy] [torch] [jax]
+    python tests/programs/simulators.py [numpy] [right] [torch] [jax]
 
-prints a line per case: the cause that `bench.examine` names, its exit status, calls and seconds. `checkers.py` asks other
-gradient checkers about the same cases.
+prints a line per case: the cause that `bench.examine` reports, its exit status, calls and seconds. `checkers.py` runs other
+gradient checkers on the same cases.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Case:
-    """A cost with a gradient, and what there is to find."""
+    """A cost with a gradient, and the expected result of an examination."""
 
     name: str
     library: str
@@ -28,7 +28,7 @@ class Case:
     theta: Any
     grad: Any
     causes: tuple[str, ...] = ()
-    """Causes that name it; none for a right gradient."""
+    """Correct names of the planted fault; empty for a correct gradient."""
     settings: dict[str, Any] = field(default_factory=dict)
 
 
@@ -36,7 +36,7 @@ class Case:
 
 
 def complex_step(cost, *extra):
-    """The gradient of an analytic cost to every digit (Squire and Trapp 1998)."""
+    """Return a function for the gradient of an analytic cost, exact up to rounding (Squire and Trapp 1998)."""
 
     def gradient(x, *w):
         steps = np.array(x, dtype=complex)[None] + 1e-30j * np.eye(len(x))
@@ -46,7 +46,7 @@ def complex_step(cost, *extra):
 
 
 def swing(x, steps=100, dt=0.02):
-    """A damped pendulum: theta is first angle, first speed and damping; the cost its squared last angle."""
+    """Return q^2 + 0.1 v^2 at the end of a damped pendulum's motion; theta is first angle, first speed and damping."""
     q, v = x[0], x[1]
     for _ in range(steps):
         v = v + dt * (-9.81 * np.sin(q) - x[2] * v)
@@ -55,7 +55,11 @@ def swing(x, steps=100, dt=0.02):
 
 
 def landing(x, damper=True, contact=True, steps=150, dt=2e-3, slope=False):
-    """A ball on a spring floor, and its derivative by height and speed; the damper acts on the way in and out."""
+    """Return the cost of a ball on a spring floor or, with ``slope``, its derivative by height and speed.
+
+    The floor's damper acts on the way in and out. The derivative omits the damper's term in speed unless ``damper``, and
+    all contact terms unless ``contact``.
+    """
     q, v, dq, dv = x[0], x[1], np.array([1.0, 0.0]), np.array([0.0, 1.0])
     for _ in range(steps):
         depth = max(-q, 0.0)
@@ -68,7 +72,7 @@ def landing(x, damper=True, contact=True, steps=150, dt=2e-3, slope=False):
 
 
 def bisected(x, tolerance, slope=False):
-    """The root of z + z^3 = x0 x1 by bisection down to a tolerance, and its derivative by the implicit function."""
+    """Return the square of the root z of z + z^3 = x0 x1, by bisection to ``tolerance``, or its implicit derivative."""
     low, high = -10.0, 10.0
     while high - low > tolerance:
         middle = 0.5 * (low + high)
@@ -78,7 +82,7 @@ def bisected(x, tolerance, slope=False):
 
 
 def fixed_point(x, tolerance=1e-7, slope=False):
-    """z = cos(z) x0 x1 / 3 iterated until it moves less than a tolerance, and its derivative by the implicit function."""
+    """Return z^2 for z = cos(z) x0 x1 / 3, iterated until z moves at most ``tolerance``, or its implicit derivative."""
     z, before, c = 0.0, 1.0, x[0] * x[1] / 3
     while abs(z - before) > tolerance:
         z, before = np.cos(z) * c, z
@@ -188,7 +192,7 @@ def numpy_cases():
 
 
 def friction(x, steps=60, dt=0.01):
-    """A block pushed over a floor whose friction turns within 1 mm/s: stiff, and right beyond its steep part."""
+    """Return the cost of a block pushed over a floor whose friction changes sign within 1 mm/s, so that it is stiff."""
     q, v = 0.0, x[0]
     for t in range(steps):
         v = v + dt * (x[1] * (t < steps // 2) - np.tanh(v / 1e-3))
@@ -197,7 +201,7 @@ def friction(x, steps=60, dt=0.01):
 
 
 def decay(x, steps=20, dt=0.1):
-    """Implicit Euler of y' = -k (y - cos y), k = 1e6: each step a Newton solve to the last digit."""
+    """Return the cost of implicit Euler steps of y' = -k (y - cos y), k = x1; each step is a Newton solve to rounding."""
     y = x[0]
     for _ in range(steps):
         z = y
@@ -208,7 +212,7 @@ def decay(x, steps=20, dt=0.1):
 
 
 def lorenz(x, steps=150, dt=0.01):
-    """Lorenz' equations by Euler's method: theta is where it starts."""
+    """Return the cost of Lorenz's equations by Euler's method; theta is the initial state."""
     a, b, c = x[0], x[1], x[2]
     for _ in range(steps):
         a, b, c = a + dt * 10 * (b - a), b + dt * (a * (28 - c) - b), c + dt * (a * b - 8 / 3 * c)
@@ -216,7 +220,7 @@ def lorenz(x, steps=150, dt=0.01):
 
 
 def conjugate(x, tolerance=1e-7, slope=False):
-    """x . A(x)^-1 b by conjugate gradients to a tolerance, and its derivative by the adjoint, as loose as the solve."""
+    """Return |A(x)^-1 b|^2 by conjugate gradients to ``tolerance``, or its adjoint derivative with the same tolerance."""
 
     def solve(matrix, right):
         z, rest = np.zeros(3), right.copy()
@@ -236,7 +240,10 @@ def conjugate(x, tolerance=1e-7, slope=False):
 
 
 def bounces(x, slope=False):
-    """A ball that bounces twice, by the times of impact: theta is height and speed up; kinks where a bounce is gained."""
+    """Return the final height of a ball that bounces twice, with exact times of impact.
+
+    theta is height and upward speed. The height has a kink where the number of bounces changes.
+    """
     state, left = (x[0], x[1]), 1.0
     while True:
         hit = (state[1] + np.sqrt(state[1] ** 2 + 2 * 9.81 * state[0])) / 9.81
@@ -246,7 +253,7 @@ def bounces(x, slope=False):
 
 
 def network(x, slope=False):
-    """Two layers of rectifiers: kinks all about, none at theta."""
+    """Return the cost of a network of rectifiers, which has kinks near theta but not at it, or its derivative."""
     first = np.outer(np.arange(1, 9) / 8, [1.0, -2.0, 0.7]) + np.sin(np.arange(24).reshape(8, 3))
     inside = first @ np.array(x) + np.cos(np.arange(8))
     out = np.maximum(inside, 0) @ np.cos(np.arange(8))
@@ -254,7 +261,7 @@ def network(x, slope=False):
 
 
 def right_cases():
-    """More right gradients: stiff, chaotic, kinked, loosely solved, and of very different sizes."""
+    """Yield more correct gradients: stiff, chaotic, with kinks, from loose solvers, and of very different sizes."""
     spread = np.array([1e-6, 1e6, 1.0])
     many = np.linspace(-3, 3, 40)
     yield Case("friction within 1 mm/s", "numpy", friction, [0.8, 3.0], complex_step(friction))
@@ -282,7 +289,7 @@ def right_cases():
 
 
 def logistic(x, steps=25):
-    """The chaotic logistic map: the derivative grows to some 1e5."""
+    """Return the last value of the chaotic logistic map, whose derivative grows to about 1e5."""
     y = x[0]
     for _ in range(steps):
         y = x[1] * y * (1 - y)

@@ -1,6 +1,8 @@
-"""Counts the steps of the tossed box in MuJoCo whose difference straddles a switch: `python tests/programs/straddled.py`.
+"""Counts MuJoCo steps whose finite difference spans a contact switch: `python tests/programs/straddled.py`.
 
-A step's Jacobian from differences of 1e-6 is held to that of 1e-8, and the gradients to differences of whole rollouts.
+The scene is the tossed box.
+The Jacobians of single steps from differences of 1e-6, 1e-7 and 1e-8 are compared with Jacobians from 1e-8, and the gradients
+with differences of whole rollouts.
 """
 
 import numpy as np
@@ -9,12 +11,12 @@ from bench.model import compose, registry
 
 DRAWS = 48
 APART = 1e-3
-"""Difference of two Jacobians of one step, or relative one of two gradients (ten times that), that rounding cannot make."""
+"""Absolute difference of two Jacobians of one step above rounding; ten times it is the relative limit for gradients."""
 FINE = 1e-8
 
 
 def problem(step):
-    """Return the tossed box in MuJoCo, its steps differenced by ``step``."""
+    """Return the problem of the tossed box in MuJoCo, with Jacobians from differences of ``step``."""
     scene = registry.make("scenes", "tossed_box", {})
     law = registry.make("contacts", "penalty", scene.contact_values)
     backend = registry.make("backends", "mujoco", {"step": step})
@@ -22,19 +24,19 @@ def problem(step):
 
 
 def draws(of, count):
-    """Return thetas and noise, the same for any step."""
+    """Return ``count`` thetas ``(d, B)`` and noise ``(n_w, B)``, the same for any difference step."""
     w = np.random.default_rng(0).standard_normal((of.program.n_noise, count))
     return np.repeat(of.program.theta0[:, None], count, axis=1), w
 
 
 def straddled(step, count=DRAWS):
-    """Return which steps have another Jacobian than with finer differences, ``(T, B)``."""
+    """Return which time steps have another Jacobian than with differences of :data:`FINE`, ``(T, B)``."""
     found = [one.jacobians(*draws(one, count)).a for one in (problem(step), problem(FINE))]
     return np.abs(found[0] - found[1]).max(axis=(1, 2)) > APART
 
 
 def wrong(step, count=DRAWS):
-    """Return which gradients are off by over 1% from differences of the whole rollout, ``(B,)``."""
+    """Return which gradients differ by more than 1% from differences of the whole rollout, ``(B,)``."""
     of = problem(step)
     theta, w = draws(of, count)
     h = 1e-7

@@ -1,8 +1,8 @@
 """Measures whether torch.compile would make the torch backend faster: ``python tests/programs/torch_compiled.py``.
 
-One gradient of ``pushing`` under the penalty law for batches of 1,000 and 100,000 rollouts, eager and compiled whole, by
-horizon: seconds to compile with nothing kept on disk, and microseconds per rollout of both. torch unrolls the loop over
-time, so that compiling takes longer with every step; a horizon that takes over ``PATIENCE`` is the last one.
+Prints, by horizon, the seconds to compile one gradient of ``pushing`` under the penalty law without a cache on disk, and the
+microseconds per rollout, eager and compiled, for batches of 1,000 and 100,000 rollouts. torch unrolls the loop over time, so
+compile time grows with the horizon. No horizon follows one that compiles for more than ``PATIENCE`` seconds.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def gradient(function: Callable[..., object], theta: object, w: object) -> tuple[object, float]:
-    """Return the gradient of the sum of costs by theta, and the seconds it took."""
+    """Return the gradient of the summed costs by theta ``(d, B)``, and the seconds it took."""
     import torch
 
     full = theta.detach().clone().requires_grad_()  # type: ignore[attr-defined]

@@ -19,12 +19,12 @@ ROOT = Path(__file__).resolve().parents[2]
 CEILINGS = Path(__file__).with_suffix(".json")
 FOLDERS = ("bench", "plugins")
 ANY_WORD = r"(?!longer\b|more\b|less\b|better\b|worse\b|other\b)[a-z]+"
-"""What a word in capitals stands for in a phrase: "is no longer" and its like are plain English."""
+"""Pattern for a word in capitals in a phrase. Words such as "longer" are excluded, since "is no longer" is plain English."""
 Place = tuple[Path, int]
 
 
 def tables(text: str) -> list[list[str]]:
-    """Return the second cells of the rows of each table in the section "Words"."""
+    """Return the second cell of each row, by table, of the tables in the section "Words"."""
     section = text.partition("\n## Words\n")[2].partition("\n## ")[0]
     blocks = re.findall(r"(?:^\|.*\n)+", section + "\n", re.MULTILINE)
     return [[line.split("|")[2] for line in block.splitlines()[2:]] for block in blocks]
@@ -88,7 +88,7 @@ def violations(paths: list[Path], contributing: str) -> dict[str, list[Place]]:
 
 
 def main(arguments: list[str]) -> int:
-    """Print the rules that are broken more often than their ceilings allow; returns the exit status."""
+    """Print the rules broken more often than their ceilings allow, with places; returns the exit status."""
     paths = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
     broken = violations(paths, (ROOT / "CONTRIBUTING.md").read_text())
     ceilings = json.loads(CEILINGS.read_text())

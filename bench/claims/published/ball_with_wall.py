@@ -97,7 +97,7 @@ class ThrownBall(Claim):
             Figure("end of the first-order descent", "0.494", *ends["fobg"], spread=0.003),
             Figure("end of the zeroth-order descent", "0.8515", *ends["reinforce"], spread=0.0035),
             Figure("end of the alpha-order descent, as published", "0.8515", *ends["alpha_order"], spread=0.0035),
-            # 0.98 is of one run, so the spread is that between runs
+            # the source's 0.98 is from one run, so its spread is the spread between runs
             Figure("share of its estimates with alpha = 0", "0.98", *off[0], spread=2 * between),
         ]
         grid = np.linspace(0.1, 1.4, 60)
@@ -168,7 +168,7 @@ def _exact_descent(at: Problem) -> np.ndarray:
 def _alpha_order(at: Problem, theta: np.ndarray, w: np.ndarray, baseline: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the published estimates of runs ``(R,)`` with accuracy 0.01 and failure probability 0.05, and where alpha is 0.
 
-    Written out since the estimator here always takes the cost at w = 0 as baseline.
+    Implemented here since the estimator of this package always uses the cost at w = 0 as baseline.
     """
     runs, log_term = len(theta), np.log(2 / 0.05)
     every, n = np.repeat(theta, w.shape[1] // runs)[None], w.shape[1] // runs

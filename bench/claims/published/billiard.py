@@ -1,4 +1,4 @@
-"""C15: a ball that misses has no gradient, and contacts from distance give it one."""
+"""C15: a ball that misses has gradient 0, and contact forces at a distance make the gradient nonzero."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Missed(Claim):
         missed = np.abs(wide[inside]) > 2.6
         pushes = {name: float(np.mean(np.abs(mean[missed]) > 1e-3)) for name, mean in means.items()}
         figures = [
-            # 2,000 values of u0 are 0.005 apart: a share is known to one of them, and so is the widest hit
+            # 2,000 values of u0 are 0.005 apart: the share and the widest hit are known to one value
             Figure("share of exact zeros", "0.562", summary(plain == 0)["mean"], spread=1 / u.size),
             Figure("widest hit", "2.189", float(hits), spread=float(u[1] - u[0])),
             Figure("share of exact zeros with contacts from distance", "0.0000", summary(surrogate == 0)["mean"]),

@@ -1,4 +1,4 @@
-"""L4: a block that sticks has no derivative, until noise gives it one."""
+"""L4: the derivative of a sticking block is 0, and with noise it is not."""
 
 from __future__ import annotations
 

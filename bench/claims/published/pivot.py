@@ -1,4 +1,4 @@
-"""C4: a pivot that falls off. Descent on first-order gradients goes over the edge."""
+"""C4: a pivot that falls off an edge. Descent on first-order gradients crosses the edge."""
 
 from __future__ import annotations
 

@@ -34,9 +34,9 @@ def sampled(
 
 
 def source_error(values: tuple[float, float], count: int) -> float:
-    """Return two standard errors of a variance from the source's 1,000 samples, from its error on ``count`` of them.
+    """Return two standard errors of the source's variance of 1,000 samples, scaled from ``values`` of ``count`` samples.
 
-    The sources give one number of about a thousand samples each, and no interval.
+    The sources state each variance as one number from about a thousand samples, without an interval.
     """
     return 2 * values[1] * math.sqrt(count / 1000)
 

@@ -46,7 +46,7 @@ class Ramp(Claim):
         at = problem(f"soft_heaviside[nu={NU},sigma={SIGMA}]")
         draw = np.random.default_rng(2)
         batches = 40_000
-        # in parts, to keep the memory small
+        # in parts, to limit memory
         parts = [at.grad(np.zeros(1), draw.standard_normal((1, 100 * batches))) == 0 for _ in range(5)]
         missed = np.concatenate([part.reshape(batches, 100).all(axis=1) for part in parts])
         figures = [

@@ -19,7 +19,7 @@ PUBLISHED = {0.1: "1.26", 0.05: "0.61", 0.02: "0.145", 0.01: "0.149", 1e-3: "0.0
 STARTS = 40_000
 """Number of starts over which each error is averaged."""
 GRIDS = (500, 1000, 2000)
-"""Possible numbers of evenly spaced starts of the source. Its spread is the difference of their averages."""
+"""Possible numbers of evenly spaced starts in the source. Its spread is the largest difference from their averages."""
 GOLDEN = (5**0.5 - 1) / 2
 KINK, SPEED = 0.305149, 0.800354
 
@@ -37,9 +37,9 @@ class SoftWall(Claim):
     labels = ("time step [s]", "mean error of df/dq0")
 
     def measure(self) -> Outcome:
-        """Average the error over starts that are 0.05 away from the physics' kink."""
+        """Average the error over starts that are more than 0.05 away from the exact solution's kink."""
         figures, errors = [], []
-        # multiples of the golden ratio meet every phase of a step alike, evenly spaced starts only some phases
+        # multiples of the golden ratio cover all phases of a step evenly, evenly spaced starts only some phases
         every = np.arange(STARTS) * GOLDEN % 1.0
         for dt, text in PUBLISHED.items():
             error, less = _mean_error(dt, every), _mean_error(dt, every[: STARTS // 2])
@@ -72,7 +72,7 @@ class SoftWall(Claim):
 
 
 def _mean_error(dt: float, shares: np.ndarray) -> float:
-    """Return the mean error of df/dq0 over starts at these shares of [0.02, 1.5], without those near the kink."""
+    """Return the mean error of df/dq0 over starts 0.02 + 1.48 ``shares``, without the starts near the kink."""
     start = 0.02 + 1.48 * shares
     start = start[np.abs(start - KINK) > 0.05]
     truth = np.where(start < KINK, -SPEED, SPEED)

@@ -54,7 +54,7 @@ class Teeth(Claim):
             if name == "with":
                 figures.append(Figure("y_T + y0", "1.012", float(np.mean(height + theta[0]))))
             else:
-                # starts that are one step's travel apart stand at the same place of their teeth
+                # starts that are one step's travel apart are at the same position within their teeth
                 trend = float(np.mean(height[TOOTH:] - height[:-TOOTH]) / (shift[TOOTH] - shift[0]))
                 figures.append(Figure("trend of the teeth", "-1.000", trend))
         return Outcome(figures, series=series)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 SAMPLES = 400_000
 AT_GAIN = 8 * SAMPLES
-"""Number of samples at T = 20, where the source gives the gain with two digits."""
+"""Number of samples at T = 20, where the source states the gain with two digits."""
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class ThreeEstimators(Claim):
             at = problem(Shifted(sigma=1.0, shift=k))
             for (name, method), text in zip(methods.items(), expected, strict=True):
                 if name == "measure-valued":
-                    # its Rayleigh variable is no polynomial of the noise
+                    # its Rayleigh variable is not a polynomial of the noise
                     _, (variance, error) = moments(at, method)
                 else:
                     values = terms(at, method, nodes)[:, 0]

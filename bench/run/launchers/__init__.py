@@ -1,4 +1,4 @@
-"""Launchers: where tasks run. All give the same rows, and each can resume a sweep that another one started."""
+"""Launchers, which run tasks here or on a cluster. All produce the same rows, and can resume each other's sweeps."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from bench.run.launchers.launcher import Launcher, local_launcher
 def launcher_of(experiment: Experiment, timed: bool = False, kind: str = "") -> Launcher:
     """Return the experiment's launcher.
 
-    Timed tasks run one at a time and have a machine to themselves. All machines are of the ``kind`` given, or of the
-    kind of the first machine. Other tasks run in parallel, each on one thread.
+    Timed tasks run one at a time on an otherwise unused machine, and all machines are of the given ``kind`` or, if it is
+    empty, of the first machine's kind. Other tasks run in parallel, each on one thread.
     """
     match experiment.execution.launcher:
         case "ray":

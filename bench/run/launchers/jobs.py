@@ -20,7 +20,7 @@ from bench.run.store import Store
 from bench.run.tasks import Task, result_of, row_of
 
 WRONG_KIND = "wrong_kind"
-"""Entry of a message from a machine of another kind than the sweep's timed rows: the kind of that machine."""
+"""Key of a message from a machine of another kind than the sweep's timed rows; its value is that machine's kind."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Job:
     """The kind of machine that timed tasks need; empty for any."""
     workers: int = 1
     stores: bool = False
-    """Whether the job stores its rows, so that they are kept if the run that sent it ends."""
+    """Whether the job stores its rows, so that they survive the end of the run that sent it."""
 
 
 def pack(experiment: Experiment) -> bytes:
@@ -86,14 +86,14 @@ def read_message(task: Task, message: dict[str, Any], kind: str) -> Answer:
 
 
 class Losses:
-    """Counts lost jobs, and blames the first task of a job that was lost ``limit`` times."""
+    """Counts lost jobs. A task that is the first unanswered task of ``limit`` lost jobs counts as crashed."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._counts: Counter[int] = Counter()
 
     def requeue(self, tasks: list[Task], waiting: deque[list[Task]], reason: str) -> list[Answer]:
-        """Put the unanswered tasks of a lost job back in front of ``waiting``; returns the answer of a blamed task."""
+        """Put the unanswered tasks of a lost job at the front of ``waiting``; returns the answer of a crashed task."""
         answers: list[Answer] = []
         if tasks:
             self._counts[id(tasks[0])] += 1
@@ -107,7 +107,7 @@ class Losses:
 
 
 def import_path() -> str:
-    """Return a PYTHONPATH with which other machines, which see the same folders, import this package."""
+    """Return a PYTHONPATH of absolute paths, so that other machines with the same folders can import this package."""
     inherited = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     package = Path(__file__).resolve().parents[3]
     return os.pathsep.join(dict.fromkeys([str(package), *(str(Path(path).absolute()) for path in inherited if path)]))

@@ -1,4 +1,4 @@
-"""The contract of a launcher, which runs tasks somewhere, and the launchers of this machine."""
+"""The interface of launchers, which run tasks, and the launchers of this machine."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from bench.run.pool import Answer, Pool, ResourceLimits
 from bench.run.tasks import FAILED, Task, TaskHandler
 
 BATCH_S = 0.05
-"""Seconds of work in this process whose answers are stored together: syncing a file takes longer than a small cell."""
+"""Seconds of work whose answers are yielded together, to be stored in one file: syncing takes longer than a small cell."""
 
 
 class Launcher(Protocol):
-    """Runs groups of tasks: a context manager that leaves nothing running."""
+    """Runs groups of tasks: a context manager that ends all its processes and jobs on exit."""
 
     def __enter__(self) -> Launcher: ...
 
@@ -28,9 +28,9 @@ class Launcher(Protocol):
     ) -> Any: ...
 
     def run(self, groups: Sequence[Sequence[Task]]) -> Iterator[list[Answer]]:
-        """Yield answers as they arrive, each task once, and an empty list every now and then.
+        """Yield answers as they arrive, one per task, and empty lists while the caller has to wait.
 
-        The tasks of a group share what is compiled, and go to one worker unless another one is idle.
+        The tasks of a group share a compilation, and run in one worker unless another worker is idle.
         """
 
     @property
@@ -52,7 +52,7 @@ class InProcessLauncher:
         return
 
     def run(self, groups: Iterable[Iterable[Task]]) -> Iterator[list[Answer]]:
-        """Yield answers, those of quick tasks together."""
+        """Yield an empty list before each task, and answers after it; the answers of quick tasks are yielded together."""
         answers: list[Answer] = []
         since = time.perf_counter()
         for task in itertools.chain.from_iterable(groups):
@@ -72,7 +72,7 @@ class InProcessLauncher:
 
 
 def local_launcher(experiment: Experiment, timed: bool = False, n_workers: int | None = None) -> Launcher:
-    """Return a launcher that uses processes of this machine, or only this process if there are 0 workers.
+    """Return a launcher that runs tasks in processes of this machine, or in this process if there are 0 workers.
 
     ``n_workers`` replaces the experiment's own setting. Timed tasks run one at a time and may use all cores.
     """

@@ -22,9 +22,9 @@ from bench.run.tasks import Task
 TICK = 0.1
 """Seconds between checks of the jobs."""
 JOBS_PER_CORE = 2
-"""Jobs sent per core: one runs, and the next is ready to start."""
+"""Jobs sent per core: one runs, and another is ready to start."""
 MAX_LOSSES = 3
-"""Times that a task may be running on a node that is lost, before it is blamed."""
+"""Number of losses of a node while it runs a task after which the task counts as crashed."""
 
 
 @dataclass(eq=False)
@@ -39,12 +39,12 @@ class _SentJob:
 class RayLauncher:
     """Runs jobs on the nodes of a Ray cluster; timed jobs have a node to themselves, and all nodes are of one kind.
 
-    Raises :class:`UserError` if Ray is not installed, no cluster runs, or no node is of the kind.
+    Raises :class:`UserError` if Ray is not installed, no cluster runs, or no node is of kind ``kind``.
     """
 
     def __init__(self, experiment: Experiment, timed: bool, kind: str) -> None:
         try:
-            os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without a choice, Ray warns
+            os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray warns if this is unset
             import ray
         except ImportError as error:
             raise unavailable("ray", error) from None
@@ -81,11 +81,11 @@ class RayLauncher:
 
     @property
     def current(self) -> list[Task]:
-        """The first unanswered task of each of the first jobs."""
+        """The first unanswered task of each of the first four jobs."""
         return [next(iter(job.unanswered.values())) for job in self._jobs[:4] if job.unanswered]
 
     def run(self, groups: Sequence[Sequence[Task]]) -> Iterator[list[Answer]]:
-        """Yield answers as they arrive, each task once, and an empty list every now and then."""
+        """Yield answers as they arrive, one per task, and empty lists while the caller has to wait."""
         nodes = self._nodes_of_one_kind() if self._timed else {}
         n_slots = len(nodes) if self._timed else int(self._ray.cluster_resources().get("CPU", 1))
         waiting = deque(split(groups, self._settings["cells"], JOBS_PER_CORE * n_slots))
@@ -140,7 +140,7 @@ class RayLauncher:
         return answers
 
     def _nodes_of_one_kind(self) -> dict[str, float]:
-        """Return the nodes for timed cells with their cores; without a kind, all of the first node's kind."""
+        """Return the core counts, by node, of the nodes for timed cells: of the required kind, else of the first node's."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         alive = {n["NodeID"]: n["Resources"].get("CPU", 0) for n in self._ray.nodes() if n["Alive"]}
@@ -172,5 +172,5 @@ def _run_job(folders: Any, experiment: bytes, settings: dict[str, Any]) -> Itera
 
 
 def _kind_of_node() -> str:
-    """Return the kind of machine of the node; a function of its own, since Ray does not accept a cached one."""
+    """Return the kind of machine of the node; a separate function, since Ray does not accept a cached function."""
     return kind_of_machine()

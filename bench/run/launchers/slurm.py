@@ -1,4 +1,4 @@
-"""Runs tasks as jobs of a Slurm cluster: many short cells per job, which stores its own rows as they finish."""
+"""Runs tasks as jobs of a Slurm cluster: many short cells per job, and each job stores rows as their cells finish."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from bench.run.tasks import Task
 TICK = 1.0
 """Seconds between checks of the jobs."""
 MAX_LOSSES = 2
-"""Times that a job may be lost before its first unanswered task is blamed."""
+"""Number of losses of a job after which its first unanswered task counts as crashed."""
 
 
 def import_submitit() -> Any:
-    """Import submitit without its set-up of logging, which closes all existing handlers, some with their streams."""
+    """Import submitit without its logging setup, which would close all existing handlers and some of their streams."""
     name, level = "SUBMITIT_LOG_LEVEL", os.environ.get("SUBMITIT_LOG_LEVEL")
     os.environ[name] = level or "NOCONFIG"
     try:
@@ -74,11 +74,11 @@ class SlurmLauncher:
 
     @property
     def current(self) -> list[Task]:
-        """The first task of each of the first jobs."""
+        """The first task of each of the first four jobs."""
         return [tasks[0] for _, tasks in self._jobs[:4]]
 
     def run(self, groups: Sequence[Sequence[Task]]) -> Iterator[list[Answer]]:
-        """Yield answers when a job has ended, each task once, and an empty list every now and then."""
+        """Yield answers when a job has ended, one per task, and empty lists while the caller has to wait."""
         n_jobs = 1 if self._timed else self._settings["parallel"]
         waiting = deque(split(groups, self._settings["cells"], n_jobs))
         while waiting or self._jobs:
@@ -102,7 +102,7 @@ class SlurmLauncher:
         self._jobs += list(zip(jobs, chunks, strict=True))
 
     def _collect(self, job: Any, tasks: list[Task], waiting: deque[list[Task]]) -> list[Answer]:
-        """Return the answers of a job that has ended, none of one that runs; a lost job's tasks are sent again."""
+        """Return the answers of a job that has ended, or none while it runs; the tasks of a lost job are requeued."""
         if not job.done():
             # each pass over all jobs takes one tick
             time.sleep(TICK / max(1, len(self._jobs)))
@@ -121,7 +121,7 @@ class SlurmLauncher:
         return answers
 
     def _requeue(self, tasks: list[Task], waiting: deque[list[Task]], reason: str) -> list[Answer]:
-        """Return the rows that a lost job has stored as answers, and send its other tasks again."""
+        """Return a lost job's stored rows as answers, and requeue its other tasks."""
         table = Store(self._experiment.directory, self._experiment.columns, self._experiment.study.name).load()
         rows = {row["key"]: row for row in table.to_dict("records")}
         answers, unanswered = [], []
@@ -135,7 +135,7 @@ class SlurmLauncher:
 
 
 def parameters(experiment: Experiment, timed: bool, cluster: str = "slurm") -> dict[str, Any]:
-    """Return the parameters of a job for submitit: minutes, cores, memory, and a whole node if cells are timed."""
+    """Return the parameters of a job for submitit: minutes, cores, memory in GB, and a whole node if cells are timed."""
     settings = experiment.execution.cluster
     memory = experiment.execution.memory
     request: dict[str, Any] = {
@@ -154,7 +154,7 @@ def parameters(experiment: Experiment, timed: bool, cluster: str = "slurm") -> d
 
 
 def script(experiment: Experiment) -> str:
-    """Return the script of a job; raises :class:`UserError` if submitit is not installed."""
+    """Return the sbatch script of a job; raises :class:`UserError` if submitit is not installed."""
     try:
         import_submitit()
         from submitit.slurm.slurm import SlurmExecutor, _make_sbatch_string

@@ -1,9 +1,10 @@
-"""What a new user goes through: a fresh environment, the install, and a first script, each timed.
+"""Times the first steps of a new user: a fresh environment, the installation, and a first script.
 
     python tests/programs/newcomer/measure.py KIND ...
 
-makes an environment per kind in a temporary folder, installs this checkout with what the kind needs, runs the kind's
-script, and prints a line of seconds and lines. The scripts beside this file are those of a first try. pip has to reach a package index.
+creates an environment per kind in a temporary folder, installs this checkout with the kind's requirements, runs the kind's
+script, and prints a line of seconds and numbers of lines. The scripts beside this file are first attempts of a new user. pip
+needs access to a package index.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ NEEDS = {
     "warp_kernel": ["-e", ".", "warp-lang"],
     "gym_env": ["-e", ".", "gymnasium"],
 }
-"""What pip is asked for, by kind of simulator."""
+"""Packages that pip installs, by kind of simulator."""
 
 
 def main(kinds: list[str]) -> None:
