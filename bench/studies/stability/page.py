@@ -1,4 +1,4 @@
-"""The page of the stability map: the share of right gradients by integrator, and the maps."""
+"""Builds the page of the stability map: the share of right gradients by integrator, and the maps."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ RESULTS = [
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the finding, the shares of right gradients, and the maps over step size and stiffness."""
+    """Return the content of the page: the finding, the shares of right gradients, and the maps over dt and stiffness."""
     shown = arrange_maps(experiment, rows)
     over = together(shown, *PLACES)
     has_verdict = (rows["verdict"] != "").any()
@@ -97,7 +97,7 @@ def shares(shown: Arranged) -> pd.DataFrame:
 
 
 def finding(shown: Arranged) -> str:
-    """Write how many gradients are finite but wrong, and the most and the least reliable step on each scene."""
+    """Format how many gradients are finite but wrong, and the most and least reliable law and integrator on each scene."""
     table = shares(shown)
     parts = []
     for scene, part in table.groupby("scene", sort=False):
@@ -113,7 +113,7 @@ def finding(shown: Arranged) -> str:
 
 
 def answers(shown: Arranged) -> pd.DataFrame:
-    """Return the shares as a table of texts."""
+    """Return the verdicts' shares as a table of strings."""
     table = shares(shown)
     texts = {name: [f"{share:.0%}" if share else "-" for share in table[name]] for name in VERDICTS if name}
     return table.assign(**texts)
