@@ -127,9 +127,7 @@ def finding(table: pd.DataFrame) -> str:
 
 
 def answers(shown: Arranged) -> pd.DataFrame:
-    """Return, by problem, the growth at the longest horizon, the gradient norms at the shortest and longest, and the horizon
-    from which the zeroth order has the lower variance.
-    """
+    """Return a line per problem: growth at the longest horizon, norms at both ends, and where the variances cross."""
     lines = []
     good = shown.rows[np.isfinite(shown.rows["gradient_median"])]
     for problem, part in good.groupby(problem_of(shown, good), sort=False):
