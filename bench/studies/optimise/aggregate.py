@@ -192,7 +192,7 @@ def regret_quantiles(rows: pd.DataFrame, spent: Sequence[np.ndarray], grid: np.n
 
 
 def hitting_times(rows: pd.DataFrame, factor: float, ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rollouts until each path's regret is at most its first regret / ``factor``, and whether it gets there.
+    """Return the rollouts until each path's regret is at most its first regret / ``factor``, and whether it reaches that.
 
     A path that never reaches the target has the number of all its rollouts. A gradient counts as ``ratio`` rollouts.
     """
@@ -292,8 +292,9 @@ def _improvement(runs: RunSet, method: str, base: str | None) -> tuple[float, fl
 
 @remember
 def quality_and_runtime(runs: RunSet, default: float, factor: float = TARGETS[0]) -> pd.DataFrame:
-    """Return a line per problem and method with an estimator: the gradient's quality at the start, and the average runtime
-    in rollouts to the first regret / ``factor``.
+    """Return, per problem and method with an estimator, the gradient's quality at the start and the runtime to a target.
+
+    ``art`` is the average runtime, in rollouts, until the regret is the first regret / ``factor``.
     """
     lines = []
     for problem, method, part in runs.by_method():
