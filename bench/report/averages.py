@@ -45,9 +45,9 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 def averages(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     """Return one row per group of cells and quantity: points, mean, its standard error, RMS, least and largest.
 
-    The cells of a group differ only in the axes of ``experiment.average`` and in the axes that step with them. Rows that are
-    not ok are omitted and not counted in ``points``. If rows have mean estimates and reference gradients, the quantity
-    ``signed error`` is the norm of the average of their differences.
+    The cells of a group differ only in the axes of ``experiment.average`` and in the axes that step with them. Rows
+    that are not ok are omitted and not counted in ``points``. If rows have mean estimates and reference gradients, the
+    quantity ``signed error`` is the norm of the average of their differences.
     """
     wanted = experiment.average
     good = rows[rows["status"] == "ok"]

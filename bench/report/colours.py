@@ -12,7 +12,7 @@ def estimator_colour(estimator: str) -> str:
 
 
 def estimator_marker(estimator: str, variant: int = 0) -> str:
-    """Return the estimator's marker; ``variant`` numbers its settings, from 0."""
+    """Return the estimator's marker; ``variant`` is the number of its parameter variant, from 0."""
     return marker(_place(estimator), variant)
 
 

@@ -28,9 +28,9 @@ _tasks: Sequence[Callable[[], Any]] = ()
 def run_tasks(tasks: Sequence[Callable[[], T]]) -> list[T]:
     """Run tasks in forked processes and return their results in order.
 
-    Re-raises the first task error, in task order. Tasks of a killed process, and tasks whose result cannot be pickled, are
-    rerun in this process. All tasks run in this process if a fork is not safe: on other systems than Linux, with other
-    Python threads, or after a module of :data:`UNSAFE` was imported.
+    Re-raises the first task error, in task order. Tasks of a killed process, and tasks whose result cannot be pickled,
+    are rerun in this process. All tasks run in this process if a fork is not safe: on other systems than Linux, with
+    other Python threads, or after a module of :data:`UNSAFE` was imported.
     """
     n_workers = min(blocks.cores(), len(tasks))
     is_safe = threading.active_count() == 1 and not any(name in sys.modules for name in UNSAFE)

@@ -32,7 +32,7 @@ def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, list
 
 
 def report(experiment: Experiment) -> tuple[pd.DataFrame, list[Path]]:
-    """Rewrite an experiment's files from its newest stored rows, without simulation; return the rows and the files' paths."""
+    """Rewrite an experiment's files from its newest stored rows, without simulation; return rows and paths."""
     rows = newest_rows(store_of(experiment).load())
     return rows, write(experiment, rows)
 
@@ -56,6 +56,6 @@ def _page(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 
 def shown(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with control characters in strings, as from a plugin or an error, made safe for a terminal."""
+    """Return the rows with strings on one line and without control characters, for a terminal (except ``parameters``)."""
     texts = [name for name in rows if rows[name].map(type).eq(str).all()]
     return rows.assign(**{str(name): rows[name].map(printable) for name in texts if name != "parameters"})

@@ -18,7 +18,7 @@ from bench.report.style import plain, quantity, width_in_inches, wrapped
 from bench.report.views import CATEGORIES
 
 WIDTH, NARROW = 7.16, 3.5
-"""Width of a figure in inches: two columns of a paper, or one for a single panel, so that fonts keep their size in print."""
+"""Figure widths in inches: two columns of a paper, or one for a single panel. Fonts keep their size in print."""
 LINE = 0.16
 """Height of a line of text in inches."""
 BOLD = 1.32
@@ -43,8 +43,8 @@ def page(
 ) -> tuple[Figure, list[list[Axes]]]:
     """Return a figure and the panels of each problem, in reading order.
 
-    A problem has one panel per label, below each other, with a total height of ``height`` inches. ``across`` problems are
-    side by side.
+    A problem has one panel per label, below each other, with a total height of ``height`` inches. ``across`` problems
+    are side by side.
     """
     width = WIDTH if across > 1 else NARROW
     titles = _panel_titles(problems, 0.86 * width / across)

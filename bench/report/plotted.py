@@ -40,8 +40,8 @@ SIGNS: dict[Any, str] = {"|": "tick", "x": "cross"}
 def plotted(figure: Figure) -> pd.DataFrame:
     """Return a table with a line per point of a figure and its interval, per corner of a band, and per text in the data.
 
-    The column ``mark`` is ``point``, ``limit`` (an upper limit), ``tick``, ``cross``, ``line`` (a corner of a line without
-    markers), ``band`` or ``text``.
+    The column ``mark`` is ``point``, ``limit`` (an upper limit), ``tick``, ``cross``, ``line`` (a corner of a line
+    without markers), ``band`` or ``text``.
     """
     rows = []
     for number, axes in enumerate(figure.axes):

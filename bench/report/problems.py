@@ -33,8 +33,9 @@ class ProblemRows:
 def split_by_problem(shown: Arranged, axis: Axis | None, always: Sequence[str] = ()) -> list[ProblemRows]:
     """Split the rows along an axis into problems, in order of appearance. Names always contain the columns ``always``.
 
-    A swept quantity distinguishes problems if it varies at a fixed value ``x`` of the axis. A quantity that steps with the
-    axis, as in a ``zip``, does not. Sample counts, repeats and parameters of estimators count as swept quantities here.
+    A swept quantity distinguishes problems if it varies at a fixed value ``x`` of the axis. A quantity that steps with
+    the axis, as in a ``zip``, does not. Sample counts, repeats and parameters of estimators count as swept quantities
+    here.
     """
     table = rows_along(shown, axis)
     if table.empty:
@@ -103,8 +104,8 @@ def problem_names(
 ) -> pd.Series:
     """Return the name of each row's problem, ``mass_spring, damping=0``, unique among problems that differ in ``parts``.
 
-    The axes ``without`` are ignored. ``always`` are columns to name even if they distinguish nothing. ``rows`` are some rows
-    of ``shown``, by default all.
+    The axes ``without`` are ignored. ``always`` are columns to name even if they distinguish nothing. ``rows`` are some
+    rows of ``shown``, by default all.
     """
     rows = shown.rows if rows is None else rows
     groups = problem_numbers(rows, parts, without)
@@ -117,7 +118,7 @@ def problem_names(
 
 
 def part_columns(shown: Arranged, parts: Sequence[str], without: Sequence[Axis] = ()) -> list[str]:
-    """Return the columns that identify some parts of the grid: identity strings, then numbers, except the axes ``without``."""
+    """Return the columns that identify ``parts`` of the grid, strings before numbers, except the axes ``without``."""
     more = {"backend": ["dtype"], "estimator": ["estimator_params"], "scene": ["noise"]}
     labels = [*parts, *(name for part in parts for name in more.get(part, []))]
     return [name for name in (*labels, *shown.numbers) if name not in {axis.column for axis in without}]

@@ -25,7 +25,7 @@ HEAD = "python -m bench name=one_cell"
 
 
 def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
-    """Return, per row, the words after :data:`HEAD` that rerun its cell, quoted for a shell; empty if a plugin is missing."""
+    """Return, per row, the words after :data:`HEAD` that rerun its cell, shell-quoted; empty if a plugin is missing."""
     folders = plugin_folders(experiment.plugins)
     revive = CellBuilder()
     lines: list[list[str]] = []
@@ -48,8 +48,8 @@ class CellBuilder:
     def cell(self, given: Mapping[str, Any], row: Mapping[Any, Any], timing: bool) -> Cell:
         """Return the cell of a row's parameters and counts; raises :class:`UserError` if a plugin is not installed.
 
-        The parameters do not contain whether the cell was timed, but its key depends on it. ``timing`` is used if neither
-        choice gives the row's key, because its plugins have changed since.
+        The parameters do not contain whether the cell was timed, but its key depends on it. ``timing`` is used if
+        neither choice gives the row's key, because its plugins have changed since.
         """
         study = self._plugin("study", given["study"])
         assert study is not None
@@ -121,8 +121,8 @@ def plugin_folders(folders: Sequence[Path]) -> list[str]:
 def check_of(cell: Cell) -> str:
     """Return a shell command that repeats a cell's gradient checks: ``gradcheck SCENE``, and non-default settings.
 
-    The cell's horizon replaces the default sweep of ``gradcheck``. Counts and estimator are omitted: no check depends on
-    them.
+    The cell's horizon replaces the default sweep of ``gradcheck``. Counts and estimator are omitted: no check depends
+    on them.
     """
     scene, line = _identity(cell.scene), []
     if isinstance(cell.scene, MechanicalScene):

@@ -54,7 +54,7 @@ def scale_x(panel: Axes, values: np.ndarray) -> None:
 
 
 def scale_y(panels: Sequence[Axes]) -> None:
-    """Set the same logarithmic y scale for all panels, with space for crosses, and shade errors above the gradient's norm."""
+    """Set one logarithmic y scale for all panels, with space for crosses, and shade errors above the gradient's norm."""
     low, high = extent(panels, "y", 0.3, 3.0)
     margin = (high / low) ** 0.12
     for panel in panels:

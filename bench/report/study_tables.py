@@ -38,8 +38,8 @@ def interval(
 ) -> str:
     """Return a number of a row with its interval as a string, ``0.5 [0.4, 0.6]``, or ``-`` if the number is missing.
 
-    The ends are the columns ``name_low`` and ``name_high`` unless ``low`` and ``high`` name other columns. All three values
-    are multiplied by ``factor``.
+    The ends are the columns ``name_low`` and ``name_high`` unless ``low`` and ``high`` name other columns. All three
+    values are multiplied by ``factor``.
     """
     values = [row[column] * factor for column in (name, low or f"{name}_low", high or f"{name}_high")]
     return "-" if math.isnan(values[0]) else "{} [{}, {}]".format(*(number(value, digits) for value in values))
@@ -54,7 +54,8 @@ def label_columns(
 ) -> list[str]:
     """Return the columns that distinguish rows with different ``parts``, ignoring the axes ``without``.
 
-    ``always`` are columns to return even if they distinguish nothing. ``rows`` are some rows of ``shown``, by default all.
+    ``always`` are columns to return even if they distinguish nothing. ``rows`` are some rows of ``shown``, by default
+    all.
     """
     rows = shown.rows if rows is None else rows
     return distinguishing_columns(rows, grouped(rows, parts, without), columns_of(shown, parts, without), always)

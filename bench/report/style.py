@@ -57,8 +57,8 @@ WORDS = {"dt": "time step", "sigma": "noise"}
 class Styles:
     """The colour, marker and line style of each estimator and backend, the same in all charts.
 
-    ``names`` are all registered estimators, so that an estimator's style does not depend on the others in a chart. Beyond the
-    palette's length, hues repeat darker or lighter, with a different marker.
+    ``names`` are all registered estimators, so that an estimator's style does not depend on the others in a chart.
+    Beyond the palette's length, hues repeat darker or lighter, with a different marker.
     """
 
     def __init__(self, rows: pd.DataFrame, names: Sequence[str]) -> None:
@@ -134,7 +134,7 @@ def quantity(name: str, value: float) -> str:
 
 
 def plain(text: str) -> str:
-    """Return text escaped so that Matplotlib does not parse it as a formula or hide it in legends for a leading underscore."""
+    """Return text escaped for Matplotlib: not parsed as a formula, not hidden in legends for a leading underscore."""
     text = " ".join(text.split()).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
@@ -157,7 +157,7 @@ inches = width_in_inches
 
 
 def wrapped(parts: Sequence[str], width: float, between: str = ", ") -> str:
-    """Return parts joined by ``between``, with line breaks so that lines are at most ``width`` inches, except long parts."""
+    """Return parts joined by ``between``, in lines of at most ``width`` inches unless a single part is longer."""
     out = ""
     for part in filter(None, parts):
         last = out.rpartition("\n")[2]

@@ -27,7 +27,7 @@ def number(value: float, digits: int = 2) -> str:
 
 
 def axis_value(value: float) -> str:
-    """Return a value of an axis as a string, with up to six or seven digits; ``-`` if it is not finite.
+    """Return a value of an axis as a string; ``-`` if it is not finite.
 
     >>> axis_value(0.01), axis_value(3000.0), axis_value(1e4)
     ('0.01', '3000', '1e4')

@@ -1,8 +1,8 @@
 """Arranges rows for reading, for tables, charts and pages.
 
 :func:`arrange` adds a column per swept axis. :func:`rows_along` selects the rows along one axis, and
-:mod:`bench.report.problems` splits them by problem. :func:`estimator_curves` returns one curve per estimator of a problem,
-with agreeing backends merged.
+:mod:`bench.report.problems` splits them by problem. :func:`estimator_curves` returns one curve per estimator of a
+problem, with agreeing backends merged.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def attempted(rows: pd.DataFrame) -> pd.DataFrame:
 def newest_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Return each cell's newest row, its parameters completed with today's defaults.
 
-    After a plugin is edited, rows of its older versions remain stored. Rows that old versions of the package stored without
-    parameters are distinguished by their identity columns.
+    After a plugin is edited, rows of its older versions remain stored. Rows that old versions of the package stored
+    without parameters are distinguished by their identity columns.
     """
     rows = completed_rows(rows)
     bare = rows["parameters"] == ""
@@ -67,7 +67,7 @@ class Arranged:
         return [*NUMBERS, *(a.column for a in self.axes if a.column not in (*NUMBERS, "seed"))]
 
     def swept(self) -> dict[Axis, int]:
-        """Return the axes with two or more values in the rows, and the number of values; seeds are merged and never an axis."""
+        """Return the axes with two or more values, and the number of values. Seeds are merged and never an axis."""
         counts = {a: int(rows_along(self, a)["x"].nunique()) for a in self.axes if a.column != "seed"}
         return {axis: count for axis, count in counts.items() if count > 1}
 
@@ -161,7 +161,8 @@ RUN = ("estimator", "estimator_params", "backend", "dtype")
 def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Curve]:
     """Return one problem's curves, one per estimator, in order of appearance; refused cells are omitted.
 
-    Backends within a relative difference of ``close`` are merged into one curve. With None, each backend has its own curve.
+    Backends within a relative difference of ``close`` are merged into one curve. With None, each backend has its own
+    curve.
     """
     rows = attempted(rows)
     several = rows["dtype"].nunique() > 1
@@ -213,7 +214,7 @@ def _agree(a: _Run, b: _Run, tolerance: float) -> bool:
 
 
 def is_logarithmic(values: Any) -> bool:
-    """Return whether an axis is logarithmic: all finite values are positive, and the largest is at least 8 times the least."""
+    """Return whether an axis is logarithmic: finite values are positive, and the largest is at least 8 times the least."""
     finite = np.asarray(values, dtype=float)
     finite = finite[np.isfinite(finite)]
     return bool(finite.size and finite.min() > 0 and finite.max() >= 8 * finite.min())

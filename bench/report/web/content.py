@@ -54,9 +54,9 @@ class PlotAxis:
 class Chart:
     """A chart of a table: points, one panel per value of the column ``facet``, joined to lines by the column ``line``.
 
-    A chart with ``level`` is a map of that column instead. With ``share`` too, the map shows which share of the rows at each
-    position has that level. With ``front``, points are marked that no other point with the same value of that column beats
-    in both x and y.
+    A chart with ``level`` is a map of that column instead. With ``share`` too, the map shows which share of the rows at
+    each position has that level. With ``front``, points are marked that no other point with the same value of that
+    column beats in both x and y.
     """
 
     title: str

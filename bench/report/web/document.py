@@ -32,7 +32,7 @@ MOST = 24
 def assemble(
     experiment: Experiment, content: Content, commands: Sequence[Sequence[str]], record: Mapping[str, Any]
 ) -> str:
-    """Return the page as HTML. ``commands`` are the words that run each row's cell, ``record`` the content of ``run.json``."""
+    """Return the page as HTML. ``commands`` are the words that run each row's cell, ``record`` is ``run.json``."""
     counts = content.rows["status"].value_counts()
     statuses = "".join(f'<li class="{escape(str(s))}"><b>{n}</b> {escape(str(s))}</li>' for s, n in counts.items())
     parts = {
@@ -112,7 +112,7 @@ def _columns_of(chart: Chart) -> set[str]:
 
 
 def column(values: pd.Series) -> Any:
-    """Encode a column for JSON: numbers as a rounded list with None where missing, texts as distinct values and an index."""
+    """Encode a column for JSON: numbers rounded, None where missing; texts as distinct values and an index."""
     if pd.api.types.is_bool_dtype(values) or not pd.api.types.is_numeric_dtype(values):
         codes, unique = pd.factorize(values.astype(str))
         return {"values": list(unique), "index": codes.tolist()}

@@ -1,7 +1,7 @@
 """Chooses an experiment's charts: bias and variance along each swept axis, error against time, or an overview.
 
-An estimator has the same colour and marker in every chart, by its position among all registered estimators. Backends that
-agree are drawn as one line. Relative errors are in units of the reference gradient's norm.
+An estimator has the same colour and marker in every chart, by its position among all registered estimators. Backends
+that agree are drawn as one line. Relative errors are in units of the reference gradient's norm.
 """
 
 from __future__ import annotations
@@ -148,9 +148,9 @@ def _has_costs(cost: Cost, rows: pd.DataFrame) -> bool:
 def choose_problems(problems: Sequence[ProblemRows], room: int = ROOM) -> tuple[list[ProblemRows], list[str]]:
     """Return the problems to draw, about ``room`` of them, and notes on how many values of each parameter are shown.
 
-    Every combination of categories (scene, contact law, integrator, noise) is drawn. The parameter with most values gets
-    the remaining panels, at evenly spaced ranks among its most frequent values, not at the ends of their range. Other
-    parameters are fixed at a middle value among their most frequent ones.
+    Every combination of categories (scene, contact law, integrator, noise) is drawn. The parameter with most values
+    gets the remaining panels, at evenly spaced ranks among its most frequent values, not at the ends of their range.
+    Other parameters are fixed at a middle value among their most frequent ones.
     """
     if len(problems) <= room:
         return list(problems), []

@@ -54,7 +54,7 @@ TIME_COMPILED = Cost(
     _seconds,
 )
 RATIO = "gradient_cost"
-"""Column with the number of rollouts that take as long as one gradient; where it is missing, a gradient counts as one."""
+"""Column with the number of rollouts that take as long as one gradient; 1 where it is missing."""
 PROGRAM = (
     "scene", "contact", "integrator", "noise", "horizon", "dt", "stiffness", "sigma", "smoothing", "backend", "dtype",
 )  # fmt: skip
@@ -100,9 +100,10 @@ EQUAL_ROLLOUTS, EQUAL_TIME = "rmse_equal_rollouts", "rmse_equal_time"
 def with_errors_at_equal_cost(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with each estimator's relative RMSE at equal rollouts and at equal time.
 
-    An estimate from c times fewer samples has the same bias and c times the variance. ``rmse_equal_rollouts`` allows one
-    rollout per sample, where a gradient counts at its measured cost (:func:`with_gradient_cost`). ``rmse_equal_time``
-    allows the time of the fastest estimator with as many samples on the same problem, each on its fastest backend.
+    An estimate from c times fewer samples has the same bias and c times the variance. ``rmse_equal_rollouts`` allows
+    one rollout per sample, where a gradient counts at its measured cost (:func:`with_gradient_cost`).
+    ``rmse_equal_time`` allows the time of the fastest estimator with as many samples on the same problem, each on its
+    fastest backend.
     """
     rows = with_gradient_cost(rows)
     good = rows["status"] == "ok"

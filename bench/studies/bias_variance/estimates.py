@@ -1,7 +1,7 @@
 """Computes a cell's estimates. Noise too large for memory is drawn in parts.
 
-An estimator that is a mean of terms is summed per repeat, part by part and in a fixed order. So memory does not grow with
-samples or repeats, and the result is the same to the last digit for any number of threads and on any machine.
+An estimator that is a mean of terms is summed per repeat, part by part and in a fixed order. So memory does not grow
+with samples or repeats, and the result is the same to the last digit for any number of threads and on any machine.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class Estimates:
         return total / self._cell.samples
 
     def _sum_terms(self, terms: np.ndarray) -> tuple[np.ndarray, float]:
-        """Subtract the mean of the first batch from terms ``(d, b)``; return their sum ``(d,)`` and the sum of squared norms."""
+        """Subtract the first batch's mean from terms ``(d, b)``; return their sum ``(d,)`` and the sum of squared norms."""
         if self._centre is None:
             self._centre = terms.mean(axis=1)
         with np.errstate(all="ignore"):

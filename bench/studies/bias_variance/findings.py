@@ -81,8 +81,8 @@ def headline(
 ) -> str:
     """Summarise failures along an axis: where the most frequently best estimator fails, and which estimators never fail.
 
-    An estimator fails where it is no better than the zero estimate, or where its cell has no result. ``marks`` are named
-    values of the axis.
+    An estimator fails where it is no better than the zero estimate, or where its cell has no result. ``marks`` are
+    named values of the axis.
     """
     names = _by_wins(parts)
     bad = {name: [_failures(curves, name) for _, curves in parts] for name in names}
@@ -155,7 +155,7 @@ def _range_text(where: str, axis: Axis) -> str:
 def _failure_range(
     bad: Sequence[Mapping[float, bool]], problems: Sequence[ProblemRows], axis: Axis, marks: Mapping[str, float]
 ) -> str:
-    """Format where along an axis an estimator fails, and in which of several problems; ``bad`` has its failures by problem."""
+    """Format where along an axis an estimator fails, and in which problems; ``bad`` has its failures by problem."""
     failing = [i for i, where in enumerate(bad) if any(where.values())]
     spans = list(dict.fromkeys(span(bad[i]) for i in failing))
     text = _range_text(spans[0], axis) if len(spans) == 1 and spans[0] else ""

@@ -100,8 +100,8 @@ def summarise_diagnostics(diagnostics: list[Auxiliaries]) -> str:
 def locate_first_bad(cell: Cell, problem: Problem, estimates: Estimates, repeat: int) -> str:
     """Return a string with the theta, seed and sample to reproduce an estimate that is not finite.
 
-    The sample is the first one of the repeat whose cost or gradient at theta is not finite. There may be none: an estimator
-    can compute an infinite estimate from finite costs and gradients, or evaluate them at another theta.
+    The sample is the first one of the repeat whose cost or gradient at theta is not finite. There may be none: an
+    estimator can compute an infinite estimate from finite costs and gradients, or evaluate them at another theta.
     """
     theta, before = problem.program.theta0, 0
     sample = "no single sample, costs and gradients are finite"

@@ -202,7 +202,7 @@ class ProblemSummary:
         self.winners = winners(self.lines, EQUAL_ROLLOUTS)
 
     def errors(self, label: str, places: Iterable[float]) -> list[float]:
-        """Return an estimator's relative RMSEs at equal rollouts, at some values of the axis, for each group of agreeing backends."""
+        """Return an estimator's relative RMSEs at equal rollouts at some values of the axis, per group of agreeing backends."""
         rows = [line.at[x] for x in places for line in self.lines if line.label == label and x in line.at]
         return [row[EQUAL_ROLLOUTS] for row in rows if row["status"] == "ok" and math.isfinite(row[EQUAL_ROLLOUTS])]
 
@@ -225,7 +225,7 @@ class BetterElsewhere:
 
     @property
     def factor(self) -> float:
-        """Largest error of the most frequently best estimator over the smallest error of the better one; may be infinite."""
+        """Largest error of the most frequently best estimator over the smallest error of the better one."""
         worse = max(self.instead_of, default=math.inf)
         return worse / min(self.errors) if min(self.errors) > 0 else math.inf
 
@@ -268,7 +268,7 @@ def _join_sentences(*parts: str) -> str:
 
 
 def finding(summaries: Sequence[ProblemSummary]) -> str:
-    """Format the finding: the estimator that most often has the lowest error at equal rollouts, and where to use another."""
+    """Format the finding: the estimator that most often has the lowest error at equal rollouts, and exceptions."""
     settings = [(one, x) for one in summaries for x in one.lowest]
     if not settings:
         return "No cell has an error that could be compared"

@@ -313,7 +313,7 @@ def _name_curves(panel: Axes, curves: Sequence[Curve], cost: Cost, look: Styles,
 
 
 def apart(heights: Sequence[float], gap: float, low: float, high: float) -> list[float]:
-    """Return increasing heights shifted to be at least ``gap`` apart and at most ``high``; at least ``low`` if there is space."""
+    """Return increasing heights, shifted to be ``gap`` apart, at most ``high`` and, if there is space, at least ``low``."""
     moved: list[float] = []
     for height in heights:
         moved.append(max(height, moved[-1] + gap if moved else low))

@@ -1,7 +1,7 @@
 """Pivot table for papers: estimators down, values of one swept axis across, within the width of a two-column page.
 
-A cell shows the relative RMSE of one estimate above its 95% interval, or a sign for its failure. Columns beyond the width
-continue in a table below. The CSV has every other number of a cell.
+A cell shows the relative RMSE of one estimate above its 95% interval, or a sign for its failure. Columns beyond the
+width continue in a table below. The CSV has every other number of a cell.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def _in_markdown(cell: PivotCell) -> str:
 
 
 def _failures(table: Pivot, form: int) -> list[tuple[str, str]]:
-    """Return the signs of failures and remarks that occur, with their meanings; ``form`` is 0 for Markdown, 1 for LaTeX."""
+    """Return the signs of failures and remarks that occur, with meanings; ``form`` is 0 for Markdown, 1 for LaTeX."""
     seen = {cell.failure for cell in table.cells()}
     meanings = [(signs[form], f"{signs[2]}.") for status, signs in FAILURES.items() if status in seen]
     if any(cell.noted and not cell.failure for cell in table.cells()):
@@ -173,7 +173,7 @@ def _failures(table: Pivot, form: int) -> list[tuple[str, str]]:
 
 
 def latex(table: Pivot) -> str:
-    """Format the table in LaTeX: floats over both columns, at most :data:`WIDTH` wide, with no package but ``booktabs``."""
+    """Format the table in LaTeX: floats over both columns, at most :data:`WIDTH` wide; needs only ``booktabs``."""
     out = [r"% needs \usepackage{booktabs}; made for a text width of 7 in over both columns, without scaling"]
     for i, blocks in enumerate(_floats([part for block in table.blocks for part in _fitting(block)])):
         title = escape_latex(table.title) + (", continued" if i else "")

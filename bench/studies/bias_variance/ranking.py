@@ -44,9 +44,9 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 def best(table: pd.DataFrame) -> pd.DataFrame:
     """Return, per estimator and problem, the setting with the lowest error at equal evaluations, and its verdict.
 
-    At one evaluation (cost or gradient) per sample, an estimate has the measured bias, and the measured variance times the
-    estimator's evaluations per sample. Choosing the best of several settings favours an estimator by about the width of
-    its interval.
+    At one evaluation (cost or gradient) per sample, an estimate has the measured bias, and the measured variance times
+    the estimator's evaluations per sample. Choosing the best of several settings favours an estimator by about the
+    width of its interval.
     """
     good = table[(table["status"] == "ok") & np.isfinite(table["equal"])]
     good = good.assign(estimator=good["label"].str.partition("[")[0])
@@ -89,8 +89,8 @@ def _column(table: pd.DataFrame, problem: str) -> list[str]:
 def rank_estimators(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one row per cell: estimator, problem, relative RMSE with its interval, and its verdict.
 
-    The table is empty unless at least three estimators ran on several problems, once per problem. The interval combines the
-    intervals of bias and variance, since rmse^2 = bias^2 + variance.
+    The table is empty unless at least three estimators ran on several problems, once per problem. The interval combines
+    the intervals of bias and variance, since rmse^2 = bias^2 + variance.
     """
     rows = rows.assign(
         label=estimator_labels(rows),

@@ -14,7 +14,7 @@ OFF = 0.5
 
 
 def sentences(rows: pd.DataFrame) -> list[str]:
-    """Return a sentence per estimator and diagnostic: the range of its medians, and the number of cells where it is mostly 0."""
+    """Return a sentence per estimator and diagnostic: the range of its medians, and in how many cells it is mostly 0."""
     texts = []
     good = rows[(rows["status"] == "ok") & (rows["auxiliaries"] != "")]
     for (estimator, params), group in good.groupby(["estimator", "estimator_params"], sort=False):

@@ -190,7 +190,7 @@ def _print_wrapped(console: Console, text: str, indent: int) -> None:
 
 
 def _show_verdict(console: Console, group: ProblemRows, axis: Axis | None) -> None:
-    """Print one problem's findings: the estimators of lowest error, and the biased and useless ones, each with its range."""
+    """Print one problem's findings: the estimators of lowest error, the biased and the useless ones, with their ranges."""
     console.print(f"  {group.title()}" + (f", by {axis.title}" if axis else ""), style="bold")
     curves = estimator_curves(group.rows)
     ranked = {f"lowest error at equal {cost}": _winners(curves, error) for cost, error in COSTS.items()}
@@ -235,7 +235,7 @@ def _has_unexplained_bias(row: Any) -> bool:
 
 
 def _first(rows: pd.DataFrame, goal: float) -> str:
-    """Format the fastest cell with a relative RMSE of at most ``goal``: estimator, backend, time and samples; else ``none``."""
+    """Format the fastest cell with a relative RMSE of at most ``goal``; ``none`` if no cell has it."""
     good = rows[(rows["status"] == "ok") & (rows["rmse_rel"] <= goal) & np.isfinite(rows["time_s"])]
     if good.empty:
         return "none"

@@ -147,7 +147,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def methods(problem: ProblemRows, target: float, cost: Cost) -> dict[str, RequiredCost]:
-    """Return each method's cost to reach an error. Methods are estimators on backends for time, estimators for rollouts."""
+    """Return each method's cost to reach an error. For time a method is an estimator on a backend, else an estimator."""
     reached: dict[str, RequiredCost] = {}
     for curve in estimator_curves(problem.rows, close=None):
         name = curve.label if cost is ROLLOUTS else f"{curve.label} on {curve.rows['backend'].iloc[0]}"
@@ -163,7 +163,7 @@ def estimator_of(method: str) -> str:
 
 
 def line(problem: ProblemRows, target: float, kind: str, cost: Cost) -> dict[str, Any]:
-    """Return a line of the table: the cheapest method, the next (of another estimator if possible), and the excluded ones."""
+    """Return a line of the table: the cheapest method, the next (if possible of another estimator), and excluded ones."""
     reached = methods(problem, target, cost)
     ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
     entry: dict[str, Any] = {
@@ -225,7 +225,7 @@ def sentence(entry: Any) -> str:
 
 
 def sentences(best: pd.DataFrame) -> list[str]:
-    """Return a sentence per problem: the method that reaches each error in the least time (in rollouts if nothing is timed)."""
+    """Return a sentence per problem: the method that reaches each error first in time (in rollouts if untimed)."""
     kind = "time" if (best["by"] == "time").any() else "rollouts"
     chosen = best[best["by"] == kind].to_dict("records")
     by_problem: dict[str, list[str]] = {}
@@ -243,7 +243,7 @@ def _is_clearly_first(entry: Any) -> bool:
 
 
 def summarise_leaders(entries: Sequence[Any]) -> str:
-    """Format which estimator is certainly first on most problems: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
+    """Format which estimator is certainly first most often: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
     clauses: list[str] = []
     before = ""
     for target in dict.fromkeys(entry["relative error"] for entry in entries):
@@ -260,7 +260,7 @@ def summarise_leaders(entries: Sequence[Any]) -> str:
 
 
 def summarise_accuracy_and_cost(problems: Sequence[ProblemRows], cost: Cost) -> str:
-    """Format which estimators are most accurate and cheapest on most problems, and where the cheapest is no better than zero."""
+    """Format which estimators are most accurate and cheapest on most problems, and where the cheapest is useless."""
     accurate: Counter[str] = Counter()
     cheap: Counter[str] = Counter()
     useless: Counter[str] = Counter()

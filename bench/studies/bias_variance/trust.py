@@ -1,8 +1,9 @@
 """When may a first-order gradient be trusted? ``python -m bench.studies.bias_variance.trust results/standard`` counts.
 
-The rules use the mean of the estimates, their spread between repeats and the remark on the row, but not the reference. Each
-rule is scored on all stored cells of ``fobg`` (or of the estimators named after the folder): how many cells it trusts, how
-many trusted cells are wrong (relative RMSE of :data:`WRONG` or more), and how many accurate cells it does not trust.
+The rules use the mean of the estimates, their spread between repeats and the remark on the row, but not the reference.
+Each rule is scored on all stored cells of ``fobg`` (or of the estimators named after the folder): how many cells it
+trusts, how many trusted cells are wrong (relative RMSE of :data:`WRONG` or more), and how many accurate cells it does
+not trust.
 """
 
 from __future__ import annotations

@@ -125,9 +125,9 @@ class Point:
 def start(problem: Problem, theta: np.ndarray, unit: float, search: SwitchSearch, seed: int) -> gradcheck.Check:
     """Check every component and random directions at ``theta (d,)`` and at other thetas near it, without noise.
 
-    ``unit`` is the unit roundoff of the program's arithmetic. Costs are evaluated in batches of a fixed width, so that a
-    compiling backend compiles once. A gradient is the last column of a batch whose first column is theta, because a faulty
-    backend may be right for a single column only.
+    ``unit`` is the unit roundoff of the program's arithmetic. Costs are evaluated in batches of a fixed width, so that
+    a compiling backend compiles once. A gradient is the last column of a batch whose first column is theta, because a
+    faulty backend may be right for a single column only.
     """
     still = np.zeros((problem.program.n_noise, COLUMNS_AT_ONCE))
 
@@ -169,7 +169,7 @@ def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, 
 
 
 def beyond_stability(cell: Cell) -> list[str]:
-    """Return a list with a remark if the integrator is unstable on the contact law's spring at this dt, else an empty list."""
+    """Return a remark if the integrator is unstable on the contact law's spring at this dt, else an empty list."""
     scene, law, integrator = cell.scene, cell.contact, cell.integrator
     spring = law.spring() if isinstance(law, ForceLaw) else None
     if not isinstance(scene, ContactScene) or spring is None or integrator is None:
@@ -207,10 +207,10 @@ def examine(
 ) -> tuple[list[Place], list[tuple[gradcheck.Sample, list[tuple[str, str]]]]]:
     """Check directional derivatives at ``theta (d,)``, without noise and with ``drawn (n_w,)``, and at contact switches.
 
-    Derivatives at theta are along the first ``search.directions`` of ``directions (D, d)``. Switches are searched along all
-    directions, without noise, and checked along the first ``search.directions`` that meet one. Returns the places and, for
-    each place, its costs and the contact modes on both sides at every eps. ``unit`` is the unit roundoff of the program's
-    arithmetic. All costs are one batch, which is evaluated twice.
+    Derivatives at theta are along the first ``search.directions`` of ``directions (D, d)``. Switches are searched along
+    all directions, without noise, and checked along the first ``search.directions`` that meet one. Returns the places
+    and, for each place, its costs and the contact modes on both sides at every eps. ``unit`` is the unit roundoff of
+    the program's arithmetic. All costs are one batch, which is evaluated twice.
     """
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     modes = contact_modes(problem)

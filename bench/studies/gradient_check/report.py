@@ -58,8 +58,8 @@ def checks(rows: pd.DataFrame) -> Iterator[tuple[dict[str, Any], int, str]]:
 def long_table(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one line per cell, check and eps, and one line per cell that could not be checked.
 
-    Columns that are not the study's own, such as swept parameters, are last. The column ``parameters`` is omitted, since it
-    would be repeated on every line: ``rows.parquet`` has it under the same ``key``.
+    Columns that are not the study's own, such as swept parameters, are last. The column ``parameters`` is omitted,
+    since it would be repeated on every line: ``rows.parquet`` has it under the same ``key``.
     """
     whole = ["experiment", *IDENTITY, "dim", "status", "reason"]
     added = [name for name in rows if name not in COLUMNS.by_name]

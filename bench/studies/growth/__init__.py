@@ -31,7 +31,7 @@ class Growth(Study):
     lags: int = param(40, "most lags whose gain is stored", positive=True)
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column: gradient norms, variances of both orders, and growth of the Jacobian product."""
+        """Return one cell's results by column: gradient norms, variances, and growth of the Jacobian product."""
         from bench.studies.growth.measure import measure
 
         return measure(cell, session, self.rollouts, self.lags)

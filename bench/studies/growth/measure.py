@@ -22,8 +22,8 @@ ROUNDING = 1e-6
 def measure(cell: Cell, session: Session, rollouts: int, most_lags: int) -> dict[str, Any]:
     """Return one cell's results by column.
 
-    They are gradient norms and variances of both orders over all samples, and Jacobian products of the first ``rollouts``
-    finite rollouts, with gains at ``most_lags`` lags at most.
+    They are gradient norms and variances of both orders over all samples, and Jacobian products of the first
+    ``rollouts`` finite rollouts, with gains at ``most_lags`` lags at most.
     """
     problem = session.problem(cell)
     program = problem.program
@@ -50,7 +50,7 @@ def measure(cell: Cell, session: Session, rollouts: int, most_lags: int) -> dict
 
 
 def variances(terms: np.ndarray, name: str) -> dict[str, float]:
-    """Return the variance per sample of terms ``(d, R, N)``: its median, 5% and 95% quantiles and mean over the R repeats."""
+    """Return the variance per sample of terms ``(d, R, N)``: median, 5% and 95% quantiles and mean over repeats R."""
     with np.errstate(over="ignore"):
         totals = np.nansum(np.nanvar(terms, axis=2, ddof=1), axis=0)
     return {
@@ -102,7 +102,7 @@ def _log(values: np.ndarray) -> np.ndarray:
 
 
 def rate(logarithms: np.ndarray, steps: int) -> tuple[float, float, float]:
-    """Return log |product| ``(B,)`` per step, averaged over noise samples, and the ends of its 95% interval (Student's t)."""
+    """Return log |product| ``(B,)`` per step, averaged over noise samples, with its 95% interval (Student's t)."""
     from scipy.special import stdtrit
 
     rates = logarithms[np.isfinite(logarithms)] / steps

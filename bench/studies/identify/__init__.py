@@ -66,7 +66,7 @@ class Identify(Study):
         return measure(cell, self)
 
     def unsupported_reason(self, cell: Cell) -> str | None:
-        """Return why a cell cannot be fitted, or None: no motion or unknowns, no steps in NumPy, sampling, or unusable data."""
+        """Return why a cell cannot be fitted (no motion, no unknowns, no NumPy steps, sampling, unusable data), or None."""
         from bench.studies.identify.measure import read
 
         scene, optimizer = cell.scene, cell.parts["optimizer"]

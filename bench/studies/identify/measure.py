@@ -23,10 +23,10 @@ SHOOTING = ("single", "multiple", "windows")
 GAP_WEIGHT = 100.0
 """Weight of a gap between windows of multiple shooting, relative to the weight of a measurement."""
 MAX_STEP_SHIFT = 0.5
-"""Largest change of an estimate at half the step, in units of its Cramer-Rao bound, that counts as independent of the step.
+"""Largest change of an estimate at half the step, in Cramer-Rao bounds, that counts as independent of the step.
 
-To first order in the step, the error of the estimate is twice this change: one bound. With a bias of one bound, 17% of the
-95% intervals miss the truth instead of 5%.
+To first order in the step, the error of the estimate is twice this change: one bound. With a bias of one bound, 17% of
+the 95% intervals miss the truth instead of 5%.
 """
 
 Settings = Any
@@ -60,7 +60,7 @@ class Model:
         return np.concatenate(self._start(theta)[2])
 
     def simulate(self, theta: np.ndarray, x: np.ndarray, begin: np.ndarray, steps: int) -> np.ndarray:
-        """Return the states ``(steps, n, B)`` after each step, from states ``x (n, B)`` before the steps numbered ``begin (B,)``."""
+        """Return the states ``(steps, n, B)`` after each step, from ``x (n, B)`` before the steps ``begin (B,)``."""
         program, own, state, scanned = self._start(theta)
         n_q, columns = len(state.q), np.arange(theta.shape[1])
         now, states = State(x[:n_q], x[n_q:]), []
@@ -156,7 +156,7 @@ class Fitting:
         return self.model.program.scene.horizon // self.n_windows
 
     def residuals(self, points: np.ndarray, data: np.ndarray) -> np.ndarray:
-        """Return the residuals ``(m, B)`` of ``points (dim, B)`` against ``data (m', B)``, in units of the noise, and of gaps."""
+        """Return residuals ``(m, B)`` of ``points (dim, B)`` against ``data (m', B)``, and of gaps, in units of the noise."""
         p, batch, n = len(self.model.names), points.shape[1], len(self.unit)
         theta = np.exp(points[:p])
         first = self.model.initial_states(theta)
@@ -184,8 +184,8 @@ class Fitting:
     def start(self, theta: np.ndarray, data: np.ndarray) -> np.ndarray:
         """Return the initial unknowns ``(dim, B)`` for ``theta (p, B)`` and ``data (m', B)``.
 
-        Windows after the first start at the measured positions and finite differences of them. Positions that are not measured
-        start on the rollout of theta.
+        Windows after the first start at the measured positions and finite differences of them. Positions that are not
+        measured start on the rollout of theta.
         """
         batch, n = data.shape[1], len(self.unit)
         states = np.zeros((self.n_windows - 1, n, batch))
@@ -207,7 +207,7 @@ class Fitting:
 def run_fits(
     fitting: Fitting, optimizer: Optimizer, start: np.ndarray, data: np.ndarray, iterations: int
 ) -> np.ndarray:
-    """Return the unknowns ``(dim, B)`` after ``iterations`` of an optimizer from ``start (dim, B)``, all fits in one batch."""
+    """Return the unknowns ``(dim, B)`` after ``iterations`` of an optimizer from ``start (dim, B)``, as one batch."""
     states = [optimizer.start(column) for column in start.T]
     no_draws = np.empty((fitting.dim, 0))
     for _ in range(iterations):

@@ -82,7 +82,7 @@ def readable(lines: pd.DataFrame) -> pd.DataFrame:
 
 
 def findings(shown: Arranged) -> list[str]:
-    """Return the findings as sentences: failures, then each problem's identifiable parameters and dependence on the step."""
+    """Return the findings: failures, then each problem's identifiable parameters and dependence on the time step."""
     lines = flatten(shown)
     if not len(lines):
         return ["No fit gave a result: the table has the reason of each."]
@@ -109,7 +109,7 @@ def headline(lines: pd.DataFrame) -> str:
 
 
 def failures(lines: pd.DataFrame) -> list[str]:
-    """Return the failures as sentences: poor convergence, narrow intervals, and fits with too many identifiable directions."""
+    """Return the failures as sentences: poor convergence, narrow intervals, fits with too many identifiable directions."""
     sentences = []
     unconverged, narrow = _unconverged(lines), _undercovered(lines)
     if len(unconverged):

@@ -85,7 +85,7 @@ class Optimise(Study):
         return given
 
     def unsupported_reason(self, cell: Cell) -> str | None:
-        """Return why a cell cannot be searched, or None: the optimizer lacks a gradient, or the target is below the optimum."""
+        """Return why a cell cannot be searched (no gradient, or a target below the optimum), or None."""
         optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
         assert isinstance(optimizer, Optimizer)
         assert estimator is None or isinstance(estimator, Estimator)

@@ -65,7 +65,8 @@ class RunSet:
     def best_tunings(self) -> dict[tuple[str, str], str]:
         """The tuning with the lowest median final cost, by problem and method.
 
-        The median is over the tuning seeds, or over all seeds if there are no tuning seeds. A failed search counts as inf.
+        The median is over the tuning seeds, or over all seeds if there are no tuning seeds. A failed search counts as
+        inf.
         """
         best: dict[tuple[str, str], tuple[float, str]] = {}
         rows = self.rows[self.rows["seed"].isin(self.tuning_seeds)] if self.tuning_seeds else self.rows
@@ -91,7 +92,7 @@ class RunSet:
             yield str(key[0]), str(key[1]), part
 
     def gradient_ratio(self, problem: str, default: float) -> float:
-        """Return the number of rollouts that take as long as one gradient: the median over searches, or ``default`` if untimed."""
+        """Return the rollouts that take as long as one gradient: the median over searches, or ``default`` if untimed."""
         ratios = self.rows.loc[self.rows["problem"] == problem, "gradient_ratio"].dropna()
         return float(ratios.median()) if len(ratios) else default
 
@@ -101,7 +102,7 @@ _latest: dict[tuple[int, int], tuple[Experiment, pd.DataFrame, RunSet]] = {}
 
 
 def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
-    """Return the searches that ran, with names of problem, method and tuning, and their scores; the last result is cached."""
+    """Return the searches that ran, with names of problem, method and tuning, and scores. The last result is cached."""
     key = (id(experiment), id(rows))
     if key not in _latest:
         _latest.clear()
@@ -244,8 +245,8 @@ def restart_runtimes(runs: RunSet, default: float) -> dict[str, np.ndarray]:
 def summarise(runs: RunSet, default: float, baseline: str = "fobg") -> pd.DataFrame:
     """Return, per method, the interquartile mean score, the probability to beat the baseline, and the performance profile.
 
-    The score's interval is a bootstrap stratified by problem. ``improvement``, with Wilson's interval, is the probability
-    of a lower final cost than the first method whose estimator is ``baseline``, paired by problem and seed.
+    The score's interval is a bootstrap stratified by problem. ``improvement``, with Wilson's interval, is the
+    probability of a lower final cost than the first method whose estimator is ``baseline``, paired by problem and seed.
     """
     reached = times_to_targets(runs, default)
     fastest = reached.groupby(["problem", "target"])["art"].transform("min") if len(reached) else None
@@ -314,8 +315,8 @@ def quality_and_runtime(runs: RunSet, default: float, factor: float = TARGETS[0]
 def rank_correlations(points: pd.DataFrame) -> pd.DataFrame:
     """Return Spearman's rho of gradient error against runtime, by class of scene.
 
-    Costs vary between problems, so errors and runtimes are ranked within each problem, and the ranks are scaled to 0..1. A
-    positive rho means that gradients with smaller errors reach the target sooner.
+    Costs vary between problems, so errors and runtimes are ranked within each problem, and the ranks are scaled to
+    0..1. A positive rho means that gradients with smaller errors reach the target sooner.
     """
     lines = []
     if points.empty:

@@ -205,7 +205,7 @@ def _run_group(group: list[Cell], session: Session, settings: Settings) -> dict[
 
 
 def _fill_caches(cell: Cell, problem: Problem, session: Session, settings: Settings) -> None:
-    """Compute the cached values that do not depend on the seed. Errors are ignored, because each search raises them again."""
+    """Compute the cached values that do not depend on the seed. Ignore errors, because each search raises them again."""
     try:
         known_optimum(cell, problem, session, settings)
         scene_class(cell, problem)

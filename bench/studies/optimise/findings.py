@@ -56,7 +56,7 @@ def effect_of_error(rho: pd.DataFrame) -> str:
 
 
 def effect_title(rho: pd.DataFrame) -> str:
-    """Return the title of quality against runtime: on which classes the better gradient reaches the target sooner or later."""
+    """Return the title of quality against runtime: the classes where the better gradient is sooner or later."""
     classes = rho[rho["scene_class"] != "all"].to_dict("records")
     known = [row for row in classes if row["points"] >= 4 and row["chance"] <= CHANCE]
     sure = {

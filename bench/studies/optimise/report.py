@@ -174,7 +174,7 @@ def _legend(drawn: Figure, names: dict[str, dict[str, Any]], extra: tuple[Any, .
 
 
 def quality_figure(runs: RunSet, default: float) -> Figure | None:
-    """Draw the runtime to a tenth of the first regret against the gradient's error, a panel per class; None without data."""
+    """Draw runtime to a tenth of the first regret against the gradient's error, a panel per class; None without data."""
     points = aggregate.quality_and_runtime(runs, default)
     if points.empty:
         return None

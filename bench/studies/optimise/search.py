@@ -48,7 +48,7 @@ class ScaledNoiseProblem(Problem):
         return self._inner.grad(theta, self._factor * w)
 
     def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return scores ``(d, B)`` under the scaled noise: scores are linear in w, and inverse to the variance of the noise."""
+        """Return scores ``(d, B)`` under the scaled noise. They are linear in w and inverse to the noise's variance."""
         return self._inner.score(theta, self._factor * w) / self._factor**2
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
@@ -73,7 +73,7 @@ class SearchPath:
     seconds: list[float] = field(default_factory=list)
 
     def stored_indices(self) -> np.ndarray:
-        """Return the indices of the entries to store, about :data:`MAX_POINTS` at most: log-spaced, with the last and lowest cost."""
+        """Return the indices of about :data:`MAX_POINTS` entries to store: log-spaced, with the last and lowest cost."""
         count = len(self.iteration)
         if count <= MAX_POINTS:
             return np.arange(count)
@@ -262,8 +262,8 @@ _classes: dict[str, str] = {}
 def scene_class(cell: Cell, problem: Problem) -> str:
     """Return the class of a problem by what makes its gradients difficult.
 
-    A problem without contacts whose gradients vary more than its zeroth-order terms is chaotic if it has time steps, else
-    stiff.
+    A problem without contacts whose gradients vary more than its zeroth-order terms is chaotic if it has time steps,
+    else stiff.
     """
     program = problem.program
     if cell.decision.names or cell.scene.identifies:
@@ -316,8 +316,8 @@ _qualities: dict[tuple[Any, ...], dict[str, float]] = {}
 def gradient_quality(search: OptimizerRun, theta: np.ndarray, settings: Settings) -> dict[str, float] | None:
     """Return relative error, cosine and share of bias of the estimator's gradients at ``theta (d,)``.
 
-    Returns None without an estimator. The reference is the mean of many gradients or of many zeroth-order terms, whichever
-    vary less. Where the cost jumps or the backend has no gradients, it is the mean of zeroth-order terms.
+    Returns None without an estimator. The reference is the mean of many gradients or of many zeroth-order terms,
+    whichever vary less. Where the cost jumps or the backend has no gradients, it is the mean of zeroth-order terms.
     """
     cell, problem, estimator = search.cell, search.problem, search.estimator
     if estimator is None:
@@ -342,8 +342,8 @@ def gradient_quality(search: OptimizerRun, theta: np.ndarray, settings: Settings
 def compare_with_reference(estimates: np.ndarray, terms: np.ndarray) -> dict[str, float]:
     """Return relative RMSE, mean cosine and share of bias of estimates ``(R, d)`` against the mean of terms ``(d, M)``.
 
-    The noise of the reference and of the mean estimate is subtracted from the bias. All values are NaN if the reference is
-    too uncertain: its squared error exceeds :data:`MAX_REFERENCE_SHARE` of the measured squared error.
+    The noise of the reference and of the mean estimate is subtracted from the bias. All values are NaN if the reference
+    is too uncertain: its squared error exceeds :data:`MAX_REFERENCE_SHARE` of the measured squared error.
     """
     truth = terms.mean(axis=1)
     reference_error = float(terms.var(axis=1, ddof=1).sum()) / terms.shape[1]

@@ -1,9 +1,9 @@
 """Measures whether a cell's gradient is right, wrong or lost, for the stability map over step size and stiffness.
 
 Each cell simulates one rollout without noise and compares its gradient with the truth for the same duration. The truth
-is the scene's physical gradient or, where it has none, the gradient of the same program at a much finer step. No estimator
-is used: the gradient is the backend's at w = 0. Where the motion is linear, the growth of the state is measured too, which
-detects instabilities that are too slow to show within the rollout.
+is the scene's physical gradient or, where it has none, the gradient of the same program at a much finer step. No
+estimator is used: the gradient is the backend's at w = 0. Where the motion is linear, the growth of the state is
+measured too, which detects instabilities that are too slow to show within the rollout.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ REACH = np.logspace(-3, 4, 141)
 
 @dataclass(frozen=True)
 class StabilityLimits:
-    """Limits for diverged rollouts and wrong gradients, and step counts of the refined truth: parameters of ``Stability``."""
+    """Limits for diverged rollouts and wrong gradients, and steps of the refined truth: parameters of ``Stability``."""
 
     diverged: float
     grown: float
@@ -96,8 +96,8 @@ def first_bad_step(
 ) -> tuple[int, str, str] | None:
     """Return the first bad step of ``states (T + 1, n)`` with its verdict and a description, or None without a bad step.
 
-    A step is bad if a component exceeds its ``largest`` value ``(n,)``, or if growth by the factor ``growth`` per step has
-    reached ``limits.grown``. The verdict is ``diverged`` or ``nonfinite``.
+    A step is bad if a component exceeds its ``largest`` value ``(n,)``, or if growth by the factor ``growth`` per step
+    has reached ``limits.grown``. The verdict is ``diverged`` or ``nonfinite``.
     """
     steps = len(states)
     outside = ~(np.abs(states) <= largest).all(axis=1)
@@ -115,7 +115,7 @@ def first_bad_step(
 
 
 def growth_factor(states: np.ndarray) -> float:
-    """Return the growth factor per step of ``states (T + 1, n)`` with linear dynamics; NaN with fewer than three finite states.
+    """Return the growth factor per step of ``states (T + 1, n)`` with linear dynamics; NaN for fewer than three states.
 
     It is the spectral radius of the linear map fitted by least squares to all pairs of consecutive states, each pair
     scaled to the size of its first state (dynamic mode decomposition; Schmid 2010).
@@ -135,9 +135,9 @@ def growth_factor(states: np.ndarray) -> float:
 def bounds(program: Rollout, trajectory: Trajectory, factor: float) -> np.ndarray:
     """Return the largest allowed value of each state component, ``(n,)``: ``factor`` times its initial scale.
 
-    The scale of positions is the distance |q_0| + T |v_0|, where T is the duration. The scale of velocities is
-    |v_0| + sqrt(|a_0| distance), the speed after accelerating over that distance. Norms are maximum norms, and a scale of
-    0 counts as 1.
+    The scale of positions is the distance |q_0| + T |v_0|, where T is the duration. The scale of velocities is |v_0| +
+    sqrt(|a_0| distance), the speed after accelerating over that distance. Norms are maximum norms, and a scale of 0
+    counts as 1.
     """
     scene = program.scene
     q, v = np.split(trajectory.states[0], [scene.n_q])
@@ -153,7 +153,7 @@ def bounds(program: Rollout, trajectory: Trajectory, factor: float) -> np.ndarra
 
 
 def compute_truth(cell: Cell, limits: StabilityLimits) -> tuple[str, np.ndarray, float]:
-    """Return the kind of truth (``physical`` or ``refined``), the true gradient ``(d,)``, and its estimated relative error."""
+    """Return the kind of truth (``physical`` or ``refined``), the true gradient ``(d,)``, and its relative error."""
     program = rollout(cell.program())
     physical = program.physical_gradient()
     if physical is not None:
@@ -232,7 +232,8 @@ def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[
 SPAN = 0.01
 """Step in theta for central differences of the law's own cost, in units of theta's largest component (1 if that is 0).
 
-It is large enough to shift an impact by many fine steps, which averages out the effect of the impact's time within a step.
+It is large enough to shift an impact by many fine steps, which averages out the effect of the impact's time within a
+step.
 """
 
 
@@ -242,9 +243,9 @@ def cause_of(
     """Return why a gradient is wrong: ``cause``, and ``step_error`` and ``law_error`` in units of the truth's norm.
 
     The law's own gradient is the gradient of the same law and integrator at a far smaller step. The step error is the
-    distance of the cell's gradient from the law's own, and the law error is the distance of the law's own gradient from the
-    truth. Their sum is at least the cell's error, so one of them is a cause. Without a contact law, or with a refined
-    truth, the cause is the step.
+    distance of the cell's gradient from the law's own, and the law error is the distance of the law's own gradient from
+    the truth. Their sum is at least the cell's error, so one of them is a cause. Without a contact law, or with a
+    refined truth, the cause is the step.
     """
     norm = float(np.linalg.norm(truth))
     error = float(np.linalg.norm(gradient - truth)) / norm if norm else math.inf
@@ -264,15 +265,15 @@ def cause_of(
 def law_gradient(cell: Cell, limits: StabilityLimits) -> tuple[np.ndarray, np.ndarray]:
     """Return the gradient ``(d,)`` of the cell's law at a far smaller step, and the gradient with half as many steps.
 
-    Both are central differences of the cost over :data:`SPAN` (twice that for the second). A derivative through a contact
-    would not converge: it jumps with the time of the impact within its step, however small the step is.
+    Both are central differences of the cost over :data:`SPAN` (twice that for the second). A derivative through a
+    contact would not converge: it jumps with the time of the impact within its step, however small the step is.
     """
     steps = max(limits.fine_steps, limits.finer * rollout(cell.program()).scene.horizon)
     return _differences(cell, steps, SPAN), _differences(cell, steps // 2, 2 * SPAN)
 
 
 def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
-    """Return the gradient ``(d,)`` of the cell's cost by central differences, with its duration divided into ``steps`` steps."""
+    """Return central differences ``(d,)`` of the cell's cost, with its duration divided into ``steps`` steps."""
     fine = _refined(cell, steps)
 
     def differences() -> np.ndarray:
@@ -292,10 +293,10 @@ def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
 
 
 def theory(cell: Cell) -> dict[str, float]:
-    """Return the columns ``spectral_radius`` of one step on the cell's oscillator, and ``stiffness_limit`` where it exceeds 1.
+    """Return ``spectral_radius`` of one step on the cell's oscillator, and ``stiffness_limit``, where it exceeds 1.
 
-    The limit has the unit of the column ``stiffness``. It is 0 for a step that is never stable, and infinite for one that
-    always is. The result is empty without an oscillator.
+    The limit has the unit of the column ``stiffness``. It is 0 for a step that is never stable, and infinite for one
+    that always is. The result is empty without an oscillator.
     """
     parameters = oscillator(cell)
     if parameters is None:
@@ -333,7 +334,7 @@ def spectral_radius(integrator: Integrator, dt: float, stiffness: float, damping
 
 
 def stiffness_limit(integrator: Integrator, dt: float, damping: float, factor: float) -> float:
-    """Return the stiffness [1/s^2] at which the step becomes unstable; 0 if always unstable, inf if stable over :data:`REACH`."""
+    """Return the stiffness [1/s^2] where the step becomes unstable; 0 if always, inf if nowhere in :data:`REACH`."""
 
     def unstable(reach: float) -> bool:
         return spectral_radius(integrator, dt, reach / dt**2, damping, factor) > NEUTRAL

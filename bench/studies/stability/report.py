@@ -106,11 +106,11 @@ class Panel:
 
     @cached_property
     def boundary(self) -> pd.DataFrame:
-        """A table by dt of the stability limit in stiffness: ``limit`` in theory, ``low`` and ``high`` as measured, ``agrees``.
+        """The stability limit by dt: ``limit`` in theory, ``low`` and ``high`` as measured, and ``agrees``.
 
-        ``high`` is the lowest unstable stiffness of the grid (infinite without one), and ``low`` the next lower stiffness (0
-        without one). A cell is unstable if it diverged or its state was measured to grow. ``agrees`` is 1 where the limit
-        lies in the interval widened by one cell of the grid, else 0.
+        ``high`` is the lowest unstable stiffness of the grid (infinite without one), and ``low`` the next lower
+        stiffness (0 without one). A cell is unstable if it diverged or its state was measured to grow. ``agrees`` is 1
+        where the limit lies in the interval widened by one cell of the grid, else 0.
         """
         limits = {}
         for dt, part in self.rows.dropna(subset=["stiffness", "stiffness_limit"]).groupby("dt"):

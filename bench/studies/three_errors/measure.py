@@ -1,8 +1,8 @@
 """Measures three errors of one gradient separately, and the forward error.
 
 Program error: distance of the program's gradient from central differences of the program's cost. Model error: distance
-from the gradient of the physics. Estimator error: bias of an estimator relative to the program's grad J_sigma. The three are
-independent, and a small forward error (error of the cost) implies none of them is small.
+from the gradient of the physics. Estimator error: bias of an estimator relative to the program's grad J_sigma. The
+three are independent, and a small forward error (error of the cost) implies none of them is small.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class DifferenceCheck:
 def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceCheck:
     """Compare the program's gradient with its best central difference over a sweep of step sizes, at w = 0.
 
-    Truncation errors and jumps dominate at large steps, rounding at small steps. All costs are one batch: one at theta, and
-    2 d len(steps) for the differences.
+    Truncation errors and jumps dominate at large steps, rounding at small steps. All costs are one batch: one at theta,
+    and 2 d len(steps) for the differences.
     """
     theta = problem.program.theta0
     shifts = (np.eye(theta.size)[:, None, :] * steps[:, None]).reshape(-1, theta.size).T

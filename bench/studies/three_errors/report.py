@@ -38,7 +38,7 @@ ERRORS = {
 EXACT = 1e-6
 """Program error up to which a gradient counts as exact."""
 CONVERGED = 0.5
-"""A cost or gradient counts as converging if its error falls at least to this share from the largest to the smallest step."""
+"""A cost or gradient converges if its error falls at least to this share from the largest to the smallest step."""
 WRONG = 0.1
 """A gradient that does not converge is a trap if its model error at the smallest step is above this."""
 AWAY: dict[str, Any] = {"marker": "x", "markersize": 6, "markeredgewidth": 1.6, "color": "#000000", "linestyle": "none"}
@@ -91,8 +91,8 @@ class Section:
 def sections(shown: Arranged) -> list[Section]:
     """Return a section per swept axis, with the programs that vary along it, then one with all other programs.
 
-    In a section of an axis, all other axes are fixed at their most common value. Axes that step together have one section:
-    the section of the time step if it is one of them, else of the first axis.
+    In a section of an axis, all other axes are fixed at their most common value. Axes that step together have one
+    section: the section of the time step if it is one of them, else of the first axis.
     """
     parts: list[Section] = []
     for axis in independent_axes(shown):
@@ -287,7 +287,7 @@ def _figure(shown: Arranged, part: Section, trap_names: Set[str]) -> Figure:
 
 
 def _laws(shown: Arranged, part: Section, panels: pd.Series) -> pd.Series:
-    """Return the law of each row, named by the columns that distinguish it within its panel, so that each law has one style."""
+    """Return each row's law, named by the columns that distinguish it in its panel, so that each law has one style."""
     axes = ["contact", "integrator", "backend"]
     return pd.concat(
         [programs_of(shown, Section(part.axis, own), axes) for _, own in part.rows.groupby(panels, sort=False)]

@@ -1,7 +1,7 @@
 """Compares a physics engine's twin of a scene with the scene's own program: one rollout, its cost and its gradient.
 
-A difference is the model error between two programs with the same masses, springs and step. Each gradient may be exact for
-its own program. Times are for a batch of ``samples`` rollouts.
+A difference is the model error between two programs with the same masses, springs and step. Each gradient may be exact
+for its own program. Times are for a batch of ``samples`` rollouts.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
     """Return one cell's results by column: differences at w = 0, and times of costs and gradients [s].
 
     ``state_difference`` is the largest difference over time and coordinates, in the units of the coordinate.
-    ``state_difference_rel`` is in units of the coordinate's largest value. Raises :class:`Unsupported` if the backend has no
-    twin, or the scene no program of its own.
+    ``state_difference_rel`` is in units of the coordinate's largest value. Raises :class:`Unsupported` if the backend
+    has no twin, or the scene no program of its own.
     """
     scene = rollout(cell.program()).scene
     if "physics" not in cell.backend.provides:
