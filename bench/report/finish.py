@@ -44,7 +44,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
     with (
         guard.capture_output("a plugin"),
         guard.protect_process(),
-    ):  # the commands that repeat a cell are made from its plugins
+    ):  # building the commands that repeat cells runs code of plugins
         writers = (study_of(experiment).write, _page, averages.write)
         return [
             path for paths in run_tasks([partial(writer, experiment, rows) for writer in writers]) for path in paths

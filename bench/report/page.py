@@ -102,7 +102,7 @@ def _legends(figure: SubFigure, legends: Iterable[Sequence[Any]], counts: Iterab
 
 
 def _panel_titles(problems: Sequence[ProblemRows], width: float) -> list[str]:
-    """Return the problems' titles. If one is wider than ``width`` inches, all are broken before their numbers."""
+    """Return the problems' titles. If any title is wider than ``width`` inches, all are broken before their numbers."""
     parts = [_title(problem) for problem in problems]
     if all(width_in_inches(", ".join(kinds + numbers)) <= width for kinds, numbers in parts):
         return [", ".join(kinds + numbers) for kinds, numbers in parts]

@@ -244,7 +244,7 @@ def relative(row: Any, column: str) -> float:
 
 
 def rmse_interval(row: Any) -> tuple[Any, Any]:
-    """Return the 95% interval of the relative RMSE of one row, or of each row of a table; NaN where the variance has none.
+    """Return the 95% interval of the relative RMSE of one row or each row of a table; NaN if the variance has none.
 
     RMSE^2 = bias^2 + variance, so each end combines the corresponding ends of bias and variance.
     """

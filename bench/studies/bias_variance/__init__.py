@@ -37,7 +37,7 @@ class BiasVariance(Study):
     )  # fmt: skip
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Measure the estimates of one cell and their statistics."""
+        """Return one cell's results by column: statistics of its estimates, and their time."""
         from bench.studies.bias_variance.measure import measure
 
         return measure(cell, session, self.timed_calls, self.settle_s)

@@ -21,7 +21,7 @@ TIE = 1.1
 FLAT = 1.5
 """Largest factor between errors along an axis at which the axis counts as having no effect."""
 NAMED = 2
-"""Most problems that a title names one by one."""
+"""Most problems that a title names individually."""
 
 
 def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
@@ -124,7 +124,7 @@ def failure_summary(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> str
 
 
 def _by_wins(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> list[str]:
-    """Return the estimators, the most frequently best one first."""
+    """Return the estimators, ordered by how often each is best, most often first."""
     wins = Counter(label for _, curves in parts for labels in winners(curves).values() for label in labels)
     return sorted(dict.fromkeys(line.label for _, curves in parts for line in curves), key=lambda name: -wins[name])
 

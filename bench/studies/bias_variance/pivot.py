@@ -38,7 +38,7 @@ FAILURES = {
     "unsupported": ("–", "--", "a combination that cannot work"),
     "unavailable": ("∅", r"$\emptyset$", "a library that is not installed"),
 }
-"""Signs of statuses other than ``ok``: in Markdown, in LaTeX, and what they mean."""
+"""Sign in Markdown, sign in LaTeX and meaning of each status other than ``ok``."""
 
 
 @dataclass(frozen=True)
@@ -253,7 +253,7 @@ def width(block: Block) -> float:
     for i, value in enumerate(block.values):
         cells = [cells[i] for _, cells in block.rows]
         texts = [(value, 8.0), *((cell.interval, 5.0) for cell in cells)]
-        # bold letters are wider: 1.2 covers the widest digits of the bold face
+        # bold characters are wider: factor 1.2 covers the widest bold digits
         texts += ((f"{cell.value or 'oo'}?", 9.6 if cell.best else 8.0) for cell in cells)
         total += max(_set(text, size) for text, size in texts)
     return total
@@ -272,7 +272,7 @@ def _set(text: str, size: float) -> float:
     if not text:
         return 0.0
     plain = "".join(letter if letter.isascii() and letter != "_" else "m" for letter in text).replace("$", "m")
-    # the five-point face is set wider than a scaled ten-point one, by up to 1.38 in its digits
+    # digits of the five-point font are up to 1.38 times as wide as digits scaled down from ten points
     stretch = 1.39 if size <= 5 else 1.07
     points = TextToPath().get_text_width_height_descent(plain, FontProperties(family="cmr10", size=size), False)[0]
     return stretch * float(points) * 72.27 / 72

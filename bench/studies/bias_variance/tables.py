@@ -34,7 +34,7 @@ FOOTNOTES = [
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``bias_variance`` (.csv, .md, .tex) and ``speed_accuracy.csv``; returns their paths."""
+    """Write ``bias_variance`` (.csv, .md, .tex) and ``speed_accuracy.csv``; return the files' paths."""
     paper = pivot.pivot(experiment, arrange(experiment, rows))
     return write_all(
         experiment.directory,
@@ -65,7 +65,7 @@ class Readable:
     shared: list[str]
     headers: list[str]
     numeric: list[bool]
-    """Per column, whether it holds numbers."""
+    """Whether each column is numeric."""
     body: list[list[str]]
     reasons: list[str]
 
@@ -136,7 +136,7 @@ def _results(row: Any) -> list[str]:
 
 
 def markdown(table: Readable) -> str:
-    """Write the main table in Markdown."""
+    """Return the main table in Markdown, with footnotes and the numbered reasons."""
     e = escape_markdown
     out = [f"## {e(table.title)}", ""]
     for text in table.shared:

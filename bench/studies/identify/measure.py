@@ -162,7 +162,7 @@ class Fitting:
         first = self.model.initial_states(theta)
         later = points[p:].reshape(self.n_windows - 1, n, batch) * self.unit[:, None]
         starts = np.concatenate([first[None], later])
-        flat = np.moveaxis(starts, 0, 1).reshape(n, -1)  # window by window, columns within
+        flat = np.moveaxis(starts, 0, 1).reshape(n, -1)  # columns ordered by window, then by fit
         begin = np.repeat(np.arange(self.n_windows) * self.window_steps, batch)
         states = self.model.simulate(np.tile(theta, (1, self.n_windows)), flat, begin, self.window_steps)
         states = states.reshape(self.window_steps, n, self.n_windows, batch)
@@ -304,7 +304,7 @@ def _fit_statistics(
     low, high = performance.wilson(n_converged, n_fits)
     is_covered = np.array(inside, dtype=float)
     coverage = float(is_covered.mean()) if is_covered.size else math.nan
-    # the interval counts records, since the invariants of one record are dependent
+    # the sample size of this interval is the number of records: invariants of one record are dependent
     interval = (
         performance.wilson(round(coverage * n_converged), n_converged) if is_covered.size else (math.nan, math.nan)
     )

@@ -73,7 +73,7 @@ class RunSet:
         final = rows["final_cost"].where(rows["status"] == "ok", math.inf).fillna(math.inf)
         for key, part in final.groupby([rows[n] for n in ("problem", "method", "tuning")], sort=False):
             problem, method, tuning = (str(k) for k in key)
-            # the lower of the two middle costs, since a mean with a failed search would be infinite
+            # the lower of the two middle costs, because their mean is infinite if one search failed
             middle = float(np.sort(part.to_numpy())[(len(part) - 1) // 2])
             if (problem, method) not in best or middle < best[problem, method][0]:
                 best[problem, method] = (middle, tuning)

@@ -260,7 +260,7 @@ _classes: dict[str, str] = {}
 
 
 def scene_class(cell: Cell, problem: Problem) -> str:
-    """Return the class of a problem by what makes its gradients difficult.
+    """Return the class of a problem, by the reason that its gradients are difficult.
 
     A problem without contacts whose gradients vary more than its zeroth-order terms is chaotic if it has time steps,
     else stiff.

@@ -86,7 +86,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
 def shares(shown: Arranged) -> pd.DataFrame:
     """Return each verdict's share of the cells by scene, contact law and integrator, the best of each scene first.
 
-    Scenes are grouped by name. Laws and integrators keep the parameters that distinguish them.
+    Scenes are grouped by name. Names of laws and integrators contain the parameters that distinguish them.
     """
     cells = with_verdict(shown.rows)
     step = problems(shown, ["contact", "integrator"], together(shown, *PLACES), ("contact", "integrator"), cells)
