@@ -1,1 +1,1 @@
-"""The shared kit for tables, charts and pages, independent of any study or plugin."""
+"""Shared functions for tables, charts and pages, independent of any study or plugin."""

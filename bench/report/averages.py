@@ -1,4 +1,4 @@
-"""Averages over swept axes, such as the phase of a step or theta: one line per quantity of each group of cells."""
+"""Averages results over swept axes, such as the phase of a step or theta: one line per group of cells and quantity."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from bench.report.text import number
 from bench.run.files import write_all
 
 SIGNED = "signed error"
-"""The length of the average of (mean estimate - reference): errors of opposite sign cancel in it."""
+"""Norm of the average of (mean estimate - reference), in which errors of opposite sign cancel."""
 ROOM = ("bias", "variance", "rmse", "rmse_rel", "model_error", SIGNED)
-"""Quantities of the Markdown table, where a study has them; the CSV has all."""
+"""Quantities in the Markdown table, if the study has any of them; the CSV has all quantities."""
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``averages.csv`` and ``averages.md``; nothing unless the experiment names axes to average over."""
+    """Write ``averages`` (.csv, .md) if the experiment names axes to average over; return the files' paths."""
     table = averages(experiment, rows)
     if table.empty:
         return []
@@ -45,9 +45,9 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 def averages(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     """Return one row per group of cells and quantity: points, mean, its standard error, RMS, least and largest.
 
-    A group holds the cells that differ in nothing but the axes of ``experiment.average`` and what moves with them. Rows
-    that are not ok are left out, and so counted in no ``points``. Where rows hold signed means and references, the
-    quantity ``signed error`` is the length of the average of their differences.
+    The cells of a group differ only in the axes of ``experiment.average`` and in the axes that step with them. Rows
+    that are not ok are omitted and not counted in ``points``. If rows have mean estimates and reference gradients, the
+    quantity ``signed error`` is the norm of the average of their differences.
     """
     wanted = experiment.average
     good = rows[rows["status"] == "ok"]
@@ -78,7 +78,7 @@ def averages(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _is_named(axis: Axis, wanted: tuple[str, ...]) -> bool:
-    """Whether a name means an axis: its column, a name in the sweep, or ``theta0`` for its coordinates."""
+    """Return whether one of the names is the axis's: its column, a name in the sweep, or ``theta0`` for a coordinate."""
     names = {axis.column, axis.short, axis.column.partition(".")[0], *axis.names}
     return bool(names & set(wanted))
 
@@ -97,7 +97,7 @@ def summary(values: np.ndarray) -> dict[str, float]:
 
 
 def _signed(part: pd.DataFrame) -> dict[str, float]:
-    """Return the length of the mean difference; its error, and RMS, least and largest length of single differences."""
+    """Return the norm of the mean difference and its standard error, and RMS, least and largest norm of the differences."""
     pairs = [
         (np.asarray(mean, float), np.asarray(truth, float))
         for mean, truth in zip(part["mean_estimate"], part["reference_gradient"], strict=True)

@@ -1,4 +1,4 @@
-"""The colour and marker of an estimator in every chart, by its position among all registered estimators."""
+"""Returns the colour and marker of an estimator in every chart, by its position among all registered estimators."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def estimator_colour(estimator: str) -> str:
 
 
 def estimator_marker(estimator: str, variant: int = 0) -> str:
-    """Return the estimator's marker, another for each variant of its parameters."""
+    """Return the estimator's marker; ``variant`` is the number of its parameter variant, from 0."""
     return marker(_place(estimator), variant)
 
 

@@ -1,4 +1,4 @@
-"""Runs tasks on several cores, in forked processes that share what this process has read."""
+"""Runs tasks on several cores, in forked processes that share this process's memory."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ UNSAFE = ("jaxlib", "torch._C")
 """Modules whose threads do not survive a fork."""
 T = TypeVar("T")
 _tasks: Sequence[Callable[[], Any]] = ()
-"""The tasks of the pool that is being started: workers inherit them, since functions of functions cannot be pickled."""
+"""The tasks of the current pool. Workers inherit them by the fork, because closures cannot be pickled."""
 
 
 def run_tasks(tasks: Sequence[Callable[[], T]]) -> list[T]:
     """Run tasks in forked processes and return their results in order.
 
-    Re-raises the first task error, in task order. Tasks of a killed process are rerun in this one, and so are tasks whose
-    result cannot be pickled. All tasks run in this process where a fork is not safe: elsewhere than on Linux, beside other
-    Python threads, and after modules of :data:`UNSAFE` were imported.
+    Re-raises the first task error, in task order. Tasks of a killed process, and tasks whose result cannot be pickled,
+    are rerun in this process. All tasks run in this process if a fork is not safe: on other systems than Linux, with
+    other Python threads, or after a module of :data:`UNSAFE` was imported.
     """
     n_workers = min(blocks.cores(), len(tasks))
     is_safe = threading.active_count() == 1 and not any(name in sys.modules for name in UNSAFE)
@@ -49,16 +49,16 @@ def run_tasks(tasks: Sequence[Callable[[], T]]) -> list[T]:
 
 
 def _finished(tasks: Sequence[Callable[[], Any]], n_workers: int) -> list[Future[bytes]]:
-    """Return the futures of all tasks once they are done; kills the workers if it is interrupted."""
+    """Run all tasks and return their completed futures; an interrupt kills the workers."""
     global _tasks
     others = set(multiprocessing.active_children())
     start = partial(_start_worker, os.getpid())
     outer, _tasks = _tasks, tasks
-    gc.freeze()  # or the first collection in a worker would copy every page
+    gc.freeze()  # without this, the first garbage collection in a worker would copy all memory pages
     try:
         pool = ProcessPoolExecutor(n_workers, multiprocessing.get_context("fork"), start)
         with pool, warnings.catch_warnings():
-            # newer Pythons warn of threads of any library; those that do not survive a fork are in UNSAFE
+            # newer Pythons warn about any library's threads; libraries whose threads do not survive a fork are in UNSAFE
             warnings.simplefilter("ignore", DeprecationWarning)
             try:
                 futures = [pool.submit(_run, place) for place in range(len(tasks))]
@@ -75,7 +75,7 @@ def _finished(tasks: Sequence[Callable[[], Any]], n_workers: int) -> list[Future
 
 
 def _start_worker(parent: int) -> None:
-    """Let the parent process alone handle interrupts, and end this process with it."""
+    """Make this worker ignore interrupts, which its parent process handles, and end when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG

@@ -1,4 +1,4 @@
-"""Figures drawn in the charts' own style and written as files."""
+"""Sets the style of figures and writes them as files."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from bench.report.style import STYLE
 from bench.run.files import write_whole
 
 METADATA: dict[str, dict[str, Any]] = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
-"""Metadata left out of each kind of file, since it would differ between equal figures."""
+"""Metadata to omit from each file format, because it would differ between equal figures."""
 
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Use matplotlib's defaults and the charts' style, whatever the user's settings; restore those afterwards."""
+    """Apply Matplotlib's defaults and the charts' style in a context; restore the user's settings afterwards."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(STYLE)  # type: ignore[arg-type]
@@ -30,10 +30,10 @@ def styled() -> Iterator[None]:
 
 
 def save(figure: Figure, stem: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
-    """Write ``stem`` in some formats, and the plotted data as ``stem.plotted.csv``; returns the files' paths.
+    """Write a figure as ``stem`` in some formats, and its data as ``stem.plotted.csv``; return the files' paths.
 
-    Equal figures give equal files, because the files hold no dates. Fonts are embedded: as outlines in SVG, as TrueType
-    in PDF.
+    Equal figures give equal files, because the files contain no dates. Fonts are embedded, as outlines in SVG and as
+    TrueType in PDF.
     """
     contents = {"plotted.csv": plotted(figure).to_csv(index=False, lineterminator="\n", float_format="%.9g").encode()}
     for suffix in formats:
@@ -46,7 +46,7 @@ def save(figure: Figure, stem: Path, formats: Sequence[str] = ("png",)) -> list[
 
 
 def _with_palette(png: io.BytesIO) -> bytes:
-    """Return a PNG with a palette of 256 colours: a third as large, without a visible difference."""
+    """Return the PNG with a palette of 256 colours: a third of the size, without a visible difference."""
     image = Image.open(png).convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     image.putpalette([255 if value >= 253 else value for value in image.getpalette() or ()])  # white stays white
     buffer = io.BytesIO()

@@ -1,4 +1,4 @@
-"""Writes files from stored rows: tables, charts, the record of the run and the page."""
+"""Writes the output files from stored rows: tables, charts, the record of the run and the page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bench.run.store import sort_rows
 
 
 def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, list[Path]]:
-    """Write the files of a run (the record first); returns its rows in the order of its cells, and the files."""
+    """Write the files of a run, the record first; return the rows in the order of the cells, and the files' paths."""
     keys = finished.keys
     rows = finished.store.load()
     rows = completed_rows(sort_rows(rows[rows["key"].isin(keys)], keys))
@@ -32,19 +32,19 @@ def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, list
 
 
 def report(experiment: Experiment) -> tuple[pd.DataFrame, list[Path]]:
-    """Write the files of an experiment again from its newest stored rows; nothing is simulated."""
+    """Rewrite an experiment's files from its newest stored rows, without simulation; return rows and paths."""
     rows = newest_rows(store_of(experiment).load())
     return rows, write(experiment, rows)
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write the study's tables and charts, and the page; raises :class:`UserError` where there are no rows."""
+    """Write tables, charts, page and averages; return the files' paths. Raises :class:`UserError` without rows."""
     if rows.empty:
         raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
     with (
         guard.capture_output("a plugin"),
         guard.protect_process(),
-    ):  # the commands that repeat a cell are made from its plugins
+    ):  # building the commands that repeat cells runs code of plugins
         writers = (study_of(experiment).write, _page, averages.write)
         return [
             path for paths in run_tasks([partial(writer, experiment, rows) for writer in writers]) for path in paths
@@ -56,6 +56,6 @@ def _page(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 
 def shown(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows whose strings are fit for a terminal, whatever a plugin or an error has put into them."""
+    """Return the rows with strings on one line and without control characters, for a terminal (except ``parameters``)."""
     texts = [name for name in rows if rows[name].map(type).eq(str).all()]
     return rows.assign(**{str(name): rows[name].map(printable) for name in texts if name != "parameters"})

@@ -1,4 +1,4 @@
-"""The page over all experiments of a results folder: ``index.html``, with the state and the finding of each."""
+"""Writes ``index.html``, a page with the state and the finding of every experiment in a results folder."""
 
 from __future__ import annotations
 
@@ -27,11 +27,14 @@ p { margin: .2rem 0; max-width: 60rem; }
 .soft { opacity: .75; font-size: .9rem; }
 """
 GOOD = ("ok", "unsupported", "unavailable")
-"""Statuses that are no failure: a number, or a cell that was refused with a reason."""
+"""Statuses that do not count as failures: the cell has a result, or was refused with a reason."""
 
 
 def write(folder: Path) -> Path:
-    """Write ``index.html`` into a folder of results; raises :class:`UserError` if no experiment is below it."""
+    """Write ``index.html`` into a results folder and return its path.
+
+    Raises :class:`UserError` if the folder does not exist or contains no experiment.
+    """
     if not folder.is_dir():
         raise UserError(f"'{folder}' is not a folder")
     places = sorted(
@@ -55,7 +58,7 @@ def write(folder: Path) -> Path:
 
 
 def _article(folder: Path, place: Path) -> str:
-    """Return what the page says of one experiment: its question, finding, state, and links to its files."""
+    """Return the HTML of one experiment: its question, finding, state, and links to its files."""
     e = html.escape
     record = _record(place / "run.json")
     name = str(record.get("experiment") or place.name)
@@ -79,12 +82,12 @@ def _article(folder: Path, place: Path) -> str:
 
 
 def _state(path: Path, record: dict[str, Any]) -> str:
-    """Return the cells by status, those that failed marked, and whether rows are missing or unreadable."""
+    """Return the HTML of the number of cells by status, failures marked, or a note that the rows cannot be read."""
     counts: dict[str, int] = {}
     if path.exists():
         try:
             table = pd.read_parquet(path, columns=["status", "stored_at"])
-        except Exception as error:  # whatever is wrong with the file, the page over all experiments has to say it
+        except Exception as error:  # any error in the file is reported on the page
             return f'<span class="bad">rows.parquet cannot be read: {html.escape(str(error)[:200])}</span>'
         counts = {str(status): int(count) for status, count in table["status"].value_counts().items()}
         newest = table["stored_at"].max()
@@ -100,13 +103,13 @@ def _state(path: Path, record: dict[str, Any]) -> str:
 
 
 def _finding(page: Path) -> str:
-    """Return the finding of an experiment's page as it stands there, escaped already; nothing without a page."""
+    """Return the finding of an experiment's page as escaped HTML; empty without a page."""
     try:
         text = page.read_text(errors="replace")
     except OSError:
         return ""
     match = re.search(r'id="finding">(.*?)</p>', text, re.DOTALL)
-    # the page has a clause per element
+    # each part of the finding is one element on the page
     text = re.sub(r"<(?!/?(br|b|em)\b)[^>]*>", "; ", match[1]) if match else ""
     return re.sub(r"(\s*;\s*)+", "; ", re.sub(r"(&\w+);", r"\1\0", text)).strip("; ").replace("\0", ";")
 
@@ -120,7 +123,7 @@ def _record(path: Path) -> dict[str, Any]:
 
 
 def main(words: Sequence[str]) -> int:
-    """Write the index of the folder named; ``results`` without one."""
+    """Write the index of the folder in ``words``, by default ``results``, and return the exit status 0."""
     if len(words) > 1 or any(word.startswith("-") or "=" in word for word in words):
         raise UserError("name one folder of results: python -m bench index [DIR]")
     path = write(Path(words[0] if words else "results").expanduser())

@@ -1,4 +1,4 @@
-"""A page of charts: a title, titled panels, and legends below them."""
+"""Lays out a figure of panels: a title, titled panels, and legends below them."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from bench.report.style import plain, quantity, width_in_inches, wrapped
 from bench.report.views import CATEGORIES
 
 WIDTH, NARROW = 7.16, 3.5
-"""Inches of two columns of a paper and of one (for a single panel): fonts are printed at the size given."""
+"""Figure widths in inches: two columns of a paper, or one for a single panel. Fonts keep their size in print."""
 LINE = 0.16
-"""Inches of a line of text."""
+"""Height of a line of text in inches."""
 BOLD = 1.32
-"""How much wider a title is than the same text elsewhere."""
+"""Width of a figure's bold title relative to the same text elsewhere."""
 PLACES: Any = ("upper center", "lower center")
 
 
 def columns(count: int, most: int) -> int:
-    """Return how many panels to put side by side, at most ``most``, so that rows are filled evenly."""
+    """Return the number of panels side by side, at most ``most``, that fills the rows evenly."""
     return math.ceil(count / math.ceil(count / most))
 
 
@@ -41,7 +41,11 @@ def page(
     legends: Sequence[Sequence[Any]],
     sharey: bool = False,
 ) -> tuple[Figure, list[list[Axes]]]:
-    """Make a figure and the panels of each problem, one per label below each other, ``height`` inches in all."""
+    """Return a figure and the panels of each problem, in reading order.
+
+    A problem has one panel per label, below each other, with a total height of ``height`` inches. ``across`` problems
+    are side by side.
+    """
     width = WIDTH if across > 1 else NARROW
     titles = _panel_titles(problems, 0.86 * width / across)
     blocks = math.ceil(len(problems) / across)
@@ -64,7 +68,7 @@ def page(
 
 
 def _panels(grid: np.ndarray, titles: Sequence[str], labels: Sequence[str]) -> list[list[Axes]]:
-    """Return the panels of each problem, titled; remove the others."""
+    """Return the titled and labelled panels of each problem, and remove unused panels."""
     blocks = grid.reshape(-1, len(labels), grid.shape[1]).swapaxes(1, 2)
     panels = blocks.reshape(-1, len(labels)).tolist()
     for spare in panels[len(titles) :]:
@@ -79,7 +83,7 @@ def _panels(grid: np.ndarray, titles: Sequence[str], labels: Sequence[str]) -> l
 
 
 def _legend_columns(entries: Sequence[Any], width: float) -> int:
-    """Return the most columns in which legend entries fit ``width`` inches; entries fill column after column."""
+    """Return the largest number of legend columns that fits ``width`` inches; entries fill column after column."""
     lengths = np.array([0.6 + width_in_inches(entry.get_label()) for entry in entries])
     for count in range(len(lengths), 1, -1):
         if sum(column.max() for column in np.array_split(lengths, count)) <= width:
@@ -88,7 +92,7 @@ def _legend_columns(entries: Sequence[Any], width: float) -> int:
 
 
 def _legends(figure: SubFigure, legends: Iterable[Sequence[Any]], counts: Iterable[int]) -> None:
-    """Draw legends at the upper and the lower edge of a figure."""
+    """Draw two legends, at the upper and the lower edge of a figure."""
     for entries, count, place, anchor in zip(legends, counts, PLACES, (1, 0), strict=True):
         if entries:
             figure.legend(
@@ -98,7 +102,7 @@ def _legends(figure: SubFigure, legends: Iterable[Sequence[Any]], counts: Iterab
 
 
 def _panel_titles(problems: Sequence[ProblemRows], width: float) -> list[str]:
-    """Return titles that distinguish problems, all broken before their numbers if one is too long for a line."""
+    """Return the problems' titles. If any title is wider than ``width`` inches, all are broken before their numbers."""
     parts = [_title(problem) for problem in problems]
     if all(width_in_inches(", ".join(kinds + numbers)) <= width for kinds, numbers in parts):
         return [", ".join(kinds + numbers) for kinds, numbers in parts]
@@ -106,7 +110,7 @@ def _panel_titles(problems: Sequence[ProblemRows], width: float) -> list[str]:
 
 
 def _title(problem: ProblemRows) -> tuple[list[str], list[str]]:
-    """Return a problem's scene, contact law and the like, and its numbers."""
+    """Return the two parts of a problem's title: its categories, such as the scene, and its numbers."""
     kinds = [plain(str(value)) for name, value in problem.identity.items() if name in CATEGORIES]
     numbers = [quantity(name, value) for name, value in problem.identity.items() if name not in CATEGORIES]
     if not (problem.rows["reference_norm"] > 0).any():
@@ -115,7 +119,7 @@ def _title(problem: ProblemRows) -> tuple[list[str], list[str]]:
 
 
 def shared(problems: Sequence[ProblemRows], axis: str) -> list[str]:
-    """Return what panels have in common and therefore leave out of their titles."""
+    """Return the values that all panels have in common, which their titles omit; ``axis`` is the column drawn along."""
     rows = pd.concat([problem.rows for problem in problems])
     named = {axis, *(name for problem in problems for name in problem.identity)}
     parts = []

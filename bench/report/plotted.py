@@ -1,4 +1,4 @@
-"""Reads the data of a figure back as a table: exactly the plotted values, wherever they are drawn on paper."""
+"""Reads the plotted data back from a figure as a table: the exact values, even where points are shifted on paper."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ COLUMNS = [
     "text",
 ]
 HOLLOW = "#ffffff"
-"""The face colour of markers at upper limits."""
+"""Face colour of markers at upper limits."""
 SIGNS: dict[Any, str] = {"|": "tick", "x": "cross"}
 
 
 def plotted(figure: Figure) -> pd.DataFrame:
-    """Return a line per point of a figure, with its interval; also bands, vertex by vertex, and texts in the data.
+    """Return a table with a line per point of a figure and its interval, per corner of a band, and per text in the data.
 
-    ``mark`` is ``point``, ``limit`` (an upper limit), ``tick``, ``cross``, ``line`` (a corner of a line without
-    markers), ``band`` or ``text``.
+    The column ``mark`` is ``point``, ``limit`` (an upper limit), ``tick``, ``cross``, ``line`` (a corner of a line
+    without markers), ``band`` or ``text``.
     """
     rows = []
     for number, axes in enumerate(figure.axes):
@@ -51,7 +51,10 @@ def plotted(figure: Figure) -> pd.DataFrame:
 
 
 def _points(axes: Axes) -> Iterator[dict[str, Any]]:
-    """Yield the points of all lines; an unlabelled line belongs to the last labelled one of its colour or the first."""
+    """Yield the points of all lines with their series.
+
+    An unlabelled line belongs to the last labelled line of its colour drawn before it, or else to the first one.
+    """
     bars = _intervals(axes)
     drawn = [line for line in axes.lines if in_data(axes, line)]
     named = {line: label for line in drawn if (label := _label(axes, line))}
@@ -73,12 +76,12 @@ def _points(axes: Axes) -> Iterator[dict[str, Any]]:
 
 
 def _place(line: Line2D) -> int:
-    """Return what distinguishes lines drawn beside each other, each with a transform of its own."""
+    """Return the id of a line's transform, which distinguishes lines that are shifted sideways on paper."""
     return id(line.get_transform())
 
 
 def _label(axes: Axes, line: Line2D) -> str:
-    """Return the label of a line, or of the error bars it belongs to; nothing where it has none."""
+    """Return the label of a line, or of the error bars that it belongs to; empty if there is none."""
     owners = [c for c in axes.containers if isinstance(c, ErrorbarContainer) and c.lines[0] is line]
     texts = [str(line.get_label()), *(str(owner.get_label()) for owner in owners)]
     return next((text for text in texts if not text.startswith("_") and text != "None"), "")
@@ -94,7 +97,7 @@ def _mark(line: Line2D) -> str:
 
 
 def _intervals(axes: Axes) -> dict[tuple[str, int, float, float], dict[str, float]]:
-    """Return the ends of error bars by the colour and place of their points."""
+    """Return the ends of error bars by the colour, transform, x and y of their points."""
     intervals: dict[tuple[str, int, float, float], dict[str, float]] = {}
     for container in axes.containers:
         if not isinstance(container, ErrorbarContainer) or container.lines[0] is None:
@@ -121,7 +124,7 @@ def _bands(axes: Axes) -> Iterator[dict[str, Any]]:
 
 
 def _texts(axes: Axes) -> Iterator[dict[str, Any]]:
-    """Yield texts at a place of the data: the letters of a map."""
+    """Yield texts positioned in data coordinates, such as the letters of a map."""
     for text in axes.texts:
         if text.get_transform() == axes.transData and text.get_text():
             x, y = text.get_position()
@@ -129,12 +132,12 @@ def _texts(axes: Axes) -> Iterator[dict[str, Any]]:
 
 
 def _title(axes: Axes) -> str:
-    """Return the panel's title, or that of the panel above it."""
+    """Return the panel's title, or else the title of the nearest titled panel above it."""
     return " ".join(_nearest(axes, "title").split())
 
 
 def _y_label(axes: Axes) -> str:
-    """Return the label of the y axis, or that of the panel to the left."""
+    """Return the label of the panel's y axis, or else of the nearest labelled panel to its left."""
     return re.sub(r"\s+", " ", _nearest(axes, "label"))
 
 

@@ -1,6 +1,6 @@
 """Splits rows by problem, and names each problem by the columns that distinguish it from the others.
 
-What a problem is stands in :mod:`bench.experiment.parameters`. Here its rows are chosen and its parameters become text.
+:mod:`bench.experiment.parameters` defines problems. This module selects their rows and formats their parameters.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ class ProblemRows:
     rows: pd.DataFrame
 
     def title(self) -> str:
-        """Return the problem as text: ``pushing, penalty, sigma=0.1``."""
+        """Return the problem as a string: ``pushing, penalty, sigma=0.1``."""
         return ", ".join(str(v) if k in CATEGORIES else f"{k}={axis_value(v)}" for k, v in self.identity.items())
 
 
 def split_by_problem(shown: Arranged, axis: Axis | None, always: Sequence[str] = ()) -> list[ProblemRows]:
-    """Split the rows along an axis into problems, in order of appearance; ``always`` are columns to name in any case.
+    """Split the rows along an axis into problems, in order of appearance. Names always contain the columns ``always``.
 
-    A swept quantity distinguishes problems if it varies at a fixed value ``x`` of the axis. One that moves with the axis,
-    as in a ``zip``, does not. Sample counts, repeats and parameters of estimators count as swept quantities here.
+    A swept quantity distinguishes problems if it varies at a fixed value ``x`` of the axis. A quantity that steps with
+    the axis, as in a ``zip``, does not. Sample counts, repeats and parameters of estimators count as swept quantities
+    here.
     """
     table = rows_along(shown, axis)
     if table.empty:
@@ -57,7 +58,7 @@ def split_by_problem(shown: Arranged, axis: Axis | None, always: Sequence[str] =
 
 
 def problem_numbers(rows: pd.DataFrame, parts: Sequence[str], without: Sequence[Axis] = ()) -> pd.Series:
-    """Return the number of each row's problem, which ignores swept axes; see :func:`~.parameters.number_problems`."""
+    """Return the number of each row's problem, ignoring the axes ``without``; see :func:`~.parameters.number_problems`."""
     return number_problems(rows, parts, [name for axis in without for name in axis.names])
 
 
@@ -68,7 +69,7 @@ def _is_worth_naming(column: str, value: Any) -> bool:
 
 
 def constants(rows: pd.DataFrame, groups: pd.Series, names: Sequence[str]) -> pd.DataFrame:
-    """Return a line per group, in order of appearance: the values of columns, empty where the group's rows differ."""
+    """Return a line per group, in order of appearance, with the values of some columns; empty where the rows differ."""
     parts = rows[list(names)].groupby(groups, sort=False)
     values = parts.first().reindex(groups.unique()).astype(object)
     return values.mask(parts.nunique(dropna=False).reindex(values.index) > 1, "")
@@ -77,7 +78,10 @@ def constants(rows: pd.DataFrame, groups: pd.Series, names: Sequence[str]) -> pd
 def distinguishing_columns(
     rows: pd.DataFrame, groups: pd.Series, names: Sequence[str], always: Sequence[str] = ("scene",)
 ) -> list[str]:
-    """Choose, of some columns, those that distinguish the groups, each only where the ones before it do not suffice."""
+    """Return the columns, of ``names``, that distinguish the groups, and the columns ``always``.
+
+    A column is added only if the columns before it do not distinguish all groups that it does.
+    """
     names = [name for name in names if name in rows]
     values = constants(rows, groups, names).astype(str)
 
@@ -98,10 +102,10 @@ def problem_names(
     always: Sequence[str] = ("scene",),
     rows: pd.DataFrame | None = None,
 ) -> pd.Series:
-    """Name the problem of each row, ``mass_spring, damping=0``: no two that differ in ``parts`` have the same name.
+    """Return the name of each row's problem, ``mass_spring, damping=0``, unique among problems that differ in ``parts``.
 
-    ``always`` are columns to name even where they distinguish nothing. ``rows`` are those of ``shown``, or some of
-    them.
+    The axes ``without`` are ignored. ``always`` are columns to name even if they distinguish nothing. ``rows`` are some
+    rows of ``shown``, by default all.
     """
     rows = shown.rows if rows is None else rows
     groups = problem_numbers(rows, parts, without)
@@ -114,14 +118,14 @@ def problem_names(
 
 
 def part_columns(shown: Arranged, parts: Sequence[str], without: Sequence[Axis] = ()) -> list[str]:
-    """Return the columns that show some parts of the grid: identity strings, then numbers, except those of some axes."""
+    """Return the columns that identify ``parts`` of the grid, strings before numbers, except the axes ``without``."""
     more = {"backend": ["dtype"], "estimator": ["estimator_params"], "scene": ["noise"]}
     labels = [*parts, *(name for part in parts for name in more.get(part, []))]
     return [name for name in (*labels, *shown.numbers) if name not in {axis.column for axis in without}]
 
 
 def value_text(value: Any) -> str:
-    """Write a value of such a column as text."""
+    """Return a value of an identity column, string or number, as a string."""
     return value if isinstance(value, str) else axis_value(value)
 
 
@@ -132,7 +136,7 @@ def _with_name(column: Any, value: Any) -> str:
 
 
 def axes_of(shown: Arranged, *columns: str) -> list[Axis]:
-    """Return the axes that hold the values of some columns, under whatever name, and the axes that step with them."""
+    """Return the axes whose values are in some columns, under any name, and the axes that step with them."""
 
     def has_values_of(axis: Axis) -> bool:
         known = shown.rows[axis.column].notna()

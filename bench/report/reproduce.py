@@ -1,4 +1,4 @@
-"""Builds, from a row, the command that runs its cell again."""
+"""Builds the shell command that reruns the cell of a row."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HEAD = "python -m bench name=one_cell"
 
 
 def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
-    """Return each row's words after :data:`HEAD`, quoted for a shell; none if one of its plugins is not installed."""
+    """Return, per row, the words after :data:`HEAD` that rerun its cell, shell-quoted; empty if a plugin is missing."""
     folders = plugin_folders(experiment.plugins)
     revive = CellBuilder()
     lines: list[list[str]] = []
@@ -40,16 +40,16 @@ def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
 
 
 class CellBuilder:
-    """Builds cells from rows, and each plugin once."""
+    """Builds cells from rows; each plugin is built once and shared."""
 
     def __init__(self) -> None:
         self._known: dict[str, Plugin] = {}
 
     def cell(self, given: Mapping[str, Any], row: Mapping[Any, Any], timing: bool) -> Cell:
-        """Make the cell of a row's parameters and counts; raises :class:`UserError` if a plugin is not installed.
+        """Return the cell of a row's parameters and counts; raises :class:`UserError` if a plugin is not installed.
 
-        The parameters do not say whether the cell was timed, but its key does; ``timing`` is used if no key matches
-        today's.
+        The parameters do not contain whether the cell was timed, but its key depends on it. ``timing`` is used if
+        neither choice gives the row's key, because its plugins have changed since.
         """
         study = self._plugin("study", given["study"])
         assert study is not None
@@ -78,7 +78,7 @@ class CellBuilder:
 
 
 def cell_settings(cell: Cell) -> list[str]:
-    """Return the settings of an experiment that consists of one cell, with the same key."""
+    """Return the settings, as command-line words, of an experiment with only this cell, which has the same key."""
     parts = [f"study={_identity(cell.study)}", *plugin_settings(cell)]
     parts += [f"{name}={getattr(cell, name)}" for name in ("samples", "repeats", "seed")]
     parts += theta_settings(cell)
@@ -95,7 +95,7 @@ def cell_settings(cell: Cell) -> list[str]:
 def plugin_settings(cell: Cell, without: Collection[str] = ()) -> list[str]:
     """Return a setting for the plugin on each axis, ``contacts=[penalty[stiffness=100]]``, except axes ``without``.
 
-    Parameters at their defaults are left out; the scene's contact values count as the defaults of its contact law.
+    Parameters at their defaults are omitted. The scene's contact values count as defaults of its contact law.
     """
     given = dict(cell.scene.contact_values) if isinstance(cell.scene, MechanicalScene) else {}
     return [
@@ -106,7 +106,7 @@ def plugin_settings(cell: Cell, without: Collection[str] = ()) -> list[str]:
 
 
 def theta_settings(cell: Cell) -> list[str]:
-    """Return the settings of theta and of the point of the gradients; none where they are the scene's own."""
+    """Return the settings of theta's names and of the point of the gradients; empty if they are the scene's own."""
     names, at = cell.decision.names, cell.decision.at
     return [f"theta=[{','.join(names)}]"] * bool(names) + (
         [] if at is None else [f"theta0=[{','.join(map(repr, at))}]"]
@@ -114,14 +114,14 @@ def theta_settings(cell: Cell) -> list[str]:
 
 
 def plugin_folders(folders: Sequence[Path]) -> list[str]:
-    """Return the setting that names folders of plugins, if there are any."""
+    """Return the setting that names the folders of plugins; empty without folders."""
     return [f"plugins=[{','.join(repr(str(folder)) for folder in folders)}]"] if folders else []
 
 
 def check_of(cell: Cell) -> str:
     """Return a shell command that repeats a cell's gradient checks: ``gradcheck SCENE``, and non-default settings.
 
-    The cell's horizon replaces the sweep that ``gradcheck`` makes. Counts and estimator are left out: no check depends
+    The cell's horizon replaces the default sweep of ``gradcheck``. Counts and estimator are omitted: no check depends
     on them.
     """
     scene, line = _identity(cell.scene), []

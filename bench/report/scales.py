@@ -1,4 +1,4 @@
-"""The axes of panels: logarithmic scales with few labels, shading, marked values."""
+"""Sets the axes of panels: logarithmic scales with few labels, shading, and marked values."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from bench.report.views import is_logarithmic
 TICKS = (
     (1, (1, 1.5, 2, 3, 5, 7)), (1, (1, 2, 5)), (1, (1, 3)), (1, (1,)), (2, (1,)), (3, (1,)), (4, (1,)), (6, (1,)), (10, (1,))
 )  # fmt: skip
-"""Choices of ticks on a logarithmic axis, finest first: every how many decades, and where in a decade."""
+"""Choices of ticks on a logarithmic axis, finest first: a stride in decades, and the positions within a decade."""
 
 
 def shifts(values: np.ndarray, count: int, columns: int) -> list[Affine2D]:
-    """Return sideways shifts for ``count`` lines by a part of the smallest step, so that no points hide others.
+    """Return sideways shifts for ``count`` lines, smaller than the least distance of values, so that points do not overlap.
 
-    They go before a panel's own transform, so that points move on paper while their data stay the same.
+    They are applied before a panel's own transform: points move on paper, and their data are unchanged.
     """
     positions = np.log10(values) if is_logarithmic(values) else values
     step = min(0.4 * np.diff(positions).min(), 0.003 * columns * count * np.ptp(positions)) / max(count, 2)
@@ -33,17 +33,17 @@ def shifts(values: np.ndarray, count: int, columns: int) -> list[Affine2D]:
 
 
 def in_data(panel: Axes, artist: Line2D) -> bool:
-    """Return whether both coordinates of an artist are data, drawn at their place or moved from it."""
+    """Return whether both coordinates of an artist are data coordinates, shifted or not."""
     return bool(artist.get_transform().contains_branch(panel.transData))
 
 
 def above(panel: Axes, place: Transform) -> Transform:
-    """Return a transform: across, data as ``place`` puts them; upwards, 0 to 1 from the panel's lower to upper edge."""
+    """Return a transform with data in x, transformed by ``place``, and 0 to 1 from the panel's lower to upper edge in y."""
     return blended_transform_factory(place, panel.transAxes)
 
 
 def scale_x(panel: Axes, values: np.ndarray) -> None:
-    """Set the scale of a swept axis, labelled at its values if they are few."""
+    """Set the x scale of a swept axis, with ticks at its values if there are at most six."""
     if is_logarithmic(values):
         margin = (values.max() / values.min()) ** 0.07
         log_axis(panel, "x", values.min() / margin, values.max() * margin, values if len(values) <= 6 else ())
@@ -54,7 +54,7 @@ def scale_x(panel: Axes, values: np.ndarray) -> None:
 
 
 def scale_y(panels: Sequence[Axes]) -> None:
-    """Set one logarithmic scale for panels, with room for crosses, and shade where the error exceeds the gradient."""
+    """Set one logarithmic y scale for all panels, with space for crosses, and shade errors above the gradient's norm."""
     low, high = extent(panels, "y", 0.3, 3.0)
     margin = (high / low) ** 0.12
     for panel in panels:
@@ -72,7 +72,11 @@ def log_axis(
     wanted: Sequence[float] | np.ndarray = (),
     text: Callable[[float], str] | None = None,
 ) -> None:
-    """Set a logarithmic axis from ``low`` to ``high`` with few labels: ``wanted`` ones if close, or round ones."""
+    """Set a logarithmic axis from ``low`` to ``high`` with few labels.
+
+    Ticks are at the values ``wanted`` if the axis spans at most three decades and they are not too close, else at round
+    values. ``text`` formats the labels.
+    """
     axis = panel.xaxis if which == "x" else panel.yaxis
     getattr(panel, f"set_{which}scale")("log")
     getattr(panel, f"set_{which}lim")(low, high)
@@ -107,7 +111,7 @@ def _power(value: float) -> str:
 
 
 def extent(panels: Iterable[Axes], which: str, low: float, high: float) -> tuple[float, float]:
-    """Return the range of the points drawn in panels, widened to contain ``low`` to ``high``."""
+    """Return the range of the positive data drawn in panels, extended to contain ``low`` and ``high``."""
     for panel in panels:
         for line in panel.lines:
             if in_data(panel, line):
@@ -118,7 +122,7 @@ def extent(panels: Iterable[Axes], which: str, low: float, high: float) -> tuple
 
 
 def mark_values(panel: Axes, marks: Mapping[str, float]) -> None:
-    """Draw lines at those named values of the horizontal axis that are in sight."""
+    """Draw vertical lines at the named values of the x axis that are within its limits."""
     low, high = panel.get_xlim()
     for value, dashes in zip(marks.values(), MARKS * len(marks), strict=False):
         if low < value < high:

@@ -1,4 +1,4 @@
-"""Shared by the studies' reports: tables as files and on the terminal, numbers with intervals, titled figures."""
+"""Functions shared by the studies' reports: tables in files and on the terminal, intervals, and titled figures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from bench.report.web.content import distinguishing_columns
 from bench.run.files import write_all
 
 TERMINAL_WIDTH = 180
-"""Fewest characters of a line where the output is not a terminal."""
+"""Least line width, in characters, if the output is not a terminal."""
 TITLE_WIDTH = 86
 """Characters of a line of a figure's title, in a figure of full width."""
 
@@ -37,9 +37,10 @@ TITLE_WIDTH = 86
 def interval(
     row: Mapping[Any, Any], name: str, low: str = "", high: str = "", factor: float = 1.0, digits: int = 2
 ) -> str:
-    """Write a number of a row with its interval, ``0.5 [0.4, 0.6]``, or ``-`` where the number is missing.
+    """Return a number of a row with its interval as a string, ``0.5 [0.4, 0.6]``, or ``-`` if the number is missing.
 
-    The ends are the columns ``name_low`` and ``name_high`` unless ``low`` and ``high`` name others.
+    The ends are the columns ``name_low`` and ``name_high`` unless ``low`` and ``high`` name other columns. All three
+    values are multiplied by ``factor``.
     """
     values = [row[column] * factor for column in (name, low or f"{name}_low", high or f"{name}_high")]
     return "-" if math.isnan(values[0]) else "{} [{}, {}]".format(*(number(value, digits) for value in values))
@@ -54,8 +55,8 @@ def label_columns(
 ) -> list[str]:
     """Return the columns that distinguish rows with different ``parts``, ignoring the axes ``without``.
 
-    ``always`` are columns to return even where they distinguish nothing. ``rows`` are those of ``shown``, or some of
-    them.
+    ``always`` are columns to return even if they distinguish nothing. ``rows`` are some rows of ``shown``, by default
+    all.
     """
     rows = shown.rows if rows is None else rows
     return distinguishing_columns(
@@ -70,7 +71,7 @@ def write_tables(
     paragraphs: Sequence[str],
     further: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Path]:
-    """Write all columns as ``stem.csv``, paragraphs as ``stem.md``, and ``further`` files; return the files' paths."""
+    """Write all columns as ``stem.csv``, paragraphs as ``stem.md``, and ``further`` files by name; return all paths."""
     contents = {
         f"{stem}.csv": table(experiment, rows).to_csv(index=False, lineterminator="\n"),
         f"{stem}.md": "\n\n".join(paragraphs) + "\n",
@@ -83,7 +84,7 @@ def write_tables(
 
 
 def open_console(experiment: Experiment, rows: pd.DataFrame) -> Console:
-    """Print the experiment's question and the number of cells by status; return the console."""
+    """Print the experiment's question and the number of cells by status; return the console for further output."""
     console = Console(highlight=False, markup=False, emoji=False)
     if not console.is_terminal:
         console.width = max(console.width, TERMINAL_WIDTH)
@@ -100,7 +101,7 @@ def print_table(
     right: Collection[str] = (),
     title: str = "",
 ) -> None:
-    """Print a table of texts; ``heads`` replace column names, and the columns ``right`` are aligned to the right."""
+    """Print a table of strings. ``heads`` replaces column names, and the columns ``right`` are right-aligned."""
     grid = Table(title=title or None, title_justify="left", box=None, padding=(0, 2, 0, 0))
     for name in texts:
         grid.add_column(heads.get(name, str(name)), justify="right" if name in right else "left")
@@ -110,7 +111,7 @@ def print_table(
 
 
 def print_reasons(console: Console, rows: pd.DataFrame) -> None:
-    """Print each reason that rows give, once."""
+    """Print each distinct reason in the rows once."""
     for reason in rows.loc[rows["reason"] != "", "reason"].unique():
         console.print(reason)
 
@@ -119,7 +120,7 @@ def print_reasons(console: Console, rows: pd.DataFrame) -> None:
 
 
 def titled_figure(width: float, height: float, title: str) -> Figure:
-    """Return an empty figure of some inches with a bold title, wrapped to the figure's width."""
+    """Return an empty figure of ``width`` by ``height`` inches with a bold title, wrapped to its width."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     limit = int(TITLE_WIDTH * width / WIDTH)
@@ -133,7 +134,7 @@ def panel_grid(
 ) -> tuple[Figure, list[Axes]]:
     """Return a titled figure and its ``count`` panels, at most ``most`` side by side.
 
-    Heights are in inches: ``height`` of a row of panels, ``margin`` of title and legend.
+    ``height`` is the height of a row of panels and ``margin`` the height of title and legend, both in inches.
     """
     across = columns(count, most)
     down = math.ceil(count / across)

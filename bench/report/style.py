@@ -1,4 +1,4 @@
-"""The look of every chart: colours, markers, line styles, and names and numbers as printed."""
+"""The style of all charts: colours, markers, line styles, and the format of names and numbers."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ SYMBOLS = {
     "repeats": "$R$",
 }
 GREEK = ("alpha", "beta", "gamma", "delta", "kappa", "lambda", "mu", "nu", "rho", "tau")
-"""Parameters whose names are letters, printed as such."""
+"""Parameters named after Greek letters, printed as these letters."""
 
 WORDS = {"dt": "time step", "sigma": "noise"}
-"""Words for an axis before its symbol, where they differ from its parameter's name."""
+"""Words for an axis's parameter if they differ from its name."""
 
 
 class Styles:
     """The colour, marker and line style of each estimator and backend, the same in all charts.
 
-    ``names`` are all registered estimators, so that an estimator's style does not depend on the others in the chart.
-    Beyond the palette's length, hues repeat darker or lighter and with another marker.
+    ``names`` are all registered estimators, so that an estimator's style does not depend on the others in a chart.
+    Beyond the palette's length, hues repeat darker or lighter, with a different marker.
     """
 
     def __init__(self, rows: pd.DataFrame, names: Sequence[str]) -> None:
@@ -74,7 +74,7 @@ class Styles:
         }
 
     def marked(self, line: Curve) -> dict[str, Any]:
-        """Return the line and the marker of an estimator and its parameters."""
+        """Return the colour, line style and marker of an estimator and its parameters."""
         return {**self.line(line), "marker": marker(self._names.index(line.estimator), self._variant(line))}
 
     def backend(self, name: str) -> str:
@@ -87,13 +87,13 @@ class Styles:
 
 
 def colour(place: int) -> str:
-    """Return the colour of a place in a list: the palette, then its hues mixed with black or white, never repeated."""
+    """Return the colour of a position, from 0: the palette, then its hues mixed with black or white; no colour repeats."""
     from matplotlib.colors import to_hex, to_rgb
 
     turn, index = divmod(place, len(PALETTE))
     if turn == 0:
         return PALETTE[index]
-    # odd turns darken and even ones lighten, by less and less of the remaining range; black can only lighten
+    # odd turns darken, even turns lighten, and each adds less than the one before; black can only be lightened
     share = 0.45 * 0.7 ** ((turn - 1) // 2)
     end = 1.0 if turn % 2 == 0 or PALETTE[index] == "#000000" else 0.0
     share = share / 2 if turn % 2 == 0 and PALETTE[index] == "#000000" else share
@@ -102,7 +102,7 @@ def colour(place: int) -> str:
 
 
 def marker(place: int, variant: int = 0) -> str:
-    """Return the marker of a place in a list, another for each variant."""
+    """Return the marker of a position, from 0, and of a variant, from 0."""
     return MARKERS[(place + place // len(PALETTE) + 3 * variant) % len(MARKERS)]
 
 
@@ -112,19 +112,19 @@ def backend_rank(line: Curve, lines: Sequence[Curve]) -> int:
 
 
 def axis_name(axis: Axis) -> str:
-    """Return an axis in words, with its symbol, its unit and what moves with it: ``stiffness $k$ [N/m]``."""
+    """Return the label of an axis: name, symbol, unit and the parameters that step with it, ``stiffness $k$ [N/m]``."""
     unit = f"[{axis.unit}]" if axis.unit else ""
     name = " ".join(filter(None, [WORDS.get(axis.column, plain(axis.column)), symbol(axis.column), unit]))
     return name + (f", {' and '.join(map(plain, axis.moves))} with it" if axis.moves else "")
 
 
 def symbol(name: str) -> str:
-    """Return the letter that stands for a quantity in formulas; nothing where there is none."""
+    """Return the symbol of a quantity in formulas; empty if it has none."""
     return SYMBOLS.get(name, rf"$\{name}$" if name in GREEK else "")
 
 
 def quantity(name: str, value: float) -> str:
-    """Write a quantity with its value: ``$k$ = 1000 N/m``."""
+    """Format a quantity with its value and unit: ``$k$ = 1000 N/m``."""
     text = axis_value(value)
     mantissa, _, power = text.partition("e")
     if power:
@@ -134,14 +134,14 @@ def quantity(name: str, value: float) -> str:
 
 
 def plain(text: str) -> str:
-    """Escape text so that it is not taken for a formula, nor left out of a legend for its underscore."""
+    """Return text escaped for Matplotlib: not parsed as a formula, not hidden in legends for a leading underscore."""
     text = " ".join(text.split()).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
 
 @cache
 def width_in_inches(text: str) -> float:
-    """Return the printed width of a text in inches."""
+    """Return the printed width of a string in inches, at the charts' font size."""
     from matplotlib.cbook import is_math_text
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import text_to_path
@@ -153,7 +153,7 @@ def width_in_inches(text: str) -> float:
 
 
 def wrapped(parts: Sequence[str], width: float, between: str = ", ") -> str:
-    """Join parts by ``between``, in lines of at most ``width`` inches unless one part is longer."""
+    """Return parts joined by ``between``, in lines of at most ``width`` inches unless a single part is longer."""
     out = ""
     for part in filter(None, parts):
         last = out.rpartition("\n")[2]

@@ -1,4 +1,4 @@
-"""Writes tables as Markdown and LaTeX: escaping, and CSV with every digit."""
+"""Formats tables as CSV and Markdown, and escapes text for Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ WHOLE = ("horizon", "samples", "repeats", "dim", "seed")
 
 
 def csv(table: pd.DataFrame) -> str:
-    """Write a table as CSV, with every digit of every number."""
+    """Return a table as CSV with all digits of every number."""
     whole = [name for name in WHOLE if name in table and (table[name].dropna() % 1 == 0).all()]
     return str(table.astype(dict.fromkeys(whole, "Int64")).to_csv(index=False, lineterminator="\n"))
 
 
 def plain_markdown(table: pd.DataFrame, heads: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Write a table of texts in Markdown; ``heads`` are headings for columns whose names do not say it."""
+    """Return a table of strings in Markdown; ``heads`` replaces the names of some columns."""
     out = ["| " + " | ".join(heads.get(name, name) for name in table) + " |", "|" + "---|" * table.shape[1]]
     out += ["| " + " | ".join(map(escape_markdown, map(str, row))) + " |" for row in table.fillna("").to_numpy()]
     return "\n".join(out)
 
 
 def escape_markdown(text: str) -> str:
-    """Escape text so that a Markdown renderer shows it as it is, in a table cell too."""
+    """Return text escaped so that a Markdown renderer prints it verbatim, also in a table cell."""
     text = one_line(text).replace("&", "&amp;")
     text = re.sub(r"<(?! )", "&lt;", text).replace(">", "&gt;")
     text = re.sub(r"([\\`*|$~])", r"\\\1", text).replace("](", r"]\(")
@@ -36,7 +36,7 @@ def escape_markdown(text: str) -> str:
 
 
 def escape_latex(text: str) -> str:
-    """Escape text so that LaTeX prints it as it is."""
+    """Return text escaped so that LaTeX prints it verbatim."""
     special = {c: rf"\{c}" for c in "&%$#_{}"} | {
         "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$",
         "|": "$|$", "[": "{[}", "]": "{]}",

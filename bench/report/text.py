@@ -1,4 +1,4 @@
-"""Numbers and names as text: the same in tables, charts, pages and on the terminal."""
+"""Formats numbers as strings, the same in tables, charts, pages and on the terminal."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["axis_value", "counted", "duration", "number", "one_line"]
 
 
 def number(value: float, digits: int = 2) -> str:
-    """Write a number in few characters; ``-`` for a missing one.
+    """Return a number as a short string with ``digits`` significant digits; ``-`` for a missing number.
 
     >>> number(0.0213), number(350.0), number(123456.0), number(math.nan)
     ('0.021', '350', '1.2e5', '-')
@@ -27,7 +27,7 @@ def number(value: float, digits: int = 2) -> str:
 
 
 def axis_value(value: float) -> str:
-    """Write a value of an axis.
+    """Return a value of an axis as a string; ``-`` if it is not finite.
 
     >>> axis_value(0.01), axis_value(3000.0), axis_value(1e4)
     ('0.01', '3000', '1e4')
@@ -41,7 +41,7 @@ def axis_value(value: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Write seconds in a unit that fits.
+    """Return a time in seconds as a string in us, ms or s; ``-`` if it is not finite.
 
     >>> duration(0.00021), duration(0.0123), duration(1.5)
     ('210 us', '12 ms', '1.5 s')
@@ -55,7 +55,7 @@ def duration(seconds: float) -> str:
 
 
 def counted(count: int, one: str, many: str = "") -> str:
-    """Write a count with its noun.
+    """Return a count with its noun in the singular or plural.
 
     >>> counted(1, "cell"), counted(3, "cell")
     ('1 cell', '3 cells')

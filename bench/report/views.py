@@ -1,7 +1,8 @@
-"""Rows arranged for reading: what tables, charts and pages share.
+"""Arranges rows for reading, for tables, charts and pages.
 
-:func:`arrange` puts the swept axes into columns; then rows along one axis (:func:`rows_along`), one problem at a time
-(:mod:`bench.report.problems`), and in it one line per estimator with the backends that agree merged (:func:`estimator_curves`).
+:func:`arrange` adds a column per swept axis. :func:`rows_along` selects the rows along one axis, and
+:mod:`bench.report.problems` splits them by problem. :func:`estimator_curves` returns one curve per estimator of a
+problem, with agreeing backends merged.
 """
 
 from __future__ import annotations
@@ -26,25 +27,25 @@ CATEGORIES = ("scene", "contact", "integrator", "noise")
 NUMBERS = ("horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats")
 """Numeric identity columns; with the categories and the swept axes they identify the problem of a row."""
 VIEWS_OF_LAWS = ("stiffness", "smoothing")
-"""Those of :data:`NUMBERS` that are views of a contact law's parameter, which may be swept under its own name."""
+"""Columns that repeat a parameter of the contact law, which may be swept under its own name."""
 CELL = ("study", "parameters", "samples", "repeats", "seed")
-"""The columns that are a cell's identity."""
+"""The columns that identify a cell."""
 UNSTEADY = "!"
-"""Mark of a time whose calls spread too much."""
+"""Mark of a time whose interquartile range is too large."""
 EXACT, CLOSE = 1e-6, 1e-2
-"""Relative difference below which backends count as giving the same numbers, and nearly the same ones."""
+"""Largest relative differences between backends whose numbers count as equal, and as nearly equal."""
 
 
 def attempted(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of cells that were run, without those that were refused."""
+    """Return the rows of cells that were run, without refused cells."""
     return rows[~rows["status"].isin(("unsupported", "unavailable"))]
 
 
 def newest_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Return each cell's newest row, its parameters completed with today's defaults.
 
-    Editing a plugin leaves rows of its older versions behind. Rows of versions that did not store their parameters are
-    distinguished by their identity columns.
+    After a plugin is edited, rows of its older versions remain stored. Rows that old versions of the package stored
+    without parameters are distinguished by their identity columns.
     """
     rows = completed_rows(rows)
     bare = rows["parameters"] == ""
@@ -54,7 +55,7 @@ def newest_rows(rows: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True, eq=False)
 class Arranged:
-    """An experiment's rows with a column per swept axis, and labels that leave those parameters out."""
+    """An experiment's rows with a column per swept axis, and labels that omit the swept parameters."""
 
     experiment: Experiment
     rows: pd.DataFrame
@@ -66,18 +67,18 @@ class Arranged:
         return [*NUMBERS, *(a.column for a in self.axes if a.column not in (*NUMBERS, "seed"))]
 
     def swept(self) -> dict[Axis, int]:
-        """Return the axes with two or more values in the rows, and how many; never the seed, which is averaged over."""
+        """Return the axes with two or more values, and the number of values. Seeds are merged and never an axis."""
         counts = {a: int(rows_along(self, a)["x"].nunique()) for a in self.axes if a.column != "seed"}
         return {axis: count for axis, count in counts.items() if count > 1}
 
     def marks(self, axis: Axis) -> Mapping[str, float]:
-        """Return the named values to draw on an axis."""
+        """Return the experiment's named values to draw on an axis."""
         names = (axis.column, *axis.names, axis.short)
         return next((self.experiment.marks[name] for name in names if name in self.experiment.marks), {})
 
 
 def arrange(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
-    """Arrange rows for reading."""
+    """Return an experiment's rows arranged for reading: with a column per swept axis, and shorter labels."""
     swept_axes = axes(experiment.sweep, rows)
     table = relabel(rows, swept_axes)
     for axis in swept_axes:
@@ -88,7 +89,10 @@ def arrange(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
 
 
 def rows_along(shown: Arranged, axis: Axis | None) -> pd.DataFrame:
-    """Return the rows that an axis applies to, seeds merged, its values in a new column ``x`` alone (0 without an axis)."""
+    """Return the rows that have a value of an axis, with seeds merged.
+
+    The axis's values move to a new column ``x``; without an axis, ``x`` is 0.
+    """
     table = merge_seeds(shown.rows).copy()  # one block of memory: slicing a fragmented table is slow
     if axis is None:
         return table.assign(x=0.0)
@@ -97,7 +101,7 @@ def rows_along(shown: Arranged, axis: Axis | None) -> pd.DataFrame:
 
 
 def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
-    """Merge seeds into one row per cell: medians over its rows that are ok; ``lost`` counts rows that failed."""
+    """Return one row per cell, with medians over the seeds that are ok; the column ``lost`` counts failed seeds."""
     good = rows["status"] == "ok"
     rows = rows.assign(lost=(~good & rows.index.isin(attempted(rows).index)).astype(float))
     if rows["seed"].nunique() < 2:
@@ -112,7 +116,7 @@ def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def estimator_label(estimator: str, params: str) -> str:
-    """Return an estimator's identity string: its name, and in brackets the parameters that differ from their defaults."""
+    """Return an estimator's identity string: its name, then its non-default parameters in brackets."""
     return f"{estimator}[{params}]" if params else estimator
 
 
@@ -129,18 +133,18 @@ class Curve:
     estimator: str
     params: str
     backends: Mapping[str, bool]
-    """Backends that gave these numbers; with False, backends that agree only nearly."""
+    """The merged backends: True if their numbers are equal, False if they are only nearly equal."""
     rows: pd.DataFrame
     """The first backend's rows, indexed by ``x`` in increasing order."""
     seconds: Mapping[str, float]
-    """Median time per estimate on each backend."""
+    """Median time [s] of one estimate on each backend."""
     noisy: frozenset[str]
-    """Backends whose timings spread too much for most of the rows."""
+    """Backends whose times are unsteady in most of the rows."""
     failed: int
 
     @cached_property
     def at(self) -> dict[float, dict[str, Any]]:
-        """Return the rows by ``x``."""
+        """The rows as dictionaries, by ``x``."""
         names, values = [str(name) for name in self.rows], self.rows.to_numpy(dtype=object)
         return {float(x): dict(zip(names, row, strict=True)) for x, row in zip(self.rows.index, values, strict=True)}
 
@@ -157,7 +161,8 @@ RUN = ("estimator", "estimator_params", "backend", "dtype")
 def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Curve]:
     """Return one problem's curves, one per estimator, in order of appearance; refused cells are omitted.
 
-    Backends within a relative difference of ``close`` are merged into one curve; with None each backend has its own.
+    Backends within a relative difference of ``close`` are merged into one curve. With None, each backend has its own
+    curve.
     """
     rows = attempted(rows)
     several = rows["dtype"].nunique() > 1
@@ -198,7 +203,7 @@ class _Run:
 
 
 def _agree(a: _Run, b: _Run, tolerance: float) -> bool:
-    """Return whether two backends ended alike at every ``x`` and gave numbers within a relative tolerance."""
+    """Return whether two backends have the same status at every ``x``, and numbers within a relative tolerance."""
     if a.ends != b.ends:
         return False
     x, y = a.numbers, b.numbers
@@ -209,14 +214,14 @@ def _agree(a: _Run, b: _Run, tolerance: float) -> bool:
 
 
 def is_logarithmic(values: Any) -> bool:
-    """Return whether an axis of these values is logarithmic: all finite ones are positive, the largest 8 times the least."""
+    """Return whether an axis is logarithmic: finite values are positive, and the largest is at least 8 times the least."""
     finite = np.asarray(values, dtype=float)
     finite = finite[np.isfinite(finite)]
     return bool(finite.size and finite.min() > 0 and finite.max() >= 8 * finite.min())
 
 
 def pareto(time: pd.Series, error: pd.Series) -> np.ndarray:
-    """Return a mask of the points for which no other is smaller in both."""
+    """Return a mask of the points on the Pareto front: no other point is smaller in both time and error."""
     points = pd.DataFrame({"time": time.to_numpy(), "error": error.to_numpy()})
     best = points.groupby("time")["error"].min().cummin().shift(fill_value=math.inf)
     return np.asarray(points["error"] <= points["time"].map(best))
@@ -233,15 +238,15 @@ def is_bias_resolved(row: Any) -> Any:
 
 
 def relative(row: Any, column: str) -> float:
-    """Return a column of a row in units of |grad J|; NaN where that is 0."""
+    """Return a column of a row in units of |grad J|; NaN if |grad J| is 0."""
     norm = row["reference_norm"]
     return float(row[column] / norm) if norm > 0 else math.nan
 
 
 def rmse_interval(row: Any) -> tuple[Any, Any]:
-    """Return the 95% interval of the relative RMSE of one row, or of each row of a table; NaN where the variance has none.
+    """Return the 95% interval of the relative RMSE of one row or each row of a table; NaN if the variance has none.
 
-    RMSE^2 = bias^2 + variance, so its ends are those of bias and variance together.
+    RMSE^2 = bias^2 + variance, so each end combines the corresponding ends of bias and variance.
     """
     norm = np.where(row["reference_norm"] > 0, row["reference_norm"], math.nan)
     low, high = (
@@ -251,7 +256,7 @@ def rmse_interval(row: Any) -> tuple[Any, Any]:
 
 
 def bias_text(row: Any, norm: float = 1.0, interval: bool = True) -> str:
-    """Write a bias over a norm: ``0.500 [0.400, 0.600]``, or ``0 (< 0.124)`` if it cannot be distinguished from 0."""
+    """Format a bias divided by a norm: ``0.500 [0.400, 0.600]``, or ``0 (< 0.124)`` if not distinguishable from 0."""
     value, low, high = (row[c] / norm if norm > 0 else math.nan for c in ("bias", "bias_low", "bias_high"))
     if not low > 0 and math.isfinite(high):
         return f"0 (< {number(high, 3)})" if high > 0 else "0"

@@ -1,1 +1,1 @@
-"""Studies that come with the package, a folder each: measurements per cell, and their tables, charts and page."""
+"""The built-in studies, one package each: what to measure per cell, and the tables, charts and page to write."""

@@ -1,6 +1,6 @@
-"""The page of an experiment: ``report.html``, one file that needs no network.
+"""Writes the page of an experiment: ``report.html``, a single file that needs no network.
 
-The experiment's study says what its page shows; without an answer the page has its table and one chart of its numbers.
+The experiment's study returns the content. If it returns None, the page has the table and one chart of its numbers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from bench.run.files import write_whole
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> Path:
-    """Write ``report.html`` from rows, and from ``run.json`` where there is one; returns its path."""
+    """Write ``report.html`` from rows, and from ``run.json`` if it exists; return the path of the page."""
     rows = rows.reset_index(drop=True)
     path = experiment.directory / "report.html"
     text = assemble(experiment, content(experiment, rows), reproduce.commands(experiment, rows), _record(path))
@@ -33,7 +33,10 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> Path:
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the content of this experiment's page, with a column for every swept parameter."""
+    """Return the content of the experiment's page, with a column for every swept parameter.
+
+    Raises :class:`UserError` if the study returns neither a :class:`Content` nor None.
+    """
     study = study_of(experiment)
     result = study.page(experiment, rows)
     if result is None:

@@ -1,4 +1,4 @@
-"""The content of a page: a finding, answers, charts and a table, all from the same rows."""
+"""The classes that describe a page's content (finding, answers, charts, table), and functions that build their parts."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ __all__ = ["distinguishing_columns"]
 SYMBOLS = dict(
     zip(MARKERS, ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star"), strict=True)
 )
-"""Plotly's names of the charts' markers."""
+"""Plotly's name of each Matplotlib marker."""
 DASHES = dict(zip(map(str, VARIANTS), ("solid", "dash", "dot"), strict=True))
-"""Plotly's names of the charts' line styles."""
+"""Plotly's name of each Matplotlib line style."""
 DARK = {"#000000": "#ffffff"}
-"""Colours that a dark page needs instead; the others stand out on both backgrounds."""
+"""Replacements for colours on a dark page; all other colours are visible on both backgrounds."""
 
 
 @dataclass(frozen=True)
 class PlotAxis:
-    """A column that can be an axis: its label, its scale, and the columns of its interval.
+    """A column to use as an axis: its label, its scale, and the columns ``low`` and ``high`` of its interval.
 
-    Where the column ``limit`` is not 0 the value is an upper limit.
+    Where the column ``limit`` is not 0, the value is an upper limit.
     """
 
     column: str
@@ -47,10 +47,11 @@ class PlotAxis:
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart of a table: points, joined to lines where ``line`` names a column, one panel per value of ``facet``.
+    """A chart of a table: points, one panel per value of the column ``facet``, joined to lines by the column ``line``.
 
-    A chart with ``level`` is a map of that column instead; with ``share`` as well, of the share of that level among the
-    rows at each place. With ``front`` the points that no other of the same ``front`` beats in x and y are marked.
+    A chart with ``level`` is a map of that column instead. With ``share`` too, the map shows which share of the rows at
+    each position has that level. With ``front``, points are marked that no other point with the same value of that
+    column beats in both x and y.
     """
 
     title: str
@@ -70,7 +71,10 @@ class Chart:
 
 @dataclass(frozen=True)
 class TableColumn:
-    """A column of the main table; ``kind``: text, number, seconds (``!`` if ``flag`` is not 0), limit (``<`` then)."""
+    """A column of the main table. ``kind`` is text, number, seconds or limit.
+
+    Where the column ``flag`` is not 0, seconds are marked with ``!`` and limits with ``<``.
+    """
 
     name: str
     label: str
@@ -80,38 +84,38 @@ class TableColumn:
 
 @dataclass(frozen=True)
 class Content:
-    """Everything that a page shows of a study."""
+    """The content of a page: finding, table, charts, answers, and the data behind them."""
 
     finding: str
     rows: pd.DataFrame
     columns: list[TableColumn]
     charts: list[Chart]
     answers: pd.DataFrame = field(default_factory=pd.DataFrame)
-    """Texts: what to use where."""
+    """A table of strings, such as the recommended estimators."""
     answers_title: str = "What to use where"
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)
-    """Further tables for charts; their column ``row`` is the row of ``rows`` that a line comes from."""
+    """Further tables for charts, by name. Their column ``row`` is the position in ``rows`` that a line belongs to."""
     looks: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """For each value of a chart's ``series`` or ``level``: colour, symbol, dash, letter, meaning."""
+    """Colour, symbol, dash, letter and meaning of each value of a chart's ``series`` or ``level``: see :func:`look`."""
     swept: Sequence[str] = ()
-    """Columns of ``rows`` that hold swept parameters besides the common ones; filled in when the page is written."""
+    """Columns of ``rows`` with the swept parameters; set when the page is written."""
 
 
 def look(
     colour: str, symbol: str = "circle", dash: str = "solid", letter: str = "", meaning: str = ""
 ) -> dict[str, Any]:
-    """Return how one series is drawn: its colour on light and on dark background, and its other marks."""
+    """Return the style of one series: its colours on a light and a dark background, symbol, dash, letter and meaning."""
     style = {"colour": [colour, DARK.get(colour, colour)], "symbol": symbol, "dash": dash}
     return style | {name: text for name, text in (("letter", letter), ("meaning", meaning)) if text}
 
 
 def looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return a colour of its own for each name (the palette's, then darker and lighter ones) and a symbol."""
+    """Return a style for each name, with a distinct colour (the palette, then darker and lighter hues) and a symbol."""
     return {name: look(colour(i), SYMBOLS[marker(i)]) for i, name in enumerate(dict.fromkeys(names))}
 
 
 def identity_columns(rows: pd.DataFrame, swept: Sequence[str] = ()) -> list[TableColumn]:
-    """Return the identity columns and the swept ones that vary; those whose values are numbers are shown as such."""
+    """Return the identity and swept columns that vary, as columns of kind number or text."""
     names = [name for name in dict.fromkeys((*IDENTITY, *swept)) if name in rows]
     varying = [name for name in names if rows[name].nunique(dropna=False) > 1] or ["scene", "estimator"]
     texts = {name for name in varying if not pd.api.types.is_numeric_dtype(rows[name])}
@@ -123,12 +127,12 @@ STATUS = [TableColumn("status", "status", "text"), TableColumn("reason", "reason
 
 
 def numeric_axis(axis: sweep.Axis, column: str = "x", log: bool = True) -> PlotAxis:
-    """Return a swept parameter as an axis of a chart, named with its unit and what moves with it."""
+    """Return a swept parameter as an axis of a chart, labelled with its unit and the parameters that step with it."""
     return PlotAxis(column, axis.title, log)
 
 
 def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:
-    """Return, per row, the values of some text columns joined by commas, without ``none`` and empty ones."""
+    """Return, per row, the values of some text columns joined by commas, without empty values and ``none``."""
     return pd.Series(
         [", ".join(text for text in map(str, row) if text not in ("", "none")) for row in rows[list(names)].to_numpy()],
         index=rows.index,
@@ -137,7 +141,7 @@ def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:
 
 
 def no_result_sentence(rows: pd.DataFrame) -> str:
-    """Return a sentence that no cell has a result; empty if one has."""
+    """Return a sentence if no cell has a result, else an empty string."""
     has_result = bool((attempted(rows)["status"] == "ok").any())
     return "" if has_result else "No cell gave a result: the table has the reason of each."
 

@@ -1,4 +1,4 @@
-"""Writes the file itself: texts escaped, numbers as columns, and script, style and Plotly inside."""
+"""Assembles the HTML file of a page: escaped texts, data by column, and the embedded script, style and Plotly."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ HERE = Path(__file__).parent
 DIGITS = 6
 """Significant digits of the numbers in a page."""
 MOST = 24
-"""Largest number of values of a column to filter by."""
+"""Largest number of distinct values of a column that is offered as a filter."""
 
 
 def assemble(
     experiment: Experiment, content: Content, commands: Sequence[Sequence[str]], record: Mapping[str, Any]
 ) -> str:
-    """Assemble the page; ``commands`` are the words to run each row's cell, ``record`` the content of ``run.json``."""
+    """Return the page as HTML. ``commands`` are the words that run each row's cell, ``record`` is ``run.json``."""
     counts = content.rows["status"].value_counts()
     statuses = "".join(f'<li class="{escape(str(s))}"><b>{n}</b> {escape(str(s))}</li>' for s, n in counts.items())
     parts = {
@@ -52,18 +52,18 @@ def assemble(
 
 
 def in_script(text: str) -> str:
-    """Write JSON so that no browser takes it for the end of its script."""
+    """Escape JSON so that it cannot end the script element that contains it."""
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
 @cache
 def plotly() -> str:
-    """Return Plotly's script, compressed: base64 of gzip, a third of its size."""
+    """Return Plotly's script as base64 of gzip, a third of its size."""
     spec = find_spec("plotly")
     assert spec is not None
     assert spec.origin is not None
     script = (Path(spec.origin).parent / "package_data" / "plotly.min.js").read_bytes()
-    # without a time stamp, so that equal pages are equal files
+    # no time stamp, so that equal pages are equal files
     return base64.b64encode(gzip.compress(script, mtime=0)).decode()
 
 
@@ -71,7 +71,7 @@ def plotly() -> str:
 
 
 def data(content: Content, commands: Sequence[Sequence[str]]) -> dict[str, Any]:
-    """Return the data that the script draws: tables as columns, and how to draw them."""
+    """Return the data for the page's script: tables by column, charts, filters, and the commands of all rows."""
     rows = content.rows
     filters = filtered(content)
     wanted = {"rows": {*IDENTITY, *content.swept, "reason", "status", *filters, *(c.name for c in content.columns)}}
@@ -97,7 +97,7 @@ def data(content: Content, commands: Sequence[Sequence[str]]) -> dict[str, Any]:
 def filtered(content: Content) -> list[str]:
     """Return the columns to filter by: cell identity, swept parameters and verdicts of the table, where they vary.
 
-    Columns with more than :data:`MOST` values are left out, and so are the reasons, which are for reading.
+    Columns with more than :data:`MOST` values and the column ``reason`` are omitted.
     """
     rows = content.rows
     texts = [column.name for column in content.columns if column.kind == "text" and column.name != "reason"]
@@ -112,7 +112,7 @@ def _columns_of(chart: Chart) -> set[str]:
 
 
 def column(values: pd.Series) -> Any:
-    """Write numbers as they are, None where missing; write texts as a list of distinct ones and an index into it."""
+    """Encode a column for JSON: numbers rounded, None where missing; texts as distinct values and an index."""
     if pd.api.types.is_bool_dtype(values) or not pd.api.types.is_numeric_dtype(values):
         codes, unique = pd.factorize(values.astype(str))
         return {"values": list(unique), "index": codes.tolist()}
@@ -130,13 +130,13 @@ def _short(value: float) -> float | int | None:
 
 
 def _finding(text: str) -> str:
-    """Write the finding, each further part of it on a line of its own, in smaller letters."""
+    """Return the finding as HTML; each part after the first semicolon is a separate line in a smaller font."""
     first, *rest = text.split("; ")
     return escape(first) + "".join(f"<span>{escape(part)}</span>" for part in rest)
 
 
 def _answers(content: Content) -> str:
-    """Write the answers on what to use where, as a table."""
+    """Return the answers as an HTML table with its heading; empty without answers."""
     table = content.answers
     if table.empty:
         return ""
@@ -149,7 +149,7 @@ def _answers(content: Content) -> str:
 
 
 def _made(record: Mapping[str, Any]) -> str:
-    """Write machine, versions and configuration, as far as they are recorded."""
+    """Return the run's machine, versions and configuration as HTML, as far as they are recorded."""
     if not record:
         return "<p>There is no run.json beside this page, so machine and versions are not known.</p>"
     machine = record.get("machine") or {}

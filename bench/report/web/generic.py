@@ -1,4 +1,4 @@
-"""The page of a study without a page of its own: one chart of any two of its numbers, as the reader chooses."""
+"""Builds the default page, for studies without their own: one chart of any two numbers that the reader chooses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bench.report.web.content import (
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return counts, a chart of the study's own numbers against the swept ones, and the table."""
+    """Return the content of the page: counts, a chart of the study's own numbers against swept ones, and the table."""
     shown = arrange(experiment, rows)
     table = shown.rows
     own = [

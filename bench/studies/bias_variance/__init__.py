@@ -37,20 +37,20 @@ class BiasVariance(Study):
     )  # fmt: skip
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Measure the estimates of one cell and their statistics."""
+        """Return one cell's results by column: statistics of its estimates, and their time."""
         from bench.studies.bias_variance.measure import measure
 
         return measure(cell, session, self.timed_calls, self.settle_s)
 
     def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the main table, error against time, the charts, the fastest methods, and who wins where."""
+        """Write the main table, error against time, the charts, the cost to reach each error, and the ranking."""
         from bench.studies.bias_variance import charts, ranking, tables, time_to_accuracy
 
         paths = tables.write(experiment, rows) + charts.write(experiment, rows)
         return paths + time_to_accuracy.write(experiment, rows) + ranking.write(experiment, rows)
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the digest: the main table, condensed where it is long, and the findings from it."""
+        """Print the main table (condensed if long), the findings, the diagnostics, and the cost to reach each error."""
         from bench.studies.bias_variance import reported, terminal, time_to_accuracy
 
         terminal.show(experiment, rows)
@@ -58,13 +58,13 @@ class BiasVariance(Study):
         time_to_accuracy.show(experiment, rows)
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the finding, what to use where, and the charts."""
+        """Return the page: the finding, the recommended estimators and the charts."""
         from bench.studies.bias_variance.page import content
 
         return content(experiment, rows)
 
     def chart(self, experiment: Experiment, rows: pd.DataFrame) -> Sequence[str]:
-        """Return the name of the chart along the longest axis."""
+        """Return the names of charts in order of preference: the experiment's own, then those of its axes, longest first."""
         from bench.studies.bias_variance.charts import along_longest
 
         return [experiment.name, *along_longest(experiment, rows)]

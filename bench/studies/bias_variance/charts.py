@@ -1,7 +1,7 @@
 """Chooses an experiment's charts: bias and variance along each swept axis, error against time, or an overview.
 
-An estimator has one colour and marker in every chart, by its position among all registered estimators. Backends that
-agree are one line. Relative means in units of the reference gradient's norm.
+An estimator has the same colour and marker in every chart, by its position among all registered estimators. Backends
+that agree are drawn as one line. Relative errors are in units of the reference gradient's norm.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from bench.studies.bias_variance.summary_matrix import draw_summary_matrix
 from bench.studies.bias_variance.time_to_accuracy import SAMPLES
 
 ROOM = 4
-"""Number of problems beyond which a chart shows only some of them."""
+"""Most problems in one chart."""
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Draw every chart that the rows can fill, in the experiment's formats; returns the files' paths."""
+    """Write every chart that the rows have data for, in the experiment's formats; return the files' paths."""
 
     def drawn(name: str, figure: Callable[[], Figure]) -> list[Path]:
         with styled():
@@ -51,7 +51,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 
 def file_name(axis: Axis, kind: str = "bias_variance") -> str:
-    """Return the file name of the chart along an axis, without ending."""
+    """Return the file name, without extension, of the chart along an axis."""
     return f"{kind}_" + re.sub(r"\W", "_", axis.column)
 
 
@@ -62,13 +62,13 @@ def along_longest(experiment: Experiment, rows: pd.DataFrame) -> list[str]:
 
 
 def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
-    """Return the charts by file name."""
+    """Return the charts as figures, by file name without extension."""
     with styled():
         return {name: figure() for name, figure in chart_drawers(experiment, rows).items()}
 
 
 def chart_drawers(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
-    """Return, by file name, a function that draws the chart."""
+    """Return the functions that draw the charts, by file name without extension."""
     shown = arrange(experiment, with_gradient_cost(rows))
     rows = shown.rows
     look = Styles(rows, sorted(registry.entries()["estimators"]))
@@ -88,7 +88,7 @@ def chart_drawers(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Calla
             drawers[file_name(axis)] = partial(bias_variance, chosen, held + merged, look, axis, shown.marks(axis))
     nothing_swept = not drawers
     good = rows[rows["status"] == "ok"]
-    # noise changes an estimate and not its time
+    # sigma is excluded: it changes an estimate but not its time
     longest = max((axis for axis in swept if axis.short != "sigma"), key=lambda axis: swept[axis], default=None)
     if longest is not None and good["samples"].nunique() < 2 and good["time_s"].notna().any():
         chosen, held = choose_problems(problems(longest, lambda part: TIME.known(part)["x"].nunique() >= FEWEST))
@@ -124,9 +124,9 @@ def _costs(problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles, 
 
 
 def _panel_sentences(problems: Sequence[ProblemRows], cost: Cost) -> tuple[dict[int, str], str]:
-    """Return sentences by position of their problem, which estimator reaches 10% and 1% error first, and a title over all.
+    """Return a text per problem (by its position) on which method reaches 10% and 1% error first, and the chart's title.
 
-    Where samples are not swept, the title names the most accurate and the fastest estimator.
+    If samples were not swept, there are no texts, and the title names the most accurate and the cheapest estimator.
     """
     kind = "rollouts" if cost is ROLLOUTS else "time"
     sentences = {}
@@ -146,10 +146,11 @@ def _has_costs(cost: Cost, rows: pd.DataFrame) -> bool:
 
 
 def choose_problems(problems: Sequence[ProblemRows], room: int = ROOM) -> tuple[list[ProblemRows], list[str]]:
-    """Choose the problems to draw if there are more than fit, and report how many values of each number are shown.
+    """Return the problems to draw, about ``room`` of them, and notes on how many values of each parameter are shown.
 
-    Every scene and contact law is drawn. The number with most values gets the remaining room, at evenly spaced ranks
-    among the values that were run most, not at their ends; the other numbers are fixed at a middle one of those values.
+    Every combination of categories (scene, contact law, integrator, noise) is drawn. The parameter with most values
+    gets the remaining panels, at evenly spaced ranks among its most frequent values, not at the ends of their range.
+    Other parameters are fixed at a middle value among their most frequent ones.
     """
     if len(problems) <= room:
         return list(problems), []
@@ -170,7 +171,7 @@ def _numbers(problems: Iterable[ProblemRows]) -> list[str]:
 
 
 def _choose_values(members: Sequence[ProblemRows], problems: Sequence[ProblemRows], room: int) -> list[ProblemRows]:
-    """Return the problems of one scene and contact law that :func:`choose` keeps."""
+    """Return the problems that :func:`choose_problems` draws of one combination of categories, at most ``room``."""
 
     def values(some: Iterable[ProblemRows], name: str) -> list[float]:
         return [float(problem.identity.get(name, -math.inf)) for problem in some]

@@ -16,21 +16,21 @@ from bench.report.views import estimator_labels
 
 @dataclass(frozen=True)
 class Cost:
-    """A way to count what one estimate costs."""
+    """A measure of the cost of one estimate, with its labels."""
 
     name: str
-    """The cost as it ends ``Relative RMSE of one estimate against``."""
+    """Name of the cost in a chart's subtitle: the words after ``relative RMSE of one estimate against``."""
     label: str
-    """The label of an axis."""
+    """Axis label."""
     of: Callable[[pd.DataFrame], pd.Series]
-    """The cost of each row."""
+    """Computes the cost of each row."""
     spread: Callable[[pd.DataFrame], pd.Series]
-    """Half its interquartile range."""
+    """Computes half the interquartile range of each row's cost."""
     text: Callable[[float], str]
-    """The cost as printed."""
+    """Formats a cost."""
 
     def known(self, rows: pd.DataFrame) -> pd.DataFrame:
-        """Return the rows that have both an error and a cost."""
+        """Return the rows that are ok and have a finite positive error and cost."""
         good = (rows["status"] == "ok").to_numpy(bool)
         for values in (self.of(rows).to_numpy(float), rows["rmse_rel"].to_numpy(float)):
             good = good & np.isfinite(values) & (values > 0)
@@ -54,7 +54,7 @@ TIME_COMPILED = Cost(
     _seconds,
 )
 RATIO = "gradient_cost"
-"""Column with the rollouts that take as long as one gradient; rows without it count a gradient as one rollout."""
+"""Column with the number of rollouts that take as long as one gradient; 1 where it is missing."""
 PROGRAM = (
     "scene", "contact", "integrator", "noise", "horizon", "dt", "stiffness", "sigma", "smoothing", "backend", "dtype",
 )  # fmt: skip
@@ -63,8 +63,8 @@ PROGRAM = (
 def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with a column :data:`RATIO`: the measured cost of a gradient in rollouts, per program and backend.
 
-    It is the ratio of seconds per gradient to seconds per rollout, from the fastest rows that use gradients alone or
-    rollouts alone, at the largest number of samples that has both. It is NaN where nothing was measured.
+    The ratio is seconds per gradient over seconds per rollout, from the fastest row that uses only gradients and the
+    fastest that uses only rollouts, at the largest number of samples with both. Without such rows it is NaN.
     """
     keys = [name for name in PROGRAM if name in rows]
     program = rows.groupby(keys, dropna=False).ngroup()
@@ -100,9 +100,10 @@ EQUAL_ROLLOUTS, EQUAL_TIME = "rmse_equal_rollouts", "rmse_equal_time"
 def with_errors_at_equal_cost(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with each estimator's relative RMSE at equal rollouts and at equal time.
 
-    An estimate from c times fewer samples has the same bias and c times the variance. ``rmse_equal_rollouts`` is for as
-    many rollouts as there are samples, a gradient at its measured cost (:func:`with_gradient_cost`); ``rmse_equal_time`` for the time
-    of the fastest estimate from as many samples on the same problem, each estimator on its fastest backend.
+    An estimate from c times fewer samples has the same bias and c times the variance. ``rmse_equal_rollouts`` allows
+    one rollout per sample, where a gradient counts at its measured cost (:func:`with_gradient_cost`).
+    ``rmse_equal_time`` allows the time of the fastest estimator with as many samples on the same problem, each on its
+    fastest backend.
     """
     rows = with_gradient_cost(rows)
     good = rows["status"] == "ok"

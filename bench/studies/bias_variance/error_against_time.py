@@ -1,6 +1,6 @@
-"""Error against time along a swept axis: each estimator one curve through all values of the axis, labelled with them.
+"""Draws error against time along a swept axis: one curve per estimator, its points labelled with the axis values.
 
-The chart shows whether a stiffer contact or a longer horizon costs time, accuracy, or both.
+The chart shows whether, for example, a stiffer contact or a longer horizon costs time, accuracy, or both.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from bench.studies.bias_variance.costs import TIME
 from bench.studies.bias_variance.findings import winners
 
 FEWEST = 3
-"""Values of an axis from which a curve along it is worth drawing."""
+"""Fewest values of an axis for which the chart is drawn."""
 APART = 0.075, 0.06
-"""Parts of a panel's width and height within which neighbours on a curve share a label."""
+"""Distance, as a share of a panel's width and height, within which neighbouring points of a curve share a label."""
 LETTER = 0.0115, 0.05
-"""Width of a letter and height of a line of labels, as parts of a panel."""
+"""Width of a character and height of a line of labels, as a share of a panel's width and height."""
 FACTOR = 2.0
-"""Factors below this are not reported in a title."""
+"""Smallest growth factor of error or time that a title reports."""
 
 
 def draw_error_against_time(problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles, axis: Axis) -> Figure:
     """Draw relative RMSE against the time of one estimate, a panel per problem, a curve per estimator.
 
-    Each curve joins the values of the axis in order, on the backend that is fastest in the median; numbers beside it are
-    those values. All panels have the same scales. The title says what the axis does to error and time.
+    A curve joins the values of the axis in order, labelled with them, on the backend with the lowest median time. All
+    panels have the same scales. The title summarises how error and time change along the axis.
     """
     drawn = [fastest(estimator_curves(problem.rows, close=None)) for problem in problems]
     entries = {
@@ -105,21 +105,21 @@ def headline(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis) -
 
 
 def _scale_ends(values: Sequence[float]) -> tuple[float, float]:
-    """Return the ends of a scale, with room for labels."""
+    """Return the lower and upper end of a scale, with a margin for labels."""
     low, high = min(values), max(values)
     margin = max(high / low, 4.0) ** 0.12
     return low / margin, high * margin
 
 
 def _panel_positions(panel: Axes, rows: Any) -> list[tuple[float, float, float]]:
-    """Return the axis's value of each point and its place, as parts of the panel."""
+    """Return each point's value of the axis and its x and y as shares of the panel's width and height."""
     ends = [np.log(panel.get_xlim()), np.log(panel.get_ylim())]
     at = [(np.log(rows[n]) - e[0]) / (e[1] - e[0]) for n, e in zip(("time_s", "rmse_rel"), ends, strict=True)]
     return list(zip(map(float, rows.index), *(part.to_numpy(float) for part in at), strict=True))
 
 
 def _label(panel: Axes, rows: Any, colour: str, taken: list[tuple[float, float, float]]) -> None:
-    """Write the axis's values beside a curve; neighbours too close for labels of their own share one: ``10-1000``."""
+    """Label a curve's points with the axis values. Points too close for separate labels share one: ``10-1000``."""
     runs: list[list[tuple[float, float, float]]] = []
     for point in _panel_positions(panel, rows):
         if runs and all(abs(point[i + 1] - runs[-1][0][i + 1]) < APART[i] for i in (0, 1)):
@@ -139,7 +139,7 @@ def _label(panel: Axes, rows: Any, colour: str, taken: list[tuple[float, float, 
 
 
 def _free_height(x: float, y: float, wide: float, taken: Sequence[tuple[float, float, float]]) -> float:
-    """Return the height nearest to ``y`` where a text hides no other; NaN where none is near."""
+    """Return the height nearest to ``y`` where a label overlaps no other, as a share of the panel; NaN if none is near."""
     for step in (0, 1, -1, 2, -2, 3, -3):
         place = y + step * LETTER[1] / 2
         if all(abs(place - b) >= LETTER[1] * 0.9 or x + wide <= a or a + w <= x for a, b, w in taken) and 0 < place < 1:

@@ -1,7 +1,7 @@
-"""Computes a cell's estimates, from noise kept whole or, where that would take too much memory, drawn in parts.
+"""Computes a cell's estimates. Noise too large for memory is drawn in parts.
 
-The terms of an estimator that is a mean are summed per repeat, part by part and in a fixed order. Memory then does not grow
-with samples or repeats, and neither threads nor the machine change a digit.
+An estimator that is a mean of terms is summed per repeat, part by part and in a fixed order. So memory does not grow
+with samples or repeats, and the result is the same to the last digit for any number of threads and on any machine.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from bench.measure.timing import Pause
 from bench.model import Auxiliaries, Problem, SampleMean, columns, per_repeat
 
 MOST_NORMS = 100_000
-"""Norms of single terms that are stored for their quantiles: the same number of each repeat, its first ones."""
+"""Most norms of single terms to store for their quantiles: the first ones of each repeat, equally many per repeat."""
 QUANTILES = {"sample_low": 0.05, "sample_median": 0.5, "sample_high": 0.95}
-"""Columns of quantiles of the norm of a single term."""
+"""Columns with quantiles of the norm of a single term, and the quantile of each."""
 
 
 @dataclass
 class TermStatistics:
-    """Counts of one repeat's terms and of those that are exactly 0, and the norms of its first terms."""
+    """One repeat's number of terms, number of terms that are exactly 0, and norms of its first terms."""
 
     n_terms: int = 0
     n_zeros: int = 0
@@ -38,9 +38,9 @@ class Estimates:
 
     def __init__(self, cell: Cell, problem: Problem, theta: np.ndarray) -> None:
         self.pause = Pause()
-        """Time spent on drawing noise and on statistics, which does not count as time of an estimate."""
+        """Time [s] spent on drawing noise and on statistics, excluded from the time of an estimate."""
         self.diagnostics: dict[int, Auxiliaries] = {}
-        """Diagnostics that the estimator reports, by first repeat."""
+        """Diagnostics that the estimator reports, by the first repeat of the batch."""
         self._cell, self._problem, self._theta = cell, problem, theta
         self._width = problem.program.n_noise
         self._estimator = cell.estimator
@@ -53,7 +53,7 @@ class Estimates:
         self._terms: dict[int, TermStatistics] = {}
 
     def of(self, start: int, stop: int) -> np.ndarray:
-        """Return the estimates of some repeats, ``(stop - start, d)``."""
+        """Return the estimates of repeats ``start`` to ``stop - 1``, ``(stop - start, d)``."""
         estimator = self._estimator
         if isinstance(estimator, SampleMean) and estimator.separable:
             if self._noise is not None:
@@ -70,7 +70,7 @@ class Estimates:
 
     @property
     def sums(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Per repeat, the sums of all terms minus a common centre, and of their squared norms; None without single terms."""
+        """Per repeat, the sum of (term - common centre) and the sum of its squared norms; None without single terms."""
         if not self._sums:
             return None
         ordered = [self._sums[repeat] for repeat in sorted(self._sums)]
@@ -78,7 +78,7 @@ class Estimates:
 
     @property
     def singles(self) -> dict[str, float]:
-        """The share of samples whose term is exactly 0, and quantiles of a term's norm; NaN without single terms."""
+        """The share of samples whose term is exactly 0, and quantiles of a term's norm; NaN without finite single terms."""
         repeats = [self._terms[repeat] for repeat in sorted(self._terms)]
         norms = np.concatenate([part for repeat in repeats for part in repeat.norms]) if repeats else np.empty(0)
         if not np.isfinite(norms).all() or not norms.size:
@@ -88,7 +88,7 @@ class Estimates:
         return {"sample_zeros": zeros, **dict(zip(QUANTILES, values.tolist(), strict=True))}
 
     def parts(self, repeat: int) -> Iterator[np.ndarray]:
-        """Yield the noise of one repeat in parts ``(n_w, b)``."""
+        """Return an iterator over the noise of one repeat, in parts ``(n_w, b)``."""
         return iter([self._noise[repeat].T]) if self._noise is not None else self._draw_parts(repeat)
 
     def _draw_parts(self, repeat: int) -> Iterator[np.ndarray]:
@@ -133,7 +133,7 @@ class Estimates:
         return total / self._cell.samples
 
     def _sum_terms(self, terms: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the sum of terms ``(d, b)`` minus the mean of the first batch, and the sum of their squared norms."""
+        """Subtract the first batch's mean from terms ``(d, b)``; return their sum ``(d,)`` and the sum of squared norms."""
         if self._centre is None:
             self._centre = terms.mean(axis=1)
         with np.errstate(all="ignore"):
@@ -146,7 +146,7 @@ class Estimates:
         return np.asarray(result, dtype=np.float64)
 
     def _count_terms(self, statistics: TermStatistics, terms: np.ndarray) -> TermStatistics:
-        """Add terms ``(d, b)`` to the statistics of their repeat, which are returned."""
+        """Add terms ``(d, b)`` to the statistics of their repeat, and return the statistics."""
         room = max(1, MOST_NORMS // self._cell.repeats) - sum(map(len, statistics.norms))
         with np.errstate(all="ignore"):
             statistics.norms.append(np.linalg.norm(terms[:, : max(0, room)], axis=0))

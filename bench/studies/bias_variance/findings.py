@@ -1,4 +1,4 @@
-"""Findings from rows of estimates: at each setting the estimators of lowest error, and where along an axis."""
+"""Finds the estimators with the lowest error at each setting, and where along an axis estimators fail."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from bench.report.text import axis_value, number
 from bench.report.views import Arranged, Curve, attempted
 
 TIE = 1.1
-"""Relative RMSEs within this factor of the lowest share the first place: R repeats do not resolve less."""
-
-
+"""Estimators within this factor of the lowest relative RMSE share first place: R repeats do not resolve less."""
 FLAT = 1.5
-"""An axis along which no error changes by more than this factor is said to change none."""
+"""Largest factor between errors along an axis at which the axis counts as having no effect."""
 NAMED = 2
-"""Most problems that a title names one by one."""
+"""Most problems that a title names individually."""
 
 
 def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
-    """Return the problems to report, each with the longest axis along which it was swept; every cell that ran is in one."""
+    """Return the problems to report, each with the longest axis along which it was swept.
+
+    Every cell that ran is in at least one problem. The axis is None for cells that no axis sweeps.
+    """
     swept = shown.swept()
     parts: list[tuple[Axis | None, ProblemRows]] = []
     seen: set[str] = set()
@@ -41,14 +42,14 @@ def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
 
 
 def lowest(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, float]:
-    """Return the lowest error at each ``x`` where there is one, in increasing order."""
+    """Return the lowest finite error at each ``x``, in increasing order of ``x``."""
     rows = pd.concat([line.rows for line in curves])
     good = rows[(rows["status"] == "ok") & np.isfinite(rows[error])]
     return {float(x): float(low) for x, low in good.groupby(level=0)[error].min().items()}
 
 
 def winners(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, list[str]]:
-    """Return, at each ``x``, the estimators whose error is lowest or not distinguishable from the lowest.
+    """Return, at each ``x``, the estimators whose error is within a factor :data:`TIE` of the lowest.
 
     ``error`` is a column: ``rmse_rel`` compares at equal samples, the columns of
     :func:`~.costs.with_errors_at_equal_cost` at equal cost.
@@ -61,7 +62,7 @@ def winners(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, lis
 
 
 def span(where: Mapping[float, bool]) -> str:
-    """Write where a finding holds on an axis: nothing (everywhere), ``<=1000``, ``>=1e4``, ``at 10 and 100..3000``."""
+    """Format where a finding holds on an axis: ``<=1000``, ``>=1e4``, ``at 10 and 100..3000``; empty if everywhere."""
     if all(where.values()):
         return ""
     values = list(where)
@@ -80,7 +81,8 @@ def headline(
 ) -> str:
     """Summarise failures along an axis: where the most frequently best estimator fails, and which estimators never fail.
 
-    An estimator fails where it is no better than the zero estimate, or where its cell has no result.
+    An estimator fails where it is no better than the zero estimate, or where its cell has no result. ``marks`` are
+    named values of the axis.
     """
     names = _by_wins(parts)
     bad = {name: [_failures(curves, name) for _, curves in parts] for name in names}
@@ -104,7 +106,7 @@ def headline(
 def failure_summary(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> str:
     """Summarise failures: how often the most frequently best estimator fails, and how many estimators never fail.
 
-    The criterion of failure is that of :func:`headline`.
+    The criterion of failure is the same as in :func:`headline`.
     """
     names = _by_wins(parts)
     failed = {
@@ -122,13 +124,13 @@ def failure_summary(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> str
 
 
 def _by_wins(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> list[str]:
-    """Return the estimators, the most frequently best one first."""
+    """Return the estimators, ordered by how often each is best, most often first."""
     wins = Counter(label for _, curves in parts for labels in winners(curves).values() for label in labels)
     return sorted(dict.fromkeys(line.label for _, curves in parts for line in curves), key=lambda name: -wins[name])
 
 
 def _error_ratio(line: Curve) -> float:
-    """Return the ratio of a line's largest to its smallest error; 1 where it has fewer than two."""
+    """Return the ratio of a curve's largest to its smallest error; 1 if it has fewer than two errors."""
     rows = line.rows[line.rows["status"] == "ok"]
     errors = rows.loc[np.isfinite(rows["rmse_rel"]), "rmse_rel"]
     return float(errors.max() / errors.min()) if len(errors) > 1 and errors.min() > 0 else 1.0
@@ -145,7 +147,7 @@ def _failures(curves: Sequence[Curve], name: str) -> dict[float, bool]:
 
 
 def _range_text(where: str, axis: Axis) -> str:
-    """Write a :func:`span` as it is said: ``from stiffness 1e4``, ``everywhere``."""
+    """Format a :func:`span` in words: ``from stiffness 1e4``, ``everywhere``."""
     sign = "from" if where.startswith(">=") else "up to" if where.startswith("<=") else "at"
     return f"{sign} {axis.column} {where.removeprefix('at ').lstrip('<>=')}" if where else "everywhere"
 
@@ -153,7 +155,7 @@ def _range_text(where: str, axis: Axis) -> str:
 def _failure_range(
     bad: Sequence[Mapping[float, bool]], problems: Sequence[ProblemRows], axis: Axis, marks: Mapping[str, float]
 ) -> str:
-    """Write where along an axis something fails, and in which of several problems."""
+    """Format where along an axis an estimator fails, and in which problems; ``bad`` has its failures by problem."""
     failing = [i for i, where in enumerate(bad) if any(where.values())]
     spans = list(dict.fromkeys(span(bad[i]) for i in failing))
     text = _range_text(spans[0], axis) if len(spans) == 1 and spans[0] else ""

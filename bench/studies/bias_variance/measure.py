@@ -18,11 +18,10 @@ from bench.studies.bias_variance.estimates import Estimates
 
 
 def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> dict[str, Any]:
-    """Return one cell's status, reason and statistics of its estimates, by column.
+    """Return one cell's results by column: its status, the reason, and statistics of its estimates.
 
-    In timed cells ``timed_calls`` estimates are computed one by one, or all of them on backends that compile. Other cells
-    compute all estimates together. ``settle_s`` is the time in seconds for which calls may be repeated until their times
-    are steady.
+    A timed cell computes ``timed_calls`` estimates one by one, or all of them on a backend that compiles. Other cells
+    compute all estimates together. ``settle_s`` [s] limits how long calls are repeated until their times are steady.
     """
     session.compilations.restart()
     program = cell.program()
@@ -33,14 +32,14 @@ def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> 
 
     timing.reset_peak_memory()
     calls = (cell.repeats if cell.backend.compiles else min(timed_calls, cell.repeats)) if cell.timing else 0
-    # usage covers the timed calls alone: the reference may have used the same problem
+    # count only the estimates: the reference may have used the same problem
     problem.reset_usage()
     started = time.perf_counter()
     parts: list[np.ndarray] = []
     clock: timing.Timing | None = None
     if calls:
         parts, clock = timing.timed(lambda r: estimates.of(r, r + 1), calls, settle_s=settle_s, pause=estimates.pause)
-    # a copy, since the remaining estimates are counted too
+    # copied here, because the estimates below, which are not timed, raise the counts further
     usage, n_counted = replace(problem.usage), clock.calls if clock else cell.repeats
     if calls < cell.repeats:
         parts.append(estimates.of(calls, cell.repeats))
@@ -85,7 +84,7 @@ def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> 
 
 
 def summarise_diagnostics(diagnostics: list[Auxiliaries]) -> str:
-    """Return, as JSON, each diagnostic's mean, its 5, 50 and 95% quantiles and its share of exact zeros."""
+    """Return JSON: each diagnostic's mean, 5, 50 and 95% quantiles and share of exact zeros; empty without diagnostics."""
     table = {}
     for name in diagnostics[0] if diagnostics else ():
         values = np.concatenate([np.ravel(batch[name]) for batch in diagnostics]).astype(np.float64)
@@ -99,10 +98,10 @@ def summarise_diagnostics(diagnostics: list[Auxiliaries]) -> str:
 
 
 def locate_first_bad(cell: Cell, problem: Problem, estimates: Estimates, repeat: int) -> str:
-    """Return theta, seed and sample of an estimate that is not finite, as text, so that it can be repeated.
+    """Return a string with the theta, seed and sample to reproduce an estimate that is not finite.
 
-    The sample is the first of the repeat whose own cost or gradient is not finite. There may be none, since an estimator
-    can turn finite ones into an infinite estimate, or move theta.
+    The sample is the first one of the repeat whose cost or gradient at theta is not finite. There may be none: an
+    estimator can compute an infinite estimate from finite costs and gradients, or evaluate them at another theta.
     """
     theta, before = problem.program.theta0, 0
     sample = "no single sample, costs and gradients are finite"

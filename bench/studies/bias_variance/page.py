@@ -1,4 +1,4 @@
-"""The page of the main study: error against time, bias and variance along each axis, and the two against each other."""
+"""Builds the main study's page: error against time, bias and variance along each axis, and bias against variance."""
 
 from __future__ import annotations
 
@@ -66,17 +66,17 @@ RESULTS = [
 POOLED = ("horizon", "dt", "stiffness", "sigma", "smoothing")
 TIME = TableColumn("time_s", "time", "seconds", "unsteady")
 GOAL = 0.1
-"""Relative RMSE for which the fastest method is named."""
+"""Relative RMSE for which the fastest estimator and backend are named."""
 IN_SIGHT = 5
-"""Identity columns that stand before time, status, reason and results, which a narrow screen has to show."""
+"""Number of identity columns left of time, status, reason and results, so that a narrow screen shows those too."""
 NAMED = 3
 """Most estimators whose failures the finding names."""
 EXCEPTIONS = 2
-"""Most settings with another best estimator that the finding names."""
+"""Most exceptions (ranges with another best estimator) that the finding names."""
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the finding, the recommended estimators and the charts."""
+    """Return the content of the page: the finding, the recommended estimators, the charts and the table."""
     shown = arrange(experiment, with_errors_at_equal_cost(rows))
     summaries = [ProblemSummary(axis, problem) for axis, problem in problems_by_axis(shown)]
     table_ = with_plotted_columns(rows)
@@ -126,7 +126,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
 
 
 def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
-    """Add the columns that charts draw: errors in units of |grad J|, and labels that distinguish points and lines."""
+    """Return rows with the columns that charts draw: errors in units of |grad J|, and labels of points and lines."""
     norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
     limit = ~is_bias_resolved(rows)
     values = {
@@ -143,7 +143,7 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
         "bias_limit": limit.astype(float),
         "unsteady": unsteady(rows).astype(float),
         "series": estimator_labels(rows),
-        # a panel never pools what makes costs differ
+        # one panel per value of each parameter that changes the cost of an estimate
         "problem": titled(rows.assign(**_named(rows)), ["scene", "contact", *POOLED]),
         "line": rows["backend"] + " " + rows["dtype"] + " " + estimator_labels(rows),
         "setting": number_problems(rows).astype(str),
@@ -152,7 +152,7 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _named(rows: pd.DataFrame) -> dict[str, Iterable[str]]:
-    """Return the pooled columns as ``sigma=0.1``; nothing where a column has one value or a row has none."""
+    """Return the :data:`POOLED` columns as strings, ``sigma=0.1``; empty if a column has one value or a row has none."""
     several = {name: rows[name].nunique() > 1 for name in POOLED}
     return {
         name: [f"{name}={axis_value(x)}" if several[name] and math.isfinite(x) else "" for x in rows[name]]
@@ -161,7 +161,7 @@ def _named(rows: pd.DataFrame) -> dict[str, Iterable[str]]:
 
 
 def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
-    """Return the rows along an axis, seeds merged, by problem; only problems with at least two values of it."""
+    """Return the points along an axis, seeds merged, for the problems with at least two values of the axis."""
     rows = shown.rows
     place = pd.Series(range(len(rows)), index=rows["key"])
     drawn = [BIAS.column, BIAS.low, BIAS.high, BIAS.limit, VARIANCE.column, VARIANCE.low, VARIANCE.high, RMSE.column]
@@ -178,7 +178,7 @@ def _along(shown: Arranged, axis: axes.Axis) -> pd.DataFrame:
 
 
 def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
-    """Return the charts' own colour, marker and line style of every estimator in the rows."""
+    """Return the colour, marker and line style of every estimator in the rows, the same as in the figures."""
     styles = Styles(rows, sorted(registry.entries()["estimators"]))
     looks = {}
     for estimator, params in dict.fromkeys(zip(rows["estimator"], rows["estimator_params"], strict=True)):
@@ -192,7 +192,7 @@ def estimator_looks(rows: pd.DataFrame) -> dict[str, dict[str, object]]:
 
 
 class ProblemSummary:
-    """One problem along an axis: which estimators have the lowest error at equal rollouts, and where."""
+    """One problem along an axis: the estimators with the lowest error at equal rollouts, by value of the axis."""
 
     def __init__(self, axis: axes.Axis | None, problem: ProblemRows) -> None:
         self.axis, self.title = axis, problem.title()
@@ -202,19 +202,19 @@ class ProblemSummary:
         self.winners = winners(self.lines, EQUAL_ROLLOUTS)
 
     def errors(self, label: str, places: Iterable[float]) -> list[float]:
-        """Return an estimator's relative RMSEs at equal rollouts at some places, on every backend whose numbers differ."""
+        """Return an estimator's relative RMSEs at equal rollouts at some values of the axis, per group of agreeing backends."""
         rows = [line.at[x] for x in places for line in self.lines if line.label == label and x in line.at]
         return [row[EQUAL_ROLLOUTS] for row in rows if row["status"] == "ok" and math.isfinite(row[EQUAL_ROLLOUTS])]
 
     def where(self, places: Sequence[float]) -> str:
-        """Write where this holds: ``stiffness >=1e4``, or nothing for everywhere."""
+        """Format some values of the axis as a range: ``stiffness >=1e4``; empty for all values."""
         text = span({x: x in places for x in self.lowest})
         return f"{self.axis.column} {text}" if self.axis and text else ""
 
 
 @dataclass(frozen=True)
 class BetterElsewhere:
-    """A range where the estimator that is best most often is not the best: the better estimator, and both errors."""
+    """A range where the most frequently best estimator is not the best: the better estimator, and the errors of both."""
 
     problem: str
     kind: str
@@ -225,20 +225,21 @@ class BetterElsewhere:
 
     @property
     def factor(self) -> float:
-        """How many times larger the error of the usual estimator would be."""
+        """Largest error of the most frequently best estimator over the smallest error of the better one."""
         worse = max(self.instead_of, default=math.inf)
         return worse / min(self.errors) if min(self.errors) > 0 else math.inf
 
     def sentence(self, main: str) -> str:
-        """Write the exception: ``pushing, penalty, stiffness >=1e4: use reinforce (0.5, where fobg has 300)``."""
+        """Format the exception: ``pushing, penalty, stiffness >=1e4: use reinforce (0.5, where fobg has 300)``."""
         where = ", ".join(filter(None, [self.problem, self.where])) or "elsewhere"
         return f"{where}: use {self.use} ({range_text(self.errors)}, where {main} has {range_text(self.instead_of)})"
 
 
 def failure_sentence(rows: pd.DataFrame) -> str:
-    """Write which estimators fail and how: worse than the zero estimate by more than their interval, no better, or no number.
+    """Format which estimators fail, and in how many cells: worse than the zero estimate, no better, or without a number.
 
-    The estimators with the largest errors come first, at most :data:`NAMED`. The text is empty if none fails.
+    An estimator is worse if its 95% interval lies above the zero estimate's error. At most :data:`NAMED` estimators are
+    named, the largest error first. The string is empty if none fails.
     """
     failures = []
     for label, part in attempted(rows).groupby(estimator_labels(attempted(rows)), sort=False):
@@ -261,13 +262,13 @@ def failure_sentence(rows: pd.DataFrame) -> str:
 
 
 def _join_sentences(*parts: str) -> str:
-    """Join the parts that are not empty into one sentence, with a capital at its start alone."""
+    """Join the parts that are not empty into one sentence; only its first part keeps a capital."""
     texts = [part for part in parts if part]
     return "; ".join([*texts[:1], *(part[0].lower() + part[1:] for part in texts[1:])]) + "."
 
 
 def finding(summaries: Sequence[ProblemSummary]) -> str:
-    """Write one sentence: the estimator that most often has the lowest error at equal rollouts, and where to use another."""
+    """Format the finding: the estimator that most often has the lowest error at equal rollouts, and exceptions."""
     settings = [(one, x) for one in summaries for x in one.lowest]
     if not settings:
         return "No cell has an error that could be compared"
@@ -287,7 +288,10 @@ def finding(summaries: Sequence[ProblemSummary]) -> str:
 
 
 def fastest(rows: pd.DataFrame) -> str:
-    """Write which estimator on which backend reaches GOAL first most often; nothing if there is only one backend."""
+    """Format which estimator and backend most often reach :data:`GOAL` in the least time.
+
+    The string is empty with a single backend, or if fewer than two settings reach it.
+    """
     good = rows[(rows["status"] == "ok") & (rows["rmse_rel"] <= GOAL) & np.isfinite(rows["time_s"])]
     if rows["backend"].nunique() < 2 or good.empty:
         return ""
@@ -303,16 +307,16 @@ def fastest(rows: pd.DataFrame) -> str:
 
 
 def refusal_sentence(rows: pd.DataFrame) -> str:
-    """Write which backends refused every cell, with the commonest reason; nothing if none did."""
+    """Format which backends refused every cell, with the most frequent reason; empty if none did."""
     left = rows[(rows["status"] == "unsupported") & ~rows["backend"].isin(attempted(rows)["backend"])]
     reasons = left.groupby("backend", sort=False)["reason"].agg(lambda reasons: reasons.mode().iloc[0])
     return "; ".join(f"{backend} refuses: {reason}" for backend, reason in reasons.items())
 
 
 def exceptions_to(summaries: Sequence[ProblemSummary], main: str) -> list[BetterElsewhere]:
-    """Return the settings where an estimator other than ``main`` is best, the largest difference first.
+    """Return the ranges where an estimator other than ``main`` is best, the largest error ratio first.
 
-    A statement that is true of every problem with the same scene and contact law is made once.
+    An exception that applies to every problem with the same scene and contact law is listed once.
     """
     exceptions = []
     for one in summaries:
@@ -333,7 +337,7 @@ def exceptions_to(summaries: Sequence[ProblemSummary], main: str) -> list[Better
 
 
 def answers(summaries: Sequence[ProblemSummary]) -> pd.DataFrame:
-    """Return the recommended estimators: a line per problem and range of its axis with the same best estimators."""
+    """Return the recommended estimators, one line per problem and range of its axis with the same best estimators."""
     entries = []
     for one in summaries:
         groups: dict[tuple[str, ...], list[float]] = {}
@@ -359,7 +363,7 @@ def answers(summaries: Sequence[ProblemSummary]) -> pd.DataFrame:
 
 
 def range_text(values: Iterable[float]) -> str:
-    """Write a range: ``0.12``, or ``0.10 to 0.15``; ``no result`` for no values."""
+    """Format the range of values: ``0.12``, or ``0.10 to 0.15``; ``no result`` without values."""
     numbers = list(values)
     if not numbers:
         return "no result"

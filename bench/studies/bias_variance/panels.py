@@ -1,4 +1,4 @@
-"""The three kinds of charts: bias and variance along an axis, error against time, and an overview."""
+"""Draws three kinds of charts: bias and variance along an axis, error against cost, and an overview."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from bench.studies.bias_variance.costs import Cost
 from bench.studies.bias_variance.findings import failure_summary, headline
 
 ALIKE = 0.03
-"""Backends within this relative difference are one line: less could not be seen."""
+"""Largest relative difference at which backends are drawn as one line: it would not be visible."""
 FLOOR = 1e-4
 """Relative biases below this, and variances below its square, are drawn at the lower edge."""
 DOWN, LEFT = (
@@ -51,15 +51,15 @@ DOWN, LEFT = (
         [(-0.25, 0), (-1, 0), (-0.78, -0.17), (-1, 0), (-0.78, 0.17)],
     )
 )
-"""Arrows from upper limits towards 0, of a fixed length on paper."""
+"""Arrow markers from upper limits towards 0, of a fixed length on paper."""
 
 
 def bias_variance(
     problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles, axis: Axis, marks: Mapping[str, float]
 ) -> Figure:
-    """Draw relative RMSE, and its parts below it: bias and variance; against one axis, a column of panels per problem.
+    """Draw relative RMSE, bias and variance against one axis, below each other, a column of panels per problem.
 
-    The title says where the best estimator fails.
+    The title states where the most frequently best estimator fails.
     """
     drawn = [estimator_curves(problem.rows, ALIKE) for problem in problems]
     across = columns(len(problems), 4)
@@ -89,26 +89,26 @@ def bias_variance(
 
 
 def _deviation(line: Curve, curves: Sequence[Curve]) -> dict[str, Any]:
-    """Return the line style of backends whose numbers differ from the first backend's."""
+    """Return the line style of a backend whose numbers differ from the first backend's; empty for the first."""
     place = backend_rank(line, curves)
     return {"linestyle": DEVIANT[(place - 1) % len(DEVIANT)]} if place else {}
 
 
 @dataclass(frozen=True)
 class Points:
-    """Values to draw, each an array ``(n,)``, relative to |grad J|."""
+    """Values to draw with their intervals, relative to |grad J|. Arrays have shape ``(n,)``, one entry per known value."""
 
     known: np.ndarray
-    """Of all rows: whether it has a value; the others are of those alone."""
+    """Mask over all rows: whether a row has a value. The other arrays contain only the rows that have one."""
     value: np.ndarray
     low: np.ndarray
     high: np.ndarray
     limit: np.ndarray
-    """Whether the value is an upper limit."""
+    """Whether the value is an upper limit or at the lower edge of the scale."""
 
 
 def _estimates(rows: pd.DataFrame, column: str, power: int) -> Points:
-    """Return the RMSE, bias or variance of rows with its interval."""
+    """Return the points of a column, ``rmse``, ``bias`` or ``variance``, divided by |grad J| to the ``power``."""
     names = (column, "reference_norm", *(f"{part}_{end}" for part in ("bias", "variance") for end in ("low", "high")))
     read = {name: rows[name].to_numpy(float) for name in names}
     scale = _scale(rows)
@@ -127,13 +127,13 @@ def _estimates(rows: pd.DataFrame, column: str, power: int) -> Points:
 
 
 def _scale(rows: pd.DataFrame) -> np.ndarray:
-    """Return |grad J|, or 1 where that is 0."""
+    """Return |grad J| per row, or 1 where it is 0 or not finite."""
     norm = rows["reference_norm"].to_numpy(float)
     return np.where((norm > 0) & np.isfinite(norm), norm, 1.0)
 
 
 def _draw_errors(panel: Axes, line: Curve, place: Transform, style: Mapping[str, Any], column: str, power: int) -> None:
-    """Draw one estimator's RMSE, bias or variance along the axis at ``place``, and crosses where cells were lost."""
+    """Draw one curve's RMSE, bias or variance with the transform ``place``, and crosses where cells failed."""
     points, at = _estimates(line.rows, column, power), line.rows.index.to_numpy(float)
     curve = {**style, "marker": "", "alpha": 0.75}
     panel.plot(at[points.known], points.value, label=line.label, transform=place, **curve)
@@ -148,7 +148,10 @@ def _draw_errors(panel: Axes, line: Curve, place: Transform, style: Mapping[str,
 
 
 def _draw_points(panel: Axes, at: np.ndarray, points: Points, style: Mapping[str, Any], lying: bool = False) -> None:
-    """Draw full markers with intervals, hollow ones with arrows at upper limits; ``lying``: values to the right."""
+    """Draw filled markers with intervals, and hollow markers with arrows at upper limits.
+
+    ``at`` are the positions on the other axis. With ``lying`` the values are on the horizontal axis.
+    """
     mark: Any = {
         "color": style["color"],
         "linestyle": "none",
@@ -171,7 +174,7 @@ def _draw_points(panel: Axes, at: np.ndarray, points: Points, style: Mapping[str
 def _line_legends(
     drawn: Sequence[Sequence[Curve]], look: Styles, axis: Axis, marks: Mapping[str, float]
 ) -> tuple[list[Any], list[Any]]:
-    """Return legend handles: estimators, then the meaning of symbols."""
+    """Return two lists of legend handles: the estimators, and the symbols."""
     every = [(line, curves) for curves in drawn for line in curves]
     entries = {line.label: _handle(line.label, **look.marked(line)) for line, _ in every}
     deviants: dict[Any, list[str]] = {}
@@ -214,9 +217,9 @@ def speed_accuracy(
 ) -> Figure:
     """Draw relative RMSE of one estimate against its cost, a panel per problem, a curve per estimator and backend.
 
-    Colour and marker are the estimator, the line style the backend; the best backend's curve has the estimator's name at
-    its end. Along a thin grey guide the error falls as N^-1/2; a dotted line is a bias that no samples remove. ``sentences``
-    are texts by problem, ``first`` one over all of them, the title.
+    Colour and marker show the estimator, the line style the backend. The estimator's name is at the end of its cheapest
+    curve. Along the thin grey guide the error falls as N^-1/2. A dotted line is a bias that more samples do not remove.
+    ``sentences`` are texts below the panels by position of the problem, ``first`` is the title.
     """
     drawn = [estimator_curves(problem.rows, close=None) for problem in problems]
     every = [line for curves in drawn for line in curves]
@@ -249,11 +252,11 @@ def speed_accuracy(
 
 
 NAME_SIZE = 6
-"""Points of the names beside curves."""
+"""Font size in points of the names beside curves."""
 APART = 0.075
-"""Part of a panel's height between two names."""
+"""Least distance between two names, as a share of a panel's height."""
 MARGIN = 0.75
-"""Inches beside a panel that its labels take, at most."""
+"""Most inches that the labels beside a panel take."""
 GUIDE: dict[str, Any] = {"color": "#b0b0b0", "linewidth": 0.8, "zorder": 0.4}
 
 
@@ -269,7 +272,7 @@ def _draw_curve(panel: Axes, line: Curve, cost: Cost, style: Mapping[str, Any]) 
         floor = last["bias"] / last["reference_norm"]
         drawn = [other for other in panel.lines if other.get_linestyle() == ":" and other.get_color() == style["color"]]
         if any(abs(math.log(float(np.ravel(other.get_ydata())[0]) / floor)) < ALIKE for other in drawn):
-            return  # of another backend
+            return  # another backend's line is already there
         panel.axhline(floor, color=style["color"], linewidth=0.9, linestyle=":", zorder=0.6)
         panel.text(
             0.01 + 0.07 * sum(text.get_text() == "bias" for text in panel.texts), floor, "bias", transform=panel.get_yaxis_transform(), color=style["color"], fontsize=NAME_SIZE - 0.5,
@@ -278,7 +281,7 @@ def _draw_curve(panel: Axes, line: Curve, cost: Cost, style: Mapping[str, Any]) 
 
 
 def _draw_guide(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
-    """Draw a line of slope -1/2 across the panel, through the point of the front with most samples."""
+    """Draw a line of slope -1/2 across the panel, through the most expensive point of the Pareto front."""
     at = cost.of(rows)
     best = rows.assign(at=at)[pareto(at, rows["rmse_rel"])].sort_values("at").iloc[-1]
     ends = np.array(panel.get_xlim())
@@ -288,7 +291,7 @@ def _draw_guide(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
 
 
 def _name_curves(panel: Axes, curves: Sequence[Curve], cost: Cost, look: Styles, width: float) -> None:
-    """Write each estimator's name at the end of its cheapest curve, names apart and within the ``width`` in inches."""
+    """Label the end of each estimator's cheapest curve with its name; names do not overlap and fit ``width`` inches."""
     ends: dict[str, tuple[float, float, Curve]] = {}
     for line in curves:
         rows = cost.known(line.rows)
@@ -310,7 +313,7 @@ def _name_curves(panel: Axes, curves: Sequence[Curve], cost: Cost, look: Styles,
 
 
 def apart(heights: Sequence[float], gap: float, low: float, high: float) -> list[float]:
-    """Return increasing heights moved so that they are ``gap`` apart and, if there is room, from ``low`` to ``high``."""
+    """Return increasing heights, shifted to be ``gap`` apart, at most ``high`` and, if there is space, at least ``low``."""
     moved: list[float] = []
     for height in heights:
         moved.append(max(height, moved[-1] + gap if moved else low))
@@ -320,7 +323,7 @@ def apart(heights: Sequence[float], gap: float, low: float, high: float) -> list
 
 
 def _draw_scales(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
-    """Set the panel's scales, with room at the right for names, and shade errors above that of the zero estimate."""
+    """Set the panel's scales, with space at the right for names, and shade errors above the zero estimate's."""
     at = cost.of(rows)
     low, high = rows["rmse_rel"].min(), rows["rmse_rel"].max()
     spread = np.minimum(cost.spread(rows), at / 2)
@@ -333,7 +336,7 @@ def _draw_scales(panel: Axes, rows: pd.DataFrame, cost: Cost) -> None:
 
 
 def overview(problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles) -> Figure:
-    """Draw relative bias and RMSE of every estimator, a panel per problem; the title says who fails on how many."""
+    """Draw relative bias and RMSE of every estimator, a panel per problem; the title summarises which estimators fail."""
     every = [estimator_curves(problem.rows, ALIKE) for problem in problems]
     drawn = [{_row_label(line, curves): line for line in curves} for curves in every]
     labels = list(dict.fromkeys(label for curves in drawn for label in curves))

@@ -1,7 +1,7 @@
-"""The table of a paper: estimators by the values of one swept axis, as wide as a page of two columns at most.
+"""Pivot table for papers: estimators down, values of one swept axis across, within the width of a two-column page.
 
-A cell is the relative RMSE of one estimate over its 95% interval, or the sign of how the cell failed. Where the columns do
-not fit the width, the rest of them stands below. Every other number of a cell is in the CSV.
+A cell shows the relative RMSE of one estimate above its 95% interval, or a sign for its failure. Columns beyond the
+width continue in a table below. The CSV has every other number of a cell.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from bench.report.views import Arranged, estimator_curves, rmse_interval
 from bench.studies.bias_variance.findings import problems_by_axis
 
 WIDTH = 504.0
-"""Points of text width over two columns, 7 inches, as most journals and conferences have at least."""
+"""Text width over two columns in points: 7 inches, which most journals and conferences have at least."""
 COLUMN_GAP = 3.0
-"""``tabcolsep`` of the table in points: space on each side of a column."""
+"""LaTeX's ``tabcolsep`` in points: the space on each side of a column."""
 NAME = 150.0
-"""Points beyond which the names of estimators are broken into lines."""
+"""Widest column of estimator names in points; longer names are broken into lines."""
 LINES = 46
-"""Lines of a float, two per estimator, that fit one page at footnotesize with the notes below."""
+"""Most lines of a LaTeX float, two per estimator: they fit one page at footnotesize, with the caption."""
 FAILURES = {
     "nonfinite": ("∞", r"$\infty$", "a result that is not finite"),
     "diverged": ("↑", r"$\uparrow$", "a state that diverged"),
@@ -38,7 +38,7 @@ FAILURES = {
     "unsupported": ("–", "--", "a combination that cannot work"),
     "unavailable": ("∅", r"$\emptyset$", "a library that is not installed"),
 }
-"""Signs of statuses other than ``ok``: in Markdown, in LaTeX, and what they mean."""
+"""Sign in Markdown, sign in LaTeX and meaning of each status other than ``ok``."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class PivotCell:
 
 @dataclass(frozen=True)
 class Block:
-    """One problem: its title, the values across and a row of cells per estimator."""
+    """One problem's table: its title, the axis and its values across, and a row of cells per estimator."""
 
     title: str
     axis: str
@@ -66,7 +66,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Pivot:
-    """The blocks of an experiment, and the notes that explain what is in them."""
+    """The pivot table of an experiment: its title and a block per problem."""
 
     title: str
     blocks: tuple[Block, ...]
@@ -77,7 +77,10 @@ class Pivot:
 
 
 def pivot(experiment: Experiment, shown: Arranged) -> Pivot:
-    """Return the table of an experiment, along the axis that ``table.columns`` names or else the longest one."""
+    """Return the pivot table of an experiment, along the axis that ``table.columns`` names, by default the longest.
+
+    Raises an error if ``table.columns`` names no swept axis.
+    """
     parts: Sequence[tuple[Axis | None, ProblemRows]] = problems_by_axis(shown)
     if experiment.table.columns:
         axis = _axis(experiment.table.columns, shown)
@@ -101,7 +104,7 @@ def _block(axis: Axis | None, problem: ProblemRows, apart: bool) -> Block:
     labels = [line.label for line in curves]
     rows = []
     for line in curves:
-        # backends are named where they tell rows apart
+        # name the backends where an estimator has several rows
         name = f"{line.label} ({', '.join(line.backends)})" if apart or labels.count(line.label) > 1 else line.label
         others = [other for other in curves if other.label != line.label]
         rows.append((name, tuple(_cell(line.at.get(x), [other.at.get(x) for other in others]) for x in values)))
@@ -122,7 +125,7 @@ def _cell(row: Mapping[str, Any] | None, others: Sequence[Mapping[str, Any] | No
 
 
 def notes(table: Pivot) -> list[str]:
-    """Return what the signs of a table mean, only those that occur."""
+    """Return the notes below a table: the meaning of its numbers, intervals and bold type, as far as they occur."""
     cells = list(table.cells())
     out = [
         "Relative RMSE: error of one estimate over the norm of the reference gradient; at 1 or above no better than zero."
@@ -135,7 +138,7 @@ def notes(table: Pivot) -> list[str]:
 
 
 def markdown(table: Pivot) -> str:
-    """Write the table in Markdown, a table per problem."""
+    """Format the table in Markdown, one table per problem."""
     e = escape_markdown
     out = [f"# {e(table.title)}", ""]
     for block in table.blocks:
@@ -158,7 +161,7 @@ def _in_markdown(cell: PivotCell) -> str:
 
 
 def _failures(table: Pivot, form: int) -> list[tuple[str, str]]:
-    """Return the signs of failures and remarks that occur, with their meanings."""
+    """Return the signs of failures and remarks that occur, with meanings; ``form`` is 0 for Markdown, 1 for LaTeX."""
     seen = {cell.failure for cell in table.cells()}
     meanings = [(signs[form], f"{signs[2]}.") for status, signs in FAILURES.items() if status in seen]
     if any(cell.noted and not cell.failure for cell in table.cells()):
@@ -170,7 +173,7 @@ def _failures(table: Pivot, form: int) -> list[tuple[str, str]]:
 
 
 def latex(table: Pivot) -> str:
-    """Write the table in LaTeX: floats over both columns, ``booktabs`` only, none wider than :data:`WIDTH`."""
+    """Format the table in LaTeX: floats over both columns, at most :data:`WIDTH` wide; needs only ``booktabs``."""
     out = [r"% needs \usepackage{booktabs}; made for a text width of 7 in over both columns, without scaling"]
     for i, blocks in enumerate(_floats([part for block in table.blocks for part in _fitting(block)])):
         title = escape_latex(table.title) + (", continued" if i else "")
@@ -214,7 +217,7 @@ def _in_latex(cell: PivotCell) -> str:
 
 
 def _fitting(block: Block) -> list[Block]:
-    """Return a block, or several with a part of its columns each, that are no wider than the page."""
+    """Split a block by columns into blocks that are no wider than the page."""
     parts, taken = [], 0
     while taken < len(block.values):
         count = len(block.values) - taken
@@ -231,7 +234,7 @@ def _part(block: Block, start: int, count: int) -> Block:
 
 
 def _floats(blocks: Sequence[Block]) -> list[list[Block]]:
-    """Return the blocks of each float."""
+    """Distribute blocks over floats of at most :data:`LINES` lines, in order."""
     floats: list[list[Block]] = []
     used = math.inf
     for block in blocks:
@@ -245,12 +248,12 @@ def _floats(blocks: Sequence[Block]) -> list[list[Block]]:
 
 
 def width(block: Block) -> float:
-    """Return the width of a block in points as LaTeX sets it, measured in Computer Modern."""
+    """Return the width of a block in points as set by LaTeX in Computer Modern."""
     total = min(NAME, _name_width(block)) + 2 * COLUMN_GAP * len(block.values)
     for i, value in enumerate(block.values):
         cells = [cells[i] for _, cells in block.rows]
         texts = [(value, 8.0), *((cell.interval, 5.0) for cell in cells)]
-        # bold letters are wider: 1.2 covers the widest digits of the bold face
+        # bold characters are wider: factor 1.2 covers the widest bold digits
         texts += ((f"{cell.value or 'oo'}?", 9.6 if cell.best else 8.0) for cell in cells)
         total += max(_set(text, size) for text, size in texts)
     return total
@@ -262,14 +265,14 @@ def _name_width(block: Block) -> float:
 
 @cache
 def _set(text: str, size: float) -> float:
-    """Return the width of a text in TeX points, in Computer Modern Roman of that size."""
+    """Return the width of a string in TeX points, in Computer Modern Roman of ``size`` points."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextToPath
 
     if not text:
         return 0.0
     plain = "".join(letter if letter.isascii() and letter != "_" else "m" for letter in text).replace("$", "m")
-    # the five-point face is set wider than a scaled ten-point one, by up to 1.38 in its digits
+    # digits of the five-point font are up to 1.38 times as wide as digits scaled down from ten points
     stretch = 1.39 if size <= 5 else 1.07
     points = TextToPath().get_text_width_height_descent(plain, FontProperties(family="cmr10", size=size), False)[0]
     return stretch * float(points) * 72.27 / 72

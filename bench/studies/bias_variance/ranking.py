@@ -1,4 +1,4 @@
-"""Ranks estimators within each problem: relative errors with intervals, one column per problem."""
+"""Ranks estimators within each problem: a table of relative errors with intervals, one column per problem."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from bench.report.views import estimator_labels
 from bench.run.files import write_all
 
 LEAST = 3
-"""Fewest estimators for which the table is written: the main table is enough for fewer."""
+"""Fewest estimators for which the ranking is written; the main table is enough for fewer."""
 WORTHLESS = 0.99
 """Relative RMSE at and above which an estimate counts as no better than the zero estimate."""
 MANY = 2.5
-"""Evaluations per sample above which they are printed."""
+"""The number of evaluations per sample is printed above this value."""
 WINS, FAILS, BIASED = "wins", "fails", "biased"
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``ranking`` (.md, .csv), unless few estimators ran or something was swept; returns the paths."""
+    """Write ``ranking`` (.md, .csv) if :func:`rank_estimators` has rows; return the files' paths."""
     table = rank_estimators(rows)
     if table.empty:
         return []
@@ -42,11 +42,11 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 
 def best(table: pd.DataFrame) -> pd.DataFrame:
-    """Return, per estimator and problem, the setting of least error at equal evaluations, and its verdict.
+    """Return, per estimator and problem, the setting with the lowest error at equal evaluations, and its verdict.
 
-    An estimate with as many evaluations (costs and gradients) as there are samples has the measured bias, and the measured
-    variance times the evaluations per sample. Choosing the best of several settings favours an estimator by about its
-    interval.
+    At one evaluation (cost or gradient) per sample, an estimate has the measured bias, and the measured variance times
+    the estimator's evaluations per sample. Choosing the best of several settings favours an estimator by about the
+    width of its interval.
     """
     good = table[(table["status"] == "ok") & np.isfinite(table["equal"])]
     good = good.assign(estimator=good["label"].str.partition("[")[0])
@@ -60,7 +60,7 @@ def best(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _best_text(table: pd.DataFrame) -> str:
-    """Write each estimator's best setting on each problem, where some estimator has more than one."""
+    """Format each estimator's best setting on each problem; empty unless some estimator has parameters."""
     if table.empty or not table["label"].str.contains("[", regex=False).any():
         return ""
     texts = {
@@ -89,8 +89,8 @@ def _column(table: pd.DataFrame, problem: str) -> list[str]:
 def rank_estimators(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one row per cell: estimator, problem, relative RMSE with its interval, and its verdict.
 
-    The table is empty unless at least three estimators ran on several problems, once each. The interval combines those of
-    bias and variance, since rmse^2 = bias^2 + variance.
+    The table is empty unless at least three estimators ran on several problems, once per problem. The interval combines
+    the intervals of bias and variance, since rmse^2 = bias^2 + variance.
     """
     rows = rows.assign(
         label=estimator_labels(rows),

@@ -1,4 +1,4 @@
-"""Sentences on the diagnostics that estimators report: a weight of 0 switches a method off."""
+"""Summarises the diagnostics that estimators report, such as a weight: where it is 0, the method has no effect."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from bench.report.text import counted, number
 from bench.report.views import estimator_label
 
 OFF = 0.5
-"""Share of exact zeros above which a diagnostic counts as switching its estimator off."""
+"""Share of exact zeros above which a diagnostic counts as 0 in a cell."""
 
 
 def sentences(rows: pd.DataFrame) -> list[str]:
-    """Return a sentence per estimator and diagnostic: the range of its medians over cells, and the cells where it is mostly 0."""
+    """Return a sentence per estimator and diagnostic: the range of its medians, and in how many cells it is mostly 0."""
     texts = []
     good = rows[(rows["status"] == "ok") & (rows["auxiliaries"] != "")]
     for (estimator, params), group in good.groupby(["estimator", "estimator_params"], sort=False):
@@ -32,6 +32,6 @@ def sentences(rows: pd.DataFrame) -> list[str]:
 
 
 def show(rows: pd.DataFrame) -> None:
-    """Print the sentences."""
+    """Print the sentences on the estimators' diagnostics."""
     for sentence in sentences(rows):
         print(f"  {sentence}")

@@ -1,4 +1,4 @@
-"""The summary matrix: the cost of each estimator to reach an error, by problem, and the first estimator of each."""
+"""Draws the summary matrix: each estimator's cost to reach an error on each problem, and the cheapest estimator's lead."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ SHADES = (
     (30.0, "#dff2ec", "black"),
     (math.inf, "#f4f4f4", "black"),
 )
-"""Largest factor over the first of a column, with the colours of cell and text."""
+"""Largest ratio of a cell's cost to the lowest cost of its column, with the colours of the cell and its text."""
 WHY = {"never": "bias", "unknown": "bias?"}
-"""Texts of cells without a number."""
+"""Text of a cell without a cost, by ``RequiredCost.how``."""
 LEGEND = (
     "Dark and bold: the first of its column; lighter: up to 3, and up to 30 times as much. Lead: the first over the next "
     "estimator, with its 95% interval; open where that reaches 1. bias: its bias is larger than the error. bias?: no bias known to be below the error."
@@ -37,9 +37,10 @@ LEAD = "lead over the next"
 
 
 def draw_summary_matrix(problems: Sequence[ProblemRows], costs: Sequence[Cost]) -> Figure:
-    """Draw, per cost and error, estimators down and problems across: the cost on the best backend, coloured by factor.
+    """Draw one matrix per kind of cost and target error: estimators down, problems across.
 
-    The last row is the factor between the first and the second estimator, with its 95% interval.
+    A cell is the cost on the best backend, coloured by its ratio to the lowest cost of the column. The last row is the
+    ratio of the second lowest cost to the lowest, with its 95% interval.
     """
     costs_by_target = {
         (cost, target): [_best(methods(problem, target, cost)) for problem in problems]
@@ -64,7 +65,7 @@ def draw_summary_matrix(problems: Sequence[ProblemRows], costs: Sequence[Cost]) 
 
 
 def _title(costs_by_target: Mapping[tuple[Cost, float], Sequence[Mapping[str, tuple[RequiredCost, str]]]]) -> str:
-    """Write which estimator is first most often at the first cost and error."""
+    """Format which estimator is first on most problems, for the first kind of cost and target error."""
     (cost, target), columns = next(iter(costs_by_target.items()))
     firsts = Counter(_first(column) for column in columns)
     unsure = firsts.pop(None, 0)
@@ -77,14 +78,14 @@ def _title(costs_by_target: Mapping[tuple[Cost, float], Sequence[Mapping[str, tu
 
 
 def _first(column: Mapping[str, tuple[RequiredCost, str]]) -> str | None:
-    """Return the estimator that is first; None if there is none or its lead may be chance."""
+    """Return the estimator with the lowest cost; None without any, or if its lead may be due to chance."""
     if _lead(column) in ("", "open"):
         return None
     return min((name for name in column if math.isfinite(column[name][0].cost)), key=lambda name: column[name][0].cost)
 
 
 def _best(reached: Mapping[str, RequiredCost]) -> dict[str, tuple[RequiredCost, str]]:
-    """Return each estimator's cost on its best backend, and that backend."""
+    """Return each estimator's lowest cost over backends, and the backend."""
     best: dict[str, tuple[RequiredCost, str]] = {}
     for name, way in reached.items():
         estimator, _, backend = name.partition(" on ")
@@ -121,7 +122,10 @@ def _matrix(
 
 
 def _lead(column: Mapping[str, tuple[RequiredCost, str]]) -> str:
-    """Return the factor between the first and the second with its interval, or ``open`` where the interval reaches 1."""
+    """Format the ratio of the second lowest cost to the lowest, with its 95% interval.
+
+    The text is ``open`` where the interval reaches 1, ``alone`` for a single estimator with a cost, and empty for none.
+    """
     ways = sorted((way for way, _ in column.values() if math.isfinite(way.cost)), key=lambda way: way.cost)
     if len(ways) < 2:
         return "alone" if ways else ""

@@ -1,4 +1,4 @@
-"""Writes the main table: CSV with every digit, Markdown to read, and the pivot of a paper in Markdown and LaTeX."""
+"""Writes the main table: all digits as CSV, rounded as Markdown, and a pivot table for papers in Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FOOTNOTES = [
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``bias_variance`` (.csv, .md, .tex) and ``speed_accuracy.csv``; returns their paths."""
+    """Write ``bias_variance`` (.csv, .md, .tex) and ``speed_accuracy.csv``; return the files' paths."""
     paper = pivot.pivot(experiment, arrange(experiment, rows))
     return write_all(
         experiment.directory,
@@ -48,7 +48,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 
 def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return error against time, with ``pareto`` where no other good row of the problem is faster and more accurate."""
+    """Return errors and costs; ``pareto`` is True where no other ok row of the problem is both faster and more accurate."""
     results = ["rmse_rel", "bias_rel", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients"]
     table = rows[["experiment", *IDENTITY, "status", *results]].assign(pareto=False)
     good = table[(table["status"] == "ok") & np.isfinite(table["rmse_rel"]) & np.isfinite(table["time_s"])]
@@ -59,19 +59,19 @@ def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Readable:
-    """The main table as text, not yet escaped for any format."""
+    """The main table as strings, not yet escaped for any format."""
 
     title: str
     shared: list[str]
     headers: list[str]
     numeric: list[bool]
-    """Per column, whether it holds numbers."""
+    """Whether each column is numeric."""
     body: list[list[str]]
     reasons: list[str]
 
 
 def readable(experiment: Experiment, rows: pd.DataFrame) -> Readable:
-    """Return the main table: identity and swept columns that vary, the results, status and reason of failures."""
+    """Return the main table as strings: identity and swept columns that vary, results, status, and numbered reasons."""
     swept_axes = axes.axes(experiment.sweep, rows)
     swept = [axis.column for axis in swept_axes if axis.column not in rows and not _is_shown(rows, axis)]
     rows = axes.relabel(axes.with_axes(experiment, rows), swept_axes)
@@ -99,7 +99,7 @@ def readable(experiment: Experiment, rows: pd.DataFrame) -> Readable:
 
 
 def _varying(rows: pd.DataFrame, swept: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the identity columns to show, and sentences with the values of the others."""
+    """Return the identity and swept columns to show, and sentences with the values of the other columns."""
     names = (*IDENTITY, *swept)
     varying = [c for c in names if rows[c].nunique(dropna=False) > 1]
     problems = rows.groupby(["scene", "contact"], sort=False)
@@ -114,7 +114,7 @@ def _varying(rows: pd.DataFrame, swept: Sequence[str]) -> tuple[list[str], list[
 
 
 def _is_shown(rows: pd.DataFrame, axis: axes.Axis) -> bool:
-    """Return whether a swept axis is already in the table, as the view of a contact law's parameter."""
+    """Return whether the column ``stiffness`` or ``smoothing`` already shows a swept axis."""
     own = np.isfinite(axes.values_of(axis, rows))
     return any(axes.shown_by(view, axis, rows)[own].all() for view in VIEWS_OF_LAWS)
 
@@ -136,7 +136,7 @@ def _results(row: Any) -> list[str]:
 
 
 def markdown(table: Readable) -> str:
-    """Write the main table in Markdown."""
+    """Return the main table in Markdown, with footnotes and the numbered reasons."""
     e = escape_markdown
     out = [f"## {e(table.title)}", ""]
     for text in table.shared:

@@ -1,4 +1,4 @@
-"""Prints rows as a digest: the main table, condensed where it is long, and the findings from it."""
+"""Prints the main table, condensed if it is long, and the findings from it."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ from bench.studies.bias_variance.costs import EQUAL_ROLLOUTS, EQUAL_TIME, with_e
 from bench.studies.bias_variance.findings import TIE, lowest, problems_by_axis, span, winners
 
 GOALS = (0.3, 0.1, 0.03)
-"""Relative RMSEs for which the fastest method is named."""
+"""Relative RMSEs for which the fastest estimator and backend are named."""
 COSTS = {"rollouts": EQUAL_ROLLOUTS, "time": EQUAL_TIME}
 NEGLIGIBLE = 0.01
-"""Relative bias too small for a remark."""
+"""Relative bias up to which an estimator is never reported as mostly biased."""
 WIDTH = 100
 FULL_ROWS = 40
-"""Most rows that are shown one by one."""
+"""Most rows to print one by one; a longer table is condensed."""
 
 
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
-    """Print the question, the counts, the main table (condensed where it is long) and the findings."""
+    """Print the question, the counts, the main table (condensed if long) and the findings."""
     console = Console(highlight=False, markup=False, emoji=False)
     if not console.is_terminal:
         console.width = max(console.width, WIDTH)
@@ -65,7 +65,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
 
 
 def _show_rows(console: Console, group: ProblemRows, axis: Axis | None, merge: bool) -> None:
-    """Print a line per cell or, with ``merge``, per estimator and the backends that agree."""
+    """Print a line per cell or, with ``merge``, a line for each estimator and group of agreeing backends."""
     table = _table(group.title())
     if axis is not None:
         table.add_column(axis.column, justify="right")
@@ -92,7 +92,7 @@ def _show_rows(console: Console, group: ProblemRows, axis: Axis | None, merge: b
 
 
 def _show_pivot(console: Console, group: ProblemRows, axis: Axis) -> None:
-    """Print two lines per estimator and agreeing backends, a column per value of the axis."""
+    """Print two lines (bias and RMSE) for each estimator and group of agreeing backends, a column per value of the axis."""
     curves = estimator_curves(group.rows)
     best = lowest(curves)
     values = _values(curves)
@@ -113,7 +113,7 @@ def _show_pivot(console: Console, group: ProblemRows, axis: Axis) -> None:
 
 
 def _cell(row: dict[str, Any] | None, best: float) -> tuple[Text, Text]:
-    """Return the texts of a cell's bias and RMSE, or its status if it failed."""
+    """Format a cell's relative bias and RMSE; its status in place of the bias if it failed."""
     if row is None or row["status"] != "ok":
         return Text("" if row is None else row["status"][:6], "red"), Text()
     if is_bias_resolved(row):
@@ -148,7 +148,7 @@ def _times(line: Curve) -> list[str]:
 
 
 def _timed_backends(line: Curve, width: int) -> str:
-    """Write ``jax 0.21ms, torch 12ms``, broken between backends."""
+    """Format the time of one estimate on each backend, ``jax 0.21ms, torch 12ms``, with line breaks between backends."""
     times = [time.replace(" ", "") for time in _times(line)]
     text = ", ".join(f"{name}\0{time}" for name, time in zip(_backends(line), times, strict=True))
     return textwrap.fill(text, width, initial_indent="  ", subsequent_indent="  ").replace("\0", " ")
@@ -173,7 +173,7 @@ def _show_legend(console: Console, condensed: bool) -> None:
 
 
 def _show_reasons(console: Console, rows: pd.DataFrame) -> None:
-    """Print the reasons of rows that failed, were refused or have a remark; reasons that differ in numbers alone are merged."""
+    """Print why rows failed or were refused, and their remarks; reasons that differ only in numbers are merged."""
     remarked = rows[rows["reason"] != ""]
     if remarked.empty:
         return
@@ -190,7 +190,7 @@ def _print_wrapped(console: Console, text: str, indent: int) -> None:
 
 
 def _show_verdict(console: Console, group: ProblemRows, axis: Axis | None) -> None:
-    """Print one problem's verdict: the estimators of lowest error, the biased and the useless ones, each with its range."""
+    """Print one problem's findings: the estimators of lowest error, the biased and the useless ones, with their ranges."""
     console.print(f"  {group.title()}" + (f", by {axis.title}" if axis else ""), style="bold")
     curves = estimator_curves(group.rows)
     ranked = {f"lowest error at equal {cost}": _winners(curves, error) for cost, error in COSTS.items()}
@@ -219,7 +219,7 @@ def _show_verdict(console: Console, group: ProblemRows, axis: Axis | None) -> No
 
 
 def _winners(curves: Sequence[Curve], error: str) -> str:
-    """Write the estimators of lowest error, and where along the axis they are; nothing where the cost is not known."""
+    """Format the estimators of lowest error and their ranges along the axis; empty where the cost is not known."""
     named = {x: ", ".join(labels) for x, labels in winners(curves, error).items()}
     ranges = {text: span({x: names == text for x, names in named.items()}) for text in named.values()}
     return "; ".join(f"{where}: {text}" if where else text for text, where in ranges.items())
@@ -235,7 +235,7 @@ def _has_unexplained_bias(row: Any) -> bool:
 
 
 def _first(rows: pd.DataFrame, goal: float) -> str:
-    """Return the fastest cell with a relative RMSE of at most ``goal``."""
+    """Format the fastest cell with a relative RMSE of at most ``goal``; ``none`` if no cell has it."""
     good = rows[(rows["status"] == "ok") & (rows["rmse_rel"] <= goal) & np.isfinite(rows["time_s"])]
     if good.empty:
         return "none"

@@ -1,7 +1,7 @@
-"""Finds the estimator and backend that reach a given relative error fastest, and the factor over the next.
+"""Finds the method (estimator and backend) that reaches a relative error at the lowest cost, and its lead over the next.
 
-The mean square error of an estimate from N samples is bias^2 + v / N. Between two measured N it is interpolated; beyond
-the largest one it is extrapolated by that law, and only to errors above what is known of the bias.
+The mean square error of an estimate from N samples is bias^2 + v / N. Between two measured N the error is interpolated.
+Beyond the largest N it is extrapolated by that law, only to errors above the 95% limit of the bias.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost, with_gradien
 
 SAMPLES = Axis("samples", ("samples",))
 TARGETS = (0.1, 0.01)
-"""Relative errors to reach."""
+"""Target relative errors."""
 NOTES = (
     "cost: of the cheapest estimate that reaches the error, in seconds without compilation, or in rollouts, where a "
     "gradient counts as the rollouts that take as long (as measured at the most samples; as one where it was not). how: "
@@ -48,15 +48,15 @@ class RequiredCost:
     cost: float = math.nan
     samples: float = math.nan
     down: float = math.nan
-    """From the cost's logarithm to the lower end of its 95% interval; NaN where the variance has no interval."""
+    """Log of cost over the lower end of its 95% interval; NaN where the variance has no interval."""
     up: float = math.nan
-    """To its upper end; infinite where it is not certain that the error is reached."""
+    """Log of the upper end over the cost; infinite where it is not certain that the error is reached."""
     times: float = 0.0
-    """The interquartile range of times, over their median."""
+    """Interquartile range of the time of one estimate over its median; 0 for rollouts."""
 
 
 def required_cost(line: Curve, target: float, cost: Cost) -> RequiredCost:
-    """Return what the estimator on its backend needs for a relative RMSE of ``target``."""
+    """Return the cost of a curve's estimator and backend to reach a relative RMSE of ``target``, with its 95% interval."""
     rows = cost.known(line.rows).sort_index()
     if rows.empty:
         return RequiredCost("unknown")
@@ -66,7 +66,7 @@ def required_cost(line: Curve, target: float, cost: Cost) -> RequiredCost:
     if not math.isfinite(way.cost) or "variance_high" not in rows:
         return replace(way, times=times)
     least, most = (_required_cost(_at_interval_end(rows, end), target, cost).cost for end in ("low", "high"))
-    if way.how == "at once":  # fewer samples may do, down to one
+    if way.how == "at once":  # fewer samples may be enough, down to one
         least = _cost_of_one_sample(rows, cost)
     down = max(0.0, math.log(way.cost / least)) if least > 0 else math.inf
     up = max(0.0, math.log(most / way.cost)) if math.isfinite(most) else math.inf
@@ -74,21 +74,24 @@ def required_cost(line: Curve, target: float, cost: Cost) -> RequiredCost:
 
 
 def _cost_of_one_sample(rows: pd.DataFrame, cost: Cost) -> float:
-    """Return the cost of one sample, on the line through the costs of the two smallest batches."""
+    """Return the cost of an estimate from one sample, extrapolated linearly from the two smallest sample counts."""
     n, price = rows.index.to_numpy(float)[:2], cost.of(rows).to_numpy(float)[:2]
     slope = (price[1] - price[0]) / (n[1] - n[0]) if len(n) > 1 else price[0] / n[0]
     return float(np.clip(price[0] - slope * (n[0] - 1.0), price[0] / n[0], price[0]))
 
 
 def _at_interval_end(rows: pd.DataFrame, end: str) -> pd.DataFrame:
-    """Return rows with variance, and bias where it is resolved, at an end of their 95% intervals."""
+    """Return rows with variance and bias at an end of their 95% intervals; the bias is 0 unless distinguishable from 0."""
     bias = rows[f"bias_{end}"].where(rows["bias_low"] > 0, 0.0)
     error = np.hypot(bias, np.sqrt(rows[f"variance_{end}"])) / rows["reference_norm"]
     return rows.assign(bias=bias, variance=rows[f"variance_{end}"], rmse_rel=error)
 
 
 def lead(first: RequiredCost, second: RequiredCost, alike: bool = False) -> tuple[float, float, float]:
-    """Return how many times the cost of the first the second has, with its 95% interval; ``alike``: times alone differ."""
+    """Return the ratio of the second cost to the first, and the ends of its 95% interval.
+
+    ``alike`` means the same estimator on two backends: only the noise of timing counts.
+    """
     factor = second.cost / first.cost
     noise = (first.times, second.times)
     low = math.hypot(*noise) if alike else math.hypot(first.up, second.down, *noise)
@@ -100,7 +103,7 @@ def _required_cost(rows: pd.DataFrame, target: float, cost: Cost) -> RequiredCos
     n, error, price = (rows.index.to_numpy(float), rows["rmse_rel"].to_numpy(float), cost.of(rows).to_numpy(float))
     if not (error <= target).any():
         return _extrapolated_cost(rows.iloc[-1], n[-1], price[-1], target)
-    # more samples may cost less: small batches are dominated by what a call costs at all
+    # more samples may cost less: the fixed cost of a call dominates small batches
     ways = [RequiredCost("measured", price[i], n[i]) for i in range(1, len(n)) if error[i] <= target]
     for i in range(1, len(n)):
         if error[i] <= target < error[i - 1]:
@@ -113,10 +116,10 @@ def _required_cost(rows: pd.DataFrame, target: float, cost: Cost) -> RequiredCos
 
 
 def _extrapolated_cost(row: Any, samples: float, price: float, target: float) -> RequiredCost:
-    """Extrapolate from the row with most samples: v is N times its variance, and the cost is proportional to N."""
+    """Extrapolate the cost from the row with most samples: v is N times its variance, and cost is proportional to N."""
     low, high, bias = (row[name] / row["reference_norm"] for name in ("bias_low", "bias_high", "bias"))
     if low >= target:
-        # a bias that the method should not have may be tails that were not seen
+        # an estimator without declared bias may only have heavy tails that the samples missed
         return RequiredCost("unknown" if is_unexplained(str(row.get("reason", ""))) else "never")
     if not high < target:
         return RequiredCost("unknown")
@@ -127,7 +130,7 @@ def _extrapolated_cost(row: Any, samples: float, price: float, target: float) ->
 
 
 def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per problem, kind of cost and target; empty where samples were not swept."""
+    """Return a line per problem, kind of cost and target error; empty if samples were not swept."""
     if rows["samples"].nunique() < 2:
         return pd.DataFrame()
     shown = arrange(experiment, with_gradient_cost(rows))
@@ -144,7 +147,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def methods(problem: ProblemRows, target: float, cost: Cost) -> dict[str, RequiredCost]:
-    """Return each method's cost to reach an error: per estimator and backend in time, per estimator in rollouts."""
+    """Return each method's cost to reach an error. For time a method is an estimator on a backend, else an estimator."""
     reached: dict[str, RequiredCost] = {}
     for curve in estimator_curves(problem.rows, close=None):
         name = curve.label if cost is ROLLOUTS else f"{curve.label} on {curve.rows['backend'].iloc[0]}"
@@ -160,7 +163,7 @@ def estimator_of(method: str) -> str:
 
 
 def line(problem: ProblemRows, target: float, kind: str, cost: Cost) -> dict[str, Any]:
-    """Return a line of the table: the fastest method, the next one (of another estimator if possible), and the excluded ones."""
+    """Return a line of the table: the cheapest method, the next (if possible of another estimator), and excluded ones."""
     reached = methods(problem, target, cost)
     ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
     entry: dict[str, Any] = {
@@ -190,7 +193,7 @@ def line(problem: ProblemRows, target: float, kind: str, cost: Cost) -> dict[str
 
 
 def texts(best: pd.DataFrame) -> pd.DataFrame:
-    """Return the table as it is printed; the CSV has the numbers."""
+    """Return the table with its numbers formatted as strings."""
     shown = best.astype(object)
     kinds = {"time": TIME, "rollouts": ROLLOUTS}
     shown["relative error"] = [f"{value:.0%}" for value in best["relative error"]]
@@ -208,7 +211,7 @@ def texts(best: pd.DataFrame) -> pd.DataFrame:
 
 
 def sentence(entry: Any) -> str:
-    """Return a line of the table as a sentence: the first method, and its factor over the next."""
+    """Format a line of the table as a sentence: the cheapest method, and how many times the next one costs."""
     what = f"to {entry['relative error']:.0%}"
     if entry["fastest"] == "-":
         never = "nobody, all have a larger bias"
@@ -222,7 +225,7 @@ def sentence(entry: Any) -> str:
 
 
 def sentences(best: pd.DataFrame) -> list[str]:
-    """Return a sentence per problem: the method that reaches each error first in time (in rollouts where no time is known)."""
+    """Return a sentence per problem: the method that reaches each error first in time (in rollouts if untimed)."""
     kind = "time" if (best["by"] == "time").any() else "rollouts"
     chosen = best[best["by"] == kind].to_dict("records")
     by_problem: dict[str, list[str]] = {}
@@ -232,7 +235,7 @@ def sentences(best: pd.DataFrame) -> list[str]:
 
 
 def _is_clearly_first(entry: Any) -> bool:
-    """Return whether the fastest method's estimator is certainly the first."""
+    """Return whether the first estimator's lead is certain: no other reaches the error, or the interval lies above 1."""
     if entry["fastest"] == "-":
         return False
     alone = entry["next"] == "-" or estimator_of(entry["next"]) == estimator_of(entry["fastest"])
@@ -240,7 +243,7 @@ def _is_clearly_first(entry: Any) -> bool:
 
 
 def summarise_leaders(entries: Sequence[Any]) -> str:
-    """Name the estimator that is certainly first on most problems: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
+    """Format which estimator is certainly first most often: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
     clauses: list[str] = []
     before = ""
     for target in dict.fromkeys(entry["relative error"] for entry in entries):
@@ -257,7 +260,7 @@ def summarise_leaders(entries: Sequence[Any]) -> str:
 
 
 def summarise_accuracy_and_cost(problems: Sequence[ProblemRows], cost: Cost) -> str:
-    """Name the estimators that are most accurate and cheapest on most problems, and count where the cheapest is useless."""
+    """Format which estimators are most accurate and cheapest on most problems, and where the cheapest is useless."""
     accurate: Counter[str] = Counter()
     cheap: Counter[str] = Counter()
     useless: Counter[str] = Counter()
@@ -276,7 +279,7 @@ def summarise_accuracy_and_cost(problems: Sequence[ProblemRows], cost: Cost) -> 
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``fastest`` (.csv, .md), where samples were swept."""
+    """Write ``time_to_accuracy`` (.csv, .md) if samples were swept; return the files' paths."""
     best = table(experiment, rows)
     if best.empty:
         return []
@@ -294,7 +297,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
-    """Print the table, if samples were swept."""
+    """Print the table if samples were swept."""
     best = table(experiment, rows)
     if not best.empty:
         _print(texts(best))

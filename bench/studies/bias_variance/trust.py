@@ -1,8 +1,9 @@
 """When may a first-order gradient be trusted? ``python -m bench.studies.bias_variance.trust results/standard`` counts.
 
-The rules use an estimate's mean and its spread between repeats, and no reference. Each rule is scored on all stored cells of
-``fobg`` (or of the estimators named after the folder): how many cells it trusts, how many of those miss the reference by
-:data:`WRONG` of its norm or more, and how many accurate ones it does not trust.
+The rules use the mean of the estimates, their spread between repeats and the remark on the row, but not the reference.
+Each rule is scored on all stored cells of ``fobg`` (or of the estimators named after the folder): how many cells it
+trusts, how many trusted cells are wrong (relative RMSE of :data:`WRONG` or more), and how many accurate cells it does
+not trust.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from bench.report.text import number
 WRONG = 0.5
 """Relative RMSE at and above which an estimate counts as wrong: half of the gradient."""
 SPREAD = 0.5
-"""Standard deviation of one estimate, over the norm of the mean one, below which the rule trusts it."""
+"""The rule trusts a cell if the standard deviation of one estimate is below this multiple of the mean estimate's norm."""
 
 
 def cells(folder: Path, estimators: Sequence[str]) -> pd.DataFrame:
-    """Return the stored cells of some estimators, in all experiments that compare estimates with a reference."""
+    """Return the ok rows of some estimators, from all experiments below a folder that compare estimates with a reference."""
     tables = [pd.read_parquet(path) for path in sorted(folder.rglob("rows.parquet"))]
     rows = pd.concat(
         [table for table in tables if {"rmse_rel", "variance", "grad_norm"} <= set(table)], ignore_index=True
@@ -34,13 +35,13 @@ def cells(folder: Path, estimators: Sequence[str]) -> pd.DataFrame:
 
 
 def spread(rows: pd.DataFrame) -> pd.Series:
-    """Return the standard deviation of one estimate over the norm of the mean one; infinite where that is 0."""
+    """Return the standard deviation of one estimate over the norm of the mean estimate; infinite where the norm is 0."""
     ratio = np.sqrt(rows["variance"]) / rows["grad_norm"].where(rows["grad_norm"] > 0)
     return ratio.fillna(np.inf)
 
 
 def stable(rows: pd.DataFrame) -> pd.Series:
-    """Return whether nothing in a row points to an unstable step: no remark on heavy tails."""
+    """Return whether each row has no remark. A remark on heavy tails points to an unstable step."""
     return rows["reason"] == ""
 
 
@@ -53,7 +54,7 @@ RULES: Mapping[str, Callable[[pd.DataFrame], Any]] = {
 
 
 def score_rules(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per rule: cells trusted, wrong ones among them, and right ones that were not trusted."""
+    """Return a line per rule: cells trusted, wrong cells trusted, worst trusted error, and right cells not trusted."""
     wrong = rows["rmse_rel"] >= WRONG
     lines = []
     for name, rule in RULES.items():
@@ -66,7 +67,7 @@ def score_rules(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def main(words: Sequence[str]) -> None:
-    """Print the rules and their errors."""
+    """Print each rule's score; ``words`` are a results folder (default ``results/standard``) and estimators (``fobg``)."""
     folder, estimators = Path(words[0] if words else "results/standard"), words[1:] or ["fobg"]
     rows = cells(folder, estimators)
     print(

@@ -1,4 +1,4 @@
-"""Is the program's gradient the derivative of its cost, away from contact switches and on both sides of one?"""
+"""Checks whether the program's gradient is the derivative of its cost, at theta0 and around a contact switch."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class GradientCheck(Study):
     around: int = param(8, "other thetas around the start at which gradients are checked", low=1)
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Make all checks of one cell."""
+        """Return one cell's results by column: all checks, and the shell command that repeats them."""
         from bench.report.reproduce import check_of
         from bench.studies.gradient_check.measure import SwitchSearch, measure
 
@@ -51,17 +51,17 @@ class GradientCheck(Study):
         return [*report.write(experiment, rows), *matrix.write(experiment, rows)]
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the counts of verdicts, and the command that repeats each fault."""
+        """Print the counts of verdicts, and the command that repeats each untrusted check."""
         from bench.studies.gradient_check import report
 
         report.show(experiment, rows)
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the finding, its table and the charts."""
+        """Return the page: the finding, the verdicts, and errors against the step of the differences."""
         from bench.studies.gradient_check.page import content
 
         return content(experiment, rows)
 
     def faults(self, rows: pd.DataFrame) -> int:
-        """Count rows with a gradient that cannot be trusted or without a finite cost."""
+        """Return the number of rows with a gradient that cannot be trusted, or without a finite cost."""
         return int(((rows["untrusted"] > 0) | (rows["status"] == "nonfinite")).sum())

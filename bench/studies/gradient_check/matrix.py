@@ -1,4 +1,4 @@
-"""The chart of the gradient checks: a matrix of verdicts, problems by horizon and point."""
+"""Draws the gradient checks as a matrix of verdicts: a row per problem, a column per horizon and point."""
 
 from __future__ import annotations
 
@@ -30,20 +30,23 @@ KINDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     "K": (tuple(name for name in BROKEN if name != "jump"), ORANGE, "kink: at most a one-sided slope"),
     "ok": (TRUSTED, "#cfe8df", "right"),
 }
-"""By the letter of a cell: its verdicts, colour and meaning, the worst first."""
+"""Verdicts, colour and meaning of each letter in a cell, the worst first."""
 ROW = 0.17
-"""Inches of a row."""
+"""Height of a row in inches."""
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Draw the matrix as ``gradient_check``, unless nothing was checked; the plotted data have a line per cell of it."""
+    """Write the matrix as ``gradient_check``, unless nothing was checked; return the files' paths.
+
+    The plotted data have a line per row and point.
+    """
     shown = arrange(experiment, rows)
     table = by_point(rows)
     if table.empty:
         return []
     with styled():
         paths = save(figure(shown), experiment.directory / "gradient_check", experiment.formats)
-    # the matrix has no points to read back: its plotted values are the verdicts
+    # plotted data cannot be read back from the matrix: write the verdicts that it shows
     write_whole(paths[-1], table.drop(columns=["row", "rank"]).to_csv(index=False, lineterminator="\n").encode())
     return paths
 
@@ -93,7 +96,7 @@ def _steps(horizon: int) -> str:
 
 
 def headline(table: pd.DataFrame) -> str:
-    """Write the problems with wrong gradients first, then how many have untrusted checks around a contact switch."""
+    """Format the title of the matrix: problems with wrong gradients, then the number with other untrusted checks."""
     faults = table[table["verdict"].isin(FAULTS)]
     undecided = [
         not is_trusted(point, verdict) and verdict not in FAULTS

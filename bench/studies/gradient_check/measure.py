@@ -18,14 +18,14 @@ from bench.model import SURROGATE, ContactScene, ForceLaw, LoopOps, Problem, Rol
 from bench.studies.gradient_check.points import is_trusted
 
 COLUMNS_AT_ONCE = 128
-"""Rollouts per evaluation. The number is always the same, so that a compiling backend compiles once."""
+"""Rollouts per evaluation. The number is fixed, so that a compiling backend compiles once."""
 NEUTRAL = 1e-9
-"""Growth of the state per step up to which rounding may be the cause."""
+"""Relative growth of the state per step up to which rounding may be the cause."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """One check to make: ``theta (d,)``, unit ``direction (d,)``, noise ``w (n_w,)``, and their labels."""
+    """One directional derivative to check: ``theta (d,)``, unit ``direction (d,)``, noise ``w (n_w,)``, and their labels."""
 
     point: str
     theta: np.ndarray
@@ -39,7 +39,7 @@ class Place:
 
 @dataclass(frozen=True)
 class SwitchSearch:
-    """Where gradients are checked: the parameters of the study."""
+    """Number of directions and search range of the checks: parameters of ``GradientCheck``, which explains them."""
 
     directions: int
     drawn: int
@@ -49,7 +49,7 @@ class SwitchSearch:
 
 
 def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any]:
-    """Return the columns of one cell, except ``command``, from checks at theta0 and around contact switches."""
+    """Return one cell's results by column, except ``command``, from checks at theta0 and around contact switches."""
     problem = session.problem(cell)
     theta = problem.program.theta0
     unit = float(np.finfo(cell.backend.dtype).eps)
@@ -102,12 +102,12 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
 
 
 PLAIN = ("smooth", "nonlinear", "zero", "mode_crossing")
-"""Verdicts on theta that need no remark."""
+"""Verdicts on theta0 that need no remark."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """One checked directional derivative."""
+    """One checked directional derivative and its verdict."""
 
     point: str
     """One of :data:`bench.studies.gradient_check.points.POINTS`."""
@@ -118,15 +118,16 @@ class Point:
     verdict: str
     sample: gradcheck.Sample
     minus: Sequence[str]
-    """Contact modes on the minus side, by step."""
+    """Contact modes on the minus side, one per step of the differences."""
     plus: Sequence[str]
 
 
 def start(problem: Problem, theta: np.ndarray, unit: float, search: SwitchSearch, seed: int) -> gradcheck.Check:
     """Check every component and random directions at ``theta (d,)`` and at other thetas near it, without noise.
 
-    Costs are evaluated in batches of one width, so that a compiling backend compiles once. A gradient is the last
-    column of a batch that begins with another theta, since a backend may be right for a single column only.
+    ``unit`` is the unit roundoff of the program's arithmetic. Costs are evaluated in batches of a fixed width, so that
+    a compiling backend compiles once. A gradient is the last column of a batch whose first column is theta, because a
+    faulty backend may be right for a single column only.
     """
     still = np.zeros((problem.program.n_noise, COLUMNS_AT_ONCE))
 
@@ -146,14 +147,14 @@ def start(problem: Problem, theta: np.ndarray, unit: float, search: SwitchSearch
 
 
 def at_start(whole: gradcheck.Check) -> list[Point]:
-    """Return all components, and the random directions and other thetas whose verdicts no component has."""
+    """Return the points at theta0: all components, and untrusted directions and thetas whose verdicts no component has."""
     parts = list(whole.components)
     seen = {part.verdict for part in parts}
     parts += [
         part for part in whole.parts if part.component is None and part.verdict not in (*gradcheck.TRUSTED, *seen)
     ]
     if whole.cause not in (*seen, *(part.verdict for part in parts)):
-        # the cause shows at other thetas only, or in a second evaluation
+        # the cause occurs only at other thetas, or in a second evaluation
         parts += [replace(part, verdict=whole.cause) for part in (*whole.worst_parts, *whole.parts)[:1]]
     return [Point("start", 0, _number(part), part.verdict, part.sample, *part.modes) for part in parts]
 
@@ -168,7 +169,7 @@ def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, 
 
 
 def beyond_stability(cell: Cell) -> list[str]:
-    """Return a remark if the integrator is unstable on the contact law's spring: each step then multiplies the state."""
+    """Return a remark if the integrator is unstable on the contact law's spring at this dt, else an empty list."""
     scene, law, integrator = cell.scene, cell.contact, cell.integrator
     spring = law.spring() if isinstance(law, ForceLaw) else None
     if not isinstance(scene, ContactScene) or spring is None or integrator is None:
@@ -198,7 +199,7 @@ def scale_of(theta: np.ndarray) -> float:
 # ----------------------------------------------------------------------------------------------------- checks
 
 Modes = Callable[[np.ndarray, np.ndarray], list[str]]
-"""Contact modes of rollouts ``theta (d, B)``, ``w (n_w, B)``, as short names."""
+"""Returns the contact mode of each rollout with ``theta (d, B)`` and ``w (n_w, B)``, as B short names."""
 
 
 def examine(
@@ -206,10 +207,10 @@ def examine(
 ) -> tuple[list[Place], list[tuple[gradcheck.Sample, list[tuple[str, str]]]]]:
     """Check directional derivatives at ``theta (d,)``, without noise and with ``drawn (n_w,)``, and at contact switches.
 
-    Derivatives at theta are along the first of ``directions (D, d)``. Switches are searched along all directions,
-    without noise, and checked on the first that meet one. Returns the places and, for each, its costs with the contact
-    modes on both sides at every eps. ``unit`` is the unit roundoff of the program's arithmetic. All costs are one
-    batch, evaluated twice.
+    Derivatives at theta are along the first ``search.directions`` of ``directions (D, d)``. Switches are searched along
+    all directions, without noise, and checked along the first ``search.directions`` that meet one. Returns the places
+    and, for each place, its costs and the contact modes on both sides at every eps. ``unit`` is the unit roundoff of
+    the program's arithmetic. All costs are one batch, which is evaluated twice.
     """
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     modes = contact_modes(problem)
@@ -246,7 +247,7 @@ def examine(
 def boundary(
     modes: Modes, theta: np.ndarray, direction: np.ndarray, w: np.ndarray, number: int, search: SwitchSearch
 ) -> list[Place]:
-    """Return places just before, at and just after the contact switch nearest to theta, or none without a switch."""
+    """Return places before, at and after the contact switch nearest to theta along a direction; empty without a switch."""
     scale = scale_of(theta)
 
     def names(at: np.ndarray) -> list[str]:
@@ -262,10 +263,10 @@ def boundary(
 
 
 def switch(names: Callable[[np.ndarray], list[str]], reach: float) -> tuple[float, float] | None:
-    """Return the two arguments nearest to 0 between which the name changes, or None if it never does.
+    """Return the two arguments nearest to 0, within ``reach``, between which the name changes; None if it never does.
 
-    Each pass evaluates a grid of arguments and refines the interval of the first change, down to floating-point
-    neighbours.
+    Each pass evaluates a grid of arguments and refines the interval of the first change, until its length is about the
+    floating-point spacing at ``reach``.
     """
     half = np.linspace(0.0, reach, COLUMNS_AT_ONCE // 2)
     values = names(np.concatenate([half, -half]))
@@ -294,11 +295,11 @@ def _change(names: Sequence[str]) -> int | None:
 
 
 def contact_modes(problem: Problem) -> Modes | None:
-    """Return the function that names contact modes, or None without contacts or without access to the states."""
+    """Return the function that names contact modes; None without contacts or if the states cannot be computed."""
     program = problem.program
     if not isinstance(program, Rollout) or not program.scene.n_contacts:
         return None
-    # engines and implicit steps need the backend, anything else is faster in NumPy
+    # engines and implicit steps need the backend; other programs are faster in NumPy
     rollout = _backend_rollout if program.needs_root or "physics" in problem.provides else _numpy_rollout
     try:
         active_contacts(
@@ -329,7 +330,7 @@ def _numpy_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[
 
 
 def _backend_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return states and controls of rollouts as :func:`_numpy_rollout`, computed by the backend."""
+    """Return the same states and controls as :func:`_numpy_rollout`, computed by the backend."""
     theta = np.ascontiguousarray(np.broadcast_to(theta, (theta.shape[0], w.shape[1])))
     return problem.trajectory(theta, w)
 
@@ -337,7 +338,7 @@ def _backend_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tupl
 def signature(contacts: np.ndarray) -> str:
     """Return a short name of ``contacts (n_contacts, horizon)``: the steps in contact, ``12-18 30``, split by ``;``.
 
-    A name of over 24 characters is cut and ends in a checksum of the whole.
+    A name longer than 24 characters is truncated and ends in its checksum.
     """
     text = ";".join(_runs(row) for row in contacts)
     return text if len(text) <= 24 else f"{text[:14]}..{zlib.crc32(text.encode()):08x}"

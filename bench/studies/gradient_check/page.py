@@ -1,4 +1,4 @@
-"""The page of the gradient checks: verdicts, and errors against the step of the differences."""
+"""Builds the page of the gradient checks: verdicts, and errors against the step of the differences."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LOOKS = {
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the finding, a table of verdicts and a chart of errors against the step of the differences."""
+    """Return the content of the page: the finding, the verdicts, and errors against the step of the differences."""
     shown = arrange(experiment, rows)
     chart = Chart(
         "Error against the step of the differences",
@@ -52,7 +52,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
 
 
 def checks(shown: Arranged) -> pd.DataFrame:
-    """Return one line per check and eps: the data of the chart."""
+    """Return the data of the chart, one line per check and eps."""
     parts = [*PROBLEM, "backend"]
     rows = shown.rows.assign(
         row=range(len(shown.rows)),
@@ -74,7 +74,7 @@ def checks(shown: Arranged) -> pd.DataFrame:
 
 
 def finding(rows: pd.DataFrame) -> str:
-    """Write how many checked points have an untrusted gradient, with their verdicts and problems."""
+    """Format how many checked points have an untrusted gradient, with their verdicts and problems."""
     points = by_point(rows)
     faults = untrusted(points)
     if points.empty:
@@ -90,7 +90,7 @@ def finding(rows: pd.DataFrame) -> str:
 
 
 def _errors(points: pd.DataFrame) -> str:
-    """Write the largest error of points with a derivative, and the number of points without one."""
+    """Format the largest error of points with a derivative, and the number of points on a kink or jump."""
     broken = points["verdict"].isin(UNTRUSTED)
     errors = points.loc[~broken, "error"].dropna()
     text = (

@@ -1,11 +1,11 @@
-"""The points at which gradients are checked, and which verdicts are expected at each."""
+"""The points at which gradients are checked, and the verdicts that pass at each."""
 
 from __future__ import annotations
 
 from bench.measure.gradcheck import BROKEN, TRUSTED
 
 POINTS = ("start", "before", "at", "after")
-"""The first is theta0; the others are on a line through it: before, at and after a switch of contact mode."""
+"""``start`` is theta0. The others are on a line through theta0: before, at and after a switch of contact mode."""
 
 
 def is_trusted(point: str, verdict: str) -> bool:

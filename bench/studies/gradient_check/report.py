@@ -1,4 +1,4 @@
-"""Writes gradient checks as a table per check, a table per component, and a summary with the command for each fault."""
+"""Writes gradient checks: tables by check and by component, and a summary with the command that repeats each fault."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PER_COMPONENT = (
     "component_ratio", "component_left", "component_right", "component_verdict",
 )  # fmt: skip
 PROBLEM = ("scene", "contact", "integrator")
-"""Parts of the grid that make a problem."""
+"""Parts of the grid that identify a problem."""
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
@@ -59,8 +59,8 @@ def checks(rows: pd.DataFrame) -> Iterator[tuple[dict[str, Any], int, str]]:
 def long_table(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one line per cell, check and eps, and one line per cell that could not be checked.
 
-    Columns that are not the study's own, such as swept parameters, come last. The cell's parameters are left out, since
-    they would be repeated on every line: ``rows.parquet`` has them under the key.
+    Columns that are not the study's own, such as swept parameters, are last. The column ``parameters`` is omitted,
+    since it would be repeated on every line: ``rows.parquet`` has it under the same ``key``.
     """
     whole = ["experiment", *IDENTITY, "dim", "status", "reason"]
     added = [name for name in rows if name not in COLUMNS.by_name]
@@ -92,10 +92,10 @@ def component_table(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def by_point(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one line per cell and point: the worst verdict, and the largest best error with its eps.
+    """Return one line per cell and point: its worst verdict, and the largest error among its checks, with the eps.
 
-    ``row`` is the position of the cell in ``rows``. ``problem`` is a number that cells with equal parameters of scene,
-    contact law and integrator share.
+    The error of a check is the smallest over all eps. ``row`` is the position of the cell in ``rows``. ``problem`` is a
+    number, the same for cells with equal parameters of scene, contact law and integrator.
     """
     lines = []
     shown = ("scene", "contact", "integrator", "backend", "horizon", "dtype", "key", "command")
@@ -150,19 +150,19 @@ def markdown(shown: Arranged) -> str:
 
 
 def distance(rows: pd.DataFrame) -> str:
-    """Write how far before and after a switch of contact mode rows were checked: their studies' ``aside``."""
+    """Format how far before and after a contact switch the rows were checked: the ``aside`` of their studies."""
     distances = dict.fromkeys(given["study"]["aside"] for given in parse(rows) if given)
     return " or ".join(_power(value) for value in distances)
 
 
 def _power(value: float) -> str:
-    """Write a value as ``1e-4``."""
+    """Format a value as ``1e-4``."""
     mantissa, _, power = f"{value:e}".partition("e")
     return f"{float(mantissa):g}e{int(power)}"
 
 
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
-    """Print the counts of verdicts of each problem, and the command that repeats each fault."""
+    """Print each problem's counts of verdicts, and the command that repeats each untrusted check."""
     open_console(experiment, rows)
     shown = arrange(experiment, rows)
     names = problem_of(shown)
@@ -190,12 +190,12 @@ def untrusted(summary: pd.DataFrame) -> pd.DataFrame:
 
 
 def count_reasons(rows: pd.DataFrame) -> list[tuple[str, int]]:
-    """Return the reasons of cells, with the status of failed cells, and the number of cells with each."""
+    """Return each distinct reason, preceded by the status of failed cells, with its number of cells."""
     given = rows[rows["reason"].fillna("") != ""]
     texts = given["reason"].where(given["status"] == "ok", given["status"] + ": " + given["reason"])
     return [(str(text), int(count)) for text, count in texts.value_counts(sort=False).items()]
 
 
 def problem_of(shown: Arranged) -> pd.Series:
-    """Return, per row, the name of its problem, the same at every horizon."""
+    """Return, per row, the name of its problem, which is the same at every horizon."""
     return problem_names(shown, PROBLEM, axes_of(shown, "horizon"), ("scene", "contact"))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Growth(Study):
-    """Measures norms of sampled gradients, the product of the step Jacobians, and variances of both orders."""
+    """Measures norms of sampled gradients, products of step Jacobians, and variances of first- and zeroth-order terms."""
 
     name = "growth"
     columns: ClassVar[Columns] = COLUMNS
@@ -31,7 +31,7 @@ class Growth(Study):
     lags: int = param(40, "most lags whose gain is stored", positive=True)
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Measure gradient norms, Jacobian products and variances of one cell."""
+        """Return one cell's results by column: gradient norms, variances, and growth of the Jacobian product."""
         from bench.studies.growth.measure import measure
 
         return measure(cell, session, self.rollouts, self.lags)
@@ -43,13 +43,13 @@ class Growth(Study):
         return report.write(experiment, rows)
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the table."""
+        """Print the table of growth, and the reasons of cells without numbers."""
         from bench.studies.growth import report
 
         report.show(experiment, rows)
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the finding, its table and the charts."""
+        """Return the page: the finding, the growth by problem, and charts of norms, variances and gains."""
         from bench.studies.growth.page import content
 
         return content(experiment, rows)

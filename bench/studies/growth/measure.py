@@ -1,4 +1,4 @@
-"""How gradients grow with the horizon: their norm, the product of the step Jacobians, and the variance."""
+"""Measures how gradients grow with the horizon: their norm, the product of the step Jacobians, and the variance."""
 
 from __future__ import annotations
 
@@ -16,11 +16,15 @@ from bench.model import Jacobians, Problem, Rollout, columns
 QUANTILES = {"low": 0.05, "quarter": 0.25, "median": 0.5, "three_quarters": 0.75, "high": 0.95}
 """Quantiles over noise samples, stored for heavy-tailed quantities."""
 ROUNDING = 1e-6
-"""Relative rounding error of the logarithm of a product's spectral radius: sqrt(eps), as for a defective eigenvalue."""
+"""Rounding error of the log of a product's spectral radius: above sqrt(eps), the error at a defective eigenvalue."""
 
 
 def measure(cell: Cell, session: Session, rollouts: int, most_lags: int) -> dict[str, Any]:
-    """Return gradient norms, variances of both orders, and Jacobian products of the first ``rollouts`` rollouts."""
+    """Return one cell's results by column.
+
+    They are gradient norms and variances of both orders over all samples, and Jacobian products of the first
+    ``rollouts`` finite rollouts, with gains at ``most_lags`` lags at most.
+    """
     problem = session.problem(cell)
     program = problem.program
     draws = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, problem.program.n_noise)
@@ -46,7 +50,7 @@ def measure(cell: Cell, session: Session, rollouts: int, most_lags: int) -> dict
 
 
 def variances(terms: np.ndarray, name: str) -> dict[str, float]:
-    """Return the variance per sample of terms ``(d, R, N)``: median over repeats with its quantiles, and mean."""
+    """Return the variance per sample of terms ``(d, R, N)``: median, 5% and 95% quantiles and mean over repeats R."""
     with np.errstate(over="ignore"):
         totals = np.nansum(np.nanvar(terms, axis=2, ddof=1), axis=0)
     return {
@@ -62,10 +66,10 @@ def variances(terms: np.ndarray, name: str) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Products:
-    """Logarithms of the Jacobian products of B rollouts, which would overflow themselves."""
+    """Logarithms of the Jacobian products of B rollouts; the products themselves would overflow."""
 
     gain: np.ndarray
-    """log of the largest singular value of dx_N/du_i (of dx_N/dx_i without controls) at lag N - i, ``(N, B)``."""
+    """log of the largest singular value of dx_N/du_i (of dx_N/dx_i without controls), ``(N, B)``, row N - 1 - i."""
     singular: np.ndarray
     """log of the singular values of dx_N/dx_0, ``(B, n)``; -inf where the product is singular."""
     spectral: np.ndarray
@@ -73,7 +77,7 @@ class Products:
 
 
 def products(jacobians: Jacobians) -> Products:
-    """Compute A_{N-1} ... A_{i+1} B_i for every i by one backward scan, normalising the product at each step."""
+    """Return the products A_{N-1} ... A_{i+1} B_i for every i, by one backward scan that normalises at each step."""
     a, b = np.moveaxis(jacobians.a, -1, 1), np.moveaxis(jacobians.b, -1, 1)
     horizon, batch, n = a.shape[:3]
     product = np.broadcast_to(np.eye(n), (batch, n, n))
@@ -98,7 +102,7 @@ def _log(values: np.ndarray) -> np.ndarray:
 
 
 def rate(logarithms: np.ndarray, steps: int) -> tuple[float, float, float]:
-    """Return the mean growth per step over noise samples ``(B,)`` of log |product|, with its 95% interval (Student)."""
+    """Return log |product| ``(B,)`` per step, averaged over noise samples, with its 95% interval (Student's t)."""
     from scipy.special import stdtrit
 
     rates = logarithms[np.isfinite(logarithms)] / steps
@@ -110,10 +114,10 @@ def rate(logarithms: np.ndarray, steps: int) -> tuple[float, float, float]:
 
 
 def classify(stretch_high: float, spectral_low: float, tolerance: float) -> str:
-    """Return ``exploding`` if the spectral radius certainly grows, ``vanishing`` if the norm certainly falls, or ``neutral``.
+    """Return ``exploding`` if the spectral radius certainly grows, ``vanishing`` if the norm certainly falls, else ``neutral``.
 
-    The spectral radius never exceeds the norm and does not depend on the units of the state. By its norm a free mass
-    would be exploding, although its product [[1, t], [0, 1]] only grows like t and has spectral radius 1.
+    The spectral radius never exceeds the norm and does not depend on the units of the state. By its norm, a free mass
+    would count as exploding, although its product [[1, t], [0, 1]] grows only like t and has spectral radius 1.
     """
     if spectral_low > tolerance:
         return "exploding"
@@ -121,7 +125,7 @@ def classify(stretch_high: float, spectral_low: float, tolerance: float) -> str:
 
 
 def _product_columns(problem: Problem, w: np.ndarray, most_lags: int) -> dict[str, Any]:
-    """Return gains, singular values, rates and class of the Jacobian product."""
+    """Return the columns of the Jacobian product for noise ``w (n_w, B)``: gains, singular values, rates and class."""
     jacobians = problem.jacobians(problem.program.theta0, w)
     steps = jacobians.a.shape[0]
     product = products(jacobians)

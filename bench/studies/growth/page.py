@@ -1,4 +1,4 @@
-"""The page of growth with the horizon: gradient norms, variances of both orders, and gains by lag."""
+"""Builds the page of growth with the horizon: gradient norms, variances of both orders, and gains by lag."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ RESULTS = [
 ]
 ORDERS = {"first_order": "first order", "zeroth_order": "zeroth order"}
 CROSSING = "zeroth order has less variance"
-"""Column of the answers: the horizon from which on it has."""
+"""Column of the answers: the horizon from which the zeroth order has the lower variance."""
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the finding, charts of norms, variances and gains, and the table."""
+    """Return the content of the page: the finding, charts of norms, variances and gains, and the table."""
     shown = arrange(experiment, rows)
     problem = problem_of(shown)
     table = shown.rows.assign(series=problem, problem=problem)
@@ -90,7 +90,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
 
 
 def variances_of(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one line per row and order: the data of the chart of variances."""
+    """Return the data of the chart of variances, one line per row and order."""
     rows = rows.assign(row=range(len(rows))).sort_values("horizon", kind="stable")
     parts = [
         pd.DataFrame({
@@ -103,7 +103,7 @@ def variances_of(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def gains_of(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one line per row and lag, at the longest horizon of each problem: the data of the chart of gains."""
+    """Return the data of the chart of gains, one line per problem and lag, at each problem's longest horizon."""
     longest = (
         rows.assign(row=range(len(rows))).sort_values("horizon", kind="stable").drop_duplicates("problem", keep="last")
     )
@@ -117,7 +117,7 @@ def gains_of(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def finding(table: pd.DataFrame) -> str:
-    """Write which problems explode and vanish, and from which horizon on the zeroth order has the lower variance."""
+    """Format on which problems gradients explode or vanish, and from which horizon the zeroth order has less variance."""
     better = table[table[CROSSING] != "nowhere"]
     text = headline(dict(zip(table["problem"], table["growth"], strict=True)))
     crossings = ", ".join(
@@ -127,7 +127,7 @@ def finding(table: pd.DataFrame) -> str:
 
 
 def answers(shown: Arranged) -> pd.DataFrame:
-    """Return, by problem, the growth at the longest horizon, norms at both ends, and the crossing of the variances."""
+    """Return a line per problem: growth at the longest horizon, norms at both ends, and where the variances cross."""
     lines = []
     good = shown.rows[np.isfinite(shown.rows["gradient_median"])]
     for problem, part in good.groupby(problem_of(shown, good), sort=False):

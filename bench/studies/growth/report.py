@@ -1,4 +1,4 @@
-"""Writes growth with the horizon as a table and a chart: gradient norms, the Jacobian product, variances."""
+"""Writes the table and the chart of growth with the horizon: gradient norms, the Jacobian product, variances."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ SINGULAR: tuple[dict[str, Any], ...] = (
     {"color": PALETTE[0], "marker": "v", "markersize": 3.5},
     {"color": "#808080", "linewidth": 0.8},
 )
-"""Styles of the largest singular value, the smallest and those between."""
+"""Line styles of the largest singular value, the smallest one, and all others."""
 CLASSES = {"exploding": PALETTE[2], "neutral": "#404040", "vanishing": PALETTE[0]}
-"""Colours of the names of growth classes."""
+"""Colour of each growth class's name."""
 PROBLEM = ("scene", "contact", "integrator", "backend")
-"""Parts of the grid that make a problem, which is drawn along the horizon and axes that step with it."""
+"""Parts of the grid that identify a problem. It is drawn along the horizon and the axes that step with it."""
 ROUNDING = float(np.finfo(np.float64).eps)
-"""Share of the largest singular value below which the others are rounding errors."""
+"""Share of the largest singular value up to which another singular value is a rounding error."""
 NOTES = (
     "|grad|: norm of one sample's gradient, median and 5% to 95% of the noise samples. growth: log of the largest "
     "singular value (stretch) and of the spectral radius of the Jacobian product dx_N/dx_0, per second, mean and 95% "
@@ -57,7 +57,7 @@ NOTES = (
 
 
 def variances() -> dict[str, tuple[str, dict[str, Any]]]:
-    """Return, by column, the name and the style of each curve of variance."""
+    """Return the name and line style of each variance curve, by the prefix of its columns."""
     return {
         "first_order": ("fobg", {"color": estimator_colour("fobg"), "marker": "D"}),
         "zeroth_order": (
@@ -88,7 +88,7 @@ def problem_of(shown: Arranged, rows: pd.DataFrame | None = None) -> pd.Series:
 
 
 def readable(shown: Arranged) -> pd.DataFrame:
-    """Return a table of texts, a line per cell in order of scene and horizon."""
+    """Return the table as strings, a line per cell, ordered by scene and horizon."""
     lines = []
     columns = [name for name in label_columns(shown, PROBLEM, axes_of(shown, "horizon")) if name != "horizon"]
     rows = shown.rows.assign(place=shown.rows["scene"].map({s: i for i, s in enumerate(shown.rows["scene"].unique())}))
@@ -109,7 +109,7 @@ def readable(shown: Arranged) -> pd.DataFrame:
 
 
 def _ends(values: Sequence[float]) -> str:
-    """Write the largest and the smallest singular value, or the rounding error as an upper bound of the smallest."""
+    """Format the largest and smallest singular value; the smallest as ``< u`` if it is below the rounding error u."""
     if not len(values):
         return "-"
     floor = ROUNDING * values[0]
@@ -129,7 +129,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
 
 
 def headline(classes: Mapping[str, str]) -> str:
-    """Write on which problems gradients explode and vanish, from the growth class of each at its longest horizon."""
+    """Format on which problems gradients explode or vanish; ``classes`` has each problem's class at its longest horizon."""
     parts = []
     for growth, verb in (("exploding", "explode"), ("vanishing", "vanish"), ("neutral", "do neither")):
         names = [name for name, value in classes.items() if value == growth]
@@ -139,7 +139,7 @@ def headline(classes: Mapping[str, str]) -> str:
 
 
 def figure(shown: Arranged) -> Figure | None:
-    """Draw a column of panels per problem: gradient norms, the Jacobian product, variances per sample."""
+    """Draw a column of panels per problem: gradient norms, singular values, gains and variances; None without data."""
     rows = attempted(shown.rows)
     rows = rows[np.isfinite(rows["gradient_median"])]
     groups = [
@@ -176,7 +176,7 @@ def _legend() -> list[Any]:
 
 
 def _draw_title(panel: Axes, name: str, rows: pd.DataFrame) -> None:
-    """Write the problem, and the growth of its Jacobian product over the longest horizon."""
+    """Title a panel with the problem, and with the growth of its Jacobian product over the longest horizon."""
     last = rows.iloc[-1]
     panel.set_title("\n".join(map(plain, name.split(", "))), pad=15)
     text = last["growth"]
@@ -188,7 +188,7 @@ def _draw_title(panel: Axes, name: str, rows: pd.DataFrame) -> None:
 
 
 def _draw_norms(panel: Axes, rows: pd.DataFrame) -> None:
-    """Draw median norms in their band, at each horizon."""
+    """Draw the median gradient norm at each horizon, with its band from 5% to 95%."""
     shown = rows[rows["gradient_median"] > 0]
     low, high = shown["gradient_low"], shown["gradient_high"]
     panel.fill_between(shown["time_horizon"], low, high, color="#000000", alpha=0.2, linewidth=0)
@@ -196,7 +196,7 @@ def _draw_norms(panel: Axes, rows: pd.DataFrame) -> None:
 
 
 def _draw_singular(panel: Axes, rows: pd.DataFrame) -> None:
-    """Draw every singular value of dx_N/dx_0 at each horizon, and the line 1 between growth and decay."""
+    """Draw the singular values of dx_N/dx_0 at each horizon, and a line at 1, between growth and decay."""
     values = np.array(rows["singular_values"].to_list(), dtype=float)
     values = np.where(values > ROUNDING * values[:, :1], values, np.nan)
     last = values.shape[1] - 1
@@ -206,7 +206,7 @@ def _draw_singular(panel: Axes, rows: pd.DataFrame) -> None:
 
 
 def _draw_gain(panel: Axes, rows: pd.DataFrame) -> None:
-    """Draw the gain at the longest horizon against the time between a control, or a state, and the end."""
+    """Draw the gain at the longest horizon against the time from a control (or state) to the end of the rollout."""
     row = rows.iloc[-1]
     times, (gain, low, high) = np.array(row["lags"]) * row["dt"], (row[f"gain{end}"] for end in ("", "_low", "_high"))
     panel.fill_between(times, low, high, color="#000000", alpha=0.2, linewidth=0)

@@ -1,4 +1,4 @@
-"""Which parameters are identifiable from a record of the motion, how precisely, and do fits reach that precision?"""
+"""Measures which parameters are identifiable from a record of the motion, how precisely, and whether fits reach that."""
 
 from __future__ import annotations
 
@@ -60,13 +60,13 @@ class Identify(Study):
     data: str | None = param(None, "CSV file with measurements of your own, a line per step; null: made from the truth")
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Fit all records by each shooting method."""
+        """Return one cell's results by column: fits of all records by each shooting method, and the Cramer-Rao bound."""
         from bench.studies.identify.measure import measure
 
         return measure(cell, self)
 
     def unsupported_reason(self, cell: Cell) -> str | None:
-        """Return why a cell cannot be fitted: no unknowns, steps that NumPy cannot take, sampling, or unusable data."""
+        """Return why a cell cannot be fitted (no motion, no unknowns, no NumPy steps, sampling, unusable data), or None."""
         from bench.studies.identify.measure import read
 
         scene, optimizer = cell.scene, cell.parts["optimizer"]
@@ -103,7 +103,7 @@ class Identify(Study):
         report.show(experiment, rows)
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the finding, errors and coverage, and the table."""
+        """Return the page: the failures, the identifiable parameters, a chart of any two numbers, and the table."""
         from bench.studies.identify.page import content
 
         return content(experiment, rows)

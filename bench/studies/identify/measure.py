@@ -19,15 +19,18 @@ from bench.model import Answer, Decision, Identified, LoopOps, MechanicalScene, 
 STEP = 1e-5
 """Step of central differences in the logarithms of parameters. Its relative error is about 1e-10."""
 SHOOTING = ("single", "multiple", "windows")
-"""Shooting methods: one rollout, windows whose ends must meet, independent windows."""
+"""Shooting methods: one rollout, consecutive windows joined by a penalty on gaps, and independent windows."""
 GAP_WEIGHT = 100.0
 """Weight of a gap between windows of multiple shooting, relative to the weight of a measurement."""
 MAX_STEP_SHIFT = 0.5
-"""Largest change of an estimate under half the step, in units of the bound of its error, at which it is independent of
-the step: to first order as much error is left, and with one bound of bias a third of the intervals miss the truth."""
+"""Largest change of an estimate at half the step, in Cramer-Rao bounds, that counts as independent of the step.
+
+To first order in the step, the error of the estimate is twice this change: one bound. With a bias of one bound, 17% of
+the 95% intervals miss the truth instead of 5%.
+"""
 
 Settings = Any
-"""An ``Identify`` study, whose parameters are the settings. Its module imports this one, so its type is not named."""
+"""An ``Identify`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Model:
     measured: tuple[int, ...]
     """Indices of the measured positions."""
     steps: tuple[int, ...]
-    """The steps after which positions are measured, counted from 1."""
+    """Numbers of the steps after which positions are measured, from 1."""
 
     @property
     def values(self) -> np.ndarray:
@@ -57,7 +60,7 @@ class Model:
         return np.concatenate(self._start(theta)[2])
 
     def simulate(self, theta: np.ndarray, x: np.ndarray, begin: np.ndarray, steps: int) -> np.ndarray:
-        """Return the states ``(steps, n, B)`` after each step from ``x (n, B)``, the states before step ``begin (B,)``."""
+        """Return the states ``(steps, n, B)`` after each step, from ``x (n, B)`` before the steps ``begin (B,)``."""
         program, own, state, scanned = self._start(theta)
         n_q, columns = len(state.q), np.arange(theta.shape[1])
         now, states = State(x[:n_q], x[n_q:]), []
@@ -81,7 +84,10 @@ class Model:
 
 
 def model_of(cell: Cell, scene: MechanicalScene | None = None, refinement: int = 1) -> Model:
-    """Return the cell's model. ``scene`` may be the cell's scene with a step ``refinement`` times shorter."""
+    """Return the cell's model. ``scene`` may be the cell's scene with a step ``refinement`` times shorter.
+
+    Raises :class:`Unsupported` if an unknown is not positive.
+    """
     own = cell.scene
     assert isinstance(own, MechanicalScene)
     scene = scene or own
@@ -98,14 +104,14 @@ def model_of(cell: Cell, scene: MechanicalScene | None = None, refinement: int =
 
 
 def refine(scene: MechanicalScene, times: int) -> MechanicalScene:
-    """Return the scene with the same duration in steps that are ``times`` times shorter."""
+    """Return the scene with the same duration and a time step ``times`` times shorter."""
     return dataclasses.replace(scene, dt=scene.dt / times, horizon=scene.horizon * times)
 
 
 def read(path: str, scene: MechanicalScene) -> np.ndarray:
     """Return the measurements ``(m,)`` of a CSV file with a line per measured step.
 
-    Raises ValueError for another number of lines or columns than the scene has, or for a number that is not finite.
+    Raises ValueError if the number of lines or columns does not match the scene, or a number is not finite.
     """
     data = np.genfromtxt(path, delimiter=",", ndmin=2)
     if np.isnan(data[0]).all():
@@ -126,9 +132,10 @@ def read(path: str, scene: MechanicalScene) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Fitting:
-    """The residuals of several fits in a batch.
+    """The residuals of a batch of fits by one shooting method.
 
-    The unknowns are the logarithms of the parameters, then the states before each later window divided by ``unit``.
+    The unknowns are the logarithms of the parameters, then the initial states of all windows but the first, divided by
+    ``unit``.
     """
 
     model: Model
@@ -145,17 +152,17 @@ class Fitting:
 
     @property
     def window_steps(self) -> int:
-        """Steps of a window."""
+        """Number of steps of a window."""
         return self.model.program.scene.horizon // self.n_windows
 
     def residuals(self, points: np.ndarray, data: np.ndarray) -> np.ndarray:
-        """Return standardised residuals ``(m, B)`` of ``points (dim, B)`` against ``data (m', B)``."""
+        """Return residuals ``(m, B)`` of ``points (dim, B)`` against ``data (m', B)``, and of gaps, in units of the noise."""
         p, batch, n = len(self.model.names), points.shape[1], len(self.unit)
         theta = np.exp(points[:p])
         first = self.model.initial_states(theta)
         later = points[p:].reshape(self.n_windows - 1, n, batch) * self.unit[:, None]
         starts = np.concatenate([first[None], later])
-        flat = np.moveaxis(starts, 0, 1).reshape(n, -1)  # window by window, columns within
+        flat = np.moveaxis(starts, 0, 1).reshape(n, -1)  # columns ordered by window, then by fit
         begin = np.repeat(np.arange(self.n_windows) * self.window_steps, batch)
         states = self.model.simulate(np.tile(theta, (1, self.n_windows)), flat, begin, self.window_steps)
         states = states.reshape(self.window_steps, n, self.n_windows, batch)
@@ -175,7 +182,11 @@ class Fitting:
         return np.asarray(change.reshape(len(change), self.dim, batch) / (2 * STEP))
 
     def start(self, theta: np.ndarray, data: np.ndarray) -> np.ndarray:
-        """Return the initial unknowns ``(dim, B)``: later windows start at measured positions and finite-difference speeds."""
+        """Return the initial unknowns ``(dim, B)`` for ``theta (p, B)`` and ``data (m', B)``.
+
+        Windows after the first start at the measured positions and finite differences of them. Positions that are not
+        measured start on the rollout of theta.
+        """
         batch, n = data.shape[1], len(self.unit)
         states = np.zeros((self.n_windows - 1, n, batch))
         if self.n_windows > 1:
@@ -196,7 +207,7 @@ class Fitting:
 def run_fits(
     fitting: Fitting, optimizer: Optimizer, start: np.ndarray, data: np.ndarray, iterations: int
 ) -> np.ndarray:
-    """Return the unknowns ``(dim, B)`` that an optimizer reaches from ``start (dim, B)``, all fits in one batch."""
+    """Return the unknowns ``(dim, B)`` after ``iterations`` of an optimizer from ``start (dim, B)``, as one batch."""
     states = [optimizer.start(column) for column in start.T]
     no_draws = np.empty((fitting.dim, 0))
     for _ in range(iterations):
@@ -220,12 +231,12 @@ def run_fits(
 
 
 def count_windows(horizon: int, most: int) -> int:
-    """Return the largest number of equal windows up to ``most`` with at least two steps each, or 1 if there is none."""
+    """Return the largest number of equal windows, at most ``most``, with at least two steps each; 1 if there is none."""
     return max((n for n in range(1, most + 1) if horizon % n == 0 and horizon // n >= 2), default=1)
 
 
 def measure(cell: Cell, settings: Settings) -> dict[str, Any]:
-    """Return the columns of one cell: fits of all records by each shooting method, compared with the Cramer-Rao bound."""
+    """Return one cell's results by column: fits of all records by each shooting method, and the Cramer-Rao bound."""
     optimizer, scene = cell.parts["optimizer"], cell.scene
     assert isinstance(optimizer, Optimizer)
     assert isinstance(scene, MechanicalScene)
@@ -293,7 +304,7 @@ def _fit_statistics(
     low, high = performance.wilson(n_converged, n_fits)
     is_covered = np.array(inside, dtype=float)
     coverage = float(is_covered.mean()) if is_covered.size else math.nan
-    # the interval counts records, since the invariants of one record are dependent
+    # the sample size of this interval is the number of records: invariants of one record are dependent
     interval = (
         performance.wilson(round(coverage * n_converged), n_converged) if is_covered.size else (math.nan, math.nan)
     )
@@ -308,7 +319,7 @@ def _fit_statistics(
 
 
 def _parameters_only(jacobian: np.ndarray, p: int) -> np.ndarray:
-    """Return the Jacobian ``(m, p)`` by the parameters, with the states of windows projected out as nuisance unknowns."""
+    """Return the Jacobian ``(m, p)`` with respect to the parameters, with the windows' initial states projected out."""
     if jacobian.shape[1] == p or not np.isfinite(jacobian).all():
         return jacobian[:, :p]
     basis, _ = np.linalg.qr(jacobian[:, p:])
@@ -316,7 +327,10 @@ def _parameters_only(jacobian: np.ndarray, p: int) -> np.ndarray:
 
 
 def information(model: Model, theta: np.ndarray, sigma: float) -> Information:
-    """Return the information of a record of ``theta (p,)`` about the logarithms of its parameters, by single shooting."""
+    """Return the Fisher information of a record of ``theta (p,)`` on the logarithms of its parameters, by single shooting.
+
+    ``sigma`` is the standard deviation of a measurement's noise.
+    """
     p = len(theta)
     shifts = STEP * np.concatenate([np.eye(p), -np.eye(p)], axis=1)
     record = model.record(np.exp(np.log(theta)[:, None] + shifts))
@@ -324,7 +338,7 @@ def information(model: Model, theta: np.ndarray, sigma: float) -> Information:
 
 
 def records(cell: Cell, model: Model, settings: Settings) -> np.ndarray:
-    """Return the records ``(m, B)`` to fit: the user's one, or ``repeats`` noisy ones of the truth."""
+    """Return the records ``(m, B)`` to fit: the user's single record, or ``repeats`` noisy records of the true motion."""
     assert isinstance(cell.scene, MechanicalScene)
     if settings.data is not None:
         return read(settings.data, cell.scene)[:, None]
@@ -335,9 +349,9 @@ def records(cell: Cell, model: Model, settings: Settings) -> np.ndarray:
 
 
 def step_dependence(cell: Cell, model: Model, known: Information, settings: Settings) -> dict[str, Any]:
-    """Return how much a fit without noise changes when the model's step is halved, as a number and a sentence.
+    """Return the columns ``step_shift`` and ``step_note``: how a noiseless fit changes when the model's step is halved.
 
-    To first order this is the least-squares change of the parameters that compensates the change of the record.
+    To first order, it is the least-squares change of the parameters that compensates the change of the record.
     """
     assert isinstance(cell.scene, MechanicalScene)
     half = model_of(cell, refine(cell.scene, 2), 2)

@@ -1,4 +1,4 @@
-"""The page of fits: identifiable parameters, errors and coverage by shooting method."""
+"""Builds the page of fits: identifiable parameters, errors and coverage by shooting method."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bench.studies.identify.report import failures, findings, flatten, readable
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the failures, a chart of any two numbers, and the table of fits."""
+    """Return the content of the page: the failures, a chart of any two numbers, and the table of fits."""
     shown = arrange(experiment, rows)
     lines = flatten(shown)
     sentences = failures(lines) if len(lines) else findings(shown)

@@ -1,4 +1,4 @@
-"""Writes fits as tables and a chart: identifiable parameters, errors in units of the bound, coverage of intervals."""
+"""Writes the table and the chart of fits: identifiable parameters, errors in units of the bound, and coverage."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PARTS = ("scene", "contact", "integrator")
 STATISTICS = (
     "converged", "converged_low", "converged_high", "error", "coverage", "coverage_low", "coverage_high", "hidden",
 )  # fmt: skip
-"""Columns with a value per shooting method."""
+"""Columns with one value per shooting method."""
 NOTES = (
     "identifiable: the products of powers of the parameters that a record determines. bound: Cramer-Rao bound of their "
     "relative standard deviations. converged: fits whose residuals are consistent with the noise. error: root mean square "
@@ -70,7 +70,7 @@ def flatten(shown: Arranged) -> pd.DataFrame:
 
 
 def readable(lines: pd.DataFrame) -> pd.DataFrame:
-    """Return the lines as a table of texts."""
+    """Return the lines of :func:`flatten` formatted as strings."""
     out = []
     for row in lines.to_dict("records"):
         out.append({
@@ -82,7 +82,7 @@ def readable(lines: pd.DataFrame) -> pd.DataFrame:
 
 
 def findings(shown: Arranged) -> list[str]:
-    """Return the failures, then for each problem its identifiable parameters and their dependence on the time step."""
+    """Return the findings: failures, then each problem's identifiable parameters and dependence on the time step."""
     lines = flatten(shown)
     if not len(lines):
         return ["No fit gave a result: the table has the reason of each."]
@@ -91,7 +91,7 @@ def findings(shown: Arranged) -> list[str]:
 
 
 def _unconverged(lines: pd.DataFrame) -> pd.DataFrame:
-    """Return the lines of which less than 90% of the fits converge, with 95% confidence."""
+    """Return the lines where fewer than 90% of the fits converge, with 95% confidence."""
     return lines[lines["converged_high"] < 0.9]
 
 
@@ -101,7 +101,7 @@ def _undercovered(lines: pd.DataFrame) -> pd.DataFrame:
 
 
 def headline(lines: pd.DataFrame) -> str:
-    """Write in how many cases fits do not converge, and in how many their intervals are too narrow."""
+    """Format the title of the chart: in how many cases fits do not converge, and in how many intervals are too narrow."""
     n_unconverged, n_narrow = len(_unconverged(lines)), len(_undercovered(lines))
     cases = counted(len(lines), "case")
     fits = f"Fits do not converge in {n_unconverged} of {cases}" if n_unconverged else f"Fits converge in all {cases}"
@@ -109,7 +109,7 @@ def headline(lines: pd.DataFrame) -> str:
 
 
 def failures(lines: pd.DataFrame) -> list[str]:
-    """Return the cases without convergence, the worst interval, and the number of fits with too many directions."""
+    """Return the failures as sentences: poor convergence, narrow intervals, fits with too many identifiable directions."""
     sentences = []
     unconverged, narrow = _unconverged(lines), _undercovered(lines)
     if len(unconverged):
@@ -135,7 +135,7 @@ def failures(lines: pd.DataFrame) -> list[str]:
 
 
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
-    """Print the findings, the table, and reasons of cells without a result."""
+    """Print the findings, the table, and the reasons of cells without a result."""
     console = open_console(experiment, rows)
     shown = arrange(experiment, rows)
     console.print(*findings(shown), sep="\n")
@@ -145,7 +145,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
 
 
 def figure(lines: pd.DataFrame) -> Figure:
-    """Draw, by problem, convergence, errors in units of the bound and coverage of each shooting method."""
+    """Draw convergence, error in units of the bound, and coverage of each shooting method, a row per problem."""
     names = list(dict.fromkeys(lines["problem"]))
     methods = list(dict.fromkeys(lines["shooting"]))
     drawn = titled_figure(WIDTH, 0.42 * len(names) + 1.5, headline(lines))

@@ -1,4 +1,4 @@
-"""Does a better gradient lead to a better controller, sooner? A search per problem, estimator, optimizer and seed."""
+"""Measures whether a better gradient finds a better theta sooner: one search per problem, estimator, optimizer and seed."""
 
 from __future__ import annotations
 
@@ -72,20 +72,20 @@ class Optimise(Study):
     quality_samples: int = param(4096, "gradients of the reference of the quality", low=64)
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Search once. Untimed cells that differ by seed only are searched together, in shared batches of rollouts."""
+        """Return one cell's results by column. Untimed cells that differ only in their seed share batches of rollouts."""
         from bench.studies.optimise.measure import measure
 
         return measure(cell, session, self)
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
-        """Return the plugins without the estimator where the optimizer uses costs only: every estimator is the same then."""
+        """Return the plugins, without the estimator if the optimizer uses only costs: it then has no effect."""
         optimizer = given.get("optimizer")
         if isinstance(optimizer, Optimizer) and "gradient" not in optimizer.needs:
             return given | {"estimator": None}
         return given
 
     def unsupported_reason(self, cell: Cell) -> str | None:
-        """Return why a cell cannot be searched: an optimizer lacks its gradient, or the target is below the optimum."""
+        """Return why a cell cannot be searched (no gradient, or a target below the optimum), or None."""
         optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
         assert isinstance(optimizer, Optimizer)
         assert estimator is None or isinstance(estimator, Estimator)
@@ -113,11 +113,11 @@ class Optimise(Study):
         report.show(experiment, rows)
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the findings, the chart of quality against runtime, paths and learning rates."""
+        """Return the page: the findings, and charts of quality against runtime, paths and learning rates."""
         from bench.studies.optimise.page import content
 
         return content(experiment, rows)
 
     def chart(self, experiment: Experiment, rows: pd.DataFrame) -> tuple[str, ...]:
-        """Return the chart of quality against runtime, then the paths."""
+        """Return the names of the charts of quality against runtime and of the paths, in order of preference."""
         return ("quality_runtime", "anytime")

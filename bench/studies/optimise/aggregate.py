@@ -1,4 +1,4 @@
-"""Aggregates searches by method: regret, times to targets, scores, and whether a smaller gradient error pays."""
+"""Aggregates searches by method: regret, times to targets, scores, and the effect of the gradient's error on runtime."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from bench.report.views import arrange, attempted
 
 PARTS = ("scene", "contact", "integrator", "backend")
 TARGETS = (10.0, 100.0, 1000.0)
-"""A target is the first regret divided by one of these."""
+"""Target regrets: the first regret divided by each of these factors."""
 RESTARTS = 100
-"""Simulated runs with restarts per problem and target."""
+"""Number of simulated runs with restarts per method, problem and target."""
 MIN_SEEDS_TO_SPLIT = 4
-"""Fewest seeds that are split into those that choose tunings and those that score."""
+"""Fewest seeds to split: some choose the tunings, the others score."""
 ROUNDING = 1e-12
-"""Regret below this share of the first one is 0."""
+"""Smallest regret, as a share of the first regret: a smaller regret is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunSet:
     """The searches of an experiment, by problem, method and tuning.
 
-    ``rows`` has the columns ``problem``, ``method``, ``tuning`` (the optimizer's swept parameters as text),
-    ``best_known`` (J*, or the lowest cost of any search where that is lower), ``best_known_status`` and ``score``.
+    ``rows`` has the columns ``problem``, ``method``, ``tuning`` (the optimizer's swept parameters as a string),
+    ``best_known`` (J*, or the lowest cost of any search if lower), ``best_known_status`` (its source) and ``score``.
     """
 
     rows: pd.DataFrame
@@ -56,7 +56,7 @@ class RunSet:
 
     @cached_property
     def tuning_seeds(self) -> tuple[int, ...]:
-        """The first third of the seeds, which choose tunings and do not score. Empty without tuning or with few seeds."""
+        """The seeds that choose the tunings and do not score: the first third. Empty without tunings or with few seeds."""
         seeds = sorted(int(seed) for seed in self.rows["seed"].unique())
         several = (self.rows.groupby(["problem", "method"])["tuning"].nunique() > 1).any()
         return tuple(seeds[: math.ceil(len(seeds) / 3)]) if several and len(seeds) >= MIN_SEEDS_TO_SPLIT else ()
@@ -65,14 +65,15 @@ class RunSet:
     def best_tunings(self) -> dict[tuple[str, str], str]:
         """The tuning with the lowest median final cost, by problem and method.
 
-        The median is over the tuning seeds, or over all seeds if there are no tuning seeds. A failed search counts as inf.
+        The median is over the tuning seeds, or over all seeds if there are no tuning seeds. A failed search counts as
+        inf.
         """
         best: dict[tuple[str, str], tuple[float, str]] = {}
         rows = self.rows[self.rows["seed"].isin(self.tuning_seeds)] if self.tuning_seeds else self.rows
         final = rows["final_cost"].where(rows["status"] == "ok", math.inf).fillna(math.inf)
         for key, part in final.groupby([rows[n] for n in ("problem", "method", "tuning")], sort=False):
             problem, method, tuning = (str(k) for k in key)
-            # the lower of the two middle costs, since a mean with a failed search would be infinite
+            # the lower of the two middle costs, because their mean is infinite if one search failed
             middle = float(np.sort(part.to_numpy())[(len(part) - 1) // 2])
             if (problem, method) not in best or middle < best[problem, method][0]:
                 best[problem, method] = (middle, tuning)
@@ -91,17 +92,17 @@ class RunSet:
             yield str(key[0]), str(key[1]), part
 
     def gradient_ratio(self, problem: str, default: float) -> float:
-        """Return the rollouts that take the time of one gradient: the median over searches, ``default`` without times."""
+        """Return the rollouts that take as long as one gradient: the median over searches, or ``default`` if untimed."""
         ratios = self.rows.loc[self.rows["problem"] == problem, "gradient_ratio"].dropna()
         return float(ratios.median()) if len(ratios) else default
 
 
 _latest: dict[tuple[int, int], tuple[Experiment, pd.DataFrame, RunSet]] = {}
-"""The last run set by the ids of experiment and rows, which are referenced here so that their ids stay theirs."""
+"""The last run set, by the ids of experiment and rows. Both are referenced here, so that no other object has their ids."""
 
 
 def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
-    """Collect the searches that ran, with names of problem, method and tuning, and their scores."""
+    """Return the searches that ran, with names of problem, method and tuning, and scores. The last result is cached."""
     key = (id(experiment), id(rows))
     if key not in _latest:
         _latest.clear()
@@ -134,7 +135,7 @@ def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
 
 
 def _method_names(rows: pd.DataFrame) -> pd.Series:
-    """Name estimator and optimizer, ``fobg, adam``, or only the optimizer where there is no estimator."""
+    """Return each row's method: estimator and optimizer, ``fobg, adam``, or only the optimizer without an estimator."""
     names = []
     for estimator, params, optimizer in rows[["estimator", "estimator_params", "optimizer"]].to_numpy():
         label = f"{estimator}[{params}]" if params else estimator
@@ -153,7 +154,7 @@ def _tuning_labels(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.Series:
 
 
 def _best_known_cost(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
-    """Return, per row, the lowest cost known for its problem and its source: J*, or a search where that went below J*."""
+    """Return, per row, the lowest cost known for its problem, and its source: J*, or a search that reached a lower cost."""
     lowest = rows.groupby("problem")["best_cost"].transform("min")
     known = rows["optimum"]
     below = known.isna() | (lowest < known - 1e-9 * known.abs())
@@ -171,7 +172,7 @@ def rollouts_spent(row: pd.Series, ratio: float) -> np.ndarray:
 
 
 def regret(row: pd.Series) -> np.ndarray:
-    """Return J(theta_t) - J* at each stored point of a path, at least :data:`ROUNDING` of the first."""
+    """Return the regret J(theta_t) - J* at each stored point of a path, at least :data:`ROUNDING` of the first regret."""
     cost = np.asarray(row["path_cost"], dtype=float)
     rounding = ROUNDING * max(abs(row["start_cost"] - row["best_known"]), 1e-300)
     return np.asarray(np.maximum(cost - row["best_known"], rounding))
@@ -180,8 +181,8 @@ def regret(row: pd.Series) -> np.ndarray:
 def regret_quantiles(rows: pd.DataFrame, spent: Sequence[np.ndarray], grid: np.ndarray) -> np.ndarray:
     """Return the 20%, 50% and 80% quantiles of regret over paths at each budget of ``grid``: ``(3, len(grid))``.
 
-    ``spent`` has the budget used up to each point of each path. A path keeps its last regret, and is infinite from
-    there on if it diverged.
+    ``spent`` has the budget spent up to each point of each path. After its end, a path has its last regret, or infinite
+    regret if it diverged.
     """
     lines = []
     for places, (_, row) in zip(spent, rows.iterrows(), strict=True):
@@ -192,9 +193,9 @@ def regret_quantiles(rows: pd.DataFrame, spent: Sequence[np.ndarray], grid: np.n
 
 
 def hitting_times(rows: pd.DataFrame, factor: float, ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rollouts at which each path first has at most its first regret / ``factor``, and whether it ever does.
+    """Return the rollouts until each path's regret is at most its first regret / ``factor``, and whether it reaches that.
 
-    The number for a path that never does is all the rollouts it spent.
+    A path that never reaches the target has the number of all its rollouts. A gradient counts as ``ratio`` rollouts.
     """
     rollouts, reached = [], []
     for _, row in rows.iterrows():
@@ -212,7 +213,7 @@ def hitting_times(rows: pd.DataFrame, factor: float, ratio: float) -> tuple[np.n
 def times_to_targets(runs: RunSet, default: float) -> pd.DataFrame:
     """Return, per problem, method and target, successes with Wilson's interval and the average runtime in rollouts.
 
-    ``default`` is the number of rollouts that a gradient counts as where no times were measured, here and below.
+    ``default``, here and below, is the number of rollouts that a gradient counts as if no times were measured.
     """
     lines = []
     for problem, method, part in runs.by_method():
@@ -242,10 +243,10 @@ def restart_runtimes(runs: RunSet, default: float) -> dict[str, np.ndarray]:
 
 @remember
 def summarise(runs: RunSet, default: float, baseline: str = "fobg") -> pd.DataFrame:
-    """Return, per method, the interquartile mean score, the chance to beat the baseline, and the performance profile.
+    """Return, per method, the interquartile mean score, the probability to beat the baseline, and the performance profile.
 
-    The score's interval is a bootstrap stratified by problem. ``improvement``, with Wilson's interval, compares final
-    costs with those of the first method whose estimator is ``baseline``, paired by problem and seed.
+    The score's interval is a bootstrap stratified by problem. ``improvement``, with Wilson's interval, is the
+    probability of a lower final cost than the first method whose estimator is ``baseline``, paired by problem and seed.
     """
     reached = times_to_targets(runs, default)
     fastest = reached.groupby(["problem", "target"])["art"].transform("min") if len(reached) else None
@@ -275,7 +276,7 @@ def _pooled_score(strata: Sequence[np.ndarray]) -> float:
 
 
 def _improvement(runs: RunSet, method: str, base: str | None) -> tuple[float, float, float]:
-    """Return the chance that a method's final cost is below the baseline's, with its interval; NaN without pairs."""
+    """Return the probability that a method's final cost is below the baseline's, with its interval; NaN without pairs."""
     if base is None or method == base:
         return math.nan, math.nan, math.nan
     final = runs.best_runs
@@ -286,13 +287,16 @@ def _improvement(runs: RunSet, method: str, base: str | None) -> tuple[float, fl
     if not strata:
         return math.nan, math.nan, math.nan
     share = float(np.mean([performance.improvement(part[:, 0], part[:, 1]) for part in strata]))
-    # with few pairs that all agree a bootstrap interval would be a point, Wilson's stays wide
+    # if few pairs all agree, a bootstrap interval would be a single point; Wilson's is not
     return share, *performance.wilson(round(share * len(both)), len(both))
 
 
 @remember
 def quality_and_runtime(runs: RunSet, default: float, factor: float = TARGETS[0]) -> pd.DataFrame:
-    """Return, per problem and method with an estimator, the gradient's quality at the start and the runtime to a target."""
+    """Return, per problem and method with an estimator, the gradient's quality at the start and the runtime to a target.
+
+    ``art`` is the average runtime, in rollouts, until the regret is the first regret / ``factor``.
+    """
     lines = []
     for problem, method, part in runs.by_method():
         first = part.iloc[0]
@@ -311,8 +315,8 @@ def quality_and_runtime(runs: RunSet, default: float, factor: float = TARGETS[0]
 def rank_correlations(points: pd.DataFrame) -> pd.DataFrame:
     """Return Spearman's rho of gradient error against runtime, by class of scene.
 
-    Costs vary between problems, so errors and runtimes are ranked within each problem, and ranks scaled to 0..1. With a
-    positive rho the smaller error reaches the target sooner.
+    Costs vary between problems, so errors and runtimes are ranked within each problem, and the ranks are scaled to
+    0..1. A positive rho means that gradients with smaller errors reach the target sooner.
     """
     lines = []
     if points.empty:
@@ -334,10 +338,10 @@ def rank_correlations(points: pd.DataFrame) -> pd.DataFrame:
 
 
 def path_quality(runs: RunSet) -> pd.DataFrame:
-    """Return median, 20% and 80% quantile over seeds of the gradient's relative error and cosine along the path.
+    """Return the median, 20% and 80% quantile over seeds of the gradient's relative error and cosine along the path.
 
-    There is one line per problem, method, quantity and point of the path, and none where quality was measured only at
-    the start.
+    There is one line per problem, method, quantity and point of the path, and none if quality was measured only at the
+    start.
     """
     lines: list[tuple[Any, ...]] = []
     for problem, method, part in runs.by_method():

@@ -1,4 +1,4 @@
-"""Runs searches that differ by seed only together, so that each batch of rollouts serves all of them."""
+"""Runs searches that differ only in their seed together, in shared batches of rollouts."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Outcome = dict[str, Any] | BaseException
 
 @dataclasses.dataclass
 class Request:
-    """A call that a search waits for, or the outcome of a search that has ended."""
+    """A function call that a search waits for, or the outcome of a search that has ended."""
 
     function: str = ""
     theta: np.ndarray = dataclasses.field(default_factory=lambda: np.empty((0, 0)))
@@ -42,10 +42,10 @@ class Request:
 
 
 class Lane(Problem):
-    """The problem as one of several searches sees it: calls wait until every search has made one, then run as one batch.
+    """A problem shared by several searches: each call waits until every search has made one, then all run as one batch.
 
-    Each search has a thread of its own, but only one runs at a time and always in the same order, so that results do
-    not depend on scheduling. Trajectories and step Jacobians are computed per lane.
+    Each search has its own thread and its own lane. Only one thread runs at a time, always in the same order, so that
+    results do not depend on scheduling. Trajectories and step Jacobians are computed per lane, not in batches.
     """
 
     def __init__(self, inner: Problem, search: Callable[[Problem], dict[str, Any]]) -> None:
@@ -57,19 +57,19 @@ class Lane(Problem):
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def start(self) -> Request:
-        """Run the search to its first call."""
+        """Start the search and return its first request."""
         self._thread.start()
         return self._requests.get()
 
     def resume(self, answer: np.ndarray | BaseException) -> Request:
-        """Answer the search's call and run it to its next call or its end."""
+        """Answer the search's request; return its next request, or its outcome at its end."""
         self._answers.put(answer)
         return self._requests.get()
 
     def _run(self) -> None:
         try:
             outcome: Outcome = self._search(self)
-        except BaseException as error:  # belongs to this seed's row
+        except BaseException as error:  # reported in this seed's row
             outcome = error
         self._requests.put(Request(outcome=outcome))
 
@@ -82,21 +82,21 @@ class Lane(Problem):
         return answer
 
     def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return costs, ``(B,)``."""
+        """Return costs ``(B,)``."""
         self.usage.rollouts += w.shape[1]
         return self._call("value", theta, w)
 
     def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return per-sample gradients, ``(d, B)``."""
+        """Return per-sample gradients ``(d, B)``."""
         self.usage.gradients += w.shape[1]
         return self._call("grad", theta, w)
 
     def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return per-sample scores, ``(d, B)``."""
+        """Return per-sample scores ``(d, B)``."""
         return self._call("score", theta, w)
 
     def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return per-sample derivatives by theta along every path but the actions, ``(d, B)``."""
+        """Return per-sample derivatives ``(d, B)`` by theta along every path except the actions."""
         if self.program.explicit:
             self.usage.gradients += w.shape[1]
         return self._call("explicit", theta, w)
@@ -115,8 +115,7 @@ class Lane(Problem):
 def run_batched(problem: Problem, searches: Sequence[Callable[[Problem], dict[str, Any]]]) -> list[Outcome]:
     """Run searches in lockstep and return their outcomes in order.
 
-    A round makes one call of the problem per requested function. Searches with the same optimizer need one round per
-    call.
+    Each round calls the problem once per requested function. Searches with the same optimizer need one round per call.
     """
     lanes = [Lane(problem, search) for search in searches]
     requests = {lane: lane.start() for lane in lanes}
@@ -125,13 +124,13 @@ def run_batched(problem: Problem, searches: Sequence[Callable[[Problem], dict[st
             group = [lane for lane in waiting if requests[lane].function == function]
             for lane, answer in zip(group, _evaluate(problem, [requests[lane] for lane in group]), strict=True):
                 requests[lane] = lane.resume(answer)
-            # a resumed search may request the same function again: that call waits for the next round
+            # a resumed search may request the same function again: that request waits for the next round
             waiting = [lane for lane in waiting if lane not in group]
     return [requests[lane].outcome or {} for lane in lanes]
 
 
 def _evaluate(problem: Problem, requests: list[Request]) -> list[np.ndarray | BaseException]:
-    """Return the answers to requests of one function, from one call, or from one call each if that fails."""
+    """Return the answers to requests of one function, from one shared call, or from one call per request if that fails."""
     function = getattr(problem, requests[0].function)
     widths = [request.w.shape[1] for request in requests]
     try:
@@ -151,24 +150,24 @@ def _evaluate(problem: Problem, requests: list[Request]) -> list[np.ndarray | Ba
 
 @dataclasses.dataclass(frozen=True)
 class LaneSession:
-    """A session for :func:`run_search` whose problem is a lane."""
+    """A session for :func:`~.search.run_search` whose problem is a lane."""
 
     experiment: Experiment
     lane: Problem
 
     def problem(self, cell: Cell) -> Problem:
-        """Return the lane."""
+        """Return the lane as the problem of any cell."""
         return self.lane
 
 
 _outcomes: WeakKeyDictionary[Session, dict[str, Outcome]] = WeakKeyDictionary()
-"""By session and key, outcomes of searches whose cells are measured later."""
+"""Outcomes of searches whose cells are measured later, by session and cell key."""
 _groups: WeakKeyDictionary[Session, dict[str, list[Cell]]] = WeakKeyDictionary()
-"""By session and key without the seed, the cells that differ by seed only."""
+"""Cells that differ only in their seed, by session and by their key with seed 0."""
 
 
 def measure_batched(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
-    """Return the columns of a cell, and store those of later cells that differ by seed only until they are measured."""
+    """Return one cell's results by column; cache the results of later cells that differ only in their seed."""
     outcomes = _outcomes.setdefault(session, {})
     if cell.key not in outcomes:
         outcomes |= _run_group(_seed_group(cell, session), session, settings)
@@ -179,7 +178,7 @@ def measure_batched(cell: Cell, session: Session, settings: Settings) -> dict[st
 
 
 def _seed_group(cell: Cell, session: Session) -> list[Cell]:
-    """Return the cell and the cells planned after it that differ by seed only."""
+    """Return the cell and the later cells of the experiment that differ from it only in their seed."""
     if session not in _groups:
         groups: dict[str, list[Cell]] = {}
         for other in cells(session.experiment):
@@ -206,7 +205,7 @@ def _run_group(group: list[Cell], session: Session, settings: Settings) -> dict[
 
 
 def _fill_caches(cell: Cell, problem: Problem, session: Session, settings: Settings) -> None:
-    """Compute cached values that do not depend on the seed. An error is ignored, since it recurs in each search."""
+    """Compute the cached values that do not depend on the seed. Ignore errors, because each search raises them again."""
     try:
         known_optimum(cell, problem, session, settings)
         scene_class(cell, problem)

@@ -1,4 +1,4 @@
-"""Findings of the searches as sentences, with their intervals, and titles of the charts."""
+"""Formats the findings of the searches as sentences with intervals, and the titles of the charts."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from bench.studies.optimise import aggregate
 from bench.studies.optimise.aggregate import RunSet
 
 CHANCE = 0.05
-"""Chance of an order among random orders above which it counts as random."""
+"""An order counts as random if a random order is at least as good with more than this probability."""
 FEW_SEEDS = 5
-"""Fewest searches for a bootstrap interval. With two, half of the resamples are one search twice."""
+"""Fewest searches per problem for a bootstrap interval. With two, half of the resamples are one search twice."""
 
 
 def sentences(runs: RunSet, default: float) -> list[str]:
@@ -33,7 +33,7 @@ def sentences(runs: RunSet, default: float) -> list[str]:
 
 
 def effect_of_error(rho: pd.DataFrame) -> str:
-    """Write for each class of scenes whether the smaller gradient error reaches the target sooner."""
+    """Format for each class of scenes whether the gradient with the smaller error reaches the target sooner."""
     if rho.empty:
         return "Whether a better gradient pays is not known: no gradient's quality was measured."
     parts = []
@@ -56,7 +56,7 @@ def effect_of_error(rho: pd.DataFrame) -> str:
 
 
 def effect_title(rho: pd.DataFrame) -> str:
-    """Write the title of quality against runtime: the classes of scenes where the smaller error is sooner or later."""
+    """Return the title of quality against runtime: the classes where the better gradient is sooner or later."""
     classes = rho[rho["scene_class"] != "all"].to_dict("records")
     known = [row for row in classes if row["points"] >= 4 and row["chance"] <= CHANCE]
     sure = {
@@ -75,19 +75,19 @@ def effect_title(rho: pd.DataFrame) -> str:
 
 
 def score_title(summary: pd.DataFrame) -> str:
-    """Write the title of the paths: the method with the best score, and the best one that uses gradients."""
+    """Return the title of the paths: the method with the best score, and the best method that uses gradients."""
     known = summary[summary["score"].notna()].sort_values("score", ascending=False)
     return _best("Best score", [(row["method"], number(row["score"], 3)) for row in known.to_dict("records")])
 
 
 def targets_title(shares: Mapping[str, float]) -> str:
-    """Write the title of targets reached: the method with the largest share, and the best one that uses gradients."""
+    """Return the title of targets reached: the method with the largest share, and the best method that uses gradients."""
     order = sorted(shares.items(), key=lambda item: -item[1])
     return _best("Most targets reached", [(name, f"{share:.0%}") for name, share in order])
 
 
 def _best(heading: str, order: Sequence[tuple[str, str]]) -> str:
-    """Write the methods that share the first figure and, if none of them uses gradients, the first one that does."""
+    """Format the methods tied for first and, if none of them uses gradients, the first method that does."""
     if not order:
         return "No method has a score"
     figure = order[0][1]
@@ -100,7 +100,7 @@ def _best(heading: str, order: Sequence[tuple[str, str]]) -> str:
 
 
 def tuning_title(lines: pd.DataFrame) -> str:
-    """Write the title of scores by tuning: the method and problem whose score changes most."""
+    """Return the title of scores by tuning: the method and problem whose score changes most."""
     spread = lines.groupby(["method", "problem"], sort=False)["score"].agg(["min", "max"])
     far = (spread["max"] - spread["min"]).sort_values(ascending=False)
     method, problem = far.index[0]
@@ -110,7 +110,7 @@ def tuning_title(lines: pd.DataFrame) -> str:
 
 
 def ranking(summary: pd.DataFrame) -> str:
-    """Write which method has the best score, and which methods cannot be distinguished from it."""
+    """Format which method has the best score, and which methods are not distinguishable from it; empty without scores."""
     known = summary[summary["score"].notna()].sort_values("score", ascending=False)
     if known.empty:
         return ""
@@ -125,7 +125,7 @@ def ranking(summary: pd.DataFrame) -> str:
 
 
 def tuning(summary: pd.DataFrame) -> str:
-    """Write by how much tuning alone changes a score, next to the range of the methods' best scores."""
+    """Format the largest change of a score by tuning only, and the range of the methods' best scores."""
     tuned = summary[(summary["tunings"] > 1) & summary["score"].notna()]
     if tuned.empty:
         return "Nothing was tuned: a comparison at one learning rate compares rates as much as gradients."
@@ -139,7 +139,7 @@ def tuning(summary: pd.DataFrame) -> str:
 
 
 def divergence(runs: RunSet) -> str:
-    """Write how many searches diverged, by method."""
+    """Format how many searches diverged, by method."""
     diverged = runs.rows[runs.rows["stopped"] == "diverged"]
     if diverged.empty:
         return "No search diverged."

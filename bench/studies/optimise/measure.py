@@ -1,4 +1,4 @@
-"""Measures one cell: by a search of its own where it is timed, else together with the cells that differ by seed only."""
+"""Measures one cell: by a separate search if it is timed, else together with the cells that differ only in their seed."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ from bench.studies.optimise.search import Settings, run_search
 
 
 def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
-    """Return the columns of one cell; untimed cells that differ by seed only share batches of rollouts."""
+    """Return one cell's results by column. Untimed cells that differ only in their seed share batches of rollouts."""
     return run_search(cell, session, settings) if cell.timing else measure_batched(cell, session, settings)

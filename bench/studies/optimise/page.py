@@ -1,4 +1,4 @@
-"""The page of searches: quality against runtime first, then the paths, the times to targets and the learning rates."""
+"""Builds the page of searches: quality against runtime, regret along the paths, and scores by learning rate."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CLASS_COLOURS = dict(
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the findings, the charts and the table of searches."""
+    """Return the content of the page: the findings, the charts and the table of searches."""
     runs, default = aggregate.collect_runs(experiment, rows), default_ratio(experiment)
     if not len(runs.rows):
         return Content(no_result_sentence(rows), rows, [*identity_columns(rows), *STATUS], [])
@@ -85,7 +85,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
 
 
 def _looks(runs: aggregate.RunSet) -> dict[str, dict[str, Any]]:
-    """Return the figures' styles in the page's terms; methods that use costs only are dashed."""
+    """Return the look of each method, with the figures' colours and markers; methods that use only costs are dashed."""
     return {
         name: look(style["color"], SYMBOLS[style["marker"]], "solid" if ", " in name else "dash")
         for name, style in looks(runs.methods).items()

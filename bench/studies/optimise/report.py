@@ -1,4 +1,4 @@
-"""Writes searches as tables and charts: quality against runtime, regret along the paths, targets, learning rates."""
+"""Writes the tables and charts of searches: quality against runtime, regret along the paths, targets, learning rates."""
 
 from __future__ import annotations
 
@@ -48,29 +48,29 @@ NOTES = (
 ACROSS = 4
 """Most panels side by side."""
 TITLE = 1.6
-"""Inches of a line of a panel's title."""
+"""Widest line of a panel's title in inches."""
 CONTEXT = tuple(zip(("#000000", "#8c8c8c", "#4d4d4d", "#b3b3b3"), (*VARIANTS[1:], *DEVIANT[:2]), strict=True))
-"""Greys and dashes of methods that use costs only."""
+"""Grey and line style of each method that uses only costs."""
 STEPS = 80
-"""Points of a drawn curve, which has five markers."""
+"""Number of points of a drawn curve."""
 DEPTH = 1e-7
-"""Share of the largest regret below which none is drawn: regret is 0 where J* is the lowest cost of any search."""
+"""Smallest regret that is drawn, as a share of the largest. Regret is 0 where J* is the lowest cost of any search."""
 
 
 def notes(runs: RunSet) -> list[str]:
-    """Return explanations of the columns, with the seeds that chose the tunings."""
+    """Return explanations of the tables' columns, with the seeds that chose the tunings."""
     chosen = runs.tuning_seeds
     seeds = f"seeds {', '.join(map(str, chosen))}, which do not score" if chosen else "the same seeds that score"
     return [text.format(seeds=seeds) for text in NOTES]
 
 
 def default_ratio(experiment: Experiment) -> float:
-    """Return the rollouts that a gradient counts as where no times were measured."""
+    """Return the number of rollouts that a gradient counts as if no times were measured."""
     return float(getattr(experiment.study, "gradient_cost", 4.0))
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``optimise`` (.csv, .md), ``targets.csv`` and ``summary.csv``, and the charts."""
+    """Write ``optimise`` (.csv, .md), ``targets.csv``, ``summary.csv`` and the charts; return the files' paths."""
     runs, default = aggregate.collect_runs(experiment, rows), default_ratio(experiment)
     if not len(runs.rows):
         return write_tables(experiment, rows, "optimise", [f"# {experiment.name}", "No search gave a result."])
@@ -98,7 +98,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 
 def methods(summary: pd.DataFrame) -> pd.DataFrame:
-    """Return the summary as a table of texts, the best score first."""
+    """Return the summary formatted as strings, the best score first."""
     lines = []
     for row in summary.sort_values("score", ascending=False).to_dict("records"):
         lines.append({
@@ -110,7 +110,7 @@ def methods(summary: pd.DataFrame) -> pd.DataFrame:
 
 
 def success_table(reached: pd.DataFrame) -> pd.DataFrame:
-    """Return the times to targets as a table of texts."""
+    """Return the times to targets formatted as strings."""
     lines = []
     for row in reached.to_dict("records"):
         rate = f"{row['successes']}/{row['searches']} [{number(row['rate_low'])}, {number(row['rate_high'])}]"
@@ -122,7 +122,7 @@ def success_table(reached: pd.DataFrame) -> pd.DataFrame:
 
 
 def optima(runs: RunSet) -> pd.DataFrame:
-    """Return J* of each problem and its source, as a table of texts."""
+    """Return each problem's class, first cost, J* and the source of J*, formatted as strings."""
     first = runs.rows.drop_duplicates("problem")
     return pd.DataFrame({
         "problem": first["problem"], "class": first["scene_class"], "J0": first["start_cost"].map(lambda x: f"{x:.6g}"),
@@ -131,7 +131,7 @@ def optima(runs: RunSet) -> pd.DataFrame:
 
 
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
-    """Print the findings, the methods, and the reasons of searches without a result."""
+    """Print the methods, the times to targets, the lowest costs, the findings, and the reasons of failed searches."""
     console = open_console(experiment, rows)
     runs, default = aggregate.collect_runs(experiment, rows), default_ratio(experiment)
     if len(runs.rows):
@@ -147,9 +147,9 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
 
 
 def looks(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return each method's colour and marker, which are its estimator's, and line style.
+    """Return each method's line style, with the colour and marker of its estimator.
 
-    Methods that use costs only are grey and dashed.
+    Methods that use only costs are grey and dashed.
     """
     styles: dict[str, dict[str, Any]] = {}
     uses: Counter[str] = Counter()
@@ -178,7 +178,7 @@ def _legend(drawn: Figure, names: dict[str, dict[str, Any]], extra: tuple[Any, .
 
 
 def quality_figure(runs: RunSet, default: float) -> Figure | None:
-    """Draw the runtime to a tenth of the first regret against the gradient's error, a panel per class of scenes."""
+    """Draw runtime to a tenth of the first regret against the gradient's error, a panel per class; None without data."""
     points = aggregate.quality_and_runtime(runs, default)
     if points.empty:
         return None
@@ -192,7 +192,7 @@ def quality_figure(runs: RunSet, default: float) -> Figure | None:
     for panel, (name, part) in zip(panels, groups, strict=True):
         reached = part[np.isfinite(part["art"])]
         missed = part[~np.isfinite(part["art"])]
-        # a search that never reaches the target is a hollow marker at the upper edge
+        # a method that never reaches the target is a hollow marker at the upper edge
         top = 3.0 * max([*reached["art"], *missed["most"], 1.0])
         for row in part.to_dict("records"):
             style = {**styles[row["method"]], "marker": marks[row["mark"]], "linestyle": "none"}
@@ -228,7 +228,7 @@ def quality_figure(runs: RunSet, default: float) -> Figure | None:
 def path_figure(runs: RunSet, default: float) -> Figure | None:
     """Draw the gradient's relative error and cosine along the path: median and 20% to 80% of seeds.
 
-    Returns None where quality was measured only at the start.
+    Returns None if quality was measured only at the start.
     """
     lines = aggregate.path_quality(runs)
     if lines.empty:
@@ -262,7 +262,7 @@ def path_figure(runs: RunSet, default: float) -> Figure | None:
 
 
 def anytime_figure(runs: RunSet, default: float) -> Figure:
-    """Draw regret against rollouts, and against seconds where they were measured: median and 20% to 80% of seeds."""
+    """Draw regret against rollouts, and against time [s] if it was measured: median and 20% to 80% of seeds."""
     units = ("rollouts", "seconds") if runs.rows["search_s"].notna().any() else ("rollouts",)
     names, styles = runs.problems, looks(runs.methods)
     across = columns(len(names), ACROSS)
@@ -302,17 +302,17 @@ def anytime_figure(runs: RunSet, default: float) -> Figure:
 
 
 def _scene(problem: str) -> str:
-    """Return the scene's bare name, for charts of more problems than there are markers."""
+    """Return the name of a problem's scene, without parameters."""
     return problem.partition(",")[0].partition("[")[0]
 
 
 def _wrapped(name: str) -> str:
-    """Break a name at its commas, into lines that fit a panel."""
+    """Break a problem's name at its commas into lines that fit a panel."""
     return wrapped(plain(name).split(", "), TITLE)
 
 
 def short(status: str) -> str:
-    """Return the source of J* in a few words."""
+    """Return the source of J*, truncated at its first comma if it is longer than 34 characters."""
     return status.partition(",")[0] if len(status) > 34 else status
 
 
@@ -329,7 +329,7 @@ def _draw_curve(panel: Axes, rows: pd.DataFrame, places: list[np.ndarray], style
 
 
 def targets_figure(runs: RunSet, default: float) -> Figure:
-    """Draw the share of targets reached, over problems, targets and restarts, against rollouts."""
+    """Draw the share of targets reached against rollouts, over all problems, targets and simulated restarts."""
     styles, times = looks(runs.methods), aggregate.restart_runtimes(runs, default)
     title = findings.targets_title({name: float(np.isfinite(t).mean()) for name, t in times.items()})
     drawn, (panel,) = panel_grid(1, 1, 2.6, title)
@@ -349,7 +349,7 @@ def targets_figure(runs: RunSet, default: float) -> Figure:
 
 
 def rates_figure(runs: RunSet, default: float) -> Figure | None:
-    """Draw the score against each tuned parameter, a panel per problem. Returns None where nothing is tuned."""
+    """Draw the score against each tuned parameter, a panel per problem; None if nothing was tuned."""
     lines = aggregate.scores_by_tuning(runs)
     lines = lines[lines.groupby(["problem", "method", "axis"])["value"].transform("nunique") > 1]
     if lines.empty:

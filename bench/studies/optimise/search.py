@@ -1,4 +1,4 @@
-"""One search: an optimizer chooses points, problem and estimator evaluate them, and the objective scores the path."""
+"""Runs one search: an optimizer chooses points, problem and estimator evaluate them, and the objective scores its path."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from bench.model.program import OWN
 from bench.run.files import make_directory, write_whole
 
 MAX_POINTS = 300
-"""Most points of a path that are stored, closer together in early iterations."""
+"""Most points of a path to store, about; they are denser in early iterations."""
 MAX_NEWTON_DIM = 1000
-"""Longest theta whose optimum is computed by Newton's method."""
+"""Largest dimension of theta for which Newton's method computes the optimum."""
 
 Settings = Any
-"""An ``Optimise`` study, whose parameters are the settings. Its module imports this one, so its type is not named."""
+"""An ``Optimise`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
 
 
 class ScaledNoiseProblem(Problem):
@@ -48,7 +48,7 @@ class ScaledNoiseProblem(Problem):
         return self._inner.grad(theta, self._factor * w)
 
     def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return scores ``(d, B)`` of the scaled noise: linear in w, divided by the factor squared."""
+        """Return scores ``(d, B)`` under the scaled noise. They are linear in w and inverse to the noise's variance."""
         return self._inner.score(theta, self._factor * w) / self._factor**2
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
@@ -64,7 +64,7 @@ class ScaledNoiseProblem(Problem):
 
 @dataclass
 class SearchPath:
-    """The record of a search: one entry per iteration in each list."""
+    """The path of a search. Each list has one entry per iteration: cost, and counts and time [s] up to that iteration."""
 
     iteration: list[int] = field(default_factory=list)
     cost: list[float] = field(default_factory=list)
@@ -73,7 +73,7 @@ class SearchPath:
     seconds: list[float] = field(default_factory=list)
 
     def stored_indices(self) -> np.ndarray:
-        """Return the indices of at most about 300 entries to store: log-spaced, with the last and the lowest cost."""
+        """Return the indices of about :data:`MAX_POINTS` entries to store: log-spaced, with the last and lowest cost."""
         count = len(self.iteration)
         if count <= MAX_POINTS:
             return np.arange(count)
@@ -82,7 +82,7 @@ class SearchPath:
 
 
 class OptimizerRun:
-    """One search on one problem, iteration by iteration."""
+    """One search on one problem: computes single iterations, and the objective at a point."""
 
     def __init__(self, cell: Cell, problem: Problem, settings: Settings) -> None:
         self.cell, self.problem, self.settings = cell, problem, settings
@@ -96,14 +96,14 @@ class OptimizerRun:
         self._scored = self._still if settings.scored == "plain" else drawn
 
     def objective(self, theta: np.ndarray) -> float:
-        """Return the objective at ``theta (d,)``, on noise that no iteration uses; its rollouts are not counted."""
+        """Return the objective at ``theta (d,)``, with noise that no iteration uses. Its rollouts are not counted."""
         before = self.problem.usage.rollouts
         cost = float(self.problem.value(theta, self._scored).mean())
         self.problem.usage.rollouts = before
         return cost
 
     def step(self, state: dict[str, Any], iteration: int) -> dict[str, Any]:
-        """Return the optimizer's state after iteration number ``iteration``, counted from 1."""
+        """Return the optimizer's state after one more iteration, whose number is ``iteration``, from 1."""
         dim = self.problem.dim
         normal = noise.draw(
             self.cell.seed, self.cell.scene.name, 1, self.optimizer.draws(dim), dim, f"optimise: points {iteration}"
@@ -121,7 +121,7 @@ class OptimizerRun:
         )
 
     def _values(self, points: np.ndarray, iteration: int) -> np.ndarray:
-        """Return the costs of points ``(d, B)``: at w = 0, or the means over samples of a smoothed objective."""
+        """Return the costs ``(B,)`` of points ``(d, B)``: at w = 0, or means over samples for a smoothed objective."""
         count = points.shape[1]
         if self.settings.scored == "plain":
             return self.problem.value(points, np.repeat(self._still, count, axis=1))
@@ -140,7 +140,7 @@ class OptimizerRun:
 
 
 def run_search(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
-    """Search until the budget, the target, a plateau or divergence; return the columns of the cell."""
+    """Search until the budget, the target, a plateau or divergence; return the cell's results by column."""
     problem = session.problem(cell)
     optimum, how = known_optimum(cell, problem, session, settings)
     search = OptimizerRun(cell, problem, settings)
@@ -188,14 +188,14 @@ def run_search(cell: Cell, session: Session, settings: Settings) -> dict[str, An
 
 
 QUALITY_SHARES = (0.25, 0.5, 0.75, 1.0)
-"""Points of a path, as shares of its iterations, at which the gradient's quality is measured besides the start."""
+"""Shares of a path's iterations at which the gradient's quality is measured, in addition to the start."""
 PATH_COLUMNS = ("iteration", "cost", "rollouts", "gradients")
 
 
 def follow_path(
     search: OptimizerRun, state: dict[str, Any], settings: Settings
 ) -> tuple[SearchPath, str, list[np.ndarray]]:
-    """Iterate until a stopping rule applies; return the path, the name of the rule, and theta at each point."""
+    """Iterate until a stopping rule applies; return the path, the name of the rule, and theta ``(d,)`` at each point."""
     problem, path, thetas = search.problem, SearchPath(), []
     problem.usage.rollouts = problem.usage.gradients = 0
     spent_s, best, waited, stopped = 0.0, np.inf, 0, ""
@@ -231,7 +231,7 @@ def follow_path(
 
 
 def known_optimum(cell: Cell, problem: Problem, session: Session, settings: Settings) -> tuple[float, str]:
-    """Return J* and its source: the scene, Newton's method (once, then from a file), or NaN if it is unknown."""
+    """Return J* and its source: the scene, or Newton's method, whose result is stored in a file; NaN if unknown."""
     if settings.scored != "plain":
         return np.nan, "unknown: the objective is smoothed"
     if isinstance(cell.scene, KnownOptimum) and cell.decision == OWN:
@@ -260,9 +260,10 @@ _classes: dict[str, str] = {}
 
 
 def scene_class(cell: Cell, problem: Problem) -> str:
-    """Return the class of a problem by what makes its gradients difficult.
+    """Return the class of a problem, by the reason that its gradients are difficult.
 
-    A problem whose gradients vary more than its zeroth-order terms is chaotic with dynamics, stiff without.
+    A problem without contacts whose gradients vary more than its zeroth-order terms is chaotic if it has time steps,
+    else stiff.
     """
     program = problem.program
     if cell.decision.names or cell.scene.identifies:
@@ -287,7 +288,7 @@ _ratios: dict[tuple[str, str], float] = {}
 
 
 def gradient_ratio(problem: Problem, cell: Cell, calls: int = 5) -> float:
-    """Return the time of a batch of gradients over that of a batch of costs, each the fastest of a few calls."""
+    """Return the time of a batch of gradients over the time of a batch of costs, each the fastest of ``calls`` calls."""
     key = (cell.program_key, cell.backend.name)
     if key not in _ratios:
         theta, w = problem.program.theta0, noise.draw(0, "ratio", 1, 128, problem.program.n_noise, "optimise: ratio")
@@ -307,7 +308,7 @@ def gradient_ratio(problem: Problem, cell: Cell, calls: int = 5) -> float:
 # ---------------------------------------------------------------------------------------------- gradient quality
 
 MAX_REFERENCE_SHARE = 0.5
-"""Largest share of a measured squared error that may come from the reference itself."""
+"""Largest share of a measured squared error that the reference's own error may cause."""
 
 _qualities: dict[tuple[Any, ...], dict[str, float]] = {}
 
@@ -315,8 +316,8 @@ _qualities: dict[tuple[Any, ...], dict[str, float]] = {}
 def gradient_quality(search: OptimizerRun, theta: np.ndarray, settings: Settings) -> dict[str, float] | None:
     """Return relative error, cosine and share of bias of the estimator's gradients at ``theta (d,)``.
 
-    None without an estimator. The reference is the mean of many gradients or zeroth-order terms, whichever vary less,
-    and zeroth-order terms where the cost jumps.
+    Returns None without an estimator. The reference is the mean of many gradients or of many zeroth-order terms,
+    whichever vary less. Where the cost jumps or the backend has no gradients, it is the mean of zeroth-order terms.
     """
     cell, problem, estimator = search.cell, search.problem, search.estimator
     if estimator is None:
@@ -339,10 +340,10 @@ def gradient_quality(search: OptimizerRun, theta: np.ndarray, settings: Settings
 
 
 def compare_with_reference(estimates: np.ndarray, terms: np.ndarray) -> dict[str, float]:
-    """Compare estimates ``(R, d)`` with the mean of reference terms ``(d, M)``.
+    """Return relative RMSE, mean cosine and share of bias of estimates ``(R, d)`` against the mean of terms ``(d, M)``.
 
-    The noise of the reference and of the mean estimate is subtracted from the bias. All values are NaN where the
-    reference is too uncertain: its squared error exceeds :data:`MAX_REFERENCE_SHARE` of the measured one.
+    The noise of the reference and of the mean estimate is subtracted from the bias. All values are NaN if the reference
+    is too uncertain: its squared error exceeds :data:`MAX_REFERENCE_SHARE` of the measured squared error.
     """
     truth = terms.mean(axis=1)
     reference_error = float(terms.var(axis=1, ddof=1).sum()) / terms.shape[1]

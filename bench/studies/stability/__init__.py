@@ -1,4 +1,4 @@
-"""Where a gradient is right, wrong or lost, over step size and stiffness: the stability map."""
+"""The stability map: where a gradient is right, wrong or lost, over step size and stiffness."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Stability(Study):
     finer: int = param(4, "fewest steps of the refined truth to one of the cell's", positive=True)
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return the verdict on one cell."""
+        """Return one cell's results by column: the verdict on its gradient, its errors and their cause."""
         from bench.studies.stability.measure import StabilityLimits, measure
 
         limits = StabilityLimits(self.diverged, self.grown, self.inaccurate, self.fine_steps, self.finer)
@@ -81,7 +81,7 @@ class Stability(Study):
         report.show(experiment, rows)
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the finding, its table and the charts."""
+        """Return the page: the finding, the shares of right gradients and the maps."""
         from bench.studies.stability.page import content
 
         return content(experiment, rows)

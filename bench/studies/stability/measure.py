@@ -1,9 +1,9 @@
-"""Where a gradient is right, wrong or lost, over step size and stiffness: the stability map.
+"""Measures whether a cell's gradient is right, wrong or lost, for the stability map over step size and stiffness.
 
 Each cell simulates one rollout without noise and compares its gradient with the truth for the same duration. The truth
-is the scene's physical gradient or, where it has none, the gradient of the same program at a much finer step.
-Estimators play no part: the gradient is the backend's own at w = 0. Where the motion is linear the growth of the state
-is measured as well, so that an instability too slow to show within the rollout is still seen.
+is the scene's physical gradient or, where it has none, the gradient of the same program at a much finer step. No
+estimator is used: the gradient is the backend's at w = 0. Where the motion is linear, the growth of the state is
+measured too, which detects instabilities that are too slow to show within the rollout.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from bench.model import (
 )
 
 NEGLIGIBLE = 1e-9
-"""Share of the truth's norm below which one of its components counts as 0."""
+"""Share of the truth's norm up to which one of its components counts as 0."""
 NEUTRAL = 1 + 1e-9
-"""Spectral radius up to which a step counts as stable, in theory and as measured: 1 and rounding."""
+"""Spectral radius, theoretical or measured, up to which a step counts as stable: 1 plus rounding."""
 REACH = np.logspace(-3, 4, 141)
 """Values of dt^2 stiffness that the search for the stability limit tries."""
 
 
 @dataclass(frozen=True)
 class StabilityLimits:
-    """Limits at which a rollout counts as diverged and a gradient as wrong, and steps of the truth: see the parameters."""
+    """Limits for diverged rollouts and wrong gradients, and steps of the refined truth: parameters of ``Stability``."""
 
     diverged: float
     grown: float
@@ -53,7 +53,10 @@ class StabilityLimits:
 
 
 def measure(cell: Cell, session: Session, limits: StabilityLimits) -> dict[str, Any]:
-    """Return the verdict on one cell; raises :class:`Unsupported` without time steps, step states or a truth."""
+    """Return one cell's results by column, verdict included.
+
+    Raises :class:`Unsupported` if the program has no time steps, step states or truth.
+    """
     program = rollout(cell.program())
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows becomes a status
         return _measured(cell, program, session, limits)
@@ -91,10 +94,10 @@ def _measured(cell: Cell, program: Rollout, session: Session, limits: StabilityL
 def first_bad_step(
     states: np.ndarray, largest: np.ndarray, growth: float, limits: StabilityLimits
 ) -> tuple[int, str, str] | None:
-    """Return the first bad step of ``states (T + 1, n)``, ``diverged`` or ``nonfinite``, and a description, or None.
+    """Return the first bad step of ``states (T + 1, n)`` with its verdict and a description, or None without a bad step.
 
-    A step is bad when a component exceeds its ``largest`` value ``(n,)``, or when growth by the factor ``growth`` per
-    step has reached ``limits.grown``, whichever is first.
+    A step is bad if a component exceeds its ``largest`` value ``(n,)``, or if growth by the factor ``growth`` per step
+    has reached ``limits.grown``. The verdict is ``diverged`` or ``nonfinite``.
     """
     steps = len(states)
     outside = ~(np.abs(states) <= largest).all(axis=1)
@@ -112,10 +115,10 @@ def first_bad_step(
 
 
 def growth_factor(states: np.ndarray) -> float:
-    """Return the growth per step of ``states (T + 1, n)`` that follow one linear map: its spectral radius.
+    """Return the growth factor per step of ``states (T + 1, n)`` with linear dynamics; NaN for fewer than three states.
 
-    The map is fitted to all pairs of neighbouring states by least squares, each pair scaled to the size of its first
-    state (dynamic mode decomposition; Schmid 2010).
+    It is the spectral radius of the linear map fitted by least squares to all pairs of consecutive states, each pair
+    scaled to the size of its first state (dynamic mode decomposition; Schmid 2010).
     """
     finite = np.isfinite(states).all(axis=1)
     count = len(states) if finite.all() else int(np.argmin(finite))
@@ -130,10 +133,11 @@ def growth_factor(states: np.ndarray) -> float:
 
 
 def bounds(program: Rollout, trajectory: Trajectory, factor: float) -> np.ndarray:
-    """Return ``factor`` times the initial scale of each component, ``(n,)``.
+    """Return the largest allowed value of each state component, ``(n,)``: ``factor`` times its initial scale.
 
-    The scale of positions is the distance |q_0| + T |v_0|. The scale of velocities is |v_0| + sqrt(|a_0| distance), the
-    speed after accelerating over that distance. Norms are largest components, and a scale of 0 counts as 1.
+    The scale of positions is the distance |q_0| + T |v_0|, where T is the duration. The scale of velocities is |v_0| +
+    sqrt(|a_0| distance), the speed after accelerating over that distance. Norms are maximum norms, and a scale of 0
+    counts as 1.
     """
     scene = program.scene
     q, v = np.split(trajectory.states[0], [scene.n_q])
@@ -149,7 +153,7 @@ def bounds(program: Rollout, trajectory: Trajectory, factor: float) -> np.ndarra
 
 
 def compute_truth(cell: Cell, limits: StabilityLimits) -> tuple[str, np.ndarray, float]:
-    """Return the kind of truth (``physical`` or ``refined``), the true gradient ``(d,)``, and its known relative error."""
+    """Return the kind of truth (``physical`` or ``refined``), the true gradient ``(d,)``, and its relative error."""
     program = rollout(cell.program())
     physical = program.physical_gradient()
     if physical is not None:
@@ -161,7 +165,10 @@ def compute_truth(cell: Cell, limits: StabilityLimits) -> tuple[str, np.ndarray,
 
 
 def _refined(cell: Cell, steps: int) -> Cell:
-    """Return the cell with its duration divided into ``steps`` steps and the same numerical damping per second."""
+    """Return the cell with its duration divided into ``steps`` steps and the same numerical damping per second.
+
+    Raises :class:`Unsupported` if the dimension of theta depends on the horizon.
+    """
     program = rollout(cell.program())
     scene = program.scene
     dt = scene.horizon * scene.dt / steps
@@ -193,7 +200,7 @@ def _cached(key: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
 
 CACHE_SIZE = 4096
 _fine_gradients: dict[str, np.ndarray] = {}
-"""Gradients at fine steps by program, shared by all cells whose fine program is the same."""
+"""Gradients at fine steps by program key, shared by all cells with the same fine program."""
 
 
 def _gradient(backend: Backend, program: Program) -> np.ndarray:
@@ -223,20 +230,22 @@ def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[
 # ---------------------------------------------------------------------------------------------------- cause
 
 SPAN = 0.01
-"""Half the span of theta for differences of the law's own cost, in units of theta's largest component (1 if that is 0).
+"""Step in theta for central differences of the law's own cost, in units of theta's largest component (1 if that is 0).
 
-It moves an impact by many fine steps, so that the effect of the impact's time within its step averages out.
+It is large enough to shift an impact by many fine steps, which averages out the effect of the impact's time within a
+step.
 """
 
 
 def cause_of(
     cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarray, limits: StabilityLimits
 ) -> dict[str, Any]:
-    """Return why a gradient is wrong: ``cause``, ``step_error`` and ``law_error``, both in units of the truth's norm.
+    """Return why a gradient is wrong: ``cause``, and ``step_error`` and ``law_error`` in units of the truth's norm.
 
-    The law's own gradient is that of the same law and integrator at a far smaller step. The step error is the cell's
-    difference from it, the law error its difference from the physics. Their sum is at least the cell's error, so at
-    least one of them is a cause. Without a law the whole error is the step's.
+    The law's own gradient is the gradient of the same law and integrator at a far smaller step. The step error is the
+    distance of the cell's gradient from the law's own, and the law error is the distance of the law's own gradient from
+    the truth. Their sum is at least the cell's error, so one of them is a cause. Without a contact law, or with a
+    refined truth, the cause is the step.
     """
     norm = float(np.linalg.norm(truth))
     error = float(np.linalg.norm(gradient - truth)) / norm if norm else math.inf
@@ -254,17 +263,17 @@ def cause_of(
 
 
 def law_gradient(cell: Cell, limits: StabilityLimits) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gradient ``(d,)`` of the cell's law at a far smaller step, and one at half its resolution.
+    """Return the gradient ``(d,)`` of the cell's law at a far smaller step, and the gradient with half as many steps.
 
-    Both are central differences of the cost over a span of theta (:data:`SPAN`), since a derivative through a contact
-    jumps with the time of the impact within its step, however small the step is.
+    Both are central differences of the cost over :data:`SPAN` (twice that for the second). A derivative through a
+    contact would not converge: it jumps with the time of the impact within its step, however small the step is.
     """
     steps = max(limits.fine_steps, limits.finer * rollout(cell.program()).scene.horizon)
     return _differences(cell, steps, SPAN), _differences(cell, steps // 2, 2 * SPAN)
 
 
 def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
-    """Return central differences ``(d,)`` of the cell's cost with its duration divided into ``steps`` steps."""
+    """Return central differences ``(d,)`` of the cell's cost, with its duration divided into ``steps`` steps."""
     fine = _refined(cell, steps)
 
     def differences() -> np.ndarray:
@@ -284,9 +293,10 @@ def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
 
 
 def theory(cell: Cell) -> dict[str, float]:
-    """Return the spectral radius of a step on the cell's oscillator, and the stiffness at which it exceeds 1.
+    """Return ``spectral_radius`` of one step on the cell's oscillator, and ``stiffness_limit``, where it exceeds 1.
 
-    The limit is 0 for a step that is never stable and infinite for one that always is. Empty without an oscillator.
+    The limit has the unit of the column ``stiffness``. It is 0 for a step that is never stable, and infinite for one
+    that always is. The result is empty without an oscillator.
     """
     parameters = oscillator(cell)
     if parameters is None:
@@ -300,9 +310,9 @@ def theory(cell: Cell) -> dict[str, float]:
 
 
 def oscillator(cell: Cell) -> tuple[float, float, float] | None:
-    """Return the cell's oscillator: stiffness [1/s^2] and damping [1/s] per unit of mass, velocity factor; or None.
+    """Return the cell's oscillator: stiffness [1/s^2] and damping [1/s] per unit of mass, and velocity factor; or None.
 
-    It is the scene's own ``oscillator()``, or else the scene's only contact while it lasts, if a spring law acts in it.
+    It is the scene's own ``oscillator()``, or else the scene in contact, if it has one contact with a spring law.
     """
     scene, law = cell.scene, cell.contact
     if isinstance(scene, Oscillator):
@@ -318,13 +328,13 @@ def oscillator(cell: Cell) -> tuple[float, float, float] | None:
 
 
 def spectral_radius(integrator: Integrator, dt: float, stiffness: float, damping: float, factor: float) -> float:
-    """Return the largest modulus of the eigenvalues of one step on the oscillator."""
+    """Return the spectral radius of one step of length ``dt`` [s] on the oscillator."""
     matrix = integrator.transition(dt, stiffness, damping, factor)
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
 def stiffness_limit(integrator: Integrator, dt: float, damping: float, factor: float) -> float:
-    """Return the stiffness [1/s^2] at which the step becomes unstable, 0 if it always is, inf if it never is within REACH."""
+    """Return the stiffness [1/s^2] where the step becomes unstable; 0 if always, inf if nowhere in :data:`REACH`."""
 
     def unstable(reach: float) -> bool:
         return spectral_radius(integrator, dt, reach / dt**2, damping, factor) > NEUTRAL

@@ -1,4 +1,4 @@
-"""The page of the stability map: the share of right gradients by integrator, and the maps."""
+"""Builds the page of the stability map: the share of right gradients by integrator, and the maps."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ RESULTS = [
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the finding, the shares of right gradients, and the maps over step size and stiffness."""
+    """Return the content of the page: the finding, the shares of right gradients, and the maps over dt and stiffness."""
     shown = arrange_maps(experiment, rows)
     over = axes_of(shown, *PLACES)
     has_verdict = (rows["verdict"] != "").any()
@@ -77,7 +77,7 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
 def shares(shown: Arranged) -> pd.DataFrame:
     """Return each verdict's share of the cells by scene, contact law and integrator, the best of each scene first.
 
-    Scenes are grouped by name. Laws and integrators keep the parameters that distinguish them.
+    Scenes are grouped by name. Names of laws and integrators contain the parameters that distinguish them.
     """
     cells = with_verdict(shown.rows)
     step = problem_names(shown, ["contact", "integrator"], axes_of(shown, *PLACES), ("contact", "integrator"), cells)
@@ -88,7 +88,7 @@ def shares(shown: Arranged) -> pd.DataFrame:
 
 
 def finding(shown: Arranged) -> str:
-    """Write how many gradients are finite but wrong, and the most and the least reliable step on each scene."""
+    """Format how many gradients are finite but wrong, and the most and least reliable law and integrator on each scene."""
     table = shares(shown)
     parts = []
     for scene, part in table.groupby("scene", sort=False):
@@ -104,7 +104,7 @@ def finding(shown: Arranged) -> str:
 
 
 def answers(shown: Arranged) -> pd.DataFrame:
-    """Return the shares as a table of texts."""
+    """Return the verdicts' shares as a table of strings."""
     table = shares(shown)
     texts = {name: [f"{share:.0%}" if share else "-" for share in table[name]] for name in VERDICTS if name}
     return table.assign(**texts)

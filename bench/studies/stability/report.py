@@ -1,6 +1,6 @@
 """Writes the stability map: a heat map per integrator, tables, and a short table on the terminal.
 
-It depends on no plugin: the theoretical boundary is the column ``stiffness_limit`` of the rows.
+It needs no plugin, because the theoretical boundary is stored in the column ``stiffness_limit``.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ VERDICTS = {
     "unresolved": ("?", "#d9d9d9", "truth not resolved"),
     "": ("", "#ffffff", "not run"),
 }
-"""Per verdict: the character in its cells, their colour, and the meaning, a template for the study's limits."""
+"""Per verdict: the character in its cells, the cells' colour, and the meaning, with placeholders for the study's limits."""
 DARK = ("nonfinite", "diverged")
 """Verdicts whose cells have white characters."""
 WRONG = ("inaccurate", "wrong_sign", "zero")
@@ -65,9 +65,9 @@ FILLS = {
     **{f"by {cause}": fill for cause, (fill, _) in CAUSES.items()},
     **{name: fill for name, (_, fill, _) in VERDICTS.items() if name not in ("ok", *WRONG)},
 }
-"""Colours of cells and bars, by :func:`looks`."""
+"""Colours of cells and bars, by the keys that :func:`looks` returns."""
 LOST = ("diverged", "nonfinite")
-"""Verdicts of cells beyond the measured stability boundary."""
+"""Verdicts of cells whose state or gradient is lost: they count as unstable."""
 GROWING = 1 + 1e-9
 """Measured growth per step above which a state counts as growing: 1 plus rounding."""
 ACROSS = 3
@@ -75,7 +75,7 @@ ACROSS = 3
 
 
 PLACES = ("dt", "stiffness")
-"""The columns that the maps are drawn over."""
+"""The axes of a map."""
 STEP = ("scene", "contact", "integrator")
 
 
@@ -84,13 +84,13 @@ class Panel:
     """The map of one integrator and problem, on the backends that agree in every verdict."""
 
     integrator: str
-    """Identity string of the integrator, as are the scene's and the contact law's."""
+    """Identity string of the integrator; the next two are the identity strings of the scene and the contact law."""
     scene: str
     contact: str
     values: Mapping[str, str]
-    """Values, as texts, of the columns that distinguish it from other maps: :func:`label_columns_of`."""
+    """Values, as strings, of the columns that distinguish the map from other maps: :func:`label_columns_of`."""
     kind: tuple[str, ...]
-    """Names of integrator, scene and law, whatever their parameters."""
+    """Names of integrator, scene and law, without parameters."""
     backends: tuple[str, ...]
     rows: pd.DataFrame
 
@@ -108,11 +108,11 @@ class Panel:
 
     @cached_property
     def boundary(self) -> pd.DataFrame:
-        """The theoretical ``limit`` and the measured interval of the stability limit by dt: ``low``, ``high``, ``agrees``.
+        """The stability limit by dt: ``limit`` in theory, ``low`` and ``high`` as measured, and ``agrees``.
 
-        ``high`` is the first unstable stiffness, infinite where none is, and ``low`` the largest below it, or 0. A cell
-        is unstable if it diverged or was measured to grow. ``agrees`` is true where the limit lies in the interval,
-        widened by one cell of the grid.
+        ``high`` is the lowest unstable stiffness of the grid (infinite without one), and ``low`` the next lower
+        stiffness (0 without one). A cell is unstable if it diverged or its state was measured to grow. ``agrees`` is 1
+        where the limit lies in the interval widened by one cell of the grid, else 0.
         """
         limits = {}
         for dt, part in self.rows.dropna(subset=["stiffness", "stiffness_limit"]).groupby("dt"):
@@ -128,7 +128,7 @@ class Panel:
 
 
 def unstable(rows: pd.DataFrame) -> pd.Series:
-    """Return a mask of the cells that diverged or were measured to grow."""
+    """Return a mask of the unstable cells: diverged, not finite, or with a state that was measured to grow."""
     return rows["verdict"].isin(LOST) | (rows["growth_factor"] > GROWING)
 
 
@@ -145,7 +145,7 @@ def looks(rows: pd.DataFrame) -> pd.Series:
 
 
 def colour_legend(rows: pd.DataFrame) -> list[Patch]:
-    """Return the legend of the cells' colours and characters."""
+    """Return legend handles for the colours that occur in the rows."""
     present = set(looks(rows))
     named = {name: f"{VERDICTS[name][0]}: {meaning(name, rows)}" for name in VERDICTS if name not in (*WRONG, "", "ok")}
     named |= {"ok": meaning("ok", rows), "": VERDICTS[""][2]}
@@ -158,17 +158,17 @@ def colour_legend(rows: pd.DataFrame) -> list[Patch]:
 
 
 def arrange_maps(experiment: Experiment, rows: pd.DataFrame) -> Arranged:
-    """Arrange rows for reading, with each cell's stored step size and stiffness, and a cause for older rows without."""
+    """Arrange rows for reading, with each cell's stored step size and stiffness; the cause is empty in older rows."""
     shown = arrange(experiment, rows)
     cause = rows["cause"].fillna("") if "cause" in rows else ""
     return replace(shown, rows=shown.rows.assign(**{name: rows[name] for name in PLACES}, cause=cause))
 
 
 def panels(shown: Arranged) -> list[Panel]:
-    """Return the maps, grouped by scene and law.
+    """Return the maps, grouped by integrator, scene and law.
 
     A map has all rows with equal parameters of scene, contact law and integrator, except step size and stiffness.
-    Backends with equal maps share one, and backends that support no cell of a map are left out.
+    Backends with equal maps share one map, and backends that support no cell of a map are omitted.
     """
     over = axes_of(shown, *PLACES)
     rows = shown.rows.assign(
@@ -214,18 +214,18 @@ def label_columns_of(shown: Arranged, over: Sequence[Axis]) -> list[str]:
 
 
 def name_of(part: Any) -> str:
-    """Return the name of a plugin in a row's parameters."""
+    """Return the name of a plugin given by its parameters in a row; ``none`` for no plugin."""
     return "none" if part is None else str(part["name"])
 
 
 def limits(rows: pd.DataFrame) -> dict[str, str]:
-    """Return the limits of the rows' studies as texts: ``{"inaccurate": "10%"}``, or ``10% or 20%`` where they differ."""
+    """Return the studies' limits as strings: ``{"inaccurate": "10%"}``, or ``10% or 20%`` if the rows' studies differ."""
     texts = dict.fromkeys(given["study"]["inaccurate"] for given in parse(rows) if given)
     return {"inaccurate": " or ".join(f"{100 * limit:g}%" for limit in texts)}
 
 
 def meaning(verdict: str, rows: pd.DataFrame) -> str:
-    """Return the meaning of a verdict for these rows."""
+    """Return the meaning of a verdict, with the limits of the rows' studies."""
     return VERDICTS[verdict][2].format(**limits(rows))
 
 
@@ -252,7 +252,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 
 def shares(maps: Sequence[Panel]) -> dict[str, float]:
-    """Return each verdict's share of the cells of some maps that ran, and the share of unstable ones."""
+    """Return each verdict's share of the cells that ran in some maps, and the share of unstable cells."""
     cells = pd.concat([attempted(panel.rows) for panel in maps])
     by_verdict = {name: float((cells["verdict"] == name).mean()) for name in VERDICTS if name}
     return by_verdict | {"unstable": float(unstable(cells).mean())}
@@ -290,7 +290,7 @@ def _percent(share: float) -> str:
 
 
 def _limits(panel: Panel) -> list[str]:
-    """Return a dt, both boundaries there, and the number of dt at which they agree."""
+    """Format a dt, the theoretical and measured stability limits at that dt, and the number of dt at which they agree."""
     limits = panel.boundary
     if limits.empty:
         return ["-"] * 4
@@ -343,7 +343,7 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
 
 
 def heat_map(integrator: str, maps: Sequence[Panel], axes: Sequence[Axis] = ()) -> Figure:
-    """Draw verdicts of one integrator over dt and stiffness, one panel per problem, with the theoretical boundary."""
+    """Draw one integrator's verdicts over dt and stiffness, one panel per problem, with the theoretical stability limit."""
     across = columns(len(maps), ACROSS)
     down = math.ceil(len(maps) / across)
     rows = pd.concat([panel.rows for panel in maps])
@@ -394,7 +394,7 @@ def _axis_name(column: str, axes: Sequence[Axis]) -> str:
 
 
 def _draw(axes: Axes, panel: Panel, steps: np.ndarray, levels: np.ndarray, common: bool) -> None:
-    """Draw the cells with their characters, and the boundary."""
+    """Draw a map's cells with their colours and characters, and the theoretical stability limit."""
     x, y = _edges(steps), _edges(levels)
     whole = panel.rows["stiffness"].isna().all()
     heights = np.array([y[0], y[-1]]) if whole else y
@@ -429,7 +429,7 @@ LETTER: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 6.5, "zord
 
 
 def _title(panel: Panel, whole: bool, common: bool) -> list[str]:
-    """Write the problem, how it was measured unless common to all panels, and the boundary where it is not a line."""
+    """Return a panel's title lines: the problem, backends and truth unless common to all panels, and notes on its limit."""
     lines = list(map(plain, panel.title.split(", ")))
     lines[1:1] = ["no contact"] if panel.contact == "none" else []
     limits = set(panel.boundary["limit"])
@@ -440,7 +440,7 @@ def _title(panel: Panel, whole: bool, common: bool) -> list[str]:
 
 
 def _draw_boundary(axes: Axes, panel: Panel, x: np.ndarray) -> None:
-    """Draw the limit along dt, extended to the edges of the panel."""
+    """Draw the theoretical limit along dt, extrapolated to the edges of the panel."""
     limit = panel.boundary["limit"]
     limit = limit[(limit > 0) & np.isfinite(limit)]
     if len(limit) < 2:
@@ -453,7 +453,7 @@ def _draw_boundary(axes: Axes, panel: Panel, x: np.ndarray) -> None:
 
 
 def _edges(values: np.ndarray) -> np.ndarray:
-    """Return the edges of cells around values on a log axis."""
+    """Return the edges ``(n + 1,)`` of cells around ``n`` values on a log axis."""
     if len(values) == 0:
         return np.array([1.0, 10.0])
     logs = np.log(values)

@@ -1,4 +1,4 @@
-"""One figure over all stability maps: shares of the verdicts of each integrator with each law."""
+"""Draws one figure that summarises all stability maps: the verdicts' shares for each integrator and contact law."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from bench.studies.stability.report import (
 SHORT = {"by step": "step", "by law": "law", "by both": "both", "by unknown": "?"} | {
     name: VERDICTS[name][0] for name in LOST
 }
-"""Labels of the bars' parts that are wide enough."""
+"""Labels of a bar's segments, drawn where a segment is wide enough."""
 CHARACTER = 0.055
-"""Share of the cells that is as wide as a character."""
+"""Width of a character, as a share of a bar's length."""
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Draw the summary as ``stability_summary``, unless no cell has a verdict."""
+    """Write the summary as ``stability_summary``, unless no cell has a verdict; return the files' paths."""
     maps = panels(arrange_maps(experiment, rows))
     if not any(len(with_verdict(panel.rows)) for panel in maps):
         return []
     with styled():
         paths = save(figure(maps), experiment.directory / "stability_summary", experiment.formats)
-    # bars have no points to read back: the plotted numbers are the counts behind them
+    # plotted data cannot be read back from bars: write the counts that the bars show
     write_whole(paths[-1], count_cells(maps).to_csv(index=False, lineterminator="\n").encode())
     return paths
 
 
 def count_cells(maps: Sequence[Panel]) -> pd.DataFrame:
-    """Return the number of cells by problem (scene and law, without parameters), integrator and colour."""
+    """Return the number of cells by problem (scene and law, without parameters), integrator and key of the colour."""
     parts = [
         with_verdict(panel.rows).assign(integrator=panel.kind[0], problem=_problem(*panel.kind[1:])) for panel in maps
     ]
@@ -61,7 +61,7 @@ def _problem(scene: str, contact: str) -> str:
 
 
 def headline(table: pd.DataFrame) -> str:
-    """Write the share of right gradients over all cells, and the integrator and problem with the largest share."""
+    """Format the share of right gradients over all cells, and the integrator and problem with the largest share."""
     totals = table.groupby(["problem", "integrator"], sort=False)["cells"].sum()
     right = table[table["look"] == "ok"].groupby(["problem", "integrator"])["cells"].sum()
     shares = (right.reindex(totals.index).fillna(0) / totals).sort_values(ascending=False)
@@ -77,7 +77,7 @@ def headline(table: pd.DataFrame) -> str:
 
 
 def figure(maps: Sequence[Panel]) -> Figure:
-    """Draw, for each problem, a bar per integrator: shares of its cells by verdict and cause, right ones first."""
+    """Draw a panel per problem with a bar per integrator: shares of its cells by verdict and cause, right ones first."""
     table = count_cells(maps)
     names = [name for name in FILLS if name in set(table["look"])]
     problems, integrators = (list(dict.fromkeys(table[column])) for column in ("problem", "integrator"))

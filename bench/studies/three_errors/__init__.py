@@ -1,4 +1,4 @@
-"""Three errors of one gradient, measured separately, and the forward error."""
+"""Measures program, model and estimator error of a gradient separately, and the forward error."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ThreeErrors(Study):
     columns: ClassVar[Columns] = COLUMNS
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Measure the forward error, the errors of program and model at w = 0, and the bias of the estimator."""
+        """Return one cell's results by column: forward, program and model error at w = 0, and the estimator's bias."""
         from bench.studies.three_errors.measure import measure
 
         return measure(cell, session)
@@ -43,7 +43,7 @@ class ThreeErrors(Study):
         report.show(experiment, rows)
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the finding, its table and the charts."""
+        """Return the page: the finding, the misleading gradients and charts of the errors."""
         from bench.studies.three_errors.page import content
 
         return content(experiment, rows)

@@ -1,8 +1,8 @@
 """Measures three errors of one gradient separately, and the forward error.
 
-Program error: the program's gradient against central differences of the same program. Model error: against the
-gradient of the physics. Estimator error: the bias of an estimator against grad J_sigma of the program. A gradient can
-have any of them without the others, and a small forward error says nothing about any of them.
+Program error: distance of the program's gradient from central differences of the program's cost. Model error: distance
+from the gradient of the physics. Estimator error: bias of an estimator relative to the program's grad J_sigma. The
+three are independent, and a small forward error (error of the cost) implies none of them is small.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ SUMMARY = (
 )  # fmt: skip
 """Columns that are statistics of the estimator."""
 ROUNDING = 1e-9
-"""Share of a gradient's norm up to which a coordinate counts as rounding error, without a sign."""
+"""Share of a gradient's norm up to which a coordinate counts as rounding error and its sign as 0."""
 STEPS = 10.0 ** -np.arange(1.0, 9.5, 0.5)
 """Step sizes of the central differences, in the units of theta."""
 
 
 def measure(cell: Cell, session: Session) -> dict[str, Any]:
-    """Return the forward error, the errors of program and model at w = 0, and the bias of the cell's estimator."""
+    """Return one cell's results by column: forward, program and model error at w = 0, and the bias of its estimator."""
     problem = session.problem(cell)
     check = difference_check(problem)
     result = {"status": "ok", "reason": ""} | check.columns() | _against_physics(problem.program, check)
@@ -49,7 +49,7 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class DifferenceCheck:
-    """A program's cost and gradient at theta0 without noise, and the central difference closest to that gradient."""
+    """A program's cost and gradient at theta0 without noise, and the central difference closest to the gradient."""
 
     cost: float
     gradient: np.ndarray
@@ -59,7 +59,7 @@ class DifferenceCheck:
     step: float
 
     def columns(self) -> dict[str, Any]:
-        """Return the columns of the program error."""
+        """Return the columns of cost, gradient and program error."""
         norm, error = _norm(self.difference), _norm(self.gradient - self.difference)
         return {
             "cost": self.cost,
@@ -74,8 +74,8 @@ class DifferenceCheck:
 def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceCheck:
     """Compare the program's gradient with its best central difference over a sweep of step sizes, at w = 0.
 
-    Truncation errors and jumps dominate at large steps, rounding at small ones. All differences are one batch of
-    2 d len(steps) costs.
+    Truncation errors and jumps dominate at large steps, rounding at small steps. All costs are one batch: one at theta,
+    and 2 d len(steps) for the differences.
     """
     theta = problem.program.theta0
     shifts = (np.eye(theta.size)[:, None, :] * steps[:, None]).reshape(-1, theta.size).T
@@ -85,16 +85,16 @@ def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceC
     differences = (ahead - behind) / (2 * steps)
     gradient = problem.grad(theta, np.zeros((problem.program.n_noise, 1)))[:, 0]
     errors = np.linalg.norm(differences - gradient[:, None], axis=0)
-    # np.argmin would return the index of a NaN
+    # without the mask, np.argmin would return the index of a NaN
     best = int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
     return DifferenceCheck(float(costs[0]), gradient, differences[:, best], float(steps[best]))
 
 
 def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]:
-    """Return the columns of forward and model error that the scene's physical cost and gradient allow.
+    """Return the columns of forward and model error, as far as the scene has a physical cost and gradient.
 
-    ``model_cosine`` is the cosine between the two gradients. ``model_signs`` is the share of coordinates with the sign
-    of the physical gradient, among the coordinates where that has a sign.
+    ``model_cosine`` is the cosine between the program's and the physical gradient. ``model_signs`` is the share of
+    coordinates where their signs agree, among the coordinates where the physical gradient has a sign.
     """
     result: dict[str, Any] = {}
     cost, physical = program.physical_cost(), program.physical_gradient()

@@ -1,4 +1,4 @@
-"""The page of the three errors: each along the swept parameters, and gradients with a small and a large error."""
+"""Builds the page of the three errors: each error along the swept parameters, and misleading gradients."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ AGREES, WRONG = 1e-3, 0.1
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the finding, charts of the errors, and the table of gradients that are right for the program only."""
+    """Return the content of the page: the finding, charts of the errors, and the misleading gradients."""
     shown = arrange(experiment, rows)
     laws = problem_names(shown, ["contact", "integrator"], shown.axes, ("contact", "integrator"))
     table = shown.rows.assign(series=laws, problem=problem_names(shown, ["scene"], shown.axes))
@@ -71,13 +71,13 @@ def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
 
 
 def misleading(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows whose gradient is right for the program but wrong for the physics, the worst first."""
+    """Return the rows with a misleading gradient, right for the program but wrong for the physics, the worst first."""
     misses = rows[(rows["program_error_rel"] <= AGREES) & (rows["model_error_rel"] >= WRONG)]
     return misses.sort_values("model_error_rel", ascending=False)
 
 
 def finding(rows: pd.DataFrame) -> str:
-    """Write how many gradients are right for their program but wrong for the physics, and the worst of them."""
+    """Format how many gradients are right for their program but wrong for the physics, and the worst one."""
     exact = rows[rows["model_error_rel"].notna() & (rows["program_error_rel"] <= AGREES)]
     wrong = misleading(rows)
     text = (

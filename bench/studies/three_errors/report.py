@@ -1,4 +1,4 @@
-"""Writes the three errors of a gradient as one table, and as one chart with a column per error and a row per scene."""
+"""Writes the three errors of a gradient: tables, and one chart with a column per error and a row per scene."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ ERRORS = {
     "program_error_rel": "program error\n(to differences)",
     "model_error_rel": "model error\n(to physics)",
 }
-"""The errors that do not depend on the estimator, each a column of panels."""
+"""Title of the column of panels of each error that does not depend on the estimator."""
 EXACT = 1e-6
 """Program error up to which a gradient counts as exact."""
 CONVERGED = 0.5
-"""Largest ratio of the errors at the smallest and the largest step at which a cost, or a gradient, counts as converging."""
+"""A cost or gradient converges if its error falls at least to this share from the largest to the smallest step."""
 WRONG = 0.1
-"""Model error at the smallest step above which a gradient that does not converge is a trap."""
+"""A gradient that does not converge is a trap if its model error at the smallest step is above this."""
 AWAY: dict[str, Any] = {"marker": "x", "markersize": 6, "markeredgewidth": 1.6, "color": "#000000", "linestyle": "none"}
 HOLLOW: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 0.9}
 ORDER = (2, 0, 3, 4, 5, 6, 7, 1)
-"""Colours of the first contact laws, as places in the palette."""
+"""Positions in the palette of the first contact laws' colours."""
 HEADERS = {
     "contact": "contact law", "forward_error_rel": "forward", "program_error_rel": "program",
     "model_error_rel": "model", "model_cosine": "cosine to physics", "model_signs": "right signs",
 }  # fmt: skip
 RESULTS = tuple(name for name in HEADERS if name != "contact")
 PROGRAM = ("scene", "contact", "integrator", "backend")
-"""Parts of the grid that make a program, which has one bias per estimator."""
+"""Parts of the grid that identify a program. It has one bias per estimator."""
 STEP = "dt"
-"""The column of the time step, along which a cost may converge."""
+"""Column of the time step, along which costs and gradients may converge."""
 NOTES = (
     "Relative errors at theta, without noise except for the biases. forward: |cost - physics' cost|. program: gradient "
     "against the best central difference of the same program. model: gradient against the physics'. right signs: share "
@@ -63,7 +63,7 @@ NOTES = (
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``three_errors`` (.csv, .md) and the chart along the time step, or else the first swept axis."""
+    """Write ``three_errors`` (.csv, .md) and the chart along the time step, or the first swept axis if it is not swept."""
     shown = arrange(experiment, rows)
     parts = sections(shown)
     texts = [f"## {part.heading}\n\n{plain_markdown(readable(shown, part), HEADERS)}" for part in parts]
@@ -77,21 +77,22 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 @dataclass(frozen=True, eq=False)
 class Section:
-    """The rows of one table: along an axis, whose values are in the column ``x``, or on no axis, with ``x`` 0."""
+    """The rows of one table, along an axis with its values in the column ``x``; without an axis, ``x`` is 0."""
 
     axis: Axis | None
     rows: pd.DataFrame
 
     @property
     def heading(self) -> str:
-        """The heading: ``Along dt [s], with horizon``."""
+        """The heading of the table: ``Along dt [s], with horizon``."""
         return "Not along a swept axis" if self.axis is None else f"Along {self.axis.title}"
 
 
 def sections(shown: Arranged) -> list[Section]:
-    """Return, per swept axis, the programs that vary along it with all other axes fixed, then the other programs.
+    """Return a section per swept axis, with the programs that vary along it, then one with all other programs.
 
-    Axes that step together have one section: that of the time step if it is among them, else of the first.
+    In a section of an axis, all other axes are fixed at their most common value. Axes that step together have one
+    section: the section of the time step if it is one of them, else of the first axis.
     """
     parts: list[Section] = []
     for axis in independent_axes(shown):
@@ -113,7 +114,7 @@ def sections(shown: Arranged) -> list[Section]:
 
 
 def independent_axes(shown: Arranged) -> list[Axis]:
-    """Return the axes that get a section: one of each set that steps together."""
+    """Return the axes that have a section: one of each set of axes that step together."""
     axes: list[Axis] = []
     for axis in sorted(shown.axes, key=lambda axis: axis.column != STEP):
         if axis.column != "seed" and not any(axis.column in other.moves for other in axes):
@@ -122,12 +123,12 @@ def independent_axes(shown: Arranged) -> list[Axis]:
 
 
 def joint_axes(shown: Arranged, axis: Axis | None) -> list[Axis]:
-    """Return an axis and those that step with it."""
+    """Return an axis and the axes that step with it; empty for None."""
     return [] if axis is None else [axis, *(other for other in shown.axes if other.column in axis.moves)]
 
 
 def _is_most_common(rows: pd.DataFrame, axis: Axis, shown: Arranged) -> pd.Series:
-    """Return a mask of the rows without a value of an axis, or with the most common one for their scene and law."""
+    """Return a mask of the rows at their scene and law's most common value of an axis, or without a value."""
     laws = problem_numbers(rows, ("scene", "contact"), shown.axes)
     mode = rows.groupby(laws)[axis.column].transform(lambda v: v.mode().iloc[0] if v.notna().any() else np.nan)
     return (rows[axis.column] == mode) | rows[axis.column].isna()
@@ -137,7 +138,7 @@ def _is_most_common(rows: pd.DataFrame, axis: Axis, shown: Arranged) -> pd.Serie
 
 
 def readable(shown: Arranged, part: Section) -> pd.DataFrame:
-    """Return a table of texts with a line per program and value of the axis: the errors, and a bias per estimator."""
+    """Return the table as strings: a line per program and value of the axis, with the errors and a bias per estimator."""
     rows, axis = part.rows, part.axis
     without = joint_axes(shown, axis)
     programs = problem_numbers(rows, PROGRAM, without)
@@ -182,13 +183,13 @@ def show(experiment: Experiment, rows: pd.DataFrame) -> None:
 
 @dataclass(frozen=True)
 class Trap:
-    """A program with a converging cost and an exact derivative that is nevertheless wrong for the physics.
+    """A program with a converging cost and an exact gradient that is nevertheless wrong for the physics.
 
-    Its gradient points away from the physical one at every step, or its model error does not fall with the step.
+    Its cosine to the physical gradient is negative at every step, or its model error does not converge with the step.
     """
 
     name: str
-    """Name of the scene, the law and further distinguishing parameters."""
+    """Name of the program: scene, law and the parameters that distinguish it."""
     program: float
     """Largest relative program error."""
     forward: tuple[float, float]
@@ -199,7 +200,7 @@ class Trap:
     """Relative model error at the largest and the smallest value of the axis."""
 
     def __str__(self) -> str:
-        """Write the trap in two sentences."""
+        """Format the trap as two sentences."""
         cosines = f"{number(self.cosine[0])} to {number(self.cosine[1])}"
         against = (
             f"but the cosine to the physical gradient is negative at every time step ({cosines})."
@@ -232,7 +233,7 @@ def traps(shown: Arranged) -> list[Trap]:
 
 
 def programs_of(shown: Arranged, part: Section, parts: Sequence[str] = PROGRAM) -> pd.Series:
-    """Return, per row of a section, the name of its program, the same along the axis: ``bounce_once, penalty``."""
+    """Return, per row of a section, the name of its program, ``bounce_once, penalty``, which is the same along the axis."""
     always = [name for name in ("scene", "contact") if name in parts]
     return problem_names(shown, parts, joint_axes(shown, part.axis), always, part.rows)
 
@@ -241,7 +242,10 @@ def programs_of(shown: Arranged, part: Section, parts: Sequence[str] = PROGRAM) 
 
 
 def figure(shown: Arranged) -> Figure | None:
-    """Draw a row of panels per scene, a column per error and a line per law, along the time step or the first axis."""
+    """Draw the errors along the time step, or the first axis if it is not swept; None without a swept axis.
+
+    There is a row of panels per scene, a column per error, and a line per law.
+    """
     parts = [part for part in sections(shown) if part.axis is not None]
     if not parts:
         return None
@@ -283,7 +287,7 @@ def _figure(shown: Arranged, part: Section, trap_names: Set[str]) -> Figure:
 
 
 def _laws(shown: Arranged, part: Section, panels: pd.Series) -> pd.Series:
-    """Name the law of each row by the columns that distinguish it within its panel, so that a law has one style overall."""
+    """Return each row's law, named by the columns that distinguish it in its panel, so that each law has one style."""
     axes = ["contact", "integrator", "backend"]
     return pd.concat(
         [programs_of(shown, Section(part.axis, own), axes) for _, own in part.rows.groupby(panels, sort=False)]
@@ -300,12 +304,12 @@ TRAP_LABELS = (
     (0.68, "looks right:\nexact"),
     (0.42, "wrong\nat every $\\Delta t$"),
 )
-"""Texts in the panels of a scene with a trap, and their heights."""
+"""Heights and texts of the labels in the panels of a scene with a trap."""
 THIN: dict[str, Any] = {"linewidth": 0.9, "markersize": 3.0, "zorder": 3}
 
 
 def _title(axis: Axis, has_trap: bool) -> str:
-    """Write the title of the chart, which explains traps if there are any."""
+    """Return the title of the chart, which explains traps if there are any."""
     text = f"Three errors of a gradient along {axis_name(axis)}, all relative"
     return text + (
         "\nBold: traps, with a converging cost and an exact derivative that the physics does not have"
@@ -315,7 +319,7 @@ def _title(axis: Axis, has_trap: bool) -> str:
 
 
 def _short_name(axis: Axis) -> str:
-    """Write an axis by its symbol and unit, which fit under a small panel."""
+    """Return an axis's symbol and unit, short enough for a small panel."""
     return " ".join(filter(None, [symbol(axis.column) or plain(axis.short), f"[{axis.unit}]" if axis.unit else ""]))
 
 
@@ -333,7 +337,7 @@ def _scale(panel: Axes, values: np.ndarray) -> None:
 
 
 def _draw(line: Sequence[Axes], rows: pd.DataFrame, estimators: Sequence[str], style: Mapping[str, Any]) -> None:
-    """Draw one law of a scene in each of its panels."""
+    """Draw one law's errors in a scene's row of panels."""
     program = rows.drop_duplicates("x")
     for panel, name in zip(line, ERRORS, strict=False):
         panel.plot(program["x"], program[name].clip(FLOOR, CEILING), **style)

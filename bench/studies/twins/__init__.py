@@ -1,4 +1,4 @@
-"""A physics engine's twin of a scene compared with the scene's own program: one rollout, its cost and its gradient."""
+"""Compares a physics engine's twin of a scene with the scene's own program: one rollout, its cost and its gradient."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Twins(Study):
     timed_calls: int = param(5, "calls timed for costs and for gradients", positive=True)
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Measure the differences at w = 0, and the seconds of costs and gradients."""
+        """Return one cell's results by column: differences at w = 0, and the times of costs and gradients [s]."""
         from bench.studies.twins.measure import measure
 
         return measure(cell, session, self.timed_calls)
@@ -60,13 +60,13 @@ class Twins(Study):
         return report.write(experiment, rows)
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the table."""
+        """Print the table, and the reason of each cell without numbers."""
         from bench.studies.twins import report
 
         report.show(experiment, rows)
 
     def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the finding, its table and the charts."""
+        """Return the page: the finding, a chart of any two numbers, and the table."""
         from bench.studies.twins.page import content
 
         return content(experiment, rows)

@@ -1,7 +1,7 @@
 """Compares a physics engine's twin of a scene with the scene's own program: one rollout, its cost and its gradient.
 
-A difference is the model error between the two programs for the same masses, springs and step; each may be exact for
-itself. Seconds are those of a batch of ``samples`` rollouts.
+A difference is the model error between two programs with the same masses, springs and step. Each gradient may be exact
+for its own program. Times are for a batch of ``samples`` rollouts.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from bench.model import Problem, Unsupported, rollout
 
 
 def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
-    """Return the differences at w = 0, and the seconds of costs and gradients.
+    """Return one cell's results by column: differences at w = 0, and times of costs and gradients [s].
 
-    ``state_difference`` is the largest over time and coordinates, in the units of each coordinate. With ``_rel`` it is
-    in units of the coordinate's largest value.
+    ``state_difference`` is the largest difference over time and coordinates, in the units of the coordinate.
+    ``state_difference_rel`` is in units of the coordinate's largest value. Raises :class:`Unsupported` if the backend
+    has no twin, or the scene no program of its own.
     """
     scene = rollout(cell.program()).scene
     if "physics" not in cell.backend.provides:
@@ -61,7 +62,7 @@ def measure(cell: Cell, session: Session, timed_calls: int) -> dict[str, Any]:
 
 
 def _seconds(cell: Cell, problem: Problem, timed_calls: int) -> dict[str, float]:
-    """Return median times of calls with ``samples`` columns, and the time to compile the gradient."""
+    """Return median times [s] of costs and gradients of ``samples`` rollouts, and the time [s] to compile the gradient."""
     theta = problem.program.theta0
     w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, problem.program.n_noise)[0].T
     _, value = timing.timed(lambda _: problem.value(theta, w), timed_calls)

@@ -1,4 +1,4 @@
-"""The page of the twins: differences between engines and own programs, and the time of an engine's gradient."""
+"""Builds the page of the twins: differences between engines and own programs, and the time of an engine's gradient."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from bench.report.web.content import Content, no_result_sentence
 
 
 def content(experiment: Experiment, rows: pd.DataFrame) -> Content:
-    """Return the finding, a chart of any two numbers, and the table."""
+    """Return the content of the page: the finding, a chart of any two numbers, and the table."""
     return replace(generic.content(experiment, rows), finding=no_result_sentence(rows) or finding(rows))
 
 
 def finding(rows: pd.DataFrame) -> str:
-    """Write the largest differences of trajectory and gradient, and the times of compilation and of one batch."""
+    """Format the largest differences of states and gradients, and the times of one batch and of compilation."""
     good = rows[rows["status"] == "ok"]
     parts = []
     for column, quantity in (("state_difference", "states"), ("gradient_difference_rel", "gradients (relative)")):

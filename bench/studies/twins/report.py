@@ -1,4 +1,4 @@
-"""Writes twins as a table and a chart: differences between each engine and the scene's own program along the rollout."""
+"""Writes the table and the chart of twins: differences between each engine and the scene's own program over time."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from bench.report.text import number
 from bench.report.views import Arranged, arrange, attempted
 
 SMALL = 1e-17
-"""Smaller differences, 0 included, are drawn at this value."""
+"""Smallest difference that is drawn; smaller ones, 0 included, are drawn at this value."""
 DIFFERENT = 1e-6
-"""Relative difference of states above which a twin counts as different. Accumulated rounding stays below."""
+"""Relative difference of states above which a twin counts as different. Accumulated rounding errors are smaller."""
 COLOURS = tuple(map(colour, (0, 2, 3, 4, 5, 6, 7)))
 DASHES: tuple[Any, ...] = ("-", (0, (4, 3)), (0, (1, 2)), (0, (6, 2, 1, 2)))
 ENGINE = ("scene", "contact", "integrator", "backend")
-"""Parts of the grid that make a line of the table."""
+"""Parts of the grid that identify a line of the table."""
 HEADERS = {
     "state_difference": "states", "state_difference_rel": "relative", "cost_difference_rel": "cost",
     "gradient_difference_rel": "gradient", "gradient_cosine": "cosine", "value_s": "value [s]",
     "gradient_s": "gradient [s]", "trace_s": "trace [s]", "lower_s": "lower [s]", "compile_s": "compile, in all [s]",
 }  # fmt: skip
 PRINTED = ("state_difference", "gradient_difference_rel", "value_s", "gradient_s", "compile_s")
-"""Results that the terminal shows."""
+"""Result columns printed on the terminal."""
 NOTES = (
     "Differences between the engine's twin and the scene's own program at theta without noise. states: the largest over "
     "the rollout. relative: in units of the coordinate's largest value. cost, gradient: relative. value [s], gradient [s]: "
@@ -55,7 +55,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
 
 
 def readable(shown: Arranged) -> pd.DataFrame:
-    """Return a table of texts with a line per scene and engine, which has a status where there are no numbers."""
+    """Return the table as strings, a line per scene and engine; a cell without numbers shows its status."""
     rows = attempted(shown.rows)
     labels = label_columns(shown, ENGINE, always=("scene", "contact", "backend"), rows=rows)
     lines = []
@@ -68,7 +68,7 @@ def readable(shown: Arranged) -> pd.DataFrame:
 
 
 def figure(shown: Arranged) -> Figure:
-    """Draw, in a panel per problem, the largest difference of any coordinate from the own program's over time."""
+    """Draw, in a panel per problem, the largest difference of any position from the own program's, over time [s]."""
     rows = shown.rows[shown.rows["status"] == "ok"]
     rows = rows.assign(engine=problem_names(shown, ["backend"], always=["backend"], rows=rows))
     titles = problem_names(shown, ["scene", "contact", "integrator"], rows=rows)
@@ -83,7 +83,7 @@ def figure(shown: Arranged) -> Figure:
 
 
 def headline(rows: pd.DataFrame, titles: pd.Series) -> str:
-    """Write on which problems an engine's states differ from the own program's, and how many problems have none."""
+    """Format on which problems an engine's states differ from the own program's, and on how many problems they agree."""
     worst = rows["state_difference_rel"].groupby(titles, sort=False).max().sort_values(ascending=False)
     different = [f"{title} ({number(value)})" for title, value in worst.items() if value > DIFFERENT]
     if not different:
@@ -96,14 +96,14 @@ def headline(rows: pd.DataFrame, titles: pd.Series) -> str:
 
 
 def _style(place: int) -> dict[str, Any]:
-    """Return the colour and dashes of an engine. The first has the widest line, as others may cover it."""
+    """Return the line style of an engine. The first engine's line is the widest, so that others do not hide it."""
     return {
         "color": COLOURS[place % len(COLOURS)], "linewidth": 1.0 if place else 1.6, "linestyle": DASHES[place % len(DASHES)]
     }  # fmt: skip
 
 
 def _draw(panel: Axes, title: str, rows: pd.DataFrame, engines: list[str]) -> None:
-    """Draw one problem, with the largest difference of each engine in the title."""
+    """Draw one problem's panel, with the largest difference of each engine in its title."""
     first = rows.iloc[0]
     count = int(first["horizon"]) + 1
     time = np.arange(count) * first["dt"]
