@@ -46,7 +46,7 @@ SYMMETRIC = 1e-6
 VAGUE = 0.1
 """Error of a reference, as a share of its norm, above which a note warns that relative columns are no more accurate."""
 THREE = 3.0
-"""An event that did not happen in n trials has a probability below 3 / n, at 95% (the rule of three)."""
+"""Numerator of the rule of three: an event absent from n trials has a probability below 3 / n, at 95% confidence."""
 UNEXPLAINED = "tails unseen or gradient wrong"
 """Remark on a row whose estimator is declared unbiased although the interval of its bias excludes 0."""
 

@@ -1,4 +1,4 @@
-"""Writes the files of a trace: one rollout's table, and its chart on a shared time axis."""
+"""Writes the files of a trace: the table of one rollout, and a chart with a shared time axis."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from bench.trace.spikes import MEASURES, align, spikes
 from bench.trace.trace import Trace
 
 PANEL = 1.05
-"""Inches of the height of a panel."""
+"""Height of a panel in inches."""
 BLUE, BLACK, RED, GREEN, PINK = PALETTE[:5]
 SLIPPING: dict[str, Any] = {"color": "#a6a6a6", "alpha": 0.6, "linewidth": 0}
 SWITCH: dict[str, Any] = {"color": GREY, "linewidth": 0.5}
 SPIKED: dict[str, Any] = {"color": RED, "linewidth": 2.4, "solid_capstyle": "butt"}
 DRAWN = 1e30
-"""Size beyond which a diverging quantity is omitted from its panel; the table keeps it."""
+"""Magnitude beyond which a diverging quantity is omitted from its panel, but not from the table."""
 LINEAR = 1e4
-"""Ratio of the largest to the median size beyond which a panel's scale is not linear."""
+"""Ratio of the largest to the median magnitude beyond which a panel's scale is not linear."""
 NAMES = {
     "jacobian_norm": r"$\|\partial x_{k+1} / \partial x_k\|$",
     "adjoint_norm": r"$\|\mathrm{d}L / \mathrm{d}x_k\|$",
@@ -39,9 +39,9 @@ NAMES = {
 
 
 def write(trace: Trace, results_dir: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
-    """Write ``trace.csv``, and the chart in some formats with its plotted data, to ``results_dir/trace/<scene>``.
+    """Write ``trace.csv``, the chart in the given formats and its plotted data; return their paths.
 
-    Raises :class:`StorageError` if they cannot be written.
+    The directory is ``results_dir/trace/<scene>``. Raises :class:`StorageError` if a file cannot be written.
     """
     directory = results_dir / "trace" / trace.scene
     make_directory(directory)
@@ -53,9 +53,9 @@ def write(trace: Trace, results_dir: Path, formats: Sequence[str] = ("png",)) ->
 
 
 def chart(trace: Trace) -> Figure:
-    """Draw gap (or positions), force, |dF/dx|, |dL/dx| and cost against time.
+    """Return a figure of gap (or positions), force, |dF/dx|, |dL/dx| and cost against time.
 
-    Contact switches are thin vertical lines through all panels, states in contact shaded, spikes thick and red.
+    Contact switches are thin vertical lines through all panels, states in contact are shaded, and spikes are thick and red.
     """
     table = trace.table
     contact = bool(table["gap"].notna().any())
@@ -89,7 +89,7 @@ def _legend(table: pd.DataFrame) -> list[Any]:
 
 
 def _contacts(ax: Axes, table: pd.DataFrame) -> None:
-    """Shade the states in contact, slipping ones darker, and mark the switches, each between the differing states."""
+    """Shade the states in contact, darker where a contact slips, and mark each switch between the two states that differ."""
     time = table["time"].to_numpy()
     half = 0.5 * (time[1] - time[0])
     for name, look in (("contacts", SHADE), ("slipping", SLIPPING)):
@@ -168,7 +168,7 @@ def _cost(ax: Axes, table: pd.DataFrame) -> None:
 
 
 def _line(ax: Axes, table: pd.DataFrame, values: pd.Series, colour: str, **look: Any) -> None:
-    """Draw a quantity in time, with a dot for each state if there is room for dots."""
+    """Draw a quantity against time, with a dot for each state if there is space for dots."""
     few = len(table) <= 80
     values = values.where(values.abs() < DRAWN)
     finite = values[np.isfinite(values)].abs()
@@ -181,7 +181,7 @@ def _line(ax: Axes, table: pd.DataFrame, values: pd.Series, colour: str, **look:
 
 
 def _logarithmic(ax: Axes, low: float, high: float) -> None:
-    """Set a log scale over at least a decade, with whole numbers as labels if there are few decades."""
+    """Set a log scale that spans at least a decade, labelled with plain numbers if there are few decades."""
     ax.set_yscale("log")
     middle = np.sqrt(low * high)
     ax.set_ylim(min(low / 1.3, middle / 3.2), max(high * 1.6, middle * 3.2))
