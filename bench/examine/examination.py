@@ -73,8 +73,8 @@ def examine(
     the same w. ``budget`` is the time limit of the whole examination in seconds or as text (``60``, ``"2m"``). A call
     that exceeds it is interrupted, compiled code as soon as it returns. ``batch`` is the way to pass several thetas in one
     call: ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``; detected by default. ``scale`` is the size
-    of each input, with theta's structure. By default it is the input's magnitude, or for an input of 0 the size of its
-    array.
+    of each input, with theta's structure. By default it is the input's magnitude, or for an input of 0 the root mean
+    square of its array, else 1.
 
     Raises :class:`bench.UserError` for a cost that cannot be called.
 

@@ -26,7 +26,7 @@ Interval = tuple[float, float]
 
 
 def wilson(successes: int, trials: int, z: float = Z) -> Interval:
-    """Return Wilson's score interval of a success rate; ``(0, 1)`` if there are no trials.
+    """Return Wilson's score interval of a success rate; ``(0, 1)`` without trials.
 
     >>> [round(x, 4) for x in wilson(8, 10)]
     [0.4902, 0.9433]

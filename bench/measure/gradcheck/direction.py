@@ -15,9 +15,9 @@ import numpy as np
 EPS = np.logspace(-2, -10, 17)
 """Step sizes, two per decade, in units of the natural scale."""
 GUARD = 64.0
-"""Allowed rounding error of a rollout's cost and of displaced thetas, in unit roundoffs, where noise is not measured."""
+"""Allowed rounding error of a rollout's cost and of displaced thetas, in unit roundoffs."""
 MEASURED = 8.0
-"""Allowed error of a cost whose noise is measured: so many standard deviations of the noise, and so many unit roundoffs."""
+"""Allowed error of a cost whose noise is measured, in standard deviations of the noise and in unit roundoffs."""
 RISE = 0.01
 """Relative error above which the difference at a large step counts as inaccurate."""
 WINDOW = 7
@@ -258,7 +258,7 @@ def _judge_one_sided(sample: Sample, noise: np.ndarray) -> str:
 
 
 def _resolution(sample: Sample, index: int) -> float:
-    """Return u^(1/3) times the derivative's size: u^(1/3) is the relative step that balances a difference's two errors."""
+    """Return u^(1/3) times the derivative's size; u^(1/3) is the relative step that balances a difference's two errors."""
     return float(np.cbrt(sample.unit)) * sample.size(index)
 
 
