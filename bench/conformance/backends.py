@@ -231,7 +231,8 @@ def shared_theta_is_spread(backend: Backend) -> str:
 def failed_rollouts_have_no_gradient(backend: Backend) -> str:
     """Verify that costs are not finite where the plain backend's are not, and gradients not where costs are not.
 
-    Theta is very large in one column of a batch. An engine that stops, resets or repeats its last state must report that.
+    Theta is very large in one column of a batch. An engine that stops, resets or repeats its last state must report
+    that.
     """
     if "grad" not in backend.provides:
         raise Skipped("computes no gradients")
@@ -354,7 +355,8 @@ def _implicit_problem(backend: Backend, unknowns: int) -> Problem:
 class _Pressed(EngineScene):
     """A ball of 1 kg that penetrates a plane with friction by 1 mm.
 
-    theta is its velocity along and away from the plane [m/s]. The cost is the velocity away from the plane after one step.
+    theta is its velocity along and away from the plane [m/s]. The cost is the velocity away from the plane after one
+    step.
     """
 
     name = "pressed"

@@ -66,15 +66,15 @@ def examine(
 ) -> Report:
     """Report whether a gradient is right, where the cost breaks, which method to use under noise, and its cost.
 
-    ``cost(theta)`` returns one number. ``theta`` is an array, a number, or nested dicts, lists and dataclasses of arrays
-    and numbers. ``grad`` is ``"jax"``, ``"torch"`` or a function of theta. Without ``grad``, only the cost is examined,
-    by differences. ``sigma`` is one or more standard deviations of noise on theta. With ``noise=n`` the call is
-    ``cost(theta, w)``, where ``w (n,)`` is standard normal, the simulator's own randomness. Costs that are compared have
-    the same w. ``budget`` is the time limit of the whole examination in seconds or as text (``60``, ``"2m"``). A call
-    that exceeds it is interrupted, compiled code as soon as it returns. ``batch`` is the way to pass several thetas in one
-    call: ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``; detected by default. ``scale`` is the size
-    of each input, with theta's structure. By default it is the input's magnitude, or for an input of 0 the root mean
-    square of its array, else 1.
+    ``cost(theta)`` returns one number. ``theta`` is an array, a number, or nested dicts, lists and dataclasses of
+    arrays and numbers. ``grad`` is ``"jax"``, ``"torch"`` or a function of theta. Without ``grad``, only the cost is
+    examined, by differences. ``sigma`` is one or more standard deviations of noise on theta. With ``noise=n`` the call
+    is ``cost(theta, w)``, where ``w (n,)`` is standard normal, the simulator's own randomness. Costs that are compared
+    have the same w. ``budget`` is the time limit of the whole examination in seconds or as text (``60``, ``"2m"``). A
+    call that exceeds it is interrupted, compiled code as soon as it returns. ``batch`` is the way to pass several
+    thetas in one call: ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``; detected by default.
+    ``scale`` is the size of each input, with theta's structure. By default it is the input's magnitude, or for an input
+    of 0 the root mean square of its array, else 1.
 
     Raises :class:`bench.UserError` for a cost that cannot be called.
 
@@ -336,8 +336,8 @@ class _Examination:
     def _missed_share(self, line: LineScan, checked: Check | None) -> float:
         """Return the share of the cost's change along a line that its gradient does not explain.
 
-        Without jumps, the integral of a right gradient along a line is the difference of the costs at its ends. The share
-        is NaN without a right gradient, or where the integral is less accurate than both a tenth of the share and
+        Without jumps, the integral of a right gradient along a line is the difference of the costs at its ends. The
+        share is NaN without a right gradient, or where the integral is less accurate than both a tenth of the share and
         :data:`LEAST_MISSED`.
         """
         if checked is None or not checked.trusted or not self.simulator.has_gradient:

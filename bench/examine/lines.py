@@ -1,9 +1,9 @@
 """Finds jumps and kinks of a cost on a line, by halving intervals around the places where its slope changes most.
 
-Where the slope changes by D over a width h, D falls like h for a smooth cost, is constant at a kink and grows like 1/h at
-a jump. The order in h over the halvings identifies the kind, so no threshold on the size of a change is needed.
-The search for one jump, :func:`bench.measure.jumps.largest_jump`, divides all lines together and needs a thousand costs
-per level. This search follows each place separately with two costs per halving, since a user's simulator may be slow.
+Where the slope changes by D over a width h, D falls like h for a smooth cost, is constant at a kink and grows like 1/h
+at a jump. The order in h over the halvings identifies the kind, so no threshold on the size of a change is needed. The
+search for one jump, :func:`bench.measure.jumps.largest_jump`, divides all lines together and needs a thousand costs per
+level. This search follows each place separately with two costs per halving, since a user's simulator may be slow.
 """
 
 from __future__ import annotations
@@ -93,8 +93,8 @@ def scan(
 ) -> LineScan:
     """Return a scan of ``cost``, ``(d, B)`` to ``(B,)``, along ``theta + t * direction`` for t from -reach to +reach.
 
-    ``theta`` and ``direction`` are ``(d,)``. ``noise`` is the size of the cost's rounding errors. At most ``most`` places
-    are searched for breaks.
+    ``theta`` and ``direction`` are ``(d,)``. ``noise`` is the size of the cost's rounding errors. At most ``most``
+    places are searched for breaks.
     """
 
     def along(t: np.ndarray) -> np.ndarray:

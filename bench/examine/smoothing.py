@@ -114,8 +114,8 @@ def measure_smoothed(
 ) -> Smoothed | None:
     """Return the gradient's bias and the methods' costs under noise ``sigma * scale * u`` on theta.
 
-    None where the time is too short for :data:`FEWEST` pairs. ``plain (d,)`` is the gradient at theta without noise, if it
-    is known to be right. At most ``pairs`` pairs are drawn.
+    None where the time is too short for :data:`FEWEST` pairs. ``plain (d,)`` is the gradient at theta without noise, if
+    it is known to be right. At most ``pairs`` pairs are drawn.
     """
     random = np.random.default_rng([seed, 0x736D6F6F])
     drawn: list[np.ndarray] = []

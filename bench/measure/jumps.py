@@ -37,8 +37,8 @@ def largest_jump(
 
     ``cost`` maps points ``(n, B)`` to ``(B,)``. As intervals of length h shrink, the second difference of a smooth cost
     falls as h^2, at a kink as h, and at a jump it is constant. Three kinds of jumps are missed: jumps below 1e-6 of the
-    cost's range on the lines, jumps between two of the first ``parts`` + 1 nodes of a line that do not change the cost at
-    these nodes, and jumps in an interval whose second difference more than :data:`SUSPECTS` other intervals exceed.
+    cost's range on the lines, jumps between two of the first ``parts`` + 1 nodes of a line that do not change the cost
+    at these nodes, and jumps in an interval whose second difference more than :data:`SUSPECTS` other intervals exceed.
     Values that are not finite are ignored.
     """
     count = starts.shape[1]

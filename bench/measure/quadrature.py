@@ -47,11 +47,12 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     """Return the smoothed gradient E[(f(w) - f(0)) w] / sigma for one- or two-dimensional noise on theta, by quadrature.
 
     Gauss-Legendre panels lie between the scene's breakpoints and are halved until the error is negligible or the next
-    level would exceed ``points`` points. Every level averages four rules, shifted against each other. The stated error is
-    twice the largest distance of a rule from the mean, or the change of the mean under the last halving if that is larger,
-    plus rounding: the cost's measured noise, and 1e-11 of its size where steps solve equations. Returns None where two
-    levels, the last of at least :data:`LEAST` points, do not fit, or a cost is not finite. A feature of the cost that is
-    narrower than the spacing and not among the breakpoints is missed. The cost is evaluated ``columns`` points at a time.
+    level would exceed ``points`` points. Every level averages four rules, shifted against each other. The stated error
+    is twice the largest distance of a rule from the mean, or the change of the mean under the last halving if that is
+    larger, plus rounding: the cost's measured noise, and 1e-11 of its size where steps solve equations. Returns None
+    where two levels, the last of at least :data:`LEAST` points, do not fit, or a cost is not finite. A feature of the
+    cost that is narrower than the spacing and not among the breakpoints is missed. The cost is evaluated ``columns``
+    points at a time.
     """
     width, dim = problem.program.n_noise, problem.dim
     breaks = problem.program.breakpoints()
@@ -112,8 +113,8 @@ def _panels(edges: np.ndarray, count: int, shift: float) -> tuple[np.ndarray, np
 def _noise(cost: Callable[[np.ndarray], np.ndarray], width: int) -> float:
     """Return a bound on the cost's rounding noise, from fourth differences over stencils too short to show the cost's shape.
 
-    The fourth difference of independent errors of variance s^2 has the variance 70 s^2. A stencil that contains a kink or
-    a jump is rare, and only makes the bound larger.
+    The fourth difference of independent errors of variance s^2 has the variance 70 s^2. A stencil that contains a kink
+    or a jump is rare, and only makes the bound larger.
     """
     # evenly spread over a disc of three standard deviations, away from round numbers
     turn = np.arange(PROBES)

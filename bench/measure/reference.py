@@ -18,8 +18,8 @@ from bench.model import Problem, Program
 BATCHES = 64
 """Number of independent batch means that represent a sampled reference."""
 COLUMNS = 4096
-"""Columns of every evaluated batch, constant so that a compiling backend compiles once, and fewer if ``samples`` is small.
-The pilot, which selects the estimator of a sampled reference, is one batch."""
+"""Columns of every evaluated batch, constant so that a compiling backend compiles once, and fewer if ``samples`` is
+small. The pilot, which selects the estimator of a sampled reference, is one batch."""
 LEAST_SAMPLES = 16384
 """Minimum samples of a sampled reference, unless the limit is lower: a small spread of few samples proves nothing."""
 QUADRATURE_POINTS = 1 << 20

@@ -23,7 +23,8 @@ def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples
 
     The gradient equals d / r times the mean of f u over the sphere (the divergence theorem; Flaxman et al. 2005, lemma
     2.1). With one variable it is a difference of two costs. Otherwise it is sampled, by first order inside the ball
-    where the cost is continuous, or by central differences across the sphere: whichever has the lower variance in a pilot.
+    where the cost is continuous, or by central differences across the sphere: whichever has the lower variance in a
+    pilot.
     """
     program, theta, d = problem.program, problem.program.theta0, problem.dim
     name = f"ball[radius={radius:g}]"

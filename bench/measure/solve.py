@@ -34,9 +34,9 @@ class Solved:
 def solve(problem: Problem, theta: np.ndarray | None = None, steps: int = 40) -> Solved:
     """Return a local minimum of the cost at w = 0, searched from ``theta (d,)`` (default: the problem's theta0).
 
-    L-BFGS is followed by at most ``steps`` damped Newton steps. The Hessian comes from central differences of gradients,
-    2 d per step. The damping grows tenfold while a step does not lower the cost, and falls tenfold after a step that does
-    (Nocedal, Wright 2006, ch. 10 to 11). A cost without a lower bound is returned as -inf.
+    L-BFGS is followed by at most ``steps`` damped Newton steps. The Hessian comes from central differences of
+    gradients, 2 d per step. The damping grows tenfold while a step does not lower the cost, and falls tenfold after a
+    step that does (Nocedal, Wright 2006, ch. 10 to 11). A cost without a lower bound is returned as -inf.
     """
     theta = np.array(problem.program.theta0 if theta is None else theta, dtype=np.float64)
     still = np.zeros((problem.program.n_noise, 1))

@@ -192,9 +192,9 @@ class Truth:
 def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95) -> tuple[float, float, float]:
     """Return the de-biased norm of a difference of means, and the low and high end of the interval of the true norm.
 
-    ``difference m (d,)`` has the covariance S, the sum of the covariances of the independent ``errors``. With T = |m|^2,
-    the norm is sqrt(max(0, T - tr S)). For a supposed norm beta, T is modelled as g times a noncentral chi-square
-    with nu degrees of freedom and noncentrality beta^2 / g, where
+    ``difference m (d,)`` has the covariance S, the sum of the covariances of the independent ``errors``. With T =
+    |m|^2, the norm is sqrt(max(0, T - tr S)). For a supposed norm beta, T is modelled as g times a noncentral
+    chi-square with nu degrees of freedom and noncentrality beta^2 / g, where
 
         g = (tr S^2 + 2 q) / (tr S + 2 beta^2),    nu = tr S / g,    q = b'Sb
 
@@ -210,9 +210,9 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
     interval can miss a bias of 0 only from above, so it covers a bias of 0 97.5% of the time.
 
     Coverage was simulated for d = 1 to 100, R = 16 to 256, equal and very unequal variances, biases of 0 to 10 errors
-    along and across the noise. Under normal, t5 and mildly skewed noise it is 91 to 99% in at least 95% of the settings,
-    and 88% in the worst. Under a skewness of 6 the worst is 82%, at R = 16. ``tests/measure/test_statistics.py -m slow``
-    prints all.
+    along and across the noise. Under normal, t5 and mildly skewed noise it is 91 to 99% in at least 95% of the
+    settings, and 88% in the worst. Under a skewness of 6 the worst is 82%, at R = 16.
+    ``tests/measure/test_statistics.py -m slow`` prints all.
     """
     observed, trace = float(difference @ difference), sum(error.trace for error in errors)
     if trace <= 1e-32 * observed or trace == 0.0:  # noise below the last digit of m
@@ -283,9 +283,10 @@ def _student_quantile(probability: float, degrees: float) -> float:
 def variance_interval(deviations: np.ndarray, level: float = 0.95) -> tuple[float, float]:
     """Return the interval of the trace of the covariance, from the deviations from the mean ``(R, d)``.
 
-    The interval is the jackknife of the logarithm, which accounts for kurtosis, with the upper end of :func:`_jackknife`,
-    which accounts for skewness. Omitting repeat i removes ``R / (R - 1) |x_i - mean|^2`` from the sum of squares. The
-    interval is ``(0, inf)`` where fewer than three repeats differ, and a single point where all repeats are equal.
+    The interval is the jackknife of the logarithm, which accounts for kurtosis, with the upper end of
+    :func:`_jackknife`, which accounts for skewness. Omitting repeat i removes ``R / (R - 1) |x_i - mean|^2`` from the
+    sum of squares. The interval is ``(0, inf)`` where fewer than three repeats differ, and a single point where all
+    repeats are equal.
     """
     repeats = len(deviations)
     squares = np.einsum("rd,rd->r", deviations, deviations)
@@ -301,8 +302,9 @@ def variance_interval(deviations: np.ndarray, level: float = 0.95) -> tuple[floa
 def _jackknife(whole: float, without: np.ndarray, level: float) -> tuple[float, float]:
     """Return the interval of a variance from its logarithm and the logarithms ``(R,)`` with one repeat omitted.
 
-    The pseudo-values are as skewed as the squares they come from. Where large squares are rare, most samples contain too
-    few large squares, and a symmetric interval is too low. With the skewness g of the pseudo-values, Hall (1992) treats
+    The pseudo-values are as skewed as the squares they come from. Where large squares are rare, most samples contain
+    too few large squares, and a symmetric interval is too low. With the skewness g of the pseudo-values, Hall (1992)
+    treats
 
         T + g T^2 / 3 + g^2 T^3 / 27 + g / (6 R),    T = (centre - truth) / spread,
 
@@ -328,9 +330,9 @@ def variance_per_sample(
     """Return the trace of the covariance of one sample's term, with its interval, from all R x N terms.
 
     ``sums (R, d)`` are the sums of the ``samples`` terms of each repeat, ``squares (R,)`` the sums of their squared
-    norms. Where the mean of the terms is large compared with their spread, subtract a common vector from all terms first.
-    The interval is the jackknife over repeats of :func:`variance_interval`, which accounts for tails. It is ``(0, inf)``
-    for fewer than three repeats, and NaN where there is only one term in total.
+    norms. Where the mean of the terms is large compared with their spread, subtract a common vector from all terms
+    first. The interval is the jackknife over repeats of :func:`variance_interval`, which accounts for tails. It is
+    ``(0, inf)`` for fewer than three repeats, and NaN where there is only one term in total.
     """
     sums, squares = np.asarray(sums, dtype=np.float64), np.asarray(squares, dtype=np.float64)
     repeats = len(sums)

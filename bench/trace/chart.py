@@ -55,7 +55,8 @@ def write(trace: Trace, results_dir: Path, formats: Sequence[str] = ("png",)) ->
 def chart(trace: Trace) -> Figure:
     """Return a figure of gap (or positions), force, |dF/dx|, |dL/dx| and cost against time.
 
-    Contact switches are thin vertical lines through all panels, states in contact are shaded, and spikes are thick and red.
+    Contact switches are thin vertical lines through all panels, states in contact are shaded, and spikes are thick and
+    red.
     """
     table = trace.table
     contact = bool(table["gap"].notna().any())

@@ -48,8 +48,9 @@ def _touching(
     """Return which contacts act at each state, and their normal forces [N], both ``(n_contacts, T + 1)``.
 
     A state has the active contacts of the step that starts there, see :func:`bench.measure.contacts.active_contacts`.
-    Under a force law, the force is evaluated at the state. Under an impulse law, the force is the impulse of the step over
-    dt, and the contacts are the measured ones. The last state then has the contacts of the last step, and a force of NaN.
+    Under a force law, the force is evaluated at the state. Under an impulse law, the force is the impulse of the step
+    over dt, and the contacts are the measured ones. The last state then has the contacts of the last step, and a force
+    of NaN.
     """
     law, states, controls = program.contact, path.states[..., None], path.controls[..., None]
     if isinstance(law, ForceLaw):

@@ -60,9 +60,9 @@ def solved_again(program: Rollout, path: Jacobians) -> tuple[np.ndarray, dict[st
     """Return the state after each step, ``(n, T)``, solved again by Newton's method, and the solver columns, ``(T + 1,)``.
 
     A backend's own solver runs inside the compiled rollout and reports nothing. So each step is solved again from its
-    state, with the law's own first guess. ``solver_residual`` is the largest component of the residual (in the unit of the
-    law's equation), ``solver_iterations`` the number of Newton steps, including the last one, which is within tolerance,
-    and ``solver_mismatch`` the largest difference from the state that the backend's solver reached.
+    state, with the law's own first guess. ``solver_residual`` is the largest component of the residual (in the unit of
+    the law's equation), ``solver_iterations`` the number of Newton steps, including the last one, which is within
+    tolerance, and ``solver_mismatch`` the largest difference from the state that the backend's solver reached.
     """
     ops = Newton()
     after = stepped(program, path, ops)

@@ -57,9 +57,9 @@ class Trace:
 def run(experiment: Experiment, seeded: bool) -> list[Trace]:
     """Return one trace for each scene of the experiment.
 
-    The noise is w = 0, or with ``seeded`` the first sample of the first repeat that estimators get from the cell's seed.
-    Raises :class:`UserError` for a scene without a rollout, for several rollouts of one scene, and for a backend without
-    step Jacobians.
+    The noise is w = 0, or with ``seeded`` the first sample of the first repeat that estimators get from the cell's
+    seed. Raises :class:`UserError` for a scene without a rollout, for several rollouts of one scene, and for a backend
+    without step Jacobians.
     """
     session = Session(experiment)
     return [_of_cell(session, cell, seeded) for cell in _chosen(experiment)]

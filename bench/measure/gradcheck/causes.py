@@ -37,8 +37,8 @@ def causes_of_ratios(
 
     - ``wrong_factor``: the ratio of each wrong component is the same at all thetas, within its error. A constant ratio
       beside a component with a missing term does not count, since a missing term may act on one input as a factor.
-    - ``missing_term``: the ratio varies, and either other components are right, or the gradient is right at thetas where
-      the term does not act, or the ratio lies between 0 and 2, so the gradient has part of the derivative.
+    - ``missing_term``: the ratio varies, and either other components are right, or the gradient is right at thetas
+      where the term does not act, or the ratio lies between 0 and 2, so the gradient has part of the derivative.
     - ``wrong_adjoint``: neither applies, or there are too few ratios to decide.
     """
     causes: dict[int | None, str] = {}
@@ -71,8 +71,8 @@ def _cause(ratios: list[Ratio], some_right: bool) -> str:
 def _constant(ratios: list[Ratio]) -> bool:
     """Return whether there are enough ratios and four in five of them agree; a kink or noise may change the others.
 
-    The ratios must agree to the accuracy of the differences, because a missing term also causes similar ratios: all near 1
-    where the term is small, and nearly equal where it hardly varies.
+    The ratios must agree to the accuracy of the differences, because a missing term also causes similar ratios: all
+    near 1 where the term is small, and nearly equal where it hardly varies.
     """
     values, errors = np.array([ratio.value for ratio in ratios]), np.array([ratio.error for ratio in ratios])
     if len(ratios) < ENOUGH or not np.isfinite(values).all():

@@ -273,8 +273,8 @@ class _Checker:
     def _directions(self, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Return the direction vectors ``(d, M)`` of chosen components and random directions, and their lengths ``(M,)``.
 
-        A component's derivative is per unit of the input. A derivative along a random direction is per unit of the inputs'
-        scales.
+        A component's derivative is per unit of the input. A derivative along a random direction is per unit of the
+        inputs' scales.
         """
         dim, count = self.theta.size, self.options.directions
         random = self.random.standard_normal((dim, count))

@@ -2,8 +2,9 @@
 
 A central difference of step h has an error of h^2 f'''/6 from the curvature of the cost and about u |f| / h from
 rounding, so its error rises at small and at large steps (Nocedal and Wright 2006, section 8.1). A difference is trusted
-where differences at neighbouring steps agree with it and none at a smaller step contradicts it by more than the noise of
-the cost explains. On an amplifying rollout, differences at wide steps may agree without approximating the derivative.
+where differences at neighbouring steps agree with it and none at a smaller step contradicts it by more than the noise
+of the cost explains. On an amplifying rollout, differences at wide steps may agree without approximating the
+derivative.
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ class Sample:
     """Costs at displacements of a point along one direction, and the program's derivative at the point.
 
     ``step (K,)`` are displacements in falling order, ``minus`` and ``plus (K,)`` the costs at -step and +step, and
-    ``centre`` is the cost at the point. ``crossing (K,)`` marks steps whose two sides differ in contact mode. ``scale`` is
-    the size of theta, ``slope`` the norm of the program's gradient and ``unit`` the unit roundoff of its arithmetic.
-    ``noise`` is the measured standard deviation of the cost's noise (None: not measured), and ``doubt`` the error of the
-    program's derivative from rounding theta.
+    ``centre`` is the cost at the point. ``crossing (K,)`` marks steps whose two sides differ in contact mode. ``scale``
+    is the size of theta, ``slope`` the norm of the program's gradient and ``unit`` the unit roundoff of its arithmetic.
+    ``noise`` is the measured standard deviation of the cost's noise (None: not measured), and ``doubt`` the error of
+    the program's derivative from rounding theta.
     """
 
     step: np.ndarray
@@ -107,8 +108,8 @@ class Sample:
 class Finding:
     """A verdict, and the numbers that support it; NaN where a verdict has no numbers.
 
-    ``difference`` is the trusted slope, with its ``uncertainty``, at step number ``index``. ``left`` and ``right`` are the
-    one-sided slopes at the same step. For a kink, this step resolves the kink best.
+    ``difference`` is the trusted slope, with its ``uncertainty``, at step number ``index``. ``left`` and ``right`` are
+    the one-sided slopes at the same step. For a kink, this step resolves the kink best.
     """
 
     verdict: str
@@ -133,8 +134,8 @@ def diagnose(sample: Sample) -> str:
 def judge(sample: Sample) -> Finding:
     """Return the verdict on the program's derivative, from differences of the cost.
 
-    - ``nondeterministic``: the same call returns another cost. ``nonfinite``: the cost at the point or at too many steps
-      is NaN or infinite. ``nan_gradient``: only the derivative is NaN or infinite.
+    - ``nondeterministic``: the same call returns another cost. ``nonfinite``: the cost at the point or at too many
+      steps is NaN or infinite. ``nan_gradient``: only the derivative is NaN or infinite.
     - ``zero``: derivative and differences are exactly 0. ``disconnected``: only the derivative is exactly 0.
     - ``jump``: at the smallest steps, the costs on the two sides differ by a constant. ``kink``: the one-sided slopes
       differ by a constant over three decades of steps, and the derivative lies between them. Where the slopes are
@@ -142,8 +143,8 @@ def judge(sample: Sample) -> Finding:
       must equal one of the slopes.
     - ``unsettled``: the differences agree at no step, or differences at smaller steps contradict them.
     - ``wrong_adjoint``: the differences agree on a value other than the derivative.
-    - Verdicts on a right derivative: ``saturated`` if derivative and differences are exactly 0 at the smallest steps only.
-      ``rounding`` if differences at small steps have more than ten times the error that float64 explains.
+    - Verdicts on a right derivative: ``saturated`` if derivative and differences are exactly 0 at the smallest steps
+      only. ``rounding`` if differences at small steps have more than ten times the error that float64 explains.
       ``mode_crossing`` if differences at large steps are inaccurate and the contact mode changes, ``nonlinear`` if it
       does not. Otherwise ``smooth``.
     """
@@ -198,8 +199,9 @@ def _finding(sample: Sample, verdict: str, index: int, uncertainty: float) -> Fi
 def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
     """Return the index of the most reliable difference, and its disagreement with differences at neighbouring steps.
 
-    Noise counts as disagreement when steps are compared, because differences rounded to 0 agree by accident. Excluded are
-    steps that a smaller step contradicts, and, if three other steps remain, steps across which the contact mode changes.
+    Noise counts as disagreement when steps are compared, because differences rounded to 0 agree by accident. Excluded
+    are steps that a smaller step contradicts, and, if three other steps remain, steps across which the contact mode
+    changes.
     """
     differences = sample.differences
     spread = _spread(differences)
@@ -225,8 +227,9 @@ def _spread(differences: np.ndarray) -> np.ndarray:
 def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:
     """Return whether differences that contradict the derivative are reliable.
 
-    Where the noise exceeds rounding, as in an amplifying rollout, the differences must agree to within ALIKE of their own
-    size over SHORT_WINDOW neighbouring steps. Elsewhere, a distance of twice the tolerance from the derivative is enough.
+    Where the noise exceeds rounding, as in an amplifying rollout, the differences must agree to within ALIKE of their
+    own size over SHORT_WINDOW neighbouring steps. Elsewhere, a distance of twice the tolerance from the derivative is
+    enough.
     """
     differences = sample.differences
     near = np.asarray(np.abs(differences - differences[index]) <= ALIKE * abs(differences[index]))
@@ -283,8 +286,8 @@ def _is_between_slopes(sample: Sample, noise: np.ndarray) -> bool:
 def _has_jump(sample: Sample, noise: np.ndarray) -> bool:
     """Return whether the cost jumps at theta: a difference of costs does not vanish as the step shrinks.
 
-    Differences at two neighbouring steps yield the limit at step 0, since the part linear in the step cancels. The limit
-    must be constant over the SHORT_WINDOW + 1 smallest steps, and exceed the noise. Unlike
+    Differences at two neighbouring steps yield the limit at step 0, since the part linear in the step cancels. The
+    limit must be constant over the SHORT_WINDOW + 1 smallest steps, and exceed the noise. Unlike
     :func:`bench.measure.jumps.largest_jump`, this needs no further costs.
     """
     height = noise * sample.step
@@ -301,8 +304,8 @@ def _has_jump(sample: Sample, noise: np.ndarray) -> bool:
 def _last_stable_index(values: np.ndarray, noise: np.ndarray) -> int | None:
     """Return the last index of the last window of values that is constant to within ``ALIKE`` and exceeds the noise.
 
-    None without such a window. A window does not count where values at smaller steps contradict it by more than their own
-    noise.
+    None without such a window. A window does not count where values at smaller steps contradict it by more than their
+    own noise.
     """
     windows, noises = _windows(values, WINDOW), _windows(noise, WINDOW).max(axis=1)
     middles = np.median(windows, axis=1)

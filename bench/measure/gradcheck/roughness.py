@@ -71,8 +71,8 @@ def is_staircase(values: np.ndarray, rounding: float) -> bool:
     """Return whether equally spaced ``values (n,)`` lie on a staircase, possibly added to a straight line.
 
     On a staircase most increments are equal to within ``rounding``. The others are isolated and exceed the remaining
-    variation by a factor of :data:`APART`. Not staircases: a single jump, a slope with a flat part, and rounding amplified
-    by a rollout, whose increments have every size.
+    variation by a factor of :data:`APART`. Not staircases: a single jump, a slope with a flat part, and rounding
+    amplified by a rollout, whose increments have every size.
     """
     if not np.isfinite(values).all():
         return False

@@ -37,7 +37,8 @@ def samples(
 ) -> list[Sample]:
     """Return a sample per direction, from the costs ``values (M, S)`` at :func:`points`.
 
-    A displacement of 1 along direction m has the length ``lengths[m]``, in the unit by which ``derivatives[m]`` is taken.
+    A displacement of 1 along direction m has the length ``lengths[m]``, in the unit by which ``derivatives[m]`` is
+    taken.
     """
     count = eps.size
     result = []
@@ -62,8 +63,9 @@ def samples(
 def order(sample: Sample) -> float:
     """Return the order in h of the Taylor remainder |f(x + h d) - f(x) - h g d|: 2 for a right gradient, 1 for a wrong one.
 
-    The order is the median slope, in log scales, over the five smallest steps on either side whose remainder exceeds ten
-    times the noise. It is NaN with fewer than four such steps, as for a linear cost. No choice of a best step is needed.
+    The order is the median slope, in log scales, over the five smallest steps on either side whose remainder exceeds
+    ten times the noise. It is NaN with fewer than four such steps, as for a linear cost. No choice of a best step is
+    needed.
     """
     slopes: list[float] = []
     for side, sign in ((sample.plus, 1.0), (sample.minus, -1.0)):
