@@ -49,7 +49,7 @@ from bench.model import (
 from bench.model.backend import CAPABILITIES
 
 GRADIENT = 1e-4
-"""Relative error allowed against central differences of step 1e-6, on columns where differences of two steps agree to 2e-5."""
+"""Relative error allowed against central differences of step 1e-6, on columns where two steps agree to 2e-5."""
 SCORE = 1e-5
 """Relative error allowed against differences of log p over a step of 1e-3: only rounding, as log p is linear in theta."""
 SINGLE = 1e-2
@@ -62,7 +62,7 @@ FAR = 1e200
 PRESSED = 1e-3
 """Penetration [m] at which the force of a contact with friction is compared."""
 PUSHED = 0.02
-"""Relative error allowed in the force of a contact with friction: an impedance of 1e-4 causes 5e-4 at a friction of 0.5."""
+"""Relative error allowed in a contact force with friction: an impedance of 1e-4 causes 5e-4 at a friction of 0.5."""
 SOLVED = 1e-9
 """Relative error allowed where equations are solved to 1e-12 in the unknown, at a condition number below 100."""
 
@@ -89,7 +89,7 @@ def programs_for(
 
 @verifies(Backend)
 def value_agrees(backend: Backend) -> str:
-    """Verify that costs equal the plain backend's on every scene and law, for physics engines within the twin's tolerance."""
+    """Verify that costs equal the plain backend's on every scene and law, within the twin's tolerance for engines."""
     plain = plain_backend()
     programs = programs_for(
         backend, list, [program for program in all_programs() if plain.incompatibility(program) is None]
@@ -151,7 +151,7 @@ def gradient_is_that_of_value(backend: Backend) -> str:
 def _against_differences(
     problem: Problem, gradient: np.ndarray, theta: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the relative error of each column's directional derivative, and whether two differences agree, both ``(B,)``."""
+    """Return the relative error of directional derivatives, and whether two difference steps agree, both ``(B,)``."""
     e = rng("direction").standard_normal(theta.shape)
     steps = (2e-6, 1e-6)
     wide, narrow = ((problem.value(theta + h * e, w) - problem.value(theta - h * e, w)) / (2 * h) for h in steps)
@@ -256,7 +256,7 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
 
 @verifies(Backend)
 def single_precision_is_finite(backend: Backend) -> str:
-    """Verify that costs and gradients with ``dtype=float32`` are close to float64, on continuous scenes without contacts."""
+    """Verify that float32 costs and gradients are close to float64, on continuous scenes without contacts."""
     single = dataclasses.replace(backend, dtype="float32")
     worst = dict.fromkeys(sorted(backend.provides & {"value", "grad"}), 0.0)
     smooth = [p for p in programs_for(single, distinguishing_programs) if p.contact is None and p.continuous]
@@ -401,7 +401,7 @@ class _Pressed(EngineScene):
 
 @verifies(Backend)
 def frictional_contact_has_the_force_of_its_law(backend: Backend) -> str:
-    """Verify that the normal force of a contact with friction is the spring law's: at rest, closing, parting and creeping.
+    """Verify the normal force of a contact with friction against the spring law: at rest, closing, parting and creeping.
 
     The result for a ball that slides at 1 m/s is reported but not limited, since an engine's friction then adds to the
     normal force.
@@ -428,7 +428,7 @@ def frictional_contact_has_the_force_of_its_law(backend: Backend) -> str:
 
 @verifies(Backend)
 def root_is_differentiated_implicitly(backend: Backend) -> str:
-    """Verify costs and implicit-function gradients for one unknown and for three coupled unknowns, with known solutions."""
+    """Verify costs and implicit-function gradients for one and for three coupled unknowns, with known solutions."""
     if "root" not in backend.provides:
         raise Skipped("solves no equations")
     worst = 0.0

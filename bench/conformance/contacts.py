@@ -58,7 +58,7 @@ PUSH_DT = 0.01
 
 
 def _push(law: ContactLaw, gap: Any, rate: Any, ops: Ops | None = None) -> np.ndarray:
-    """Return the normal impulses of a tower's two contacts over 0.01 s [N s], ``(2, B)``, for gaps and gap rates ``(2, B)``."""
+    """Return the normal impulses of a tower's two contacts over 0.01 s [N s], for gaps and gap rates, all ``(2, B)``."""
     gaps, rates = (np.asarray(part, dtype=float).reshape(2, -1) for part in (gap, rate))
     if isinstance(law, ForceLaw):
         return np.asarray(PUSH_DT * law.force(np, gaps, rates))
@@ -76,7 +76,7 @@ FAR = ([[0.05, 0.2, 1.0], [0.05, 0.2, 1.0]], [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
 
 
 def _sharpened(law: ContactLaw, factor: float) -> ContactLaw:
-    """Return the law with its smoothing parameter multiplied or divided by ``factor``, whichever pushes less at a distance."""
+    """Return the law with its smoothing multiplied or divided by ``factor``, whichever pushes less at a distance."""
     value = getattr(law, law.smoothing)
     changed = [dataclasses.replace(law, **{law.smoothing: value * f}) for f in (factor, 1 / factor)]
     return min(changed, key=lambda one: np.abs(_push(one, *FAR)).max())
@@ -84,7 +84,7 @@ def _sharpened(law: ContactLaw, factor: float) -> ContactLaw:
 
 @verifies(ContactLaw)
 def does_not_push_from_afar(law: ContactLaw) -> str:
-    """Verify that no force acts on separated bodies, or that the force of a smoothed law vanishes as smoothing decreases."""
+    """Verify that separated bodies get no force, or, under a smoothed law, a force that vanishes with the smoothing."""
     push = np.abs(_push(law, *FAR)).max() / PUSH_DT
     if not law.smoothing:
         require(push == 0, f"a force of {push:.3g} N on separated bodies")
@@ -97,7 +97,7 @@ def does_not_push_from_afar(law: ContactLaw) -> str:
 
 @verifies(ContactLaw)
 def pushes_in_contact(law: ContactLaw) -> str:
-    """Verify that bodies that overlap and approach are pushed apart, and that a faster approach does not lower the force."""
+    """Verify that bodies that overlap and approach are pushed apart, and no less by a faster approach."""
     push = _push(law, [[-0.01] * 3, [1.0] * 3], [[-1.0, -2.0, -4.0], [0.0] * 3])[0] / PUSH_DT
     require((push > 0).all(), f"forces of {push.round(3).tolist()} N on bodies that overlap and approach: it pulls")
     require((np.diff(push) >= -1e-9 * push.max()).all(), f"a faster approach lowers the force: {push.tolist()} N")

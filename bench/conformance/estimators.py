@@ -96,7 +96,7 @@ def oracles() -> tuple[Oracle, ...]:
 
 @cache
 def feedback_oracle() -> Oracle:
-    """Return a smooth five-step oracle with noise on a policy's actions, whose gradient is from long first-order sampling."""
+    """Return a smooth five-step oracle with noise on a policy's actions, and its gradient from first-order sampling."""
     for default in sound_scenes():
         if not isinstance(default, MechanicalScene) or default.n_contacts or not default.continuous:
             continue
@@ -166,7 +166,7 @@ def shape_and_repeatability(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def diagnostics_are_as_declared(estimator: Estimator) -> str:
-    """Verify that ``estimate_with_diagnostics`` returns the same estimates, and finite arrays of the declared diagnostics."""
+    """Verify that ``estimate_with_diagnostics`` returns the same estimates, and finite, declared diagnostics."""
     oracle = varying_oracle(estimator)
     noise = draw_noise(oracle, 6, 8)
     values, diagnostics = estimator.estimate_with_diagnostics(oracle.problem, oracle.problem.program.theta0, noise)

@@ -35,7 +35,7 @@ def has_docstring(plugin: type[Plugin]) -> str:
 
 @verifies(Plugin)
 def has_good_name(plugin: type[Plugin]) -> str:
-    """Verify that the name is one word, for command line and tables, and equals a built-in plugin's file or folder name."""
+    """Verify that the name is one word, and, for a built-in plugin, the name of its file or folder."""
     name, module = plugin.name, plugin.__module__
     require(name.isidentifier() and name.islower(), f"'{name}' must have only lower-case letters, digits and '_'")
     kinds = registry.kinds()

@@ -143,7 +143,7 @@ def error_falls_with_declared_order(integrator: Integrator) -> str:
 
 @verifies(Integrator)
 def free_motion_is_exact(integrator: Integrator) -> str:
-    """Verify that without forces q grows by dt v, v is multiplied by the scene's velocity factor, and columns are separate."""
+    """Verify that without forces q grows by dt v and v is multiplied by the scene's velocity factor, column by column."""
     scene = _Swing(stiffness=0.0, friction=0.0, velocity_factor=0.5)
     state = State(np.array([[1.0, 0.3]]), np.array([[0.5, -1.0]]))
     end = integrator.step(Dynamics(NewtonOps(), scene, None), state, np.zeros((1, 2)), 0.01)

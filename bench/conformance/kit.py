@@ -121,7 +121,7 @@ def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str,
 
 
 def variants(plugin_class: type[Plugin]) -> dict[str, Plugin]:
-    """Return instances by identity: the default, and one per other choice of a string or boolean parameter except ``dtype``."""
+    """Return instances by identity: the default, and one per other choice of a string or boolean, except ``dtype``."""
     instances = {plugin_class.name: build(plugin_class, {})}
     for name, parameter in parameters(plugin_class).items():
         choices = (True, False) if parameter.type is bool else parameter.choices or ()

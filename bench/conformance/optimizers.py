@@ -85,7 +85,7 @@ def path_repeats_after_a_stop(optimizer: Optimizer) -> str:
 
 @verifies(Optimizer)
 def state_is_left_alone(optimizer: Optimizer) -> str:
-    """Verify that ``ask`` and ``tell`` modify neither the state nor the points, so that a search can return to a state."""
+    """Verify that ``ask`` and ``tell`` modify neither state nor points, so that a search can return to a state."""
     before = b""
     kept: dict[str, Any] = {}
 

@@ -50,7 +50,7 @@ SCORED_STEPS = 8
 FINER = (4, 16)
 """Factors by which the time step is divided to approach the physics."""
 SPAN, POINTS = 0.2, 65
-"""Half range in sigma, and number of costs, of the fit that separates the slope of the physics from jumps between steps."""
+"""Half range in sigma, and number of costs, of the fit that separates the physics' slope from jumps between steps."""
 LIMITING = 0.05
 """Largest relative difference of a coordinate between two converged refinements, and of a refinement from the physics."""
 ELSEWHERE = 6.0
@@ -150,7 +150,7 @@ def continuity_is_as_declared(scene: Scene) -> str:
 
 @verifies(Scene)
 def closed_form_is_right(scene: Scene) -> str:
-    """Verify the closed form against long sampling for every law and integrator, at the default sigma and at twice sigma."""
+    """Verify the closed form against long sampling for every law and integrator, at once and twice the default sigma."""
     worst, count = 0.0, 0
     for sigma in (scene.sigma, 2 * scene.sigma):
         for program in _all_combinations(dataclasses.replace(scene, sigma=sigma)):
@@ -180,7 +180,7 @@ def _all_combinations(scene: Scene) -> Iterator[Program]:
 
 
 def _sampled_gradient(program: Program) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard error ``(d,)`` of first-order terms for a continuous program, else of zeroth-order terms."""
+    """Return mean and standard error ``(d,)`` of first-order terms, or of zeroth-order terms if the program jumps."""
     problem, theta = able_backend(program).compile(program), program.theta0
     w = rng("closed form").standard_normal((program.n_noise, 1 << 14))
     if program.continuous:
@@ -256,7 +256,7 @@ def physical_gradient_is_the_limit(scene: Scene) -> str:
         off = float(np.abs(ratios[1] - 1.0).max())
         if off <= LIMITING:
             return f"{describe(program)} is {off:.1g} from it at a step finer by {FINER[1]}"
-        # a coordinate that acts for one step only has a slope that changes with dt, but its ratio to the physical one converges
+        # the slope of a coordinate that acts for one step changes with dt, but its ratio to the physical slope converges
         if np.isfinite(ratios).all() and np.abs(ratios[1] - ratios[0]).max() <= LIMITING:
             apart[describe(program)] = off
     if not apart:

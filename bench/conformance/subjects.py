@@ -197,7 +197,7 @@ def distance(actual: np.ndarray, expected: np.ndarray) -> float:
 
 
 def standard_errors(difference: np.ndarray, error: np.ndarray, tolerance: np.ndarray | float) -> np.ndarray:
-    """Return the excess of ``difference (d,)`` over a tolerance for rounding, in units of the standard errors ``error (d,)``.
+    """Return the excess of ``difference (d,)`` over a tolerance for rounding, in standard errors ``error (d,)``.
 
     The result is inf where a difference exceeds the tolerance and its error is 0.
     """

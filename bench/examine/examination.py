@@ -359,7 +359,7 @@ class _Examination:
         return float(missed) if doubt < max(0.1 * missed, LEAST_MISSED) else math.nan
 
     def _measure_noise(self, checked: Check | None, repeats: bool) -> list[Smoothed]:
-        """Return the gradient's bias and the methods' costs at each sigma, with an equal share of the time for each sigma."""
+        """Return the gradient's bias and the methods' costs at each sigma, which all get an equal share of the time."""
         levels, scale = list(self.levels), np.ones(self.theta.size)
         if not levels and self.simulator.noise:
             levels, scale = [RELATIVE], self.scale

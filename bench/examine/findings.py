@@ -213,7 +213,7 @@ class Findings:
 
     @property
     def resolution(self) -> str:
-        """The smallest relative error that a check in this precision detects, u^(2/3) for central differences, as text in %."""
+        """The smallest relative error that central differences detect in this precision, about u^(2/3), as text in %."""
         unit = 2.0**-7 if self.precision == "bfloat16" else float(np.finfo(self.precision).eps)
         return f"{100 * unit ** (2 / 3):.1g}%"
 

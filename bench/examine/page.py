@@ -104,7 +104,7 @@ def _figure(panels: int, height: float = 2.6) -> tuple[Figure, list[Axes]]:
 
 
 def _steps(report: Findings) -> Figure:
-    """Return a figure of the error of each derivative, and of the Taylor remainder of each direction, against the step."""
+    """Return a figure of each derivative's error and each direction's Taylor remainder, against the step."""
     assert report.check is not None
     figure, (left, right) = _figure(2, 2.9)
     components = sorted(report.check.components, key=lambda p: -np.nan_to_num(p.error, nan=np.inf))[:SHOWN]

@@ -135,7 +135,7 @@ def measure_smoothed(
 def _draw(
     simulator: Simulator, theta: np.ndarray, spread: np.ndarray, random: np.random.Generator, size: int
 ) -> np.ndarray:
-    """Return pairs ``(3 d + 1, n)`` with n = ``size``: directions u, half differences of costs, gradients at +u and at -u."""
+    """Return ``size`` pairs, ``(3 d + 1, size)``: directions u, half differences of costs, gradients at +u and at -u."""
     u = random.standard_normal((theta.size, size))
     w = random.standard_normal((simulator.noise, size)) if simulator.noise else None
     up, down = theta[:, None] + spread[:, None] * u, theta[:, None] - spread[:, None] * u
@@ -184,7 +184,7 @@ def _summary(
 
 
 def _terms(u: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Return terms ``(d, n)`` with expectation E[d u] and less variance, by the straight line fitted to the other half."""
+    """Return terms ``(d, n)`` with expectation E[d u], less variable thanks to a line fitted to the other half."""
     dim, count = u.shape
     halves = np.arange(count) % 2 == 0
     out = np.empty_like(u)
@@ -217,7 +217,7 @@ def _method(name: str, bias: float, terms: np.ndarray, norm: float, calls: int, 
 
 
 def directions(count: int, scale: np.ndarray, seed: int) -> np.ndarray:
-    """Return random directions ``(count, d)``, each of length 1 in units of ``scale``; a single direction where d is 1."""
+    """Return random directions ``(count, d)`` of length 1 in units of ``scale``; only one direction where d is 1."""
     if scale.size == 1:
         return scale[None, :]
     drawn = np.random.default_rng([seed, 0x6C696E65]).standard_normal((count, scale.size))

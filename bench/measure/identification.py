@@ -53,7 +53,7 @@ class Information:
 
     @cached_property
     def invariants(self) -> np.ndarray:
-        """Exponents of the identifiable products of powers, ``(rank, p)``; unit vectors if all parameters are identifiable.
+        """Exponents of the identifiable products of powers, ``(rank, p)``; unit vectors if all are identifiable.
 
         Each unidentifiable direction has one leading parameter. Every other parameter is divided by the powers of the
         leading parameters that scale with it.
@@ -87,7 +87,7 @@ class Information:
 
     @property
     def words(self) -> str:
-        """One sentence that states which parameters or products are identifiable, and which changes do not affect the data."""
+        """A sentence on which parameters or products are identifiable, and which changes do not affect the data."""
         if self.rank == len(self.names):
             return f"{_listed(self.names)} {'are' if len(self.names) > 1 else 'is'} identifiable"
         hidden = [_direction(self.names, row) for row in self.gauge]

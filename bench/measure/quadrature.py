@@ -111,7 +111,7 @@ def _panels(edges: np.ndarray, count: int, shift: float) -> tuple[np.ndarray, np
 
 
 def _noise(cost: Callable[[np.ndarray], np.ndarray], width: int) -> float:
-    """Return a bound on the cost's rounding noise, from fourth differences over stencils too short to show the cost's shape.
+    """Return a bound on the cost's rounding noise, from fourth differences over stencils too short to show its shape.
 
     The fourth difference of independent errors of variance s^2 has the variance 70 s^2. A stencil that contains a kink
     or a jump is rare, and only makes the bound larger.

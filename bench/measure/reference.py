@@ -36,7 +36,7 @@ ROUNDING = 1e-9
 SHARED = 1e-10
 """Relative error common to the terms of all samples, from rounding and central differences."""
 WARNED, REFUSED = 0.999, 1.0 - 1e-6
-"""Confidence levels at which a difference between first and zeroth order adds a note, and makes zeroth order replace it."""
+"""Confidence levels at which a difference of first from zeroth order adds a note, and makes zeroth order replace first."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def _reason_against_first_order(
     directions: np.ndarray,
     columns: int,
 ) -> str:
-    """Return why first order cannot be trusted: the pilot's zeroth order disagrees, or the cost jumps. Empty if neither."""
+    """Return why first order is rejected: zeroth order disagrees in the pilot, or the cost jumps. Empty if neither."""
     if "zeroth_order" in pilots:
         # both use the same noise, so their differences are independent samples too
         paired = (pilots["first_order"] - pilots["zeroth_order"]).T
@@ -295,7 +295,7 @@ def _tail_error(
 
 
 def _directions(effect: np.ndarray) -> np.ndarray:
-    """Return unit vectors in noise space, ``(n_w, L)``: evenly chosen coordinates and the direction of the mean effect."""
+    """Return unit vectors in noise space, ``(n_w, L)``: evenly spaced coordinates, and the mean effect's direction."""
     width = effect.size
     chosen = np.unique(np.linspace(0, width - 1, min(width, DIRECTIONS)).astype(int))
     directions = np.eye(width)[:, chosen] if width <= DIRECTIONS else np.zeros((width, chosen.size))

@@ -52,7 +52,7 @@ UNEXPLAINED = "tails unseen or gradient wrong"
 
 
 def is_unexplained(reason: str) -> bool:
-    """Return whether a row's remark states that its bias contradicts the estimator's declaration, so is not established."""
+    """Return whether a row's remark marks its bias as not established: it contradicts the estimator's declaration."""
     return UNEXPLAINED in reason
 
 
@@ -137,7 +137,7 @@ class Truth:
 
     @classmethod
     def exact(cls, mean: np.ndarray, error: float = 0.0) -> Truth:
-        """Return a truth from a closed form or quadrature ``(d,)``, with an error of norm ``error`` and unknown direction."""
+        """Return a truth from a closed form or quadrature ``(d,)``; its error has norm ``error`` and unknown direction."""
         mean = np.asarray(mean, dtype=np.float64)
         return cls(mean, Sampling.without_direction(error, mean.size))
 
@@ -398,7 +398,7 @@ class Summary:
     cosine: float
     """Mean over repeats of the cosine between one estimate and the reference; an estimate of 0 counts as 0."""
     sign_agreement: float
-    """Share of coordinates of one estimate with the sign of the reference, over coordinates where the reference is not 0."""
+    """Share of one estimate's coordinates that have the reference's sign, among those where the reference is not 0."""
     finite_fraction: float
     """Share of repeats whose coordinates are all finite."""
     note: str = ""
@@ -417,7 +417,7 @@ def summarise(
     terms: tuple[np.ndarray, np.ndarray] | None = None,
     unbiased: bool = False,
 ) -> Summary:
-    """Return the statistics of independent ``estimates (R, d)``, each of ``samples`` samples, compared with the reference.
+    """Return the statistics of independent ``estimates (R, d)`` of ``samples`` samples each, compared with the reference.
 
     ``terms`` are the sums and squares for :func:`variance_per_sample`, for estimates that are means of one term per
     sample. Without ``terms``, the variance per sample is ``samples`` times the variance of an estimate. ``unbiased`` is
@@ -519,7 +519,7 @@ def _directions(estimates: np.ndarray, reference: np.ndarray) -> tuple[float, fl
 
 
 def _reference_remarks(reference: Truth, relative: float) -> list[str]:
-    """Return remarks on relative columns that the reference limits; ``relative`` is its norm, or NaN where it vanishes."""
+    """Return remarks on how the reference limits relative columns; ``relative`` is its norm, NaN where it vanishes."""
     norm, error = reference.norm, reference.standard_error
     if math.isnan(relative):
         if error == 0.0:
@@ -545,7 +545,7 @@ def heavy_tails(deviations: np.ndarray) -> float:
 
 
 def _interval_remarks(deviations: np.ndarray, difference: np.ndarray, samples: int, identical: bool) -> list[str]:
-    """Return remarks that give reasons to doubt the intervals, from deviations ``(R, d)`` and a difference of means ``(d,)``."""
+    """Return remarks that question the intervals, from deviations ``(R, d)`` and a difference of means ``(d,)``."""
     repeats = len(deviations)
     if repeats == 1:
         return ["only 1 repeat: no variance, and no interval of the bias"]

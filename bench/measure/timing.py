@@ -90,7 +90,7 @@ def timed(
 
 
 def _must_repeat(seconds: list[float], least_s: float, settle_s: float) -> bool:
-    """Return whether to repeat calls: their total is below ``least_s``, or they are unsteady and it is below ``settle_s``."""
+    """Return whether to repeat calls: below ``least_s`` in total, or unsteady and below ``settle_s`` in total."""
     total = sum(seconds)
     if total < least_s:
         return True

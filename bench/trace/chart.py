@@ -90,7 +90,7 @@ def _legend(table: pd.DataFrame) -> list[Any]:
 
 
 def _contacts(ax: Axes, table: pd.DataFrame) -> None:
-    """Shade the states in contact, darker where a contact slips, and mark each switch between the two states that differ."""
+    """Shade the states in contact, darker where a contact slips, and mark each switch between its two states."""
     time = table["time"].to_numpy()
     half = 0.5 * (time[1] - time[0])
     for name, look in (("contacts", SHADE), ("slipping", SLIPPING)):

@@ -49,7 +49,7 @@ class Newton(LoopOps):
 
 
 def stepped(program: Rollout, path: Jacobians, ops: Newton) -> np.ndarray:
-    """Return the state after each step, ``(n, T)``, computed from the states of ``path`` with the steps as batch columns."""
+    """Return the state after each step of ``path``, ``(n, T)``, computed with the steps as batch columns."""
     import jax.numpy as jnp
 
     before, u = jnp.asarray(path.states[:-1].T), jnp.asarray(path.controls.T)
@@ -57,7 +57,7 @@ def stepped(program: Rollout, path: Jacobians, ops: Newton) -> np.ndarray:
 
 
 def solved_again(program: Rollout, path: Jacobians) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the state after each step, ``(n, T)``, solved again by Newton's method, and the solver columns, ``(T + 1,)``.
+    """Return the state after each step, ``(n, T)``, solved again by Newton's method, and the solver columns ``(T + 1,)``.
 
     A backend's own solver runs inside the compiled rollout and reports nothing. So each step is solved again from its
     state, with the law's own first guess. ``solver_residual`` is the largest component of the residual (in the unit of

@@ -51,7 +51,7 @@ def spikes(values: Sequence[float] | np.ndarray) -> np.ndarray:
 
 
 def align(values: Sequence[float] | np.ndarray, switch: Sequence[int] | np.ndarray) -> Alignment:
-    """Return how the spikes of ``values (T + 1,)`` align with ``switch (T + 1,)``, 1 where contacts differ from the state before."""
+    """Return how spikes of ``values (T + 1,)`` align with ``switch (T + 1,)``, 1 where contacts have just changed."""
     from scipy.stats import hypergeom
 
     spiked = spikes(values)

@@ -47,7 +47,7 @@ class Trace:
     table: pd.DataFrame
     """``horizon + 1`` rows, one per state; NaN where a quantity does not exist, such as |dF/dx| at the last state."""
     gradient_error: float
-    """|gradient from the adjoints - program's gradient| / |program's gradient|; absolute if the program's gradient is 0."""
+    """|adjoints' gradient - program's gradient| / |program's gradient|; absolute if the program's gradient is 0."""
 
     def report(self) -> list[str]:
         """Describe the trace in sentences."""
@@ -152,7 +152,7 @@ def _norms(matrices: np.ndarray) -> np.ndarray:
 
 
 def _costs(scene: MechanicalScene, path: Jacobians) -> dict[str, np.ndarray]:
-    """Return costs by column name, each ``(T + 1,)``: stage costs and terms per step, the terminal cost at the last state."""
+    """Return costs by column, each ``(T + 1,)``: stage costs and terms per step, the terminal cost at the last state."""
     states, u = path.states.T, path.controls.T
     before = split(scene, states[:, :-1])
 

@@ -27,7 +27,7 @@ SUSPICIOUS = 4
 ELSEWHERE = 4
 """Most other thetas at which the ratio of a wrong component is computed."""
 FAR = (1.0, 3.0)
-"""Standard deviations, in units of each input's scale, of thetas where a term may be inactive, such as a contact force."""
+"""Standard deviations, in units of each input's scale, of thetas where a term such as a contact may be inactive."""
 PLAINLY = ("smooth", "nonlinear", "mode_crossing")
 """Verdicts that count as right at the thetas drawn with :data:`FAR`."""
 
@@ -37,7 +37,7 @@ class Options:
     """The scope of a check."""
 
     components: int = 16
-    """Most components checked one by one. If there are more, half have the largest |gradient x scale|, half the smallest."""
+    """Most components checked one by one; of more, half have the largest |gradient * scale|, half the smallest."""
     directions: int = 2
     """Number of random directions, drawn in units of each input's own scale."""
     draws: int = 8
@@ -360,7 +360,7 @@ class _Checker:
         return findings
 
     def _judge_staircase(self, sample: Sample, finding: Finding, row: np.ndarray) -> Finding:
-        """Return the finding on a staircase: ``precision`` where the gradient is right on scales above the treads' height.
+        """Return the finding on a staircase: ``precision`` where the gradient is right on scales above its treads.
 
         A cast to a shorter float keeps the gradient, a cast to an integer removes it.
         """

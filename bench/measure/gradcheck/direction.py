@@ -261,7 +261,7 @@ def _judge_one_sided(sample: Sample, noise: np.ndarray) -> str:
 
 
 def _resolution(sample: Sample, index: int) -> float:
-    """Return u^(1/3) times the derivative's size; u^(1/3) is the relative step that balances a difference's two errors."""
+    """Return u^(1/3) times the derivative's size: at the relative step u^(1/3), a difference's two errors balance."""
     return float(np.cbrt(sample.unit)) * sample.size(index)
 
 

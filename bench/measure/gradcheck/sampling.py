@@ -61,7 +61,7 @@ def samples(
 
 
 def order(sample: Sample) -> float:
-    """Return the order in h of the Taylor remainder |f(x + h d) - f(x) - h g d|: 2 for a right gradient, 1 for a wrong one.
+    """Return the order in h of the Taylor remainder |f(x + h d) - f(x) - h g d|: 2 for a right gradient, 1 if wrong.
 
     The order is the median slope, in log scales, over the five smallest steps on either side whose remainder exceeds
     ten times the noise. It is NaN with fewer than four such steps, as for a linear cost. No choice of a best step is
