@@ -150,7 +150,7 @@ def continuity_is_as_declared(scene: Scene) -> str:
 
 @verifies(Scene)
 def closed_form_is_right(scene: Scene) -> str:
-    """Verify the closed form against long sampling for every law and integrator, at once and twice the default sigma."""
+    """Verify the closed form against long sampling for every law and integrator, at the default sigma and its double."""
     worst, count = 0.0, 0
     for sigma in (scene.sigma, 2 * scene.sigma):
         for program in _all_combinations(dataclasses.replace(scene, sigma=sigma)):
