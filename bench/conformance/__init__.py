@@ -1,14 +1,14 @@
 """The conformance kit: every fact that a plugin declares is verified by running the plugin.
 
-Each check is one function, registered for a kind of plugin. It takes an instance, returns the numbers it measured as
-text, and raises :class:`Failed` or :class:`Skipped`. A plugin is checked with its default parameters and once more for every
+Each check is one function, registered for a kind of plugin. It takes an instance and returns its measurements as text,
+or raises :class:`Failed` or :class:`Skipped`. A plugin is checked with its default parameters and once more for every
 other choice it offers (``reinforce[baseline=none]``). Noise has fixed seeds, so results repeat. Limits on sample
-means are 4.5 standard errors, one false alarm in 150,000.
+means are 4.5 standard errors: one false alarm in 150,000.
 
 ``python -m bench check`` prints a line for each check; :func:`parametrize` makes each check a pytest test.
 """
 
-# the modules of checks register them as they are imported
+# importing these modules registers their checks
 from bench.conformance import backends, contacts, estimators, generic, integrators, optimizers, scenes
 from bench.conformance.kit import CheckResult, Failed, Skipped, check, main, parametrize, verifies
 

@@ -1,4 +1,4 @@
-"""Checks of backends: their numbers compared with NumPy's, with differences, and with known solutions."""
+"""Checks of backends: their results compared with NumPy's, with differences, and with known solutions."""
 
 from __future__ import annotations
 
@@ -51,26 +51,29 @@ from bench.model.backend import CAPABILITIES
 GRADIENT = 1e-4
 """Relative error allowed against central differences of step 1e-6, on columns where two steps agree to 2e-5."""
 SCORE = 1e-5
-"""Relative error allowed against differences of log p, which is linear in theta: rounding over a step of 1e-3."""
+"""Relative error allowed against differences of log p over a step of 1e-3: only rounding, as log p is linear in theta."""
 SINGLE = 1e-2
 """Relative error allowed in single precision: rollouts round hundreds of times by 6e-8, and central differences keep
 two or three digits."""
 ELSEWHERE = 30.0
-"""Factor by which the second check of gradients is further from theta0: 3 sigma."""
+"""Factor by which the second check of gradients is farther from theta0: 3 sigma instead of 0.1 sigma."""
 FAR = 1e200
-"""Size of a theta whose square is not finite."""
+"""Size of a theta whose square overflows."""
 PRESSED = 1e-3
 """Penetration [m] at which the force of a contact with friction is compared."""
 PUSHED = 0.02
-"""Relative error allowed in that force: an impedance of 1e-4 hides 5e-4 of it at a friction of 0.5."""
+"""Relative error allowed in a contact force with friction: an impedance of 1e-4 causes 5e-4 at a friction of 0.5."""
 SOLVED = 1e-9
-"""Relative error allowed where equations are solved to 1e-12 in the unknown, through a condition number below 100."""
+"""Relative error allowed where equations are solved to 1e-12 in the unknown, at a condition number below 100."""
 
 
 def programs_for(
     backend: Backend, sort: Callable[[list[Program]], list[Program]], candidates: Iterable[Program] | None = None
 ) -> list[Program]:
-    """Return programs of a sort that the backend can run; with non-default parameters, smooth ones and equations."""
+    """Return the programs that ``sort`` selects from those the backend can run.
+
+    With non-default parameters, the backend gets only programs without contacts and programs that solve equations.
+    """
     runs = [
         program
         for program in (all_programs() if candidates is None else candidates)
@@ -86,7 +89,7 @@ def programs_for(
 
 @verifies(Backend)
 def value_agrees(backend: Backend) -> str:
-    """Verify that costs equal the plain backend's on every scene and law; for engines, within the twin's tolerance."""
+    """Verify that costs equal the plain backend's on every scene and law, within the twin's tolerance for engines."""
     plain = plain_backend()
     programs = programs_for(
         backend, list, [program for program in all_programs() if plain.incompatibility(program) is None]
@@ -104,7 +107,7 @@ def value_agrees(backend: Backend) -> str:
 
 
 def _allowed(backend: Backend, program: Program, exact: float) -> float:
-    """Return the relative difference allowed from the scene's own program: ``exact``, or more for physics engines."""
+    """Return the allowed relative difference from the scene's own program: ``exact``, or more for physics engines."""
     scene = program.scene
     if "physics" in backend.provides and isinstance(scene, EngineTwin):
         return max(exact, scene.twin_difference)
@@ -132,7 +135,7 @@ def gradient_is_that_of_value(backend: Backend) -> str:
             continue
         off = np.where(smooth, off, 0.0)
         require(off.max() < GRADIENT, f"{describe(program)}: differs from central differences by {off.max():.1e}")
-        # another theta than the scene's own, where an adjoint may use values it stored for theta0
+        # far from theta0, where an adjoint must not use values stored for theta0
         theta = program.theta0[:, None] + ELSEWHERE * (theta - program.theta0[:, None])
         with np.errstate(all="ignore"):
             far_error, agree = _against_differences(problem, problem.grad(theta, w), theta, w)
@@ -148,19 +151,19 @@ def gradient_is_that_of_value(backend: Backend) -> str:
 def _against_differences(
     problem: Problem, gradient: np.ndarray, theta: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the relative error of directional derivatives per column, and whether two difference steps agree there."""
+    """Return the relative error of directional derivatives, and whether two difference steps agree, both ``(B,)``."""
     e = rng("direction").standard_normal(theta.shape)
     steps = (2e-6, 1e-6)
     wide, narrow = ((problem.value(theta + h * e, w) - problem.value(theta - h * e, w)) / (2 * h) for h in steps)
     slope = (gradient * e).sum(axis=0)
-    # rounding leaves about 1e-16 / 1e-6 of the cost in a difference; a gradient below that cannot be judged
+    # rounding causes an error of about 1e-16 / 1e-6 of the cost in a difference: smaller gradients cannot be checked
     scale = np.abs(narrow) + np.abs(gradient * e).sum(axis=0) + 1e-5 * np.abs(problem.value(theta, w)) + 1e-9
     return np.abs(slope - narrow) / scale, np.abs(wide - narrow) < 2e-5 * scale
 
 
 @verifies(Backend)
 def score_is_that_of_actions(backend: Backend) -> str:
-    """Verify scores: w / sigma without feedback; with it, the derivative of log p(actions), of mean zero."""
+    """Verify scores: w / sigma without feedback. With feedback, the derivative of log p(actions), with mean 0."""
     if "score" not in backend.provides:
         raise Skipped("computes no scores")
     details = []
@@ -186,7 +189,7 @@ def score_is_that_of_actions(backend: Backend) -> str:
 
 @verifies(Backend)
 def columns_are_independent(backend: Backend) -> str:
-    """Verify that column b of a result depends only on column b of theta and w, whatever else is in the batch."""
+    """Verify that column b of a result depends only on column b of theta and w, not on other columns or their order."""
     worst = 0.0
     for program in programs_for(backend, distinguishing_programs):
         problem, (theta, w) = backend.compile(program), samples(program)
@@ -206,7 +209,7 @@ def columns_are_independent(backend: Backend) -> str:
 
 @verifies(Backend)
 def shared_theta_is_spread(backend: Backend) -> str:
-    """Verify that ``theta (d,)`` acts as ``theta (d, B)`` of equal columns, and a batch as its columns one by one."""
+    """Verify that ``theta (d,)`` acts like ``theta (d, B)`` with equal columns, and a batch like its separate columns."""
     worst = 0.0
     for program in programs_for(backend, distinguishing_programs)[-1:]:
         problem, w = backend.compile(program), samples(program)[1]
@@ -226,9 +229,10 @@ def shared_theta_is_spread(backend: Backend) -> str:
 
 @verifies(Backend)
 def failed_rollouts_have_no_gradient(backend: Backend) -> str:
-    """Verify that costs are not finite where the plain backend's are not, nor gradients where their costs are not.
+    """Verify that costs are not finite where the plain backend's are not, and gradients not where costs are not.
 
-    Theta is very large in one column of a batch. An engine that stops, resets or repeats its last state has to report it.
+    Theta is very large in one column of a batch. An engine that stops, resets or repeats its last state must report
+    that.
     """
     if "grad" not in backend.provides:
         raise Skipped("computes no gradients")
@@ -252,7 +256,7 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
 
 @verifies(Backend)
 def single_precision_is_finite(backend: Backend) -> str:
-    """Verify that costs and gradients with ``dtype=float32`` are close to double precision, on smooth scenes."""
+    """Verify that float32 costs and gradients are close to float64, on continuous scenes without contacts."""
     single = dataclasses.replace(backend, dtype="float32")
     worst = dict.fromkeys(sorted(backend.provides & {"value", "grad"}), 0.0)
     smooth = [p for p in programs_for(single, distinguishing_programs) if p.contact is None and p.continuous]
@@ -268,7 +272,7 @@ def single_precision_is_finite(backend: Backend) -> str:
 
 @verifies(Backend)
 def provides_is_truthful(backend: Backend) -> str:
-    """Verify that declared capabilities are known and present, and that equations are rejected without ``root``."""
+    """Verify that declared capabilities exist and work, and that equations are rejected without ``root``."""
     strange = sorted(set(backend.provides) - CAPABILITIES)
     require(not strange, f"{', '.join(strange)}: not among {', '.join(sorted(CAPABILITIES))}")
     require("value" in backend.provides, "computes no costs")
@@ -295,7 +299,7 @@ COUPLING = np.array([[2.0, 0.5, -0.3], [0.2, 1.5, 0.4], [-0.6, 0.1, 1.8]])
 
 @dataclass(frozen=True)
 class _Initial(MechanicalScene):
-    """f = sum_i (i + 1) q_i after one step from q = theta."""
+    """The cost sum_i (i + 1) q_i after one step from q = theta."""
 
     name = "conformance_initial"
     n_q: ClassVar[int] = 3
@@ -318,7 +322,7 @@ class _Initial(MechanicalScene):
 
 @dataclass(frozen=True)
 class _Solving(Integrator):
-    """q+ solves COUPLING q+ + q+^3 + 0.1 q+ (q+_0)^2 = q."""
+    """A step from q to the solution q+ of COUPLING q+ + q+^3 + 0.1 q+ (q+_0)^2 = q."""
 
     name = "conformance_solving"
     needs_root: ClassVar[bool] = True
@@ -349,7 +353,11 @@ def _implicit_problem(backend: Backend, unknowns: int) -> Problem:
 
 @dataclass(frozen=True)
 class _Pressed(EngineScene):
-    """A ball of 1 kg, 1 mm into a plane with friction, at velocity theta (along, away); f is its velocity away a step on."""
+    """A ball of 1 kg that penetrates a plane with friction by 1 mm.
+
+    theta is its velocity along and away from the plane [m/s]. The cost is the velocity away from the plane after one
+    step.
+    """
 
     name = "pressed"
     n_q: ClassVar[int] = 2
@@ -362,11 +370,11 @@ class _Pressed(EngineScene):
     friction: float = param(0.5, "Coulomb coefficient", low=0.0)
 
     def theta0(self) -> np.ndarray:
-        """Rest."""
+        """Return velocities of 0."""
         return np.zeros(2)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Press the ball in."""
+        """Return the ball's position, 1 mm into the plane, and its velocity theta."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero + 0.1 - PRESSED]), theta)
 
@@ -375,7 +383,7 @@ class _Pressed(EngineScene):
         return v[1]
 
     def mjcf(self) -> str:
-        """Return the ball on its plane."""
+        """Return MuJoCo's description of the ball and the plane."""
         return f"""
             <worldbody>
               <geom name="ground" type="plane" size="1 1 1"/>
@@ -393,10 +401,10 @@ class _Pressed(EngineScene):
 
 @verifies(Backend)
 def frictional_contact_has_the_force_of_its_law(backend: Backend) -> str:
-    """Verify the normal force of a contact with friction at rest, closing, parting and creeping, against the spring law's.
+    """Verify the normal force of a contact with friction against the spring law: at rest, closing, parting and creeping.
 
-    The result for the same ball sliding at 1 m/s is reported but not limited, since an engine's friction adds to the
-    normal force there.
+    The result for a ball that slides at 1 m/s is reported but not limited, since an engine's friction then adds to the
+    normal force.
     """
     if "physics" not in backend.provides:
         raise Skipped("does not have its own physics")
@@ -420,7 +428,7 @@ def frictional_contact_has_the_force_of_its_law(backend: Backend) -> str:
 
 @verifies(Backend)
 def root_is_differentiated_implicitly(backend: Backend) -> str:
-    """Verify costs and implicit-function gradients for one unknown and for three coupled ones, with known solutions."""
+    """Verify costs and implicit-function gradients for one and for three coupled unknowns, with known solutions."""
     if "root" not in backend.provides:
         raise Skipped("solves no equations")
     worst = 0.0

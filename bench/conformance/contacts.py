@@ -58,7 +58,7 @@ PUSH_DT = 0.01
 
 
 def _push(law: ContactLaw, gap: Any, rate: Any, ops: Ops | None = None) -> np.ndarray:
-    """Return the normal impulse over 0.01 s on both contacts of a tower, ``(2, B)``, for the gaps and rates of each."""
+    """Return the normal impulses of a tower's two contacts over 0.01 s [N s], for gaps and gap rates, all ``(2, B)``."""
     gaps, rates = (np.asarray(part, dtype=float).reshape(2, -1) for part in (gap, rate))
     if isinstance(law, ForceLaw):
         return np.asarray(PUSH_DT * law.force(np, gaps, rates))
@@ -72,11 +72,11 @@ def _push(law: ContactLaw, gap: Any, rate: Any, ops: Ops | None = None) -> np.nd
 
 
 FAR = ([[0.05, 0.2, 1.0], [0.05, 0.2, 1.0]], [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Gaps and rates of contacts that do not meet within the step."""
+"""Gaps [m] and gap rates [m/s], by contact, of bodies that do not meet within the step."""
 
 
 def _sharpened(law: ContactLaw, factor: float) -> ContactLaw:
-    """Return the law with its smoothing multiplied or divided by a factor, whichever pushes less at a distance."""
+    """Return the law with its smoothing multiplied or divided by ``factor``, whichever pushes less at a distance."""
     value = getattr(law, law.smoothing)
     changed = [dataclasses.replace(law, **{law.smoothing: value * f}) for f in (factor, 1 / factor)]
     return min(changed, key=lambda one: np.abs(_push(one, *FAR)).max())
@@ -84,7 +84,7 @@ def _sharpened(law: ContactLaw, factor: float) -> ContactLaw:
 
 @verifies(ContactLaw)
 def does_not_push_from_afar(law: ContactLaw) -> str:
-    """Verify that there is no force on separated bodies; with smoothing, that the force vanishes as it sharpens."""
+    """Verify that separated bodies get no force, or, under a smoothed law, a force that vanishes with the smoothing."""
     push = np.abs(_push(law, *FAR)).max() / PUSH_DT
     if not law.smoothing:
         require(push == 0, f"a force of {push:.3g} N on separated bodies")
@@ -97,7 +97,7 @@ def does_not_push_from_afar(law: ContactLaw) -> str:
 
 @verifies(ContactLaw)
 def pushes_in_contact(law: ContactLaw) -> str:
-    """Verify that bodies that overlap and approach are pushed apart, and faster ones no less."""
+    """Verify that bodies that overlap and approach are pushed apart, and no less by a faster approach."""
     push = _push(law, [[-0.01] * 3, [1.0] * 3], [[-1.0, -2.0, -4.0], [0.0] * 3])[0] / PUSH_DT
     require((push > 0).all(), f"forces of {push.round(3).tolist()} N on bodies that overlap and approach: it pulls")
     require((np.diff(push) >= -1e-9 * push.max()).all(), f"a faster approach lowers the force: {push.tolist()} N")
@@ -117,7 +117,7 @@ def force_grows_with_penetration(law: ForceLaw) -> str:
 
 @verifies(ForceLaw)
 def contacts_are_separate(law: ForceLaw) -> str:
-    """Verify that the force of one contact does not depend on another's gap."""
+    """Verify that the force of one contact does not depend on the gap and gap rate of another."""
     draw = rng("separate")
     gap, rate = 0.02 * draw.standard_normal((2, 50)), draw.standard_normal((2, 50))
     together = law.force(np, gap, rate)
@@ -128,7 +128,7 @@ def contacts_are_separate(law: ForceLaw) -> str:
 
 @verifies(ContactLaw)
 def smoothing_converges(law: ContactLaw) -> str:
-    """Verify that forces settle on those of an unsmoothed law as the smoothing sharpens by factors of 10."""
+    """Verify that forces converge as smoothing decreases by factors of 10."""
     if not law.smoothing:
         raise Skipped("has no smoothing")
     gaps = np.array([[-0.05, -0.01, -0.001, 0.0, 0.001, 0.01, 0.05], [1.0] * 7])
@@ -141,7 +141,7 @@ def smoothing_converges(law: ContactLaw) -> str:
 
 @verifies(ImpulseLaw)
 def impulse_keeps_momentum(law: ImpulseLaw) -> str:
-    """Verify that bodies meeting in the air push each other equally, and apart; afterwards they do not approach."""
+    """Verify that bodies that meet in the air get equal and opposite impulses, and do not approach afterwards."""
     sharp = _sharpened(law, 1e4) if law.smoothing else law
     rate = np.array([[0.0, 0.3, -0.2], [-1.0, -3.0, -0.5]])
     push = _push(sharp, [[1.0] * 3, [0.0] * 3], rate)
@@ -155,7 +155,7 @@ def impulse_keeps_momentum(law: ImpulseLaw) -> str:
 
 @verifies(ContactLaw)
 def needs_root_of_law_is_truthful(law: ContactLaw) -> str:
-    """Verify that the law solves an equation if and only if it declares so."""
+    """Verify that the law solves an equation if and only if it declares ``needs_root``."""
     ops = NewtonOps()
     _push(law, [[-0.01], [1.0]], [[-1.0], [0.0]], ops)
     require(

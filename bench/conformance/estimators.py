@@ -26,11 +26,11 @@ from bench.conformance.subjects import (
 from bench.model import Estimator, FunctionScene, MechanicalScene, Problem, SampleMean, compose
 
 SIGMAS = (0.1, 0.5)
-"""Noise levels of the oracles: never 1, where sigma and its square are the same."""
+"""Noise levels of the oracles. 1 is excluded, because sigma and its square would be equal."""
 
 
 class RecordingProblem(Problem):
-    """A problem that records which capabilities are used and rejects undeclared ones."""
+    """A problem that records which capabilities are used, and rejects undeclared capabilities."""
 
     def __init__(self, inner: Problem, allowed: frozenset[str]) -> None:
         super().__init__(inner.program)
@@ -50,7 +50,7 @@ class RecordingProblem(Problem):
         return self._use("score", theta, w)
 
     def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return explicit derivatives, which belong to scores."""
+        """Return explicit derivatives, which count as part of the scores."""
         require("score" in self._allowed, "uses explicit, and score is not in needs")
         return self._inner.explicit(theta, w)
 
@@ -72,13 +72,13 @@ class Oracle(NamedTuple):
 
     @property
     def continuous(self) -> bool:
-        """Whether its cost is continuous."""
+        """Whether the cost is continuous."""
         return self.problem.program.continuous
 
 
 @cache
 def oracles() -> tuple[Oracle, ...]:
-    """Return every sound function with a valid closed-form gradient, at each of :data:`SIGMAS`."""
+    """Return an oracle for every sound function with a valid closed-form gradient, at each of :data:`SIGMAS`."""
     result = []
     for default, sigma in itertools.product(sound_scenes(), SIGMAS):
         if isinstance(default, FunctionScene):
@@ -96,7 +96,7 @@ def oracles() -> tuple[Oracle, ...]:
 
 @cache
 def feedback_oracle() -> Oracle:
-    """Return a smooth five-step scene with noise on a policy's actions, its gradient from long first-order sampling."""
+    """Return a smooth five-step oracle with noise on a policy's actions, and its gradient from first-order sampling."""
     for default in sound_scenes():
         if not isinstance(default, MechanicalScene) or default.n_contacts or not default.continuous:
             continue
@@ -111,7 +111,7 @@ def feedback_oracle() -> Oracle:
 
 
 def varying_oracle(estimator: Estimator) -> Oracle:
-    """Return the first oracle on which all samples have different gradients, and sigma changes the gradient."""
+    """Return the first oracle whose samples all have different gradients and whose gradient depends on sigma."""
     for oracle in usable(estimator, [o for o in oracles() if o.continuous]):
         w = rng("lively").standard_normal((oracle.problem.program.n_noise, 64))
         gradients = oracle.problem.grad(oracle.problem.program.theta0, w)
@@ -127,14 +127,14 @@ def usable(estimator: Estimator, candidates: Iterable[Oracle]) -> Iterator[Oracl
 
 
 def draw_noise(oracle: Oracle, repeats: int, count: int, *key: str | int) -> np.ndarray:
-    """Draw read-only noise ``(R, N, n_w)``, as estimators get it."""
+    """Return read-only noise ``(R, N, n_w)``, in the form that estimators get."""
     noise = rng("noise", *key).standard_normal((repeats, count, oracle.problem.program.n_noise))
     noise.setflags(write=False)
     return noise
 
 
 def estimates(estimator: Estimator, oracle: Oracle, noise: np.ndarray, problem: Problem | None = None) -> np.ndarray:
-    """Return estimates of the right shape, all finite; raises :class:`Failed` otherwise."""
+    """Return estimates ``(R, d)``; raises :class:`Failed` if the shape is wrong or a number is not finite."""
     problem = problem or oracle.problem
     result = np.asarray(estimator.estimate(problem, problem.program.theta0, noise))
     require(result.shape == (noise.shape[0], problem.dim), f"shape {result.shape}, not {(noise.shape[0], problem.dim)}")
@@ -143,7 +143,7 @@ def estimates(estimator: Estimator, oracle: Oracle, noise: np.ndarray, problem: 
 
 
 def target(estimator: Estimator, oracle: Oracle) -> np.ndarray:
-    """Return the quantity that the estimator declares to estimate, ``(d,)``."""
+    """Return the gradient that the estimator declares as its target, ``(d,)``."""
     if estimator.target == "smoothed":
         return oracle.truth
     program = oracle.problem.program
@@ -166,7 +166,7 @@ def shape_and_repeatability(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def diagnostics_are_as_declared(estimator: Estimator) -> str:
-    """Verify that ``estimate_with_diagnostics`` returns the estimates, and finite arrays of the declared diagnostics."""
+    """Verify that ``estimate_with_diagnostics`` returns the same estimates, and finite, declared diagnostics."""
     oracle = varying_oracle(estimator)
     noise = draw_noise(oracle, 6, 8)
     values, diagnostics = estimator.estimate_with_diagnostics(oracle.problem, oracle.problem.program.theta0, noise)
@@ -206,7 +206,7 @@ def repeats_are_independent(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def uses_every_sample(estimator: Estimator) -> str:
-    """Verify that changing the noise of any of 8 samples (or any eighth of 4096, if needed) changes the estimate."""
+    """Verify that the estimate depends on the noise of each of 8 samples, or else of each eighth of 4096 samples."""
     oracle = varying_oracle(estimator)
     unused = set(range(8))
     for size in (1, 512):
@@ -235,7 +235,7 @@ def variance_falls_as_one_over_n(estimator: Estimator) -> str:
         logs[i] = np.log(variance)
     slopes = np.polyfit(np.log(counts), logs, 1)[0]
     slope, error = slopes.mean(), slopes.std(ddof=1) / math.sqrt(groups)
-    allowed = LIMIT * error + 0.02  # 0.02: terms of order 1/N^2 (leave-one-out baselines) at N = 32
+    allowed = LIMIT * error + 0.02  # 0.02 allows terms of order 1/N^2 (leave-one-out baselines) at N = 32
     detail = f"slope {slope:.3f} +- {error:.3f}"
     require(slope < -1 + allowed, f"{detail}: falls slower than 1/N")
     if isinstance(estimator, SampleMean) or estimator.unbiased:
@@ -245,7 +245,7 @@ def variance_falls_as_one_over_n(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def bias_is_as_declared(estimator: Estimator) -> str:
-    """Verify the bias on continuous costs: none if ``unbiased``, else less than that of the zero estimate."""
+    """Verify the bias on continuous costs: none if ``unbiased``, else smaller than the bias of the zero estimate."""
     candidates = list(usable(estimator, [o for o in oracles() if o.continuous]))
     if not candidates:
         raise Skipped("supports no continuous oracle")
@@ -254,7 +254,7 @@ def bias_is_as_declared(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def bias_across_jumps_is_as_declared(estimator: Estimator) -> str:
-    """Verify the bias on discontinuous costs: none if ``unbiased_at_discontinuities``, else a significant one."""
+    """Verify the bias on discontinuous costs: none if ``unbiased_at_discontinuities``, else a significant bias."""
     candidates = list(usable(estimator, [o for o in oracles() if not o.continuous]))
     if not estimator.unbiased:
         raise Skipped("declares a bias everywhere")
@@ -308,7 +308,7 @@ def _verify_smaller_than_zero_estimate(estimator: Estimator, candidates: list[Or
 
 
 def _standard_errors(estimator: Estimator, oracle: Oracle, count: int, repeats: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bias of each coordinate in standard errors, beyond rounding, and the bias itself."""
+    """Return the bias beyond rounding in standard errors, and the bias itself, both ``(d,)``."""
     values = estimates(estimator, oracle, draw_noise(oracle, repeats, count, oracle.label, count))
     truth = target(estimator, oracle)
     bias = values.mean(axis=0) - truth
@@ -318,7 +318,7 @@ def _standard_errors(estimator: Estimator, oracle: Oracle, count: int, repeats: 
 
 @verifies(Estimator)
 def needs_are_truthful(estimator: Estimator) -> str:
-    """Verify that the estimator uses every capability in ``needs``, and no other."""
+    """Verify that the estimator uses every capability in ``needs``, and no other capability."""
     oracle = varying_oracle(estimator)
     recording = RecordingProblem(oracle.problem, estimator.needs)
     estimates(estimator, oracle, draw_noise(oracle, 4, 8), recording)

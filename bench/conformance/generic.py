@@ -18,7 +18,7 @@ from bench.model.parameters import build, check, parameters
 
 @verifies(Plugin)
 def is_frozen_dataclass(plugin: type[Plugin]) -> str:
-    """Verify that instances are values that can be compared, hashed and used as keys."""
+    """Verify that instances are values that can be compared, hashed and used as dictionary keys."""
     require("__dataclass_fields__" in plugin.__dict__, "is not decorated with @dataclass(frozen=True)")
     require(plugin.__dataclass_params__.frozen, "is not frozen: write @dataclass(frozen=True)")  # type: ignore[attr-defined]
     require(build(plugin, {}) == build(plugin, {}), "two default instances are not equal")
@@ -27,7 +27,7 @@ def is_frozen_dataclass(plugin: type[Plugin]) -> str:
 
 @verifies(Plugin)
 def has_docstring(plugin: type[Plugin]) -> str:
-    """Verify that the plugin has its own docstring, not the one that dataclass generates."""
+    """Verify that the plugin has its own docstring, not the docstring that ``dataclass`` generates."""
     text = (plugin.__dict__.get("__doc__") or "").strip()
     require(text and not text.startswith(f"{plugin.__name__}("), "has no docstring")
     return text.splitlines()[0]
@@ -35,7 +35,7 @@ def has_docstring(plugin: type[Plugin]) -> str:
 
 @verifies(Plugin)
 def has_good_name(plugin: type[Plugin]) -> str:
-    """Verify that the name is one word for command line and tables; a built-in plugin is named after its file or folder."""
+    """Verify that the name is one word, and, for a built-in plugin, the name of its file or folder."""
     name, module = plugin.name, plugin.__module__
     require(name.isidentifier() and name.islower(), f"'{name}' must have only lower-case letters, digits and '_'")
     kinds = registry.kinds()
@@ -61,7 +61,7 @@ def declares_parameters(plugin: type[Plugin]) -> str:
 
 @verifies(Plugin)
 def survives_spawned_process(plugin: type[Plugin]) -> str:
-    """Verify that every variant, pickled into a fresh process and back, equals itself."""
+    """Verify that every variant equals its copy that was pickled into a spawned process and back."""
     registered = tuple(p for kind in registry.kinds() for p in available(kind))
     fault = _round_trips(registered if plugin in registered else (plugin,))[plugin]
     require(not fault, fault)
@@ -70,7 +70,7 @@ def survives_spawned_process(plugin: type[Plugin]) -> str:
 
 @cache
 def _round_trips(plugins: tuple[type[Plugin], ...]) -> dict[type[Plugin], str]:
-    """Return the fault of each plugin on its way to a spawned process and back; empty if it returns equal."""
+    """Return the fault of each plugin when pickled into a spawned process and back; empty if the copy is equal."""
     faults = dict.fromkeys(plugins, "")
     sent: dict[type[Plugin], bytes] = {}
     for plugin in plugins:
@@ -96,7 +96,7 @@ def _round_trips(plugins: tuple[type[Plugin], ...]) -> dict[type[Plugin], str]:
 
 
 def _echo() -> None:
-    """Unpickle each item of the list on standard input and pickle it to standard output; run by the spawned process."""
+    """Unpickle each item of the list on standard input, and pickle it to standard output; runs in the spawned process."""
     folders, texts = pickle.load(sys.stdin.buffer)
     for folder in folders:
         registry.add_folder(folder)

@@ -27,7 +27,7 @@ from bench.model import (
 
 @dataclass(frozen=True)
 class _Swing(DampedScene):
-    """The motion q'' = -4 sin q - 0.2 v + u from (1, 0.5), smooth and without closed form."""
+    """The motion q'' = -4 sin q - 0.2 v + u from (q, v) = (1, 0.5), smooth and without a closed form."""
 
     name = "conformance_swing"
     n_q: ClassVar[int] = 1
@@ -61,7 +61,7 @@ class _Kick(ImpulseLaw):
 
 @dataclass(frozen=True)
 class _Kicked(_Swing, ContactScene):
-    """The same motion, with a contact."""
+    """The motion of :class:`_Swing`, with a contact."""
 
     n_contacts: ClassVar[int] = 1
 
@@ -77,7 +77,7 @@ class _Kicked(_Swing, ContactScene):
 
 @dataclass(frozen=True)
 class _Decay(MechanicalScene):
-    """v' = rate v, without positions."""
+    """The motion v' = rate v, without positions."""
 
     name = "conformance_decay"
     n_q: ClassVar[int] = 0
@@ -100,14 +100,14 @@ class _Decay(MechanicalScene):
 
 @dataclass(frozen=True)
 class _Oscillator(_Swing):
-    """q'' = -stiffness q - friction v."""
+    """The motion q'' = -stiffness q - friction v."""
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         return -self.stiffness * q - self.friction * v
 
 
 EXACT = 1e-9
-"""Relative difference allowed between numbers equal up to rounding and to the end of a Newton iteration (1e-13)."""
+"""Relative difference allowed between numbers that are equal up to rounding and a Newton tolerance of 1e-13."""
 
 
 def _advance(integrator: Integrator, dynamics: Dynamics, steps: int, dt: float) -> State:
@@ -119,7 +119,7 @@ def _advance(integrator: Integrator, dynamics: Dynamics, steps: int, dt: float) 
 
 @verifies(Integrator)
 def error_falls_with_declared_order(integrator: Integrator) -> str:
-    """Verify the slope of log error against log dt over 1 s of a smooth motion, within 0.2 of ``order``."""
+    """Verify that the slope of log error against log dt is within 0.2 of ``order``, over 1 s of a smooth motion."""
     from scipy.integrate import solve_ivp
 
     scene = _Swing()
@@ -143,7 +143,7 @@ def error_falls_with_declared_order(integrator: Integrator) -> str:
 
 @verifies(Integrator)
 def free_motion_is_exact(integrator: Integrator) -> str:
-    """Verify that without forces q grows by dt v, v takes the scene's velocity factor, and columns stay separate."""
+    """Verify that without forces q grows by dt v and v is multiplied by the scene's velocity factor, column by column."""
     scene = _Swing(stiffness=0.0, friction=0.0, velocity_factor=0.5)
     state = State(np.array([[1.0, 0.3]]), np.array([[0.5, -1.0]]))
     end = integrator.step(Dynamics(NewtonOps(), scene, None), state, np.zeros((1, 2)), 0.01)
@@ -159,7 +159,7 @@ def free_motion_is_exact(integrator: Integrator) -> str:
 
 @verifies(Integrator)
 def amplification_is_that_of_the_step(integrator: Integrator) -> str:
-    """Verify that the factor of one step on v' = a v is ``amplification(a dt)``: decay and growth, slow and stiff."""
+    """Verify that one step on v' = a v multiplies v by ``amplification(a dt)``, for decay and growth, slow and stiff."""
     worst = 0.0
     for dt, rate in itertools.product((0.01, 0.5), (-50.0, -3.0, 0.0, 0.7)):
         state = State(np.zeros((0, 1)), np.ones((1, 1)))
@@ -176,7 +176,7 @@ def amplification_is_that_of_the_step(integrator: Integrator) -> str:
 
 @verifies(Integrator)
 def transition_is_that_of_the_step(integrator: Integrator) -> str:
-    """Verify ``transition`` against a step on q' = v, v' = -stiffness q - damping v, for two velocity factors."""
+    """Verify ``transition`` against one step on q' = v, v' = -stiffness q - damping v, for two velocity factors."""
     worst = 0.0
     for dt, stiffness, damping, factor in itertools.product((0.01, 0.3), (0.0, 4.0, 1e4), (0.0, 0.5, 20.0), (1.0, 0.6)):
         scene = _Oscillator(stiffness=stiffness, friction=damping, velocity_factor=factor)
@@ -192,7 +192,7 @@ def transition_is_that_of_the_step(integrator: Integrator) -> str:
 
 @verifies(Integrator)
 def takes_impulses_is_truthful(integrator: Integrator) -> str:
-    """Verify that an impulse law changes the step if and only if the integrator declares it."""
+    """Verify that an impulse law changes the step if and only if the integrator declares ``takes_impulses``."""
     plain, kicked = (_advance(integrator, Dynamics(NewtonOps(), _Kicked(), law), 1, 0.01) for law in (None, _Kick()))
     change = np.array([np.abs(kicked.q - plain.q).max(), np.abs(kicked.v - plain.v).max()])
     if not integrator.takes_impulses:
@@ -206,7 +206,7 @@ def takes_impulses_is_truthful(integrator: Integrator) -> str:
 
 @verifies(Integrator)
 def needs_root_of_integrator_is_truthful(integrator: Integrator) -> str:
-    """Verify that the integrator solves an equation if and only if it declares so."""
+    """Verify that the integrator solves an equation if and only if it declares ``needs_root``."""
     ops = NewtonOps()
     _advance(integrator, Dynamics(ops, _Swing(), None), 1, 0.01)
     require(

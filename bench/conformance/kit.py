@@ -1,4 +1,4 @@
-"""Registers checks, and runs them on plugins as printed lines, as a list of results, or as pytest tests."""
+"""Registers checks, and runs them on plugins. Outcomes are printed lines, a list of results, or pytest tests."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Failed(Exception):
 
 
 class Skipped(Exception):
-    """Raised when the check does not apply to the plugin."""
+    """Raised when a check does not apply to the plugin."""
 
 
 Check = Callable[[Any], str]
@@ -37,7 +37,7 @@ _CHECKS: dict[type[Plugin], list[Check]] = {}
 
 
 def verifies(kind: type[Plugin]) -> Callable[[Check], Check]:
-    """Register a check for plugins of one kind."""
+    """Return a decorator that registers a check for plugins of one kind."""
 
     def register(function: Check) -> Check:
         _CHECKS.setdefault(kind, []).append(function)
@@ -53,7 +53,7 @@ def require(condition: Any, message: str) -> None:
 
 
 def main(names: Sequence[str]) -> int:
-    """Check the named plugins, or all, print a line per check, and return the exit status."""
+    """Check the named plugins, or all of them, print a line per check, and return the exit status."""
     started = time.perf_counter()
     tally = dict.fromkeys(("pass", "fail", "skip"), 0)
     plugins = 0
@@ -75,9 +75,9 @@ def main(names: Sequence[str]) -> int:
 
 
 def check(plugin_class: type[Plugin], only: Collection[str] = ()) -> list[CheckResult]:
-    """Run every check that applies to a plugin class, with default parameters and with each other choice it offers.
+    """Return the results of a plugin class's checks, with default parameters and with each other choice it offers.
 
-    ``only`` has the names of the checks to run, if not all.
+    ``only`` contains the names of the checks to run; empty runs all.
     """
     results = [
         _outcome(function, subject, name)
@@ -89,10 +89,10 @@ def check(plugin_class: type[Plugin], only: Collection[str] = ()) -> list[CheckR
 
 
 def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str, str] | None = None) -> Any:
-    """Make a ``pytest.mark.parametrize`` over (plugin, check) pairs, one per check of each variant of the classes.
+    """Return a ``pytest.mark.parametrize`` over (plugin, check) pairs: one per check of each variant of the plugins.
 
-    ``expected_failures`` maps the name of a check, or the id of one test (``variant-check``), to the reason; if such a
-    check passes, the test fails. Plugins whose required modules are not installed are skipped::
+    ``expected_failures`` maps the name of a check, or the id of one test (``variant-check``), to the reason of the
+    failure. If such a check passes, the test fails. Plugins whose required modules are not installed are skipped::
 
         @bench.conformance.parametrize([MyEstimator], expected_failures={
             "bias_is_as_declared": "biased below 4 samples, see #12"})
@@ -121,7 +121,7 @@ def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str,
 
 
 def variants(plugin_class: type[Plugin]) -> dict[str, Plugin]:
-    """Return instances by identity: the default one, and one per other choice of a string or switch except ``dtype``."""
+    """Return instances by identity: the default, and one per other choice of a string or boolean, except ``dtype``."""
     instances = {plugin_class.name: build(plugin_class, {})}
     for name, parameter in parameters(plugin_class).items():
         choices = (True, False) if parameter.type is bool else parameter.choices or ()
@@ -135,7 +135,7 @@ def variants(plugin_class: type[Plugin]) -> dict[str, Plugin]:
 def _items(plugin_class: type[Plugin]) -> Iterator[tuple[str, Any, Check]]:
     """Yield identity, subject and check for every check of a plugin class.
 
-    The last one verifies that any of the others applied, so it comes last.
+    The last check verifies that at least one of the others applied.
     """
     for function in _CHECKS[Plugin]:
         yield plugin_class.name, plugin_class, function
@@ -158,12 +158,12 @@ def _own_checks(plugin: Plugin) -> list[Check]:
 
 
 def builds(plugin_class: type[Plugin]) -> str:
-    """Verify that an instance can be created with default parameters, and with each other choice."""
+    """Verify that an instance can be created with default parameters, and with each other choice it offers."""
     return f"{len(variants(plugin_class))} variants"
 
 
 def something_was_checked(plugin_class: type[Plugin]) -> str:
-    """Verify that at least one check of its kind applies to the plugin."""
+    """Verify that at least one check of the plugin's kind applies to it."""
     for name, plugin in variants(plugin_class).items():
         for function in _own_checks(plugin):
             if (function, plugin_class, name) not in _skipped:
@@ -174,7 +174,7 @@ def something_was_checked(plugin_class: type[Plugin]) -> str:
 
 
 _skipped: dict[tuple[Check, type, str], bool] = {}
-"""Whether a check did not apply to a variant, for the checks that ran in this process."""
+"""Whether a check was skipped, by check, plugin class and variant, for the checks that ran in this process."""
 
 
 def _outcome(function: Check, subject: Any, name: str) -> CheckResult:
@@ -190,7 +190,7 @@ def _outcome(function: Check, subject: Any, name: str) -> CheckResult:
 
 
 def _remembered(function: Check, subject: Any, name: str) -> str:
-    """Run the check, record whether it applied, and return its details."""
+    """Run the check, record whether it was skipped, and return its details."""
     skipped = False
     try:
         return function(subject)
@@ -202,7 +202,7 @@ def _remembered(function: Check, subject: Any, name: str) -> str:
 
 
 def _run(function: Check, name: str, subject: Any) -> None:
-    """Run the check as a test: a reason to skip the check skips the test."""
+    """Run the check as a test; :class:`Skipped` skips the test."""
     import pytest
 
     try:

@@ -14,11 +14,11 @@ from bench.model import Answer, Optimizer
 from bench.model.optimizer import WANTED
 
 DIM = 4
-"""Dimensions of the bowl."""
+"""Dimension of the bowl."""
 STEPS = 40
-"""Steps of a search that is checked."""
+"""Number of steps of a checked search."""
 TURN = 13
-"""The step before which a search is stored and resumed."""
+"""Number of steps after which a search is stored and resumed."""
 
 SLOPES = np.diag([0.5, 1.0, 1.5, 2.0]) + 0.1
 GOAL = np.array([1.0, -0.5, 0.3, 0.8])
@@ -27,7 +27,7 @@ Watcher = Callable[[int, dict[str, Any], np.ndarray], dict[str, Any]]
 
 
 def answer(points: np.ndarray, wanted: frozenset[str]) -> Answer:
-    """Return the requested fields of |A (theta - goal)|^2 / 2 at points ``(d, B)``."""
+    """Return the requested fields of the cost |A (theta - goal)|^2 / 2 at points ``(d, B)``."""
     residual = SLOPES @ (points - GOAL[:, None])
     known = {
         "value": 0.5 * (residual**2).sum(axis=0),
@@ -39,7 +39,7 @@ def answer(points: np.ndarray, wanted: frozenset[str]) -> Answer:
 
 
 def search(optimizer: Optimizer, watch: Watcher | None = None, steps: int = STEPS) -> tuple[dict[str, Any], list[Any]]:
-    """Return the last state of a search from 0, and theta after each step."""
+    """Return the last state of a search that starts at 0, and theta after each step."""
     state, path = optimizer.start(np.zeros(DIM)), []
     for i in range(steps):
         noise = rng("optimizer", i).standard_normal((DIM, optimizer.draws(DIM)))
@@ -57,7 +57,7 @@ def search(optimizer: Optimizer, watch: Watcher | None = None, steps: int = STEP
 
 @verifies(Optimizer)
 def needs_are_declared(optimizer: Optimizer) -> str:
-    """Verify that the optimizer requests exactly the declared fields of an answer, each at some step."""
+    """Verify that the optimizer requests every declared field of an answer at some step, and no other field."""
     wanted: set[str] = set()
 
     def note(step: int, state: dict[str, Any], points: np.ndarray) -> dict[str, Any]:
@@ -72,7 +72,7 @@ def needs_are_declared(optimizer: Optimizer) -> str:
 
 @verifies(Optimizer)
 def path_repeats_after_a_stop(optimizer: Optimizer) -> str:
-    """Verify that a search that is pickled halfway and resumed takes the same path to the last digit."""
+    """Verify that a search that is pickled during its run and resumed repeats its path to the last digit."""
 
     def stopped(step: int, state: dict[str, Any], points: np.ndarray) -> dict[str, Any]:
         return pickle.loads(pickle.dumps(state)) if step == TURN else state
@@ -85,7 +85,7 @@ def path_repeats_after_a_stop(optimizer: Optimizer) -> str:
 
 @verifies(Optimizer)
 def state_is_left_alone(optimizer: Optimizer) -> str:
-    """Verify that ask and tell modify neither the state nor the points, so that a search can return to a state."""
+    """Verify that ``ask`` and ``tell`` modify neither state nor points, so that a search can return to a state."""
     before = b""
     kept: dict[str, Any] = {}
 

@@ -1,4 +1,4 @@
-"""Checks of scenes: costs, continuity, stated gradients, contact geometry."""
+"""Checks of scenes: costs, continuity, declared gradients, contact geometry."""
 
 from __future__ import annotations
 
@@ -46,20 +46,20 @@ from bench.model import (
 )
 
 SCORED_STEPS = 8
-"""Most steps of rollouts whose scores are compared with differences."""
+"""Most steps of the rollouts in which scores are checked."""
 FINER = (4, 16)
-"""Factors by which steps are refined towards the physics."""
+"""Factors by which the time step is divided to approach the physics."""
 SPAN, POINTS = 0.2, 65
-"""Range in sigma and number of the costs in the fit that separates the slope of the physics from jumps between steps."""
+"""Half range in sigma, and number of costs, of the fit that separates the physics' slope from jumps between steps."""
 LIMITING = 0.05
-"""Largest relative difference of a coordinate between two converged refinements, and between them and the physics."""
+"""Largest relative difference of a coordinate between two converged refinements, and of a refinement from the physics."""
 ELSEWHERE = 6.0
-"""Offset in sigma of the other lines that are searched for jumps."""
+"""Offset from theta0, in sigma, of further lines that are searched for jumps."""
 
 
 @verifies(Scene)
 def theta_and_noise_are_declared(scene: Scene) -> str:
-    """Verify that theta0 is a finite vector, noise is one of the two models, and breakpoints are sorted."""
+    """Verify that theta0 is a finite vector, the noise is one of the two models, and breakpoints are sorted."""
     theta = scene.theta0()
     require(isinstance(theta, np.ndarray) and theta.ndim == 1 and theta.size, "theta0 must be a vector (d,)")
     require(theta.dtype == np.float64 and np.isfinite(theta).all(), "theta0 must be finite and of type float64")
@@ -75,7 +75,7 @@ def theta_and_noise_are_declared(scene: Scene) -> str:
 
 @verifies(Scene)
 def costs_are_finite(scene: Scene) -> str:
-    """Verify that costs are ``(B,)`` and finite, and depend only on their own column, under every contact law."""
+    """Verify that costs are ``(B,)`` and finite, and each depends only on its own column, under every contact law."""
     subjects = programs(scene)
     for program in subjects:
         (theta, w), problem = samples(program), able_backend(program).compile(program)
@@ -127,9 +127,9 @@ def backends_agree(scene: Scene) -> str:
 
 @verifies(Scene)
 def continuity_is_as_declared(scene: Scene) -> str:
-    """Verify jumps along lines through theta0, and 6 sigma away from it: none if ``continuous``, at least one if not.
+    """Verify that the cost does not jump along lines near theta0 if ``continuous``, and jumps on at least one if not.
 
-    The contact law is a continuous one.
+    The lines run through theta0, and for a continuous scene also 6 sigma away from it. The contact law is continuous.
     """
     subjects = [p for p in programs(scene) if p.contact is None or p.contact.continuous]
     runs = [p for p in subjects if plain_backend().incompatibility(p) is None] or subjects
@@ -150,7 +150,7 @@ def continuity_is_as_declared(scene: Scene) -> str:
 
 @verifies(Scene)
 def closed_form_is_right(scene: Scene) -> str:
-    """Verify the closed form against long sampling for every law and integrator, at the default sigma and twice it."""
+    """Verify the closed form against long sampling for every law and integrator, at the default sigma and its double."""
     worst, count = 0.0, 0
     for sigma in (scene.sigma, 2 * scene.sigma):
         for program in _all_combinations(dataclasses.replace(scene, sigma=sigma)):
@@ -180,7 +180,7 @@ def _all_combinations(scene: Scene) -> Iterator[Program]:
 
 
 def _sampled_gradient(program: Program) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard error of first-order terms if the program is continuous, else of zeroth-order ones."""
+    """Return mean and standard error ``(d,)`` of first-order terms, or of zeroth-order terms if the program jumps."""
     problem, theta = able_backend(program).compile(program), program.theta0
     w = rng("closed form").standard_normal((program.n_noise, 1 << 14))
     if program.continuous:
@@ -194,7 +194,7 @@ def _sampled_gradient(program: Program) -> tuple[np.ndarray, np.ndarray]:
 def score_gives_the_gradient(scene: Scene) -> str:
     """Verify that the mean of cost times score plus the explicit derivative equals the mean gradient of the cost.
 
-    Rollouts are shortened to :data:`SCORED_STEPS` steps, since the variance of both grows with their length.
+    Rollouts have at most :data:`SCORED_STEPS` steps, since the variance of both means grows with the number of steps.
     """
     if isinstance(scene, MechanicalScene):
         scene = dataclasses.replace(scene, horizon=min(scene.horizon, SCORED_STEPS))
@@ -205,7 +205,7 @@ def score_gives_the_gradient(scene: Scene) -> str:
     problem, theta = plain_backend().compile(program), program.theta0[:, None]
     w = rng("score", scene.name).standard_normal((program.n_noise, 1 << 13))
     centre = problem.value(theta, np.zeros((program.n_noise, 1)))
-    # averaging w and -w keeps the expectation and reduces the variance
+    # the average over w and -w has the same expectation and less variance
     terms = sum(
         (
             (problem.value(theta, s) - centre) * problem.score(theta, s)
@@ -226,7 +226,7 @@ def score_gives_the_gradient(scene: Scene) -> str:
 
 @verifies(Scene)
 def physical_gradient_is_finite(scene: Scene) -> str:
-    """Verify that the physical gradient has shape ``(d,)`` and is finite, where there is one."""
+    """Verify that the physical gradient, if the scene declares one, has shape ``(d,)`` and is finite."""
     gradient = scene.physical_gradient()
     if gradient is None:
         raise Skipped("has none")
@@ -237,10 +237,10 @@ def physical_gradient_is_finite(scene: Scene) -> str:
 
 @verifies(Scene)
 def physical_gradient_is_the_limit(scene: Scene) -> str:
-    """Verify that the slope of the cost converges to the physical gradient as steps get finer, under at least one law.
+    """Verify that the cost's slope converges to the physical gradient as time steps get finer, under at least one law.
 
-    Other laws may converge to another slope, such as a spring that approximates a rigid impact. The check is skipped
-    where the slopes do not converge under any law.
+    Another law may converge to another slope, such as a spring that approximates a rigid impact. The check is skipped
+    if the slopes converge under no law.
     """
     if scene.physical_gradient() is None:
         raise Skipped("has none")
@@ -256,7 +256,7 @@ def physical_gradient_is_the_limit(scene: Scene) -> str:
         off = float(np.abs(ratios[1] - 1.0).max())
         if off <= LIMITING:
             return f"{describe(program)} is {off:.1g} from it at a step finer by {FINER[1]}"
-        # a coordinate may act for one step only, and so change with the step: its ratio to the physical gradient converges
+        # the slope of a coordinate that acts for one step changes with dt, but its ratio to the physical slope converges
         if np.isfinite(ratios).all() and np.abs(ratios[1] - ratios[0]).max() <= LIMITING:
             apart[describe(program)] = off
     if not apart:
@@ -268,7 +268,7 @@ def physical_gradient_is_the_limit(scene: Scene) -> str:
 
 
 def _towards_physics(scene: Scene) -> Iterator[tuple[ContactLaw | None, Integrator | None]]:
-    """Yield the laws and integrators under which a scene's program may converge to its physics, the likeliest first."""
+    """Yield the laws and integrators under which a scene's program may converge to its physics, most likely first."""
     if not isinstance(scene, MechanicalScene):
         yield None, None
     elif scene.n_contacts:
@@ -280,7 +280,10 @@ def _towards_physics(scene: Scene) -> Iterator[tuple[ContactLaw | None, Integrat
 
 
 def _refined(scene: Scene, factor: int, law: ContactLaw | None, integrator: Integrator | None) -> Program:
-    """Compose the scene with a step finer by ``factor``, over the same time. Raises :class:`Skipped` if theta changes."""
+    """Return the scene's program with dt divided by ``factor``, over the same time.
+
+    Raises :class:`Skipped` if theta changes its length.
+    """
     if not isinstance(scene, MechanicalScene):
         return compose(scene)
     finer: dict[str, Any] = {"horizon": scene.horizon * factor, "dt": scene.dt / factor}
@@ -293,9 +296,9 @@ def _refined(scene: Scene, factor: int, law: ContactLaw | None, integrator: Inte
 
 
 def _ratios(program: Program, physical: np.ndarray) -> np.ndarray:
-    """Return the slopes of the cost at theta0 over the physical ones, ``(d,)``; 1 where both are 0 to rounding.
+    """Return the slopes of the cost at theta0 over the physical gradient, ``(d,)``; 1 where both are 0 to rounding.
 
-    A slope is that of a cubic through costs on either side, so that the jumps of a program between steps average out.
+    A slope comes from a cubic fitted to costs on both sides, so that a program's jumps between time steps average out.
     """
     problem, theta, d = able_backend(program).compile(program), program.theta0, program.dim
     span = SPAN * program.scene.sigma
@@ -320,7 +323,7 @@ def state_has_declared_size(scene: MechanicalScene) -> str:
 
 @verifies(ContactScene)
 def contact_geometry_is_consistent(scene: ContactScene) -> str:
-    """Verify that gap_rate is the derivative of gap along the motion, and forces act linearly and push bodies apart."""
+    """Verify that ``gap_rate`` is the time derivative of ``gap``, and that forces act linearly and push bodies apart."""
     require(scene.n_contacts > 0, "n_contacts is 0: a ContactScene sets it to the number of its gaps")
     draw = rng("geometry")
     start = scene.initial_state(np, scene.theta0()[:, None])
@@ -329,7 +332,7 @@ def contact_geometry_is_consistent(scene: ContactScene) -> str:
     shape = (scene.n_contacts, COLUMNS)
     require(scene.gap(np, q).shape == shape, f"gap has shape {scene.gap(np, q).shape}, not {shape}")
     off = distance(scene.gap_rate(np, q, v), (scene.gap(np, q + 1e-6 * v) - scene.gap(np, q - 1e-6 * v)) / 2e-6)
-    # 1e-6: central differences of step 1e-6 of a smooth gap leave 1e-10 by rounding, 1e-12 by truncation
+    # 1e-6: central differences of step 1e-6 of a smooth gap have errors of 1e-10 by rounding and 1e-12 by truncation
     require(off < 1e-6, f"gap_rate differs from the derivative of gap by {off:.1e}")
     a, b = draw.uniform(0.0, 1.0, (2, *shape))
     pushed, parts = scene.contact_acceleration(np, q, a + 2 * b), [scene.contact_acceleration(np, q, f) for f in (a, b)]

@@ -32,29 +32,29 @@ from bench.model import (
 from bench.model.parameters import build, parameters
 
 LIMIT = 4.5
-"""Standard errors by which a sample mean may differ from its expectation."""
+"""Allowed difference of a sample mean from its expectation, in standard errors."""
 ROUNDED = 1e-12
-"""Relative difference allowed between numbers from the same few operations: vectorised functions may round differently
-from one batch to the next, by some 1e-16 each."""
+"""Relative difference allowed between numbers from the same few operations: a vectorised function may round differently
+in another batch, by about 1e-16 each time."""
 SAME = 1e-9
-"""Relative difference allowed between rollouts by the same operations in another order: hundreds of steps, each
-rounding by 1e-16, through springs that multiply it by up to 1e4."""
+"""Relative difference allowed between rollouts with the same operations in another order: each of hundreds of steps
+rounds by 1e-16, and springs multiply this error by up to 1e4."""
 DIFFERENCED = 1e-7
-"""Relative error allowed where gradients may be central differences of step 1e-6: rounding leaves 1e-10 of the cost."""
+"""Relative error allowed where gradients may be central differences of step 1e-6: rounding causes 1e-10 of the cost."""
 PARTS = 512
-"""Intervals that a line is divided into at first in a search for jumps."""
+"""Number of intervals of a line at the first level of a search for jumps."""
 COLUMNS = 6
-"""Samples on which backends are compared: the same number everywhere, since some backends compile for each."""
+"""Number of samples on which backends are compared, always the same since some backends compile for each number."""
 
 
 def available(kind: str) -> list[type[Any]]:
-    """Return the plugin classes of a kind that can be used here."""
+    """Return the plugin classes of a kind whose required modules are installed."""
     return [e.plugin for e in registry.entries()[kind].values() if e.plugin is not None and e.available]
 
 
 @cache
 def plain_backend() -> Backend:
-    """Return the reference backend of all comparisons: it needs no library and compiles nothing."""
+    """Return the reference backend of all comparisons, which needs no library and compiles nothing."""
     for plugin in available("backends"):
         is_plain = not plugin.requires and not plugin.compiles and "simulator" not in plugin.provides
         if is_plain and {"value", "grad", "score"} <= plugin.provides:
@@ -73,7 +73,7 @@ def able_backend(program: Program) -> Backend:
 
 @cache
 def stepping() -> Integrator:
-    """Return a first-order integrator that works with every contact law, since it applies the law's impulses."""
+    """Return an explicit first-order integrator that works with every contact law, since it applies impulses."""
     for plugin in available("integrators"):
         if plugin.takes_impulses and not plugin.needs_root and plugin.order == 1:
             return cast(Integrator, plugin())
@@ -81,13 +81,16 @@ def stepping() -> Integrator:
 
 
 def law_for(scene: MechanicalScene, law: type[ContactLaw], values: dict[str, Any] | None = None) -> ContactLaw:
-    """Return a contact law with the scene's values for its parameters."""
+    """Return a contact law with the scene's parameter values, overridden by ``values``."""
     given = {**scene.contact_values, **(values or {})}
     return cast(ContactLaw, build(law, {k: v for k, v in given.items() if k in parameters(law)}))
 
 
 def programs(scene: Scene) -> list[Program]:
-    """Compose the scene with every sound law, if it has contacts; raises :class:`Skipped` without its engines."""
+    """Return the scene's programs: one with each sound law, or only one if the scene has no contacts.
+
+    Raises :class:`Skipped` for an engine's scene if no such engine is available.
+    """
     if not isinstance(scene, MechanicalScene):
         return [compose(scene)]
     if not scene.n_contacts:
@@ -105,7 +108,7 @@ def programs(scene: Scene) -> list[Program]:
 
 @cache
 def sound_laws() -> tuple[type[ContactLaw], ...]:
-    """Return the available contact laws under which some scene has finite costs; others fail their own checks."""
+    """Return the available contact laws under which some scene has finite costs; all other laws fail their own checks."""
     scenes = [s for s in available("scenes") if issubclass(s, MechanicalScene) and s.n_contacts]
     return tuple(law for law in available("contacts") if any(_works(scene, law) for scene in scenes))
 
@@ -118,7 +121,7 @@ def _works(scene: type[MechanicalScene], law: type[ContactLaw]) -> bool:
 
 @cache
 def all_programs() -> tuple[Program, ...]:
-    """Compose every available scene with every sound law, if costs are finite; others fail their own checks."""
+    """Return every available scene with every sound law, if costs are finite; other scenes fail their own checks."""
     result: list[Program] = []
     for scene_class in available("scenes"):
         with contextlib.suppress(Exception):
@@ -137,12 +140,12 @@ def _is_sound(program: Program) -> bool:
 
 
 def sound_scenes() -> list[Scene]:
-    """Return the scenes of :func:`all_programs`."""
+    """Return the scenes of :func:`all_programs`, each once."""
     return list(dict.fromkeys(program.scene for program in all_programs()))
 
 
 def representative_programs(programs: Iterable[Program]) -> list[Program]:
-    """Return a subset of the programs in which every scene and every contact law still occurs."""
+    """Return a subset of the programs that contains every scene and every contact law."""
     few = []
     for index, (_, group) in enumerate(itertools.groupby(programs, key=lambda p: type(p.scene))):
         laws = list(group)
@@ -156,7 +159,7 @@ def representative_programs(programs: Iterable[Program]) -> list[Program]:
 
 
 def distinguishing_programs(programs: Iterable[Program]) -> list[Program]:
-    """Return one program of each sort: function, feedback, open loop, force law, impulse law, equation to solve."""
+    """Return one program of each kind: function, feedback, open loop, force law, impulse law, equation to solve."""
     sorts: dict[tuple[bool, ...], Program] = {}
     for program in programs:
         law = (isinstance(program.contact, ForceLaw), isinstance(program.contact, ImpulseLaw), program.needs_root)
@@ -165,19 +168,19 @@ def distinguishing_programs(programs: Iterable[Program]) -> list[Program]:
 
 
 def rng(*key: str | int) -> np.random.Generator:
-    """Return a random generator with a fixed seed."""
+    """Return a random generator whose seed is the key."""
     return np.random.default_rng([zlib.crc32(str(part).encode()) for part in key])
 
 
 def samples(program: Program, count: int = COLUMNS) -> tuple[np.ndarray, np.ndarray]:
-    """Return a theta near theta0 and noise for each of ``count`` columns."""
+    """Return thetas near theta0, ``(d, count)``, and noise ``(n_w, count)``."""
     draw = rng("samples", program.scene.name)
     theta = program.theta0[:, None] + 0.1 * program.scene.sigma * draw.standard_normal((program.dim, count))
     return theta, draw.standard_normal((program.n_noise, count))
 
 
 def with_changed_column(theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same samples with column 2 changed."""
+    """Return copies of theta ``(d, B)`` and noise ``(n_w, B)`` with column 2 changed."""
     column = np.arange(COLUMNS) == 2
     return theta + 1e-3 * column, w * (1 - 0.5 * column)
 
@@ -188,29 +191,29 @@ def describe(program: Program) -> str:
 
 
 def distance(actual: np.ndarray, expected: np.ndarray) -> float:
-    """Return the largest difference, relative to the largest expected number."""
+    """Return the largest absolute difference, relative to the largest absolute expected number."""
     scale = np.abs(expected).max() or 1.0
     return float(np.abs(actual - expected).max() / scale)
 
 
 def standard_errors(difference: np.ndarray, error: np.ndarray, tolerance: np.ndarray | float) -> np.ndarray:
-    """Return by how many standard errors ``error (d,)`` differences ``(d,)`` exceed a tolerance for rounding.
+    """Return the excess of ``difference (d,)`` over a tolerance for rounding, in standard errors ``error (d,)``.
 
-    A difference beyond the tolerance with an error of 0 is infinitely many.
+    The result is inf where a difference exceeds the tolerance and its error is 0.
     """
     beyond = np.maximum(np.abs(difference) - tolerance, 0.0)
     return np.asarray(np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0))
 
 
 class NewtonOps(LoopOps):
-    """NumPy operations for checks without a backend: a loop, Newton's method, and a count of the equations solved."""
+    """NumPy operations for checks without a backend: a loop, Newton's method, and a count of equations solved."""
 
     def __init__(self) -> None:
         super().__init__(np)
         self.solved = 0
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Solve by Newton's method with forward differences, until the steps are rounding."""
+        """Return the root by Newton's method with forward differences, iterated until the steps are rounding."""
         self.solved += 1
         z = np.array(guess, dtype=float)
         for _ in range(50):
@@ -226,10 +229,10 @@ class NewtonOps(LoopOps):
 
 
 def largest_jump(program: Program, lines: int = 1, offset: float = 0.0) -> float:
-    """Return the largest jump of the cost along lines through theta0, relative to its range on each; 0 without one.
+    """Return the largest jump of the cost along lines through theta0, relative to the cost's range on the line, or 0.
 
-    ``offset`` moves the lines by that many sigma in every coordinate. A line on which a rollout fails has no jump there,
-    whereas rollouts on lines through theta0 itself must not fail.
+    ``offset`` moves the lines by that many sigma in every coordinate. Without an offset, a rollout that fails raises
+    :class:`Failed`. With an offset, failed rollouts do not count as jumps.
     """
     problem = able_backend(program).compile(program)
     theta = program.theta0 + offset * program.scene.sigma

@@ -1,4 +1,4 @@
-"""Examines a user's own simulator: whether its gradient is right, where it breaks, which method to use, and its cost."""
+"""Examines a user's simulator: whether its gradient is right, where its cost breaks, and which method to use."""
 
 from bench.examine.examination import examine
 from bench.examine.report import Report

@@ -20,7 +20,7 @@ QUIET = "--quiet"
 
 
 def run(words: Sequence[str]) -> Report:
-    """Run the examination of a command line, print the report, and save it where ``save=`` is given.
+    """Run the examination of a command line, print the report, save it if ``save=`` is given, and return it.
 
     Raises :class:`UserError` for a command line that cannot be parsed.
     """
@@ -60,7 +60,7 @@ def run(words: Sequence[str]) -> Report:
 
 
 def main(words: Sequence[str]) -> int:
-    """Run the command; returns the exit status."""
+    """Run the command, and return the exit status."""
     report = run(words)
     sys.stdout.flush()
     return report.status

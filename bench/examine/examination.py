@@ -1,4 +1,4 @@
-"""Runs the examination: the checks of a cost and its gradient, in order, within one time budget."""
+"""Runs the examination: checks a cost and its gradient, in order, within one time budget."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from bench.model.simulator.simulator import Simulator
 from bench.model.simulator.tree import ParameterTree
 
 GENERATED_SUFFIX = re.compile(r"_[0-9a-f]{8}$")
-"""Suffix of the name of a module that is loaded from a file."""
+"""Suffix of the generated name of a module that is loaded from a file."""
 RELATIVE = 0.01
-"""Default sigma of the lines, and of a cost with its own noise, in units of each input's scale."""
+"""Default sigma of the line scans, and of a cost with its own noise, in units of each input's scale."""
 SHARES = {"check": 0.75, "again": 0.5, "lines": 0.3}
-"""Largest share of the remaining time for each part; unused time goes to the next part."""
+"""Share of the remaining time planned for each part; the next part may use the remainder. Lines may take twice theirs."""
 POINTS_EACH = 2 * (2 * EPS.size + 17)
 """Approximate number of costs per checked direction."""
 SCAN = 7 * 65
-"""Costs of the search for a staircase along one direction, for directions that are not clearly right."""
+"""Number of costs of a staircase search along one direction that is not clearly right."""
 EFFORTS = (
     Options(),
     Options(draws=2, scanned=1),
@@ -36,19 +36,19 @@ EFFORTS = (
     Options(components=4, draws=2, directions=1, scanned=0),
     Options(components=0, draws=0, directions=1, eps=EPS[::2], scanned=0),
 )
-"""Scopes of a check, from the full check to the smallest, for slow simulators."""
+"""Scopes of a check, from the full check to the smallest, which is for slow simulators."""
 PANELS = (7, 12)
-"""Panels of 4 Gauss-Legendre points of the two integrals of the gradient along a line."""
+"""Numbers of panels, of 4 Gauss-Legendre points each, of the two integrals of the gradient along a line."""
 LEAST_MISSED = 0.002
-"""Share of a cost's change that the integral of its gradient may miss through its own error."""
+"""Largest error of the integral of the gradient, as a share of the cost's change, that is always accepted."""
 LINE_EFFORTS = ((PLACES, HALVINGS), (3, 10), (1, 10))
 """Places searched on a line and halvings of each, from the full search to the smallest."""
 FEWEST_POINTS = 17
 """Fewest points of a line scan."""
 HELD = 20_000_000
-"""Most numbers of theta in the pairs of one sigma, of which memory holds several copies."""
+"""Most numbers in the thetas of the pairs of one sigma, since memory stores several copies."""
 OTHER_NOISE = 2
-"""Further draws of the simulator's own noise under which the gradient is checked along random directions."""
+"""Number of further draws of the simulator's own noise under which the gradient is checked along random directions."""
 
 
 def examine(
@@ -66,13 +66,15 @@ def examine(
 ) -> Report:
     """Report whether a gradient is right, where the cost breaks, which method to use under noise, and its cost.
 
-    ``cost(theta)`` returns one number; theta is an array, a number, or nested dicts, lists and dataclasses of them.
-    ``grad`` is ``"jax"``, ``"torch"`` or a function of theta; without it, only the cost is examined, by
-    differences. ``sigma`` are standard deviations of noise on theta. ``noise=n`` makes it ``cost(theta, w)`` with ``w (n,)`` standard normal, the
-    simulator's own randomness; costs that are compared have the same w. ``budget`` is the time limit of the whole
-    examination (``60``, ``"2m"``); a call that exceeds it is interrupted, compiled code as soon as it returns.
-    ``batch`` is the way to pass several thetas in one call: ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``; detected by default.
-    ``scale`` is the size of each input, with theta's structure; by default its own size, and for 0 that of its array.
+    ``cost(theta)`` returns one number. ``theta`` is an array, a number, or nested dicts, lists and dataclasses of
+    arrays and numbers. ``grad`` is ``"jax"``, ``"torch"`` or a function of theta. Without ``grad``, only the cost is
+    examined, by differences. ``sigma`` is one or more standard deviations of noise on theta. With ``noise=n`` the call
+    is ``cost(theta, w)``, where ``w (n,)`` is standard normal, the simulator's own randomness. Costs that are compared
+    have the same w. ``budget`` is the time limit of the whole examination in seconds or as text (``60``, ``"2m"``). A
+    call that exceeds it is interrupted, compiled code as soon as it returns. ``batch`` is the way to pass several
+    thetas in one call: ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``; detected by default.
+    ``scale`` is the size of each input, with theta's structure. By default it is the input's magnitude, or for an input
+    of 0 the root mean square of its array, else 1.
 
     Raises :class:`bench.UserError` for a cost that cannot be called.
 
@@ -120,7 +122,7 @@ def _scales(layout: ParameterTree, scale: Any) -> np.ndarray:
 
 
 def _function_name(function: Any) -> str:
-    """Return the name of a function, ``mysim.cost``, or of the library that differentiates."""
+    """Return the name of a function, such as ``mysim.cost``, or of the library that differentiates."""
     if function is None or isinstance(function, str):
         return function or ""
     module = getattr(function, "__module__", "") or ""
@@ -152,7 +154,7 @@ class _Examination:
         self.w = self.random.standard_normal((simulator.noise, 1)) if simulator.noise else None
 
     def run(self, gradient: str) -> Report:
-        """Run the checks that the time allows, the gradient first."""
+        """Run the checks that the time allows, the gradient check first, and return the report."""
         value, spread = self._repeat_cost()
         simulator, clock = self.simulator, self.clock
         checked, more = None, []
@@ -194,12 +196,15 @@ class _Examination:
     # ------------------------------------------------------------------------------------------------ parts
 
     def _costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
-        """Return costs under one draw of the simulator's own noise."""
+        """Return the costs ``(B,)`` of ``thetas (d, B)``, all under the same draw of the simulator's own noise."""
         w = self.w if w is None else w
         return self.simulator.costs(thetas, None if w is None else np.repeat(w, thetas.shape[1], axis=1))
 
     def _repeat_cost(self) -> tuple[float, float]:
-        """Return the cost at theta, and the difference between equal calls with a call at another theta between them."""
+        """Return the cost at theta, and the largest difference between equal calls.
+
+        Calls at theta alternate with calls at another theta, which exposes a cost that depends on earlier calls.
+        """
         self.clock.start_stage("repeating a call")
         other = self.theta + 1e-3 * self.scale
         values: list[float] = []
@@ -226,14 +231,14 @@ class _Examination:
         return not self.simulator.gradient_error
 
     def _seconds_each(self) -> float:
-        """Return the seconds per cost in batches of the width that a check uses."""
+        """Return the time per cost [s], in batches as wide as those of a check."""
         width = self.simulator.width
         if width == 1:
             return self.clock.per_cost()
         columns = np.repeat(self.theta[:, None], width, axis=1)
         taken = math.nan
         try:
-            for _ in range(2):  # the first of this shape may compile
+            for _ in range(2):  # the first call with this shape may compile
                 began = self.clock.spent
                 self._costs(columns)
                 taken = (self.clock.spent - began) / width
@@ -249,7 +254,7 @@ class _Examination:
         for effort in EFFORTS[:-1]:
             chosen = min(effort.components, self.theta.size) + effort.directions
             calls = chosen * POINTS_EACH + effort.draws * effort.directions * POINTS_EACH // 2
-            # further calls for a wrong gradient: scans, ratios at other thetas, and checks at thetas farther away
+            # a wrong gradient needs further calls: scans, ratios at other thetas, and checks at thetas farther away
             calls += effort.scanned * SCAN + effort.draws * POINTS_EACH
             calls += min(effort.draws, 4) * min(effort.components, self.theta.size) * POINTS_EACH // 2
             if calls * each + (3 * effort.draws + 3) * slope < SHARES["check"] * self.clock.remaining:
@@ -284,7 +289,7 @@ class _Examination:
         return check(lambda thetas: self._costs(thetas, w), slope, self.theta, options)
 
     def _check_under_other_noise(self, checked: Check | None) -> list[Check]:
-        """Check along random directions under other draws of the simulator's own noise."""
+        """Return checks along random directions under other draws of the simulator's own noise."""
         if self.w is None or checked is None or not checked.trusted:
             return []
         checks = []
@@ -299,7 +304,7 @@ class _Examination:
         return checks
 
     def _scan_lines(self, checked: Check | None) -> list[LineScan]:
-        """Scan the cost for jumps and kinks along random directions."""
+        """Return scans of the cost for jumps and kinks, along random directions through theta."""
         self.clock.start_stage("scanning lines")
         spread = self.scale * RELATIVE if not self.levels else np.full(self.theta.size, max(self.levels))
         along = directions(2, spread, self.seed)
@@ -331,8 +336,9 @@ class _Examination:
     def _missed_share(self, line: LineScan, checked: Check | None) -> float:
         """Return the share of the cost's change along a line that its gradient does not explain.
 
-        Without jumps, the integral of a right gradient along a line is the difference of the costs at its ends. NaN where
-        the integral is not accurate to a tenth of the missed share, or without a gradient.
+        Without jumps, the integral of a right gradient along a line is the difference of the costs at its ends. The
+        share is NaN without a right gradient, or where the integral is less accurate than both a tenth of the share and
+        :data:`LEAST_MISSED`.
         """
         if checked is None or not checked.trusted or not self.simulator.has_gradient:
             return math.nan
@@ -353,7 +359,7 @@ class _Examination:
         return float(missed) if doubt < max(0.1 * missed, LEAST_MISSED) else math.nan
 
     def _measure_noise(self, checked: Check | None, repeats: bool) -> list[Smoothed]:
-        """Measure the gradient under noise on theta, with an equal share of the time for each sigma."""
+        """Return the gradient's bias and the methods' costs at each sigma, which all get an equal share of the time."""
         levels, scale = list(self.levels), np.ones(self.theta.size)
         if not levels and self.simulator.noise:
             levels, scale = [RELATIVE], self.scale

@@ -36,23 +36,23 @@ EXPLANATIONS = {
     "saturated": "the gradient is right and exactly 0, though wider steps show a slope: the input is clipped, or has no effect here",
     "zero": "the gradient and all differences are exactly 0: does this input have any effect?",
 }
-"""The meaning of each cause for the owner of the simulator, with likely reasons."""
+"""The meaning of each cause for the simulator's author, with likely reasons."""
 SEEN = 0.01
-"""Share of a cost's change that a gradient may miss on a line without a warning."""
+"""Share of a cost's change along a line that the integral of the gradient may miss without a warning."""
 NOTEWORTHY = ("zero", "saturated")
 """Verdicts of right gradients that deserve a warning."""
 
 
 @dataclass(frozen=True)
 class Findings:
-    """The findings about a cost and its gradient at a theta; ``print`` shows them as text."""
+    """The findings about a cost and its gradient at one theta; ``print`` shows them as text."""
 
     name: str
     """Name of the cost."""
     gradient: str
     """Source of the gradient: ``jax``, ``torch``, a function's name, or empty for differences only."""
     names: Sequence[str]
-    """A name for each number of theta."""
+    """A name for each of theta's d numbers."""
     theta: np.ndarray
     """``(d,)``."""
     cost: float
@@ -69,9 +69,9 @@ class Findings:
     seconds: float
     budget: float
     cost_s: float
-    """Seconds of one cost."""
+    """Time of one cost [s]."""
     gradient_s: float
-    """Seconds of one gradient; NaN without one."""
+    """Time of one gradient [s]; NaN without a gradient."""
     check: Check | None
     """The gradient check; None if it did not finish within the budget."""
     more: Sequence[Check]
@@ -86,17 +86,17 @@ class Findings:
     """The exception that the gradient raised; empty if none."""
     notes: Sequence[str]
     left_out: Sequence[str]
-    """The parts that the budget did not allow."""
+    """The parts of the examination that the budget did not allow."""
 
     # -------------------------------------------------------------------------------------------- verdicts
 
     @property
     def cause(self) -> str:
-        """The cause of the first problem, or the verdict on a right gradient: a verdict of the gradient check, or one below.
+        """The cause of the first problem, or the verdict on a right gradient.
 
-        ``raised``: the gradient could not be computed. ``undecided``: the budget ended before the check. ``jumps`` or
-        ``biased``: the gradient is right at theta and misses jumps around it. ``spread``: its values around theta vary
-        too widely to decide.
+        A cause is a verdict of the gradient check or one of these. ``raised``: the gradient could not be computed.
+        ``undecided``: the budget ended before the check. ``jumps`` or ``biased``: the gradient is right at theta, but
+        misses jumps around theta. ``spread``: the gradient's values around theta vary too widely to decide.
         """
         if self.error:
             return "raised"
@@ -201,19 +201,19 @@ class Findings:
 
     @property
     def missed(self) -> float:
-        """Largest share of the cost's change along a line that the integral of the gradient misses, 0 where unknown."""
+        """Largest share of the cost's change along a line that the integral of the gradient misses; 0 if unknown."""
         return max((line.missed for line in self.lines if math.isfinite(line.missed)), default=0.0)
 
     @property
     def tread(self) -> float:
-        """Height of the jumps, if all lines have equal, evenly spaced ones that the gradient misses; else 0."""
+        """Height of the jumps, if all lines have equal, evenly spaced jumps that the gradient misses; else 0."""
         treads = [line.tread for line in self.lines] or [0.0]
         alike = min(treads) > (1 - ALIKE) * max(treads)
         return max(treads) if alike and self.missed > SEEN else 0.0
 
     @property
     def resolution(self) -> str:
-        """The smallest relative error that a check in this precision detects, about u^(2/3) (central differences)."""
+        """The smallest relative error that central differences detect in this precision, about u^(2/3), as text in %."""
         unit = 2.0**-7 if self.precision == "bfloat16" else float(np.finfo(self.precision).eps)
         return f"{100 * unit ** (2 / 3):.1g}%"
 
@@ -223,7 +223,7 @@ class Findings:
         return 1 if self.problems else 0
 
     def label(self, part: Part) -> str:
-        """Return a part's name: the name of its component of theta, or ``direction 0``."""
+        """Return a part's name: the name of its component of theta, or the name of its direction, ``direction 0``."""
         return self.names[part.component] if part.component is not None else part.name
 
     def sentence(self, check: Check) -> str:
@@ -244,7 +244,7 @@ class Findings:
 
     @property
     def frame(self) -> pd.DataFrame:
-        """One row per derivative checked: the program's value, the differences, and the verdict."""
+        """A row per checked derivative: the program's value, the difference, and the verdict."""
         import pandas as pd
 
         parts = [(self.label(part), part) for part in (*self.check.parts, *self.check.draws)] if self.check else []
@@ -266,7 +266,7 @@ class Findings:
 
     @property
     def sigmas(self) -> pd.DataFrame:
-        """One row per sigma and method: the bias, and the cost of a relative error of 10%."""
+        """A row per sigma and method: the bias, and the cost of a relative error of 10%."""
         import pandas as pd
 
         rows = []
@@ -293,7 +293,7 @@ class Findings:
 
     @property
     def breaks(self) -> pd.DataFrame:
-        """One row per jump or kink: line, position in standard deviations, and size."""
+        """A row per jump or kink: line, position in standard deviations, and size."""
         import pandas as pd
 
         rows = [
@@ -434,7 +434,7 @@ class Findings:
         return f"{best.name}, N = {int(best.samples):,}", f"{counted(int(best.calls), kind)}, {duration(best.seconds)}"
 
     def _without_noise(self) -> list[str]:
-        """Return the recommendation without noise."""
+        """Return the lines of the recommendation for use without noise."""
         if self.check is None or self.status:
             return []
         dim = self.theta.size
@@ -451,7 +451,7 @@ class Findings:
         return [*lines, self.conclusion, *self._scope()]
 
     def _scope(self) -> list[str]:
-        """Return what was checked and what was not, for a report without problems."""
+        """Return lines that state what was and was not checked, for a report without problems."""
         check = self.check
         assert check is not None
         dim, seen = self.theta.size, len(check.components)
@@ -471,7 +471,7 @@ class Findings:
 
 
 def _table(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return rows with aligned columns."""
+    """Return the rows as lines of text with aligned columns."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [
         "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows

@@ -16,7 +16,7 @@ from bench.examine.report import Report
 
 @pytest.fixture
 def examine() -> Callable[..., Report]:
-    """Return a function like :func:`bench.examine` that fails the test where the report has a problem."""
+    """Return :func:`bench.examine` as a function that fails the test if the report has a problem."""
 
     def examined(cost: Callable[..., Any], theta: Any, **settings: Any) -> Report:
         report = _examine(cost, theta, **{"progress": False, **settings})

@@ -1,8 +1,8 @@
 """Finds jumps and kinks of a cost on a line, by halving intervals around the places where its slope changes most.
 
-Where the slope changes by D over a width h, D falls like h for a smooth cost, stays for a kink and grows like 1/h for a
-jump. The order in h over the halvings gives the kind, so no threshold on the size of a change is needed.
-The search for one jump, :func:`bench.measure.jumps.largest_jump`, cuts all lines together and takes a thousand costs per
+Where the slope changes by D over a width h, D falls like h for a smooth cost, is constant at a kink and grows like 1/h
+at a jump. The order in h over the halvings identifies the kind, so no threshold on the size of a change is needed. The
+search for one jump, :func:`bench.measure.jumps.largest_jump`, divides all lines together and needs a thousand costs per
 level. This search follows each place separately with two costs per halving, since a user's simulator may be slow.
 """
 
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 POINTS = 97
-"""Points of a scan. Not a power of 2 plus one, so that round numbers rarely coincide with points."""
+"""Number of points of a scan. Not a power of 2 plus one, so that points rarely coincide with round numbers."""
 HALVINGS = 14
-"""Halvings of an interval."""
+"""Number of halvings of an interval."""
 PLACES = 6
 """Most places searched on a line: those where the slope changes most."""
 TREADS = 4
@@ -24,7 +24,7 @@ TREADS = 4
 ALIKE = 0.01
 """Relative difference between heights of jumps that count as equal; the slope of the cost adds to each height."""
 EVEN = 0.02
-"""Deviation of a tread from even spacing that is allowed, as a share of the spacing."""
+"""Largest deviation from even spacing of the jumps of a staircase, as a share of the spacing."""
 GUARD = 64.0
 """Multiple of the cost's rounding error that a change of slope has to exceed."""
 
@@ -36,9 +36,9 @@ class Break:
     kind: str
     """``jump`` or ``kink``."""
     at: float
-    """Position on the line, in units of the line's direction."""
+    """Position t on the line ``theta + t * direction``."""
     size: float
-    """The height of a jump, or the change of slope at a kink, per unit of the line's direction."""
+    """The height of a jump, or the change of slope per unit of t at a kink."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class LineScan:
     steps: bool
     """Whether the cost is constant between jumps everywhere: a staircase."""
     missed: float = float("nan")
-    """Share of the cost's change along the line that the integral of the gradient misses; NaN where unknown."""
+    """Share of the cost's change along the line that the integral of the gradient misses; NaN if unknown."""
 
     @property
     def jumps(self) -> tuple[Break, ...]:
@@ -69,10 +69,10 @@ class LineScan:
 
     @property
     def tread(self) -> float:
-        """The common height of all jumps, if there are at least four, equal and evenly spaced; else 0.
+        """The common height of all jumps, if there are at least four, of equal height and evenly spaced; else 0.
 
-        Only the six largest jumps are known, so distances are multiples of the smallest. Four random jumps are evenly
-        spaced by chance less than once in 500 times, and rarely of equal height too.
+        Only the six largest jumps are known, so distances may be multiples of the smallest distance. Four random jumps
+        are evenly spaced by chance less than once in 500 times, and rarely have equal heights too.
         """
         heights, at = np.array([b.size for b in self.jumps]), np.array([b.at for b in self.jumps])
         if heights.size < TREADS or np.ptp(heights) > ALIKE * heights.max():
@@ -91,9 +91,10 @@ def scan(
     halvings: int = HALVINGS,
     most: int = PLACES,
 ) -> LineScan:
-    """Scan ``cost((d, B)) -> (B,)`` on a line from -reach to +reach times ``direction (d,)`` about ``theta (d,)``.
+    """Return a scan of ``cost``, ``(d, B)`` to ``(B,)``, along ``theta + t * direction`` for t from -reach to +reach.
 
-    ``noise`` is the size of the cost's rounding errors; at most ``most`` places are searched.
+    ``theta`` and ``direction`` are ``(d,)``. ``noise`` is the size of the cost's rounding errors. At most ``most``
+    places are searched for breaks.
     """
 
     def along(t: np.ndarray) -> np.ndarray:
@@ -121,14 +122,14 @@ def _locate_breaks(
     halvings: int,
     noise: float,
 ) -> list[Break]:
-    """Halve the intervals around all places together, and return the breaks."""
+    """Return the breaks at the given places, found by halving the intervals around all places together."""
     count = len(places)
     centre = np.array([t[i + 1] for i in places])
     width = float(t[1] - t[0])
     # three points: left, middle, right
     values = np.stack([[f[i], f[i + 1], f[i + 2]] for i in places])
     turns, widths = [_second_difference(values)], [width]
-    bends = [turns[0] / width]  # changes of slope: over all five points, as a kink may lie off the middle of three
+    bends = [turns[0] / width]  # changes of slope: over all five points, as a kink may not be in the middle of three
     for _ in range(halvings):
         between = along(np.stack([centre - width / 2, centre + width / 2], axis=1))
         five = np.stack([values[:, 0], between[:, 0], values[:, 1], between[:, 1], values[:, 2]], axis=1)
@@ -163,7 +164,7 @@ def _second_difference(values: np.ndarray) -> np.ndarray:
 
 
 def _without_duplicates(breaks: list[Break], near: float) -> list[Break]:
-    """Return the breaks without those within ``near`` of another one; jumps take precedence over kinks."""
+    """Return the breaks, without any break within ``near`` of another; jumps take precedence over kinks."""
     kept: list[Break] = []
     for one in sorted(breaks, key=lambda b: b.kind):
         if all(abs(one.at - other.at) > near for other in kept):

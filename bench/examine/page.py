@@ -1,4 +1,4 @@
-"""Writes an examination as files: text, tables, charts, and one self-contained page."""
+"""Writes the files of an examination: text, tables, charts, and one self-contained page."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH = 7.16
-"""Inches of two columns of a paper."""
+"""Width of two columns of a paper in inches."""
 SHOWN = 8
 """Most components drawn: those with the largest errors."""
 PAGE = """<!doctype html>
@@ -49,7 +49,10 @@ th:first-child, td:first-child {{ text-align: left; }}
 
 
 def write(report: Findings, directory: Path) -> list[Path]:
-    """Write ``report.txt``, ``derivatives.csv``, ``sigmas.csv``, ``breaks.csv``, the charts and ``report.html``."""
+    """Write the text, the tables, the charts and ``report.html`` into ``directory``, and return their paths.
+
+    The files are ``report.txt``, ``derivatives.csv``, ``sigmas.csv``, ``breaks.csv``, the charts and ``report.html``.
+    """
     make_directory(directory)
     tables = {"derivatives": report.frame, "sigmas": report.sigmas, "breaks": report.breaks}
     texts = {f"{name}.csv": table.to_csv(index=False, lineterminator="\n") for name, table in tables.items()}
@@ -74,13 +77,13 @@ def write(report: Findings, directory: Path) -> list[Path]:
 
 
 def _wrapping(text: str) -> str:
-    """Return a text as HTML in which sentences wrap and aligned columns do not."""
+    """Return text as HTML in which sentences wrap and aligned columns do not."""
     lines = [(escape(line), "  " in line.strip()) for line in text.splitlines()]
     return "\n".join(line if row else f'<span class="sentence">{line}</span>' for line, row in lines)
 
 
 def charts(report: Findings) -> dict[str, tuple[str, Figure]]:
-    """Return a title and a figure for each chart that the report has data for."""
+    """Return, by name, the title and figure of each chart for which the report has data."""
     drawn = {}
     if report.check is not None and report.gradient:
         drawn["steps"] = ("The gradient against differences of the cost", _steps(report))
@@ -101,7 +104,7 @@ def _figure(panels: int, height: float = 2.6) -> tuple[Figure, list[Axes]]:
 
 
 def _steps(report: Findings) -> Figure:
-    """Draw the error of each derivative, and the remainder of each random direction, against the step."""
+    """Return a figure of each derivative's error and each direction's Taylor remainder, against the step."""
     assert report.check is not None
     figure, (left, right) = _figure(2, 2.9)
     components = sorted(report.check.components, key=lambda p: -np.nan_to_num(p.error, nan=np.inf))[:SHOWN]
@@ -149,7 +152,7 @@ def _steps(report: Findings) -> Figure:
 
 
 def _lines(report: Findings) -> Figure:
-    """Draw the cost on each line, with its jumps and kinks."""
+    """Return a figure of the cost along each line, with its jumps and kinks."""
     figure, panels = _figure(len(report.lines))
     for index, (panel, line) in enumerate(zip(panels, report.lines, strict=True)):
         panel.plot(line.at, line.costs, color=PALETTE[0], marker=".", markersize=2.5, linewidth=0.9)
@@ -167,7 +170,7 @@ def _lines(report: Findings) -> Figure:
 
 
 def _sigmas(report: Findings) -> Figure:
-    """Draw the bias of the gradient, and its change by smoothing, against sigma."""
+    """Return a figure of the gradient's bias and the effect of smoothing, against sigma."""
     figure, (panel,) = _figure(1)
     shown = [one for one in report.smoothed if one.known]
     sigma = np.array([one.sigma for one in shown])

@@ -10,7 +10,7 @@ from bench.examine.findings import Findings
 
 @dataclass(frozen=True)
 class Report(Findings):
-    """The findings about a cost and its gradient at a theta; ``print`` shows them as text.
+    """The findings about a cost and its gradient at one theta; ``print`` shows them as text.
 
     ``frame``, ``sigmas`` and ``breaks`` are tables, ``problems`` and ``warnings`` are sentences, and ``status`` is the
     exit status.
@@ -22,7 +22,7 @@ class Report(Findings):
             raise AssertionError(f"{'; '.join(self.problems)}\n\n{self}")
 
     def save(self, directory: str | Path) -> list[Path]:
-        """Write the text, the tables, the charts and ``report.html`` into a directory, and return their paths."""
+        """Write text, tables, charts and ``report.html`` into a directory, and return the paths of the files."""
         # importing charts and tables takes a second, which a report without files does not need
         from bench.examine import page
 

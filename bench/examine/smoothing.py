@@ -1,10 +1,10 @@
-"""Effect of noise of size sigma on theta: the bias of the program's gradient, and the cost of each method.
+"""Measures the effect of noise of size sigma on theta: the bias of the program's gradient, and the cost of each method.
 
-The truth is grad J, J(theta) = E cost(theta + sigma u) with u ~ N(0, I), computed only from costs, so it is right
-across jumps, which a mean of gradients misses. Costs are taken in pairs at +u and -u, with the same noise w of the
-simulator's own: d = (cost(theta + sigma u) - cost(theta - sigma u)) / 2 sigma. Then E[d u] = grad J (Nesterov and
-Spokoiny 2017, Found. Comput. Math. 17, section 2), and subtracting a fitted straight line d = b . u, whose mean is known,
-removes most of its variance. The line is fitted to the other half of the pairs, so the mean stays unbiased.
+The reference is grad J, J(theta) = E cost(theta + sigma u) with u ~ N(0, I). It is computed only from costs, so it is
+right across jumps, which a mean of gradients misses. Costs are computed in pairs at +u and -u, with the same noise w of
+the simulator: d = (cost(theta + sigma u) - cost(theta - sigma u)) / 2 sigma. Then E[d u] = grad J (Nesterov and
+Spokoiny 2017, Found. Comput. Math. 17, section 2). Subtracting a fitted straight line d = b . u, whose mean is known,
+removes most of the variance. Each half of the pairs uses the line fitted to the other half, so the mean stays unbiased.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from bench.model.simulator.clock import Clock, OutOfTime
 from bench.model.simulator.simulator import Simulator
 
 PAIRS = 4096
-"""Pairs of costs for one sigma, where the time allows."""
+"""Most pairs of costs for one sigma."""
 FEWEST = 64
 """Fewest pairs for a result."""
 FIRM = 1024
-"""Fewest pairs before drawing stops early, however small the spread, since a jump may be rare."""
+"""Fewest pairs before sampling stops early, however small the spread, since a jump may be rare."""
 GROUPS = 32
-"""Independent means that intervals are computed from."""
+"""Number of independent means from which intervals are computed."""
 ENOUGH = 0.03
-"""Relative standard error of grad J at which drawing stops, once the bias is decided."""
+"""Relative standard error of grad J at which sampling stops, once the bias is decided."""
 TARGET_ERROR = 0.1
-"""Relative error for which the cost of each method is stated."""
+"""Relative error at which the costs of the methods are compared."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """A method to estimate grad J, and its cost for a relative error of 10%."""
+    """A method of estimating grad J, and its cost for a relative error of 10%."""
 
     name: str
     """``gradient``: mean of the program's gradients; ``smoothing``: pairs of costs along random directions."""
     bias: float
-    """Relative to |grad J|: the upper end of its 95% interval."""
+    """Upper end of the 95% interval of the method's bias, relative to |grad J|."""
     samples: float
-    """Samples for a relative root-mean-square error of 10%; infinity where its bias exceeds that."""
+    """Samples for a relative root-mean-square error of 10%; infinity where the bias is 10% or more."""
     calls: float
     """Calls of cost or gradient for these samples."""
     seconds: float
@@ -48,13 +48,13 @@ class Method:
 
 @dataclass(frozen=True)
 class Smoothed:
-    """The findings at one sigma."""
+    """The bias of the program's gradient and the cost of each method, at one sigma."""
 
     sigma: float
     gradient: np.ndarray
-    """grad J, from costs, ``(d,)``."""
+    """grad J ``(d,)``, computed from costs."""
     error: float
-    """Standard error of its norm."""
+    """Standard error of grad J, as a norm."""
     norm: float
     """|grad J|, with the contribution of noise subtracted."""
     pairs: int
@@ -64,7 +64,7 @@ class Smoothed:
     bias_high: float
     """The 95% interval of the bias."""
     moved: float
-    """|grad J - grad cost| at theta: the change by smoothing itself; NaN without a right gradient."""
+    """|grad J - grad cost| at theta, the effect of smoothing; NaN without a right gradient."""
     remark: str
     """Why the intervals may be too narrow; empty if there is no such reason."""
     methods: tuple[Method, ...]
@@ -87,17 +87,17 @@ class Smoothed:
 
     @property
     def biased(self) -> bool:
-        """Whether the bias interval of the program's gradient is entirely above 10% at this sigma."""
+        """Whether the bias interval of the program's gradient is entirely above 10% of |grad J|."""
         return self.known and bool(self.bias_low > TARGET_ERROR * self.norm)
 
     @property
     def unshown(self) -> bool:
-        """Whether the bias interval is so wide that the bias may, but need not, exceed grad J itself."""
+        """Whether the bias interval is so wide that the bias may, but need not, exceed |grad J|."""
         return self.known and not self.biased and bool(self.bias_high > self.norm)
 
     @property
     def best(self) -> Method | None:
-        """The fastest method to reach an error of 10%; None where no method does."""
+        """The fastest method to reach an error of 10%; None if no method reaches it."""
         usable = [m for m in self.methods if math.isfinite(m.seconds)]
         return min(usable, key=lambda m: m.seconds) if usable and self.known else None
 
@@ -112,9 +112,10 @@ def measure_smoothed(
     seed: int = 0,
     pairs: int = PAIRS,
 ) -> Smoothed | None:
-    """Measure the gradient under noise ``sigma * scale * u`` on theta; None where there is time for too few pairs.
+    """Return the gradient's bias and the methods' costs under noise ``sigma * scale * u`` on theta.
 
-    ``plain (d,)`` is the gradient at theta without noise, if it is known to be right.
+    None where the time is too short for :data:`FEWEST` pairs. ``plain (d,)`` is the gradient at theta without noise, if
+    it is known to be right. At most ``pairs`` pairs are drawn.
     """
     random = np.random.default_rng([seed, 0x736D6F6F])
     drawn: list[np.ndarray] = []
@@ -134,7 +135,7 @@ def measure_smoothed(
 def _draw(
     simulator: Simulator, theta: np.ndarray, spread: np.ndarray, random: np.random.Generator, size: int
 ) -> np.ndarray:
-    """Return n pairs, ``(3 d + 1, n)``: directions u, half differences per unit of u, gradients at +u and at -u."""
+    """Return ``size`` pairs, ``(3 d + 1, size)``: directions u, half differences of costs, gradients at +u and at -u."""
     u = random.standard_normal((theta.size, size))
     w = random.standard_normal((simulator.noise, size)) if simulator.noise else None
     up, down = theta[:, None] + spread[:, None] * u, theta[:, None] - spread[:, None] * u
@@ -152,7 +153,7 @@ def _summary(
     simulator: Simulator,
     clock: Clock,
 ) -> Smoothed:
-    # SciPy's distributions take long to import, and only this needs them
+    # SciPy's distributions are slow to import, and only this function needs them
     from bench.measure.statistics import Truth, summarise
 
     dim, pairs = scale.size, drawn.shape[1]
@@ -183,7 +184,7 @@ def _summary(
 
 
 def _terms(u: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Return terms ``(d, n)`` whose mean is E[d u], with a straight line fitted to the other half subtracted."""
+    """Return terms ``(d, n)`` with expectation E[d u], less variable thanks to a line fitted to the other half."""
     dim, count = u.shape
     halves = np.arange(count) % 2 == 0
     out = np.empty_like(u)
@@ -196,12 +197,12 @@ def _terms(u: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 
 def _means(terms: np.ndarray) -> np.ndarray:
-    """Return independent means of ``terms (d, n)``, ``(GROUPS, d)``; each takes equally many terms of both halves."""
+    """Return independent means of ``terms (d, n)``, ``(GROUPS, d)``, each over equally many terms of both halves."""
     return np.asarray(terms.reshape(terms.shape[0], GROUPS, -1).mean(axis=2).T)
 
 
 def _methods(norm: float, bias: float, terms: np.ndarray, slopes: np.ndarray, clock: Clock) -> tuple[Method, ...]:
-    """Return the cost of a relative error of 10% with each method, from its single samples ``(d, n)``."""
+    """Return the methods, fastest first, with their costs for a relative error of 10%, from single samples ``(d, n)``."""
     methods = [_method("smoothing", 0.0, terms, norm, 2, clock.per_cost())]
     if np.isfinite(slopes).all():
         methods.append(_method("gradient", bias / norm, slopes, norm, 1, clock.per_gradient()))
@@ -216,7 +217,7 @@ def _method(name: str, bias: float, terms: np.ndarray, norm: float, calls: int, 
 
 
 def directions(count: int, scale: np.ndarray, seed: int) -> np.ndarray:
-    """Return random directions of one standard deviation each, ``(count, d)``; one of them where d is 1."""
+    """Return random directions ``(count, d)`` of length 1 in units of ``scale``; only one direction where d is 1."""
     if scale.size == 1:
         return scale[None, :]
     drawn = np.random.default_rng([seed, 0x6C696E65]).standard_normal((count, scale.size))

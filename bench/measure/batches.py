@@ -10,7 +10,7 @@ import numpy as np
 def in_columns(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray, columns: int) -> np.ndarray:
     """Return ``function(w)``, ``(..., B)``, for noise ``w (n_w, B)``, evaluated ``columns`` at a time.
 
-    The last part is padded with copies of its last column, and their results are dropped.
+    The last part is padded with copies of its last column, whose results are dropped.
     """
     count = w.shape[1]
     n_missing = -count % columns

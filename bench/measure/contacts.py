@@ -1,4 +1,4 @@
-"""Which contacts are active in each step of a rollout: the single definition of a contact mode."""
+"""Determines which contacts are active in each step of a rollout: the single definition of a contact mode."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ def active_contacts(
 ) -> np.ndarray:
     """Return which contacts are active in each step, boolean ``(horizon, n_contacts, B)``.
 
-    ``states (horizon + 1, n, B)`` and ``controls (horizon, n_u, B)`` are those of a rollout. Under a force law a
-    contact is active where its bodies overlap before the step. Under an impulse law there are two answers:
+    ``states (horizon + 1, n, B)`` and ``controls (horizon, n_u, B)`` come from one rollout. Under a force law a contact
+    is active where its bodies overlap before the step. Under an impulse law there are two criteria:
 
     - predicted, without ``forces``: the criterion of the law itself. The bodies approach and would overlap after the
-      step, or, where the law solves for the end of the step, they would overlap there without contact. This needs only
-      the state before the step, so many rollouts can be labelled quickly.
+      step. Where the law solves for the end of the step, the bodies would overlap at the end of a step without contact.
+      This needs only the state before the step, so many rollouts can be labelled quickly.
     - measured, with ``forces (horizon, n_contacts, B)`` [N], the impulses of the steps over dt: the bodies overlap
-      before the step, or the impulse opened the gap by more than the gap left after the step, dt^2 (J M^-1 J^T)_ii
-      lambda_i > gap_i. On the central path, where forces act at every distance, a step without contact would have
-      overlapped there.
+      before the step, or the impulse opened the gap by more than the gap after the step, dt^2 (J M^-1 J^T)_ii
+      lambda_i > gap_i. On the central path, where forces act at every distance, this means that the bodies would have
+      overlapped after a step without contact.
 
-    The two differ for bodies that overlap and already separate: only the measured answer counts them as a contact.
+    The two differ for bodies that overlap and already separate: only the measured criterion counts them as a contact.
     Raises :class:`Unsupported` for scenes whose contacts only an engine knows.
     """
     scene = program.scene

@@ -1,8 +1,8 @@
-"""Which parameters a record identifies: Fisher information, unidentifiable directions, the Cramer-Rao bound.
+"""Finds the parameters that a record identifies: Fisher information, unidentifiable directions, the Cramer-Rao bound.
 
-All quantities are for logarithms of the parameters, so a direction is a product of powers. A null vector (1, 1, 1) of
-mass, stiffness and damping means that scaling all three together does not change the data, which identify only their
-ratios.
+All quantities refer to logarithms of the parameters, so a direction is a product of powers. A null vector (1, 1, 1) of
+mass, stiffness and damping means that scaling all three together does not change the data: only their ratios are
+identifiable.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ RANK_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """The Jacobian ``(m, p)`` of standardised residuals by the logarithms of named parameters, and the information in it."""
+    """The Fisher information in the Jacobian ``(m, p)`` of standardised residuals by logarithms of named parameters."""
 
     names: tuple[str, ...]
     jacobian: np.ndarray
@@ -42,7 +42,7 @@ class Information:
 
     @property
     def condition(self) -> float:
-        """The largest singular value over the smallest that counts as nonzero."""
+        """The largest singular value over the smallest that counts as nonzero; inf if none does."""
         values, _ = self._svd
         return float(values[0] / values[self.rank - 1]) if self.rank else np.inf
 
@@ -53,17 +53,17 @@ class Information:
 
     @cached_property
     def invariants(self) -> np.ndarray:
-        """Exponents of the identifiable products of powers, as rows ``(rank, p)``: unit vectors where all are identifiable.
+        """Exponents of the identifiable products of powers, ``(rank, p)``; unit vectors if all are identifiable.
 
-        One parameter leads each unidentifiable direction. Every other parameter is divided by the powers of the leaders
-        that scale with it.
+        Each unidentifiable direction has one leading parameter. Every other parameter is divided by the powers of the
+        leading parameters that scale with it.
         """
         rows = self.gauge.copy()
         leaders: list[int] = []
         for i in range(len(rows)):
             free = [j for j in range(rows.shape[1]) if j not in leaders]
             size = np.abs(rows[i][free])
-            # the first of nearly equal ones, so that the text does not depend on rounding
+            # the first of nearly equal entries, so that the text does not depend on rounding
             lead = free[int(np.flatnonzero(size > 0.9 * size.max())[0])]
             rows[i] /= rows[i, lead]
             for k in range(len(rows)):
@@ -87,7 +87,7 @@ class Information:
 
     @property
     def words(self) -> str:
-        """One sentence: which parameters or products are identifiable, and which changes leave the data as they are."""
+        """A sentence on which parameters or products are identifiable, and which changes do not affect the data."""
         if self.rank == len(self.names):
             return f"{_listed(self.names)} {'are' if len(self.names) > 1 else 'is'} identifiable"
         hidden = [_direction(self.names, row) for row in self.gauge]
@@ -96,7 +96,7 @@ class Information:
         return f"only {', '.join(self.labels)}: {'; '.join(hidden)} does not change the data"
 
     def covariance(self) -> np.ndarray:
-        """Return the Cramer-Rao bound of the logarithms of the invariants, ``(rank, rank)``."""
+        """Return the Cramer-Rao bound on the covariance of the invariants' logarithms, ``(rank, rank)``."""
         values, rows = self._svd
         kept = rows[: self.rank]
         inverse = (kept.T / values[: self.rank] ** 2) @ kept
@@ -104,7 +104,7 @@ class Information:
 
 
 def product(names: tuple[str, ...], exponents: np.ndarray) -> str:
-    """Write a product of powers: ``stiffness/mass``, ``damping^2*mass``."""
+    """Return a product of powers as text: ``stiffness/mass``, ``damping^2*mass``."""
     above: list[str] = []
     below: list[str] = []
     for name, exponent in zip(names, exponents, strict=True):

@@ -8,15 +8,15 @@ from typing import NamedTuple
 import numpy as np
 
 PARTS = 64
-"""Intervals that each line is divided into at first, by default."""
+"""Default number of intervals of each line at the first level."""
 CUTS = 32
-"""Intervals that a suspected one, and its neighbour, are divided into at every further level."""
+"""Number of intervals into which a suspicious interval and its neighbour are divided at every further level."""
 SUSPECTS = 32
-"""Intervals refined at each level."""
+"""Number of intervals refined at each level."""
 FINEST = 1e-11
-"""Length, as a share of the line, at which a change of the cost that has stopped falling is a jump."""
+"""Interval length, as a share of the line, at which a change of the cost that no longer shrinks is a jump."""
 NO_JUMP = 1e-6
-"""Change of a cost, relative to its range on the lines, below which rounding may keep it from falling further."""
+"""Change of a cost, relative to its range on the lines, below which rounding may hide that the change still shrinks."""
 LOUD = 100.0
 """Multiple of the cost's rounding noise below which a change counts as noise."""
 
@@ -25,7 +25,7 @@ class Jump(NamedTuple):
     """The largest jump of a cost on some lines."""
 
     height: float
-    """Change of the cost across the jump; 0 without one."""
+    """Change of the cost across the jump; 0 without a jump."""
     span: float
     """Range of the cost on the lines."""
 
@@ -33,13 +33,13 @@ class Jump(NamedTuple):
 def largest_jump(
     cost: Callable[[np.ndarray], np.ndarray], starts: np.ndarray, ends: np.ndarray, parts: int = PARTS
 ) -> Jump:
-    """Find the largest jump of ``cost`` on the lines from ``starts (n, L)`` to ``ends (n, L)``.
+    """Return the largest jump of ``cost`` on the lines from ``starts (n, L)`` to ``ends (n, L)``.
 
-    ``cost`` maps points ``(n, B)`` to ``(B,)``. Where a smooth cost is divided into intervals of length h, its second
-    difference falls as h^2, at a kink as h, and at a jump it stays. Three kinds of jumps are missed: those below 1e-6
-    of the cost's range on the lines, those between two of the first ``parts`` + 1 nodes of a line that leave the cost
-    at both nodes as it was, and those that more than :data:`SUSPECTS` other intervals exceed. Values that are not
-    finite are ignored.
+    ``cost`` maps points ``(n, B)`` to ``(B,)``. As intervals of length h shrink, the second difference of a smooth cost
+    falls as h^2, at a kink as h, and at a jump it is constant. Three kinds of jumps are missed: jumps below 1e-6 of the
+    cost's range on the lines, jumps between two of the first ``parts`` + 1 nodes of a line that do not change the cost
+    at these nodes, and jumps in an interval whose second difference more than :data:`SUSPECTS` other intervals exceed.
+    Values that are not finite are ignored.
     """
     count = starts.shape[1]
     line = np.arange(count)

@@ -1,4 +1,4 @@
-"""Counter-based common random numbers: the same noise for every estimator and backend."""
+"""Draws common random numbers: the same noise for every estimator and backend, from counter-based generators."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from functools import lru_cache
 import numpy as np
 
 HELD = 1 << 22
-"""Most normal numbers that a cell holds in memory (32 MiB). A cell that needs more draws them part by part."""
+"""Most normal numbers that a cell stores in memory (32 MiB). A cell that needs more draws them in parts."""
 
 
 @lru_cache(maxsize=2)
 def shared(seed: int, scene: str, repeats: int, samples: int, width: int) -> np.ndarray:
-    """Return :func:`draw` for cells, cached for the next cell with the same arguments."""
+    """Return the noise of cells, see :func:`draw`, cached for the next cell with the same arguments."""
     return draw(seed, scene, repeats, samples, width, "cells")
 
 
 def draw(seed: int, scene: str, repeats: int, samples: int, width: int, stream: str) -> np.ndarray:
-    """Draw standard normal noise ``(repeats, samples, width)``, read-only.
+    """Return standard normal noise ``(repeats, samples, width)``, read-only.
 
-    Repeat r comes from a Philox generator keyed only by (seed, stream, scene, r): adding repeats, or samples to a
-    repeat, keeps the earlier numbers. Stored component-first, so that flattening to ``(width, R * N)`` copies nothing.
+    Repeat r comes from a Philox generator whose key depends only on (seed, stream, scene, r), so more repeats or more
+    samples per repeat do not change the earlier numbers. The array is stored component-first, so that flattening it to
+    ``(width, R * N)`` copies nothing.
     """
     block = np.empty((width, repeats, samples))
     for r in range(repeats):
@@ -34,7 +35,7 @@ def draw(seed: int, scene: str, repeats: int, samples: int, width: int, stream: 
 
 
 def parts(seed: int, scene: str, repeat: int, samples: int, width: int, stream: str) -> Iterator[np.ndarray]:
-    """Yield one repeat of :func:`draw`, the same numbers, in parts ``(width, b)`` of at most :data:`HELD` numbers.
+    """Yield the numbers of one repeat of :func:`draw` in parts ``(width, b)`` of at most :data:`HELD` numbers.
 
     The sizes of the parts depend only on the width, so sums over parts do not depend on the machine.
     """
@@ -46,7 +47,7 @@ def parts(seed: int, scene: str, repeat: int, samples: int, width: int, stream: 
 
 @lru_cache(maxsize=64)
 def seconds(seed: int, scene: str, samples: int, width: int) -> float:
-    """Return the seconds that drawing the noise of one estimate takes, extrapolated from its first part."""
+    """Return the time to draw the noise of one estimate [s], extrapolated from its first part."""
     started = time.perf_counter()
     part = next(parts(seed, scene, 0, samples, width, "cells"))
     return float((time.perf_counter() - started) * samples / part.shape[1])

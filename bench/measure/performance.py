@@ -1,11 +1,13 @@
-"""Performance of searches: success rates, times to a target, summaries and rank correlations, with 95% intervals.
+"""Measures the performance of searches: success rates, costs to a target, summaries and rank correlations.
+
+Intervals are at 95%.
 
 Sources: Wilson 1927 (success rates), Hansen et al. 2016, *COCO performance assessment* (average runtime, ECDF with
 simulated restarts), Agarwal et al. 2021, *Deep RL at the edge of the statistical precipice* (interquartile mean,
 probability of improvement), Dahl et al. 2023, *AlgoPerf* (the integral of the performance profile), Efron 1979
-(bootstrap). Ranks are SciPy's. The Wilson interval and Spearman's rho agree with SciPy's to 1e-14, but stay here: SciPy's
-last digits differ from stored results, it rejects an interval without trials, and its rho is five times slower, which
-matters in a bootstrap. SciPy's bootstrap has no strata and does not skip resamples without a value.
+(bootstrap). Ranks are SciPy's. The Wilson interval and Spearman's rho agree with SciPy's to 1e-14. SciPy's are not used
+because their last digits differ from stored results, SciPy rejects an interval without trials, and its rho is five
+times slower, which matters in a bootstrap. SciPy's bootstrap has no strata and does not skip resamples without a value.
 """
 
 from __future__ import annotations
@@ -16,15 +18,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 Z = 1.959963984540054
-"""The normal quantile of 0.975."""
+"""The 0.975 quantile of the standard normal distribution."""
 DRAWS = 1000
-"""Bootstrap samples of an interval."""
+"""Number of resamples per bootstrap interval."""
 
 Interval = tuple[float, float]
 
 
 def wilson(successes: int, trials: int, z: float = Z) -> Interval:
-    """Return Wilson's score interval of a success rate, ``(0, 1)`` without trials.
+    """Return Wilson's score interval of a success rate; ``(0, 1)`` without trials.
 
     >>> [round(x, 4) for x in wilson(8, 10)]
     [0.4902, 0.9433]
@@ -42,9 +44,9 @@ def wilson(successes: int, trials: int, z: float = Z) -> Interval:
 def bootstrap(
     strata: Sequence[np.ndarray], statistic: Callable[[Sequence[np.ndarray]], float], seed: int = 0, draws: int = DRAWS
 ) -> Interval:
-    """Return the percentile interval of a statistic of strata, resampling each stratum along its first axis.
+    """Return the bootstrap percentile interval of a statistic, resampling each stratum along its first axis.
 
-    Resamples in which the statistic is NaN are ignored.
+    Resamples in which the statistic is NaN are ignored. The interval is NaN if all are.
     """
     rng = np.random.default_rng(seed)
     values = np.array(
@@ -58,7 +60,7 @@ def bootstrap(
 
 
 def average_runtime(spent: np.ndarray, reached: np.ndarray) -> float:
-    """Return the cost of all searches, failed ones included, over the number of successes; infinite without a success.
+    """Return the total cost of all searches, failed ones included, over the number of successes; inf without a success.
 
     ``spent (n,)`` is the cost until the target, or until the search stopped; ``reached (n,)`` is whether it succeeded.
 
@@ -70,7 +72,10 @@ def average_runtime(spent: np.ndarray, reached: np.ndarray) -> float:
 
 
 def runtime_interval(spent: np.ndarray, reached: np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
-    """Return the bootstrap interval of :func:`average_runtime`; its upper end is infinite where resamples often fail."""
+    """Return the bootstrap interval of :func:`average_runtime`.
+
+    The upper end is infinite where too many resamples contain no success.
+    """
     drawn = np.random.default_rng(seed).integers(0, len(spent), (draws, len(spent)))
     counts = reached[drawn].sum(axis=1)
     values = np.where(counts > 0, spent[drawn].sum(axis=1) / np.maximum(counts, 1), math.inf)
@@ -79,9 +84,9 @@ def runtime_interval(spent: np.ndarray, reached: np.ndarray, seed: int = 0, draw
 
 
 def runtimes(spent: np.ndarray, reached: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
-    """Return ``count`` runtimes with simulated restarts: the total cost of runs drawn at random until one succeeds.
+    """Return ``count`` simulated runtimes with restarts: the total cost of runs drawn at random until one succeeds.
 
-    All runtimes are infinite without a success.
+    All runtimes are infinite if no run succeeds.
     """
     if not np.any(reached):
         return np.full(count, math.inf)
@@ -94,7 +99,7 @@ def runtimes(spent: np.ndarray, reached: np.ndarray, count: int, seed: int = 0) 
 
 
 def interquartile_mean(values: np.ndarray) -> float:
-    """Return the mean of the middle half of the values; the two values at its ends count by their share.
+    """Return the mean of the middle half of the values. A value at the edge of that half is weighted by its share in it.
 
     >>> interquartile_mean(np.array([0.0, 1.0, 2.0, 9.0]))
     1.5
@@ -108,7 +113,7 @@ def interquartile_mean(values: np.ndarray) -> float:
 
 
 def improvement(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Return the share of pairs in which ours is smaller; a tie counts half."""
+    """Return the share of paired values in which ours is smaller; a tie counts half."""
     return float(np.mean((ours < theirs) + 0.5 * (ours == theirs)))
 
 
@@ -123,14 +128,14 @@ def profile_score(ratios: np.ndarray, most: float = 4.0) -> float:
 
 
 def ranks(values: np.ndarray) -> np.ndarray:
-    """Return ranks from 1 on. Ties share their mean rank, and infinities rank last, together."""
+    """Return ranks, starting at 1. Ties share their mean rank, and infinities tie for last."""
     from scipy.stats import rankdata
 
     return np.asarray(rankdata(values))
 
 
 def spearman(x: np.ndarray, y: np.ndarray) -> float:
-    """Return Spearman's rank correlation; NaN where one side does not vary or there are fewer than three points."""
+    """Return Spearman's rank correlation; NaN if ``x`` or ``y`` is constant or there are fewer than three points."""
     if len(x) < 3:
         return math.nan
     a, b = ranks(x), ranks(y)
@@ -140,7 +145,7 @@ def spearman(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def spearman_interval(points: Sequence[np.ndarray], seed: int = 0, draws: int = DRAWS) -> Interval:
-    """Return the bootstrap interval of Spearman's rho of points ``(n, 2)``, resampled stratum by stratum."""
+    """Return the bootstrap interval of Spearman's rho over strata of points ``(n, 2)``, resampled within each stratum."""
 
     def rho(parts: Sequence[np.ndarray]) -> float:
         both = np.concatenate(parts)
@@ -150,7 +155,7 @@ def spearman_interval(points: Sequence[np.ndarray], seed: int = 0, draws: int = 
 
 
 def spearman_chance(points: Sequence[np.ndarray], seed: int = 0, draws: int = DRAWS) -> float:
-    """Return the permutation p-value of Spearman's rho of points ``(n, 2)``, permuted within each stratum.
+    """Return the permutation p-value of Spearman's rho over strata of points ``(n, 2)``, permuted within each stratum.
 
     A few points that happen to be in order give a narrow bootstrap interval, but their p-value stays large.
     """

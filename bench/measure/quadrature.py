@@ -1,4 +1,4 @@
-"""Smoothed gradients by quadrature, with an error from the disagreement of several rules."""
+"""Computes smoothed gradients by quadrature, with an error from the disagreement of several rules."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from bench.measure.batches import in_columns
 from bench.model import Problem
 
 NODES = 8
-"""Gauss-Legendre nodes of a panel."""
+"""Number of Gauss-Legendre nodes per panel."""
 REACH = 9.0
-"""Standard deviations integrated over: beyond, the normal density is below 1e-17."""
+"""Limit of integration on either side, in standard deviations: beyond it, the normal density is below 1e-17."""
 SHIFTS = {1: ((0.0, 0.5, 0.25, 0.75),), 2: ((0.0, 0.5, 0.25, 0.75), (0.0, 0.25, 0.75, 0.5))}
-"""Shift of the panels of each rule, as a share of a panel, by noise dimension: every rule samples the cost elsewhere."""
+"""Shift of each rule's panels, as a share of a panel, by number of noise dimensions: no two rules share their points."""
 FIRST = {1: 512, 2: 12}
-"""Panels of the coarsest rules."""
+"""Panels per dimension of the coarsest rules, by number of noise dimensions."""
 LEAST = {1: 1 << 15, 2: 1 << 17}
-"""Fewest points. One dimension: 1800 per standard deviation, enough for an event of width .001. Two: 21 each way."""
+"""Fewest points, by number of noise dimensions. One: 1800 per standard deviation, enough for an event of width .001.
+Two: 20 per standard deviation in each dimension."""
 SAFETY = 2.0
-"""Stated error, relative to the largest distance of a rule from the mean of all rules."""
+"""Stated error, as a multiple of the largest distance of a rule from the mean of all rules."""
 SETTLED = 1e-10
-"""Relative error at which refining stops."""
+"""Relative error at which refinement stops."""
 SOLVED = 1e-11
-"""Relative error of costs whose steps solve an equation to 1e-12."""
+"""Relative error of costs of programs whose steps solve an equation to 1e-12."""
 PROBES, STEP = 32, 1e-7
-"""Points at which the cost's rounding noise is measured, and the spacing of the stencils there, in standard deviations."""
+"""Number of stencils that measure the cost's rounding noise, and the spacing of their points in standard deviations."""
 
 
 @dataclass(frozen=True)
 class Integral:
-    """A smoothed gradient ``(d,)``, the norm of its error, the number of points used, and their average spacing."""
+    """A smoothed gradient ``(d,)``, the norm of its error, and the points used: their number and average spacing."""
 
     gradient: np.ndarray
     error: float
@@ -43,14 +44,15 @@ class Integral:
 
 
 def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) -> Integral | None:
-    """Integrate E[(f(w) - f(0)) w] / sigma over noise on theta of one or two dimensions, on at most ``points`` points.
+    """Return the smoothed gradient E[(f(w) - f(0)) w] / sigma for one- or two-dimensional noise on theta, by quadrature.
 
-    Gauss-Legendre panels lie between the scene's breakpoints and are halved until the error is negligible or the points
-    are spent. Every level averages four rules, shifted against each other. The stated error is twice the largest distance
-    of a rule from the mean, or the change of the mean under the last halving if that is larger, plus rounding: the cost's
-    measured noise, and 1e-11 of its size where steps solve equations. Returns None where two levels of at least
-    :data:`LEAST` points do not fit, or a cost is not finite. A feature of the cost that is narrower than the spacing, and
-    not among the breakpoints, is missed. The cost is evaluated ``columns`` points at a time.
+    Gauss-Legendre panels lie between the scene's breakpoints and are halved until the error is negligible or the next
+    level would exceed ``points`` points. Every level averages four rules, shifted against each other. The stated error
+    is twice the largest distance of a rule from the mean, or the change of the mean under the last halving if that is
+    larger, plus rounding: the cost's measured noise, and 1e-11 of its size where steps solve equations. Returns None
+    where two levels, the last of at least :data:`LEAST` points, do not fit, or a cost is not finite. A feature of the
+    cost that is narrower than the spacing and not among the breakpoints is missed. The cost is evaluated ``columns``
+    points at a time.
     """
     width, dim = problem.program.n_noise, problem.dim
     breaks = problem.program.breakpoints()
@@ -58,7 +60,7 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     for i in range(width):
         inner = [(b - theta[i]) / problem.sigma for b in (breaks[i] if i < len(breaks) else ())]
         edges.append(np.unique([-REACH, *(b for b in inner if abs(b) < REACH), REACH]))
-    # E[w] = 0, so subtracting f at w = 0 keeps the integral and loses fewer digits
+    # E[w] = 0, so subtracting f(0) does not change the integral, and loses fewer digits
     centre = problem.value(theta, np.zeros((width, 1)))[0]
 
     def cost(nodes: np.ndarray) -> np.ndarray:
@@ -96,7 +98,7 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
 
 
 def _panels(edges: np.ndarray, count: int, shift: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights (normal density included) of about ``count`` panels, moved by ``shift`` of a panel."""
+    """Return nodes and weights (normal density included) of about ``count`` panels, shifted by ``shift`` of a panel."""
     x, w = np.polynomial.legendre.leggauss(NODES)
     cuts = [edges]
     for a, b in itertools.pairwise(edges):
@@ -111,8 +113,8 @@ def _panels(edges: np.ndarray, count: int, shift: float) -> tuple[np.ndarray, np
 def _noise(cost: Callable[[np.ndarray], np.ndarray], width: int) -> float:
     """Return a bound on the cost's rounding noise, from fourth differences over stencils too short to show its shape.
 
-    The fourth difference of independent errors of variance s^2 has the variance 70 s^2. A stencil that contains a kink or
-    a jump is rare, and only makes the bound larger.
+    The fourth difference of independent errors of variance s^2 has the variance 70 s^2. A stencil that contains a kink
+    or a jump is rare, and only makes the bound larger.
     """
     # evenly spread over a disc of three standard deviations, away from round numbers
     turn = np.arange(PROBES)

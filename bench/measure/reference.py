@@ -1,4 +1,4 @@
-"""Certified gradients: closed form, quadrature or long sampling, each with an error meant as a bound."""
+"""Reference gradients from a closed form, quadrature or long sampling, each with an error intended as a bound."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from bench.measure.statistics import Sampling, Truth, bias_interval, heavy_tails
 from bench.model import Problem, Program
 
 BATCHES = 64
-"""Number of independent batch means that a sampled reference is stored as."""
+"""Number of independent batch means that represent a sampled reference."""
 COLUMNS = 4096
-"""Columns of every batch evaluated, so that a compiling backend compiles once; fewer where few samples are allowed.
-Choosing the estimator of a sampled reference takes one batch too."""
+"""Columns of every evaluated batch, constant so that a compiling backend compiles once, and fewer if ``samples`` is
+small. The pilot, which selects the estimator of a sampled reference, is one batch."""
 LEAST_SAMPLES = 16384
-"""Fewest samples of a sampled reference, where so many are allowed: a small spread of few samples proves nothing."""
+"""Minimum samples of a sampled reference, unless the limit is lower: a small spread of few samples proves nothing."""
 QUADRATURE_POINTS = 1 << 20
 QUADRATURE_TOLERANCE = 1e-3
 """Relative error above which quadrature is accepted only where sampling does no better."""
 TAIL_EVENTS = 10.0
-"""Samples expected in the tails, whose contribution is estimated separately: so few may not show in a spread."""
+"""Expected samples in the tails. Their contribution is estimated separately, as a spread may not show so few samples."""
 DIRECTIONS = 16
-"""Directions in noise space searched for tails and jumps: coordinates, and the direction of the largest mean effect."""
+"""Most coordinate directions in noise space searched for tails and jumps, besides the direction of the mean effect."""
 FAR = 4.5
-"""Standard deviations searched for jumps along a direction, to either side."""
+"""Distance searched for jumps on either side along a direction, in standard deviations."""
 ROUNDING = 1e-9
-"""Share of a gradient below which first and zeroth order differ only by rounding."""
+"""Difference of first and zeroth order, relative to the gradient, that rounding explains."""
 SHARED = 1e-10
-"""Error that the terms of all samples may share, relative to their size: from rounding and central differences."""
+"""Relative error common to the terms of all samples, from rounding and central differences."""
 WARNED, REFUSED = 0.999, 1.0 - 1e-6
-"""Confidence levels at which a difference between first and zeroth order is noted, and at which zeroth order is used."""
+"""Confidence levels at which a difference of first from zeroth order adds a note, and makes zeroth order replace first."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A certified grad J_sigma.
+    """A reference for grad J_sigma, with its error.
 
     ``batches (K, d)`` are independent estimates whose mean is the gradient, or one row where the gradient has no
-    sampling error. ``error`` is the norm of an error that their spread does not show: the remaining error of a
-    deterministic method, or the change that samples in the tails would make. ``plain (d,)`` is the program's gradient at
-    w = 0 and ``physical (d,)`` that of the physics it approximates; each is empty when unknown. ``note`` states what
-    could not be certified.
+    sampling error. ``error`` is the norm of the error that their spread does not show: the error of a deterministic
+    method, or the effect of the tails. ``plain (d,)`` is the program's gradient at w = 0, and ``physical (d,)`` the
+    gradient of the physics that the program approximates. Each is empty when unknown. ``note`` states what could not be
+    certified.
     """
 
     batches: np.ndarray
@@ -63,7 +63,7 @@ class Reference:
         return np.asarray(self.batches.mean(axis=0))
 
     def known(self) -> Truth:
-        """Return the reference for the statistics: a mean, its sampling error, and the error that sampling does not show."""
+        """Return the reference as a :class:`Truth`: mean, sampling error, and the error that sampling does not show."""
         if len(self.batches) > 1:
             return Truth.from_batches(self.batches, self.error)
         return Truth.exact(self.gradient, self.error)
@@ -81,13 +81,13 @@ def certify(
     tolerance: float,
     physical: np.ndarray | None = None,
 ) -> Reference:
-    """Compute the reference of a problem by the best method that applies.
+    """Return the reference gradient of a problem, by the best applicable method.
 
-    A closed form belongs to the scene's own program, so it is not used for a backend that ``provides`` physics of its
-    own. Quadrature handles noise of one or two dimensions on theta, unless the cost jumps in a plane at places that the
-    scene does not list. Above a relative error of 0.1%, sampling replaces quadrature if its error is smaller. Sampling
-    stops at an error of ``tolerance`` times the gradient's norm, or after ``samples`` samples. ``physical (d,)`` is the
-    gradient that the program approximates, if known.
+    A closed form belongs to the scene's own program, so it is not used for a backend that ``provides`` its own physics.
+    Quadrature handles noise on theta of one or two dimensions, or of one only if the cost may jump at places that the
+    scene does not list. If its relative error exceeds 0.1%, sampling replaces quadrature where the error of sampling is
+    smaller. Sampling stops at an error of ``tolerance`` times the gradient's norm, or after ``samples`` samples.
+    ``physical (d,)`` is the gradient of the physics that the program approximates, if known.
     """
     program = problem.program
     theta = program.theta0
@@ -141,10 +141,10 @@ Terms = Callable[[np.ndarray], np.ndarray]
 
 
 def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float) -> Reference:
-    """Sample with the valid estimator of lowest variance, in independent batches, and compare it with zeroth order.
+    """Return a sampled reference from the valid estimator of lowest variance, checked against zeroth order.
 
-    First order is valid where the cost is continuous. Zeroth order replaces it, with a note, where a line through the
-    samples has a jump or the two estimators disagree. Otherwise both are unbiased.
+    First order is valid where the cost is continuous. Zeroth order replaces it, with a note, where the cost jumps on a
+    line through the samples or the two estimators disagree.
     """
     columns = min(COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
     still = np.zeros((problem.program.n_noise, 1))
@@ -192,9 +192,9 @@ def _reason_against_first_order(
     directions: np.ndarray,
     columns: int,
 ) -> str:
-    """Return why first order cannot be trusted: the pilot's zeroth order disagrees, or the cost jumps. Empty if neither."""
+    """Return why first order is rejected: zeroth order disagrees in the pilot, or the cost jumps. Empty if neither."""
     if "zeroth_order" in pilots:
-        # both come from the same noise, so their differences are independent samples too
+        # both use the same noise, so their differences are independent samples too
         paired = (pilots["first_order"] - pilots["zeroth_order"]).T
         if bias_interval(paired.mean(axis=0), Sampling.of(paired), level=REFUSED)[1] > ROUNDING * np.abs(paired).max():
             return "first and zeroth order disagree in the pilot, so zeroth order is used"
@@ -219,7 +219,7 @@ def _batches(
     samples: int,
     tolerance: float,
 ) -> Reference:
-    """Sample until the error, tails included, is small enough or the samples are spent."""
+    """Return a sampled reference whose error, tails included, is within ``tolerance``, or that spends all ``samples``."""
     for batches, count in doubling_batches(problem, terms, "reference", columns):
         if not np.isfinite(batches).all():
             break
@@ -248,7 +248,10 @@ def _batches(
 def _cross_checked(
     problem: Problem, reference: Reference, zeroth: Terms, columns: int, instead: Callable[[], Reference]
 ) -> Reference:
-    """Compare a first-order reference with zeroth order on a quarter of its samples, and record the resolution."""
+    """Return a first-order reference after comparing it with zeroth order on a quarter of its samples.
+
+    The method's name records the resolution of the comparison. A clear disagreement returns ``instead()``.
+    """
     count = max(columns, _count(reference) // 4 // columns * columns)
     check = in_columns(zeroth, draw_columns(problem, "check", count, 0), columns)
     check = check.reshape(problem.dim, BATCHES, -1).mean(axis=2).T
@@ -270,10 +273,10 @@ def _cross_checked(
 def _tail_error(
     problem: Problem, terms: Terms, mean: np.ndarray, directions: np.ndarray, count: int, columns: int
 ) -> float:
-    """Return the contribution of the far tails to the mean, the largest norm over the directions.
+    """Return the norm of the far tails' contribution to the mean, the largest over the directions; NaN if not finite.
 
-    The tails hold few of the ``count`` samples or none, so the spread of the samples does not show their contribution.
-    Along each direction the tails begin where :data:`TAIL_EVENTS` samples are expected beyond, and are sampled there.
+    The tails contain few of the ``count`` samples or none, so the spread of the samples does not show the contribution.
+    Along each direction, the tails are where :data:`TAIL_EVENTS` samples are expected, and are sampled separately.
     """
     from scipy.special import ndtri
 
@@ -281,7 +284,7 @@ def _tail_error(
     each = max(1, columns // directions.shape[1])
     along = np.repeat(directions, each, axis=1)
     w = draw_columns(problem, "tails", along.shape[1], 0)
-    # replace the component of the noise along the direction by one beyond the quantile, of either sign
+    # replace the component of the noise along the direction by a component in the tail, of either sign
     middle = (np.arange(each) + 0.5) / each
     depth = -ndtri(0.5 * share * middle) * np.where(np.arange(each) % 2, 1.0, -1.0)
     w = w + along * (np.tile(depth, directions.shape[1]) - (along * w).sum(axis=0))
@@ -292,7 +295,7 @@ def _tail_error(
 
 
 def _directions(effect: np.ndarray) -> np.ndarray:
-    """Return unit vectors in noise space, ``(n_w, L)``: evenly chosen coordinates and the direction of the mean effect."""
+    """Return unit vectors in noise space, ``(n_w, L)``: evenly spaced coordinates, and the mean effect's direction."""
     width = effect.size
     chosen = np.unique(np.linspace(0, width - 1, min(width, DIRECTIONS)).astype(int))
     directions = np.eye(width)[:, chosen] if width <= DIRECTIONS else np.zeros((width, chosen.size))
@@ -310,7 +313,7 @@ def _with_note(reference: Reference, note: str) -> Reference:
 
 
 def doubling_batches(problem: Problem, terms: Terms, stream: str, columns: int) -> Iterator[tuple[np.ndarray, int]]:
-    """Yield batch means ``(BATCHES, d)`` and the samples of each, adding as many samples again after each yield.
+    """Yield batch means ``(BATCHES, d)`` and the samples per batch, which double after each yield.
 
     ``terms`` are evaluated ``columns`` at a time, on noise of the named stream.
     """
@@ -325,7 +328,7 @@ def doubling_batches(problem: Problem, terms: Terms, stream: str, columns: int) 
 
 
 def draw_columns(problem: Problem, stream: str, count: int, block: int) -> np.ndarray:
-    """Draw noise ``(n_w, count)`` from a stream of references, which no cell uses."""
+    """Return noise ``(n_w, count)`` from the named stream of a reference, which is independent of the noise of cells."""
     program = problem.program
     drawn = noise.draw(block, program.scene.name, 1, count, program.n_noise, stream)
     return np.moveaxis(drawn, -1, 0).reshape(program.n_noise, count)

@@ -1,4 +1,4 @@
-"""References of smoothings other than J_sigma: a Gaussian of another width, or the average over a ball."""
+"""References for smoothed costs other than J_sigma: a Gaussian of another width, or the average over a ball."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from bench.model import Problem, Program, compose
 
 
 def widened(program: Program, radius: float) -> Program:
-    """Return the program whose J_sigma is the smoothing by a Gaussian of standard deviation ``radius``."""
+    """Return the program with sigma = ``radius``, whose J_sigma is the cost smoothed by a Gaussian of that width."""
     scene = dataclasses.replace(program.scene, sigma=radius)
     return compose(scene, program.contact, program.integrator, program.decision)
 
 
 def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples: int, tolerance: float) -> Reference:
-    """Compute the gradient at theta0 of the cost averaged over the ball of that radius around theta.
+    """Return the reference gradient at theta0 of the cost averaged over a ball of radius ``radius`` around theta.
 
     The gradient equals d / r times the mean of f u over the sphere (the divergence theorem; Flaxman et al. 2005, lemma
-    2.1). With one variable it is a difference of two costs. Otherwise it is sampled: first order inside the ball where
-    the cost is continuous, or central differences across the sphere, whichever has the lower variance in a pilot.
+    2.1). With one variable it is a difference of two costs. Otherwise it is sampled, by first order inside the ball
+    where the cost is continuous, or by central differences across the sphere: whichever has the lower variance in a
+    pilot.
     """
     program, theta, d = problem.program, problem.program.theta0, problem.dim
     name = f"ball[radius={radius:g}]"
@@ -58,10 +59,10 @@ def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples
 
 
 def _polar(problem: Problem, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return directions ``(d, B)`` and shares of the radius ``(B,)`` such that share u is uniform in the unit ball."""
+    """Return unit directions ``(d, B)`` and radii ``(B,)`` in [0, 1] whose product is uniform in the unit ball."""
     from scipy.special import gammainc
 
     normal = problem.directions(w)
     size = np.linalg.norm(normal, axis=0)
-    # the squared length is chi-squared and independent of the direction: its quantile is uniform
+    # the squared length is chi-squared and independent of the direction, so its distribution function is uniform
     return normal / size, gammainc(problem.dim / 2, size**2 / 2) ** (1 / problem.dim)

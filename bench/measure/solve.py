@@ -1,4 +1,4 @@
-"""Newton's method on a problem without noise: a local minimum of the cost, with a certificate."""
+"""Minimises the cost of a problem without noise by Newton's method, and certifies the local minimum."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from scipy.optimize import minimize
 from bench.model import Problem
 
 STEP = 1e-5
-"""Step of the differences of gradients for the Hessian, in units of theta: their relative error is about 1e-10."""
+"""Step, in units of theta, of the gradient differences for the Hessian, whose relative error is about 1e-10."""
 CONVERGED = 1e-8
-"""A gradient below this share of the first gradient counts as 0: differences of costs no longer show it."""
+"""Share of the first gradient below which a gradient counts as 0, because differences of costs no longer show it."""
 FAR = 1e6
-"""Multiple of the start beyond which theta counts as diverged: the cost then counts as unbounded below."""
+"""Multiple of the problem's theta0 beyond which theta counts as diverged, and the cost as unbounded below."""
 ROUNDING = 1e-13
 """Relative difference of two costs that rounding explains."""
 
 
 @dataclass(frozen=True)
 class Solved:
-    """A local minimum: cost, theta, norm of the gradient there, and smallest curvature."""
+    """A local minimum: cost, theta ``(d,)``, norm of the gradient at theta, and smallest eigenvalue of the Hessian."""
 
     cost: float
     theta: np.ndarray
     gradient: float
     curvature: float
     certified: bool
-    """Whether the gradient is 0 to rounding and every curvature above -1e-8 of the largest."""
+    """Whether the gradient is 0 to rounding and no curvature is below -1e-8 times the largest."""
 
 
 def solve(problem: Problem, theta: np.ndarray | None = None, steps: int = 40) -> Solved:
-    """Minimise the cost at w = 0 from ``theta (d,)``, by default the problem's own: L-BFGS, then damped Newton steps.
+    """Return a local minimum of the cost at w = 0, searched from ``theta (d,)`` (default: the problem's theta0).
 
-    The Hessian comes from central differences of gradients, 2 d per step. The damping grows tenfold while a step does not
-    lower the cost, and falls tenfold after a step that does (Nocedal, Wright 2006, ch. 10 to 11). The cost is -inf where
-    it has no lower bound.
+    L-BFGS is followed by at most ``steps`` damped Newton steps. The Hessian comes from central differences of
+    gradients, 2 d per step. The damping grows tenfold while a step does not lower the cost, and falls tenfold after a
+    step that does (Nocedal, Wright 2006, ch. 10 to 11). A cost without a lower bound is returned as -inf.
     """
     theta = np.array(problem.program.theta0 if theta is None else theta, dtype=np.float64)
     still = np.zeros((problem.program.n_noise, 1))
@@ -77,7 +77,7 @@ def solve(problem: Problem, theta: np.ndarray | None = None, steps: int = 40) ->
 
 
 def _curvatures(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return eigenvalues and eigenvectors of the Hessian."""
+    """Return eigenvalues ``(d,)`` and eigenvectors ``(d, d)`` of the Hessian."""
     d = theta.size
     h = STEP * max(1.0, float(np.abs(theta).max()))
     moved = theta[:, None] + h * np.concatenate([np.eye(d), -np.eye(d)], axis=1)

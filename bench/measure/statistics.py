@@ -1,11 +1,11 @@
-"""Bias, variance and their intervals: pure functions of arrays.
+"""Computes bias, variance and their intervals, as pure functions of arrays.
 
 R independent estimates ``x_r`` of a gradient are compared with a :class:`Truth`. With m = mean(x) - truth and
 S = cov(x) / R + cov(truth), the covariance of m, everything about the bias b = E m follows from
 
     E |m|^2 = |b|^2 + tr S,        Var |m|^2 = 2 tr S^2 + 4 b'Sb        (Gaussian m),
 
-so |m| overstates the bias because of its noise. The interval inverts this law, see :func:`bias_interval`.
+so |m| overstates the bias because m is noisy. The interval inverts this law, see :func:`bias_interval`.
 
 Sources: Chen and Qin 2010 (|m|^2 - tr S in many dimensions), Himeno and Yamada 2014 (unbiased tr S^2 under any
 noise), Satterthwaite 1946 (moment matching), Sankaran 1959 (normal form of the noncentral chi-square), Welch 1947
@@ -37,7 +37,7 @@ __all__ = [
 ROUNDING = 1e-12
 """Differences below this share of a gradient's size are rounding: no bias, and no spread of the estimates."""
 FEW_REPEATS = 8
-"""With fewer repeats than this, a note says so, and tails are not tested."""
+"""Fewest repeats for a test of tails; a note reports fewer."""
 CONCENTRATION = 0.75
 """Tails are heavy when (sum y)^2 / sum y^2 of the squared deviations y is below this times sqrt(R). That holds for 5%
 of cells with normal noise at R = 8, 1% at 16, none of thousands at 64, and half of cells with kurtosis 100."""
@@ -46,13 +46,13 @@ SYMMETRIC = 1e-6
 VAGUE = 0.1
 """Error of a reference, as a share of its norm, above which a note warns that relative columns are no more accurate."""
 THREE = 3.0
-"""An event that did not happen in n trials has a probability below 3 / n, at 95% (the rule of three)."""
+"""Numerator of the rule of three: an event absent from n trials has a probability below 3 / n, at 95% confidence."""
 UNEXPLAINED = "tails unseen or gradient wrong"
-"""Remark on a row whose estimator declares to be unbiased although the interval of its bias excludes 0."""
+"""Remark on a row whose estimator is declared unbiased although the interval of its bias excludes 0."""
 
 
 def is_unexplained(reason: str) -> bool:
-    """Return whether a row's remark says that its bias contradicts the estimator's declaration, so is not an established bias."""
+    """Return whether a row's remark marks its bias as not established: it contradicts the estimator's declaration."""
     return UNEXPLAINED in reason
 
 
@@ -61,10 +61,10 @@ def is_unexplained(reason: str) -> bool:
 
 @dataclass(frozen=True)
 class Sampling:
-    """The covariance of a mean, stored as ``rows`` with covariance ``rows' rows``: a large d needs no d x d matrix."""
+    """The covariance of a mean, ``rows' rows``, stored as ``rows`` so that a large d needs no d x d matrix."""
 
     rows: np.ndarray
-    """``(K, d)``. Of a sample: deviations from its mean, divided by sqrt(K (K - 1))."""
+    """``(K, d)``. For a sample of K: deviations from the sample's mean, divided by sqrt(K (K - 1))."""
     degrees: float
     """Degrees of freedom: K - 1 for a sample of K, infinite for a known covariance."""
 
@@ -90,11 +90,11 @@ class Sampling:
         return replace(self, rows=self.rows / unit)
 
     def excess(self) -> float:
-        """Return the upward bias of the trace of the squared covariance, which comes from estimating it from a sample.
+        """Return the upward bias of tr C^2 as an estimate, where C is the covariance of a sample's mean; 0 for a known C.
 
         For n + 1 = K rows r with C = sum r r', the unbiased estimate under any noise is (Himeno and Yamada 2014)
-        ``n / (K (K-2) (K-3)) * (n (K-2) tr C^2 + (tr C)^2 - K n sum |r|^4)``; below four rows none exists,
-        and the upper bound (tr C)^2 is used.
+        ``n / (K (K-2) (K-3)) * (n (K-2) tr C^2 + (tr C)^2 - K n sum |r|^4)``. With fewer than four rows no unbiased
+        estimate exists, and the upper bound (tr C)^2 replaces it.
         """
         if math.isinf(self.degrees):
             return 0.0
@@ -121,7 +121,7 @@ class Truth:
     mean: np.ndarray
     """``(d,)``."""
     sampling: Sampling
-    """Its error, independent of that of the estimates compared with it."""
+    """Sampling error of ``mean``, independent of the errors of the estimates."""
     unseen: float = 0.0
     """Norm of an error of unknown direction that ``sampling`` does not show."""
 
@@ -137,13 +137,13 @@ class Truth:
 
     @classmethod
     def exact(cls, mean: np.ndarray, error: float = 0.0) -> Truth:
-        """Make the truth of a closed form or quadrature ``(d,)``, with an error of norm ``error`` in unknown direction."""
+        """Return a truth from a closed form or quadrature ``(d,)``; its error has norm ``error`` and unknown direction."""
         mean = np.asarray(mean, dtype=np.float64)
         return cls(mean, Sampling.without_direction(error, mean.size))
 
     @classmethod
     def from_covariance(cls, mean: np.ndarray, covariance: np.ndarray, degrees: float = math.inf) -> Truth:
-        """Make the truth of a mean ``(d,)`` and the covariance ``(d, d)`` of that mean, not of one sample."""
+        """Return a truth from a mean ``(d,)`` and the covariance ``(d, d)`` of that mean, not of one sample."""
         mean, covariance = np.asarray(mean, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
         if covariance.shape != (mean.size, mean.size):
             raise ValueError(f"the covariance of a mean {mean.shape} is {(mean.size,) * 2}; given {covariance.shape}")
@@ -152,9 +152,9 @@ class Truth:
 
     @classmethod
     def from_batches(cls, batches: np.ndarray, unseen: float = 0.0) -> Truth:
-        """Make the truth of independent batch means of equal size ``(K, d)``, K > 1; their spread gives its error.
+        """Return a truth from K > 1 independent means ``(K, d)`` of equally large batches, whose spread is its error.
 
-        ``unseen`` is the norm of an error that their spread does not show.
+        ``unseen`` is the norm of an error that this spread does not show.
         """
         batches = np.asarray(batches, dtype=np.float64)
         if batches.ndim != 2 or len(batches) < 2:
@@ -168,7 +168,7 @@ class Truth:
 
     @property
     def errors(self) -> tuple[Sampling, ...]:
-        """The independent errors: the sampling error, and the error that sampling does not show, if any."""
+        """The independent errors: the sampling error and, if any, the error that sampling does not show."""
         hidden = (Sampling.without_direction(self.unseen, self.mean.size),) if self.unseen else ()
         return (self.sampling, *hidden)
 
@@ -190,35 +190,35 @@ class Truth:
 
 
 def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95) -> tuple[float, float, float]:
-    """Return the de-biased norm of a difference of means, and the interval of the norm of its expectation.
+    """Return the de-biased norm of a difference of means, and the low and high end of the interval of the true norm.
 
-    ``difference m (d,)`` has the covariance S, the sum of those of the independent ``errors``. With T = |m|^2, the
-    norm is sqrt(max(0, T - tr S)). For a supposed norm beta, T is modelled as g times a noncentral chi-square
-    with nu degrees of freedom and noncentrality beta^2 / g, where
+    ``difference m (d,)`` has the covariance S, the sum of the covariances of the independent ``errors``. With T =
+    |m|^2, the norm is sqrt(max(0, T - tr S)). For a supposed norm beta, T is modelled as g times a noncentral
+    chi-square with nu degrees of freedom and noncentrality beta^2 / g, where
 
         g = (tr S^2 + 2 q) / (tr S + 2 beta^2),    nu = tr S / g,    q = b'Sb
 
-    give it the mean and the variance above. The term q matters because a bias in a direction of little noise is known
-    more accurately than a bias in a direction of much noise. Its unbiased estimate at the observed norm is q0 = m'Sm - tr S^2; from
-    there q follows the direction in which noise moves m,
+    give T the mean and variance stated at the top of this module. The term q matters because a bias in a direction of
+    little noise is known more accurately than a bias in a direction of much noise. The unbiased estimate of q at the
+    observed norm is q0 = m'Sm - tr S^2. At other norms, q follows the direction in which noise moves m,
 
-        q(beta) = q0 + (m'S^2 m / m'Sm) (beta^2 - T + tr S),    kept between 0 and tr S beta^2.
+        q(beta) = q0 + (m'S^2 m / m'Sm) (beta^2 - T + tr S),    limited to 0 ... tr S beta^2.
 
-    The interval holds the beta at which T lies within Student's quantiles, with the degrees of freedom of S, on the
+    The interval contains the beta at which T lies within Student's quantiles, with the degrees of freedom of S, on the
     normal scale of Sankaran's transform. Where T is below tr S, the upper end is computed for T = tr S, so that a lucky
-    draw never claims more than the noise allows. The lower end is 0 where T is within its quantiles for no bias at all.
-    An interval can miss a bias of 0 only from above, so it covers a bias of 0 97.5% of the time.
+    draw never claims more than the noise allows. The lower end is 0 where T is within its quantiles for a bias of 0. An
+    interval can miss a bias of 0 only from above, so it covers a bias of 0 97.5% of the time.
 
     Coverage was simulated for d = 1 to 100, R = 16 to 256, equal and very unequal variances, biases of 0 to 10 errors
-    along and across the noise. Under normal, t5 and mildly skewed noise it is 91 to 99% in at least 95% of the settings,
-    and 88% in the worst. Under a skewness of 6 the worst is 82%, at R = 16. ``tests/measure/test_statistics.py -m slow``
-    prints all.
+    along and across the noise. Under normal, t5 and mildly skewed noise it is 91 to 99% in at least 95% of the
+    settings, and 88% in the worst. Under a skewness of 6 the worst is 82%, at R = 16.
+    ``tests/measure/test_statistics.py -m slow`` prints all.
     """
     observed, trace = float(difference @ difference), sum(error.trace for error in errors)
     if trace <= 1e-32 * observed or trace == 0.0:  # noise below the last digit of m
         return (math.sqrt(observed),) * 3
 
-    # In units of tr S from here on.
+    # in units of tr S from here on
     unit = math.sqrt(trace)
     errors = tuple(error.over(unit) for error in errors)
     difference = difference / unit
@@ -283,9 +283,10 @@ def _student_quantile(probability: float, degrees: float) -> float:
 def variance_interval(deviations: np.ndarray, level: float = 0.95) -> tuple[float, float]:
     """Return the interval of the trace of the covariance, from the deviations from the mean ``(R, d)``.
 
-    The interval is the jackknife of the logarithm, which accounts for kurtosis, with the upper end of :func:`_jackknife`,
-    which accounts for skewness. Omitting repeat i removes ``R / (R - 1) |x_i - mean|^2`` from the sum of squares. The
-    interval is ``(0, inf)`` where fewer than three repeats differ, and a single point where none do.
+    The interval is the jackknife of the logarithm, which accounts for kurtosis, with the upper end of
+    :func:`_jackknife`, which accounts for skewness. Omitting repeat i removes ``R / (R - 1) |x_i - mean|^2`` from the
+    sum of squares. The interval is ``(0, inf)`` where fewer than three repeats differ, and a single point where all
+    repeats are equal.
     """
     repeats = len(deviations)
     squares = np.einsum("rd,rd->r", deviations, deviations)
@@ -301,12 +302,13 @@ def variance_interval(deviations: np.ndarray, level: float = 0.95) -> tuple[floa
 def _jackknife(whole: float, without: np.ndarray, level: float) -> tuple[float, float]:
     """Return the interval of a variance from its logarithm and the logarithms ``(R,)`` with one repeat omitted.
 
-    The pseudo-values are as skewed as the squares they come from. Where large squares are rare, most samples contain too
-    few of them, and a symmetric interval is too low. With the skewness g of the pseudo-values, Hall (1992) uses
+    The pseudo-values are as skewed as the squares they come from. Where large squares are rare, most samples contain
+    too few large squares, and a symmetric interval is too low. With the skewness g of the pseudo-values, Hall (1992)
+    treats
 
         T + g T^2 / 3 + g^2 T^3 / 27 + g / (6 R),    T = (centre - truth) / spread,
 
-    for normal, with deviation 1 / sqrt(R). The upper end is the larger of this and Student's. The lower end stays
+    as normal with standard deviation 1 / sqrt(R). The upper end is the larger of Hall's and Student's. The lower end is
     Student's, which missing squares do not lower.
     """
     repeats = len(without)
@@ -328,9 +330,9 @@ def variance_per_sample(
     """Return the trace of the covariance of one sample's term, with its interval, from all R x N terms.
 
     ``sums (R, d)`` are the sums of the ``samples`` terms of each repeat, ``squares (R,)`` the sums of their squared
-    norms. Where the mean of the terms is large compared with their spread, subtract a common vector from all terms first.
-    The interval is the jackknife over repeats of :func:`variance_interval`, which accounts for tails. It is ``(0, inf)``
-    for fewer than three repeats, and NaN where there is only one term in total.
+    norms. Where the mean of the terms is large compared with their spread, subtract a common vector from all terms
+    first. The interval is the jackknife over repeats of :func:`variance_interval`, which accounts for tails. It is
+    ``(0, inf)`` for fewer than three repeats, and NaN where there is only one term in total.
     """
     sums, squares = np.asarray(sums, dtype=np.float64), np.asarray(squares, dtype=np.float64)
     repeats = len(sums)
@@ -343,7 +345,7 @@ def variance_per_sample(
     if count < 2:
         return (math.nan,) * 3
     total, power = sums.sum(axis=0), float(squares.sum())
-    # below this share of the squares a difference is rounding
+    # a difference below this share of the squares is rounding
     floor = 1e-14 * power
     whole = power - float(total @ total) / count
     value = max(0.0, whole) / (count - 1)
@@ -376,7 +378,7 @@ class Summary:
     reference_se: float
     """Standard error of the reference, as the root of the trace of its covariance."""
     bias: float
-    """sqrt(max(0, |m|^2 - tr S)) with m the mean estimate less the reference and S the covariance of m."""
+    """sqrt(max(0, |m|^2 - tr S)), where m is the mean estimate minus the reference and S the covariance of m."""
     bias_low: float
     bias_high: float
     bias_rel: float
@@ -386,17 +388,17 @@ class Summary:
     variance_low: float
     variance_high: float
     variance_per_sample: float
-    """``samples * variance``, or computed from all samples where their sums are given."""
+    """``samples * variance``, or computed from the terms of all samples where their sums are given."""
     variance_per_sample_low: float
     variance_per_sample_high: float
     rmse: float
-    """Root mean squared distance of one estimate from the truth, with the reference's own error subtracted."""
+    """Root mean squared distance of one estimate from the reference, with the reference's own error subtracted."""
     rmse_rel: float
     """``rmse / reference_norm``."""
     cosine: float
     """Mean over repeats of the cosine between one estimate and the reference; an estimate of 0 counts as 0."""
     sign_agreement: float
-    """Share of coordinates of one estimate with the sign of the reference, over coordinates where the reference is not 0."""
+    """Share of one estimate's coordinates that have the reference's sign, among those where the reference is not 0."""
     finite_fraction: float
     """Share of repeats whose coordinates are all finite."""
     note: str = ""
@@ -415,13 +417,14 @@ def summarise(
     terms: tuple[np.ndarray, np.ndarray] | None = None,
     unbiased: bool = False,
 ) -> Summary:
-    """Return the statistics of independent ``estimates (R, d)``, each of ``samples`` samples, compared with the reference.
+    """Return the statistics of independent ``estimates (R, d)`` of ``samples`` samples each, compared with the reference.
 
     ``terms`` are the sums and squares for :func:`variance_per_sample`, for estimates that are means of one term per
-    sample; without them that column is ``samples`` times the variance of an estimate. ``unbiased`` is the estimator's
-    declaration: a bias of an estimator declared unbiased gets the remark :data:`UNEXPLAINED`. The relative and
-    directional fields are NaN, with a remark, where the reference is not distinguishable from 0. Intervals of identical
-    estimates have the width that the rule of three leaves for an event of the gradient's size that no estimate contains.
+    sample. Without ``terms``, the variance per sample is ``samples`` times the variance of an estimate. ``unbiased`` is
+    the estimator's declaration: a bias of an estimator declared unbiased gets the remark :data:`UNEXPLAINED`. The
+    relative fields are NaN, with a remark, where the reference is not distinguishable from 0. Intervals of identical
+    estimates allow for an event of the gradient's size that no estimate contains, with the probability that the rule of
+    three leaves for such an event.
     Raises ValueError for shapes that do not fit. Estimates that are not finite do not raise: see :class:`Summary`.
     """
     estimates = np.asarray(estimates, dtype=np.float64)
@@ -516,7 +519,7 @@ def _directions(estimates: np.ndarray, reference: np.ndarray) -> tuple[float, fl
 
 
 def _reference_remarks(reference: Truth, relative: float) -> list[str]:
-    """Return the effects of the reference on relative columns; ``relative`` is its norm, or NaN where it vanishes."""
+    """Return remarks on how the reference limits relative columns; ``relative`` is its norm, NaN where it vanishes."""
     norm, error = reference.norm, reference.standard_error
     if math.isnan(relative):
         if error == 0.0:
@@ -533,7 +536,7 @@ def _reference_remarks(reference: Truth, relative: float) -> list[str]:
 
 
 def heavy_tails(deviations: np.ndarray) -> float:
-    """Return the largest share of one repeat in the squared deviations ``(R, d)``, or 0 if tails are not heavy."""
+    """Return the largest share of one repeat in the squares of ``deviations (R, d)``, or 0 if tails are not heavy."""
     squares = np.einsum("rd,rd->r", deviations, deviations)
     total, fourth = float(squares.sum()), float(squares @ squares)
     if fourth > 0.0 and total**2 / fourth < CONCENTRATION * math.sqrt(len(deviations)):
@@ -542,7 +545,7 @@ def heavy_tails(deviations: np.ndarray) -> float:
 
 
 def _interval_remarks(deviations: np.ndarray, difference: np.ndarray, samples: int, identical: bool) -> list[str]:
-    """Return the reasons to doubt intervals from deviations ``(R, d)`` and a difference of means ``(d,)``."""
+    """Return remarks that question the intervals, from deviations ``(R, d)`` and a difference of means ``(d,)``."""
     repeats = len(deviations)
     if repeats == 1:
         return ["only 1 repeat: no variance, and no interval of the bias"]

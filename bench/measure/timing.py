@@ -1,4 +1,4 @@
-"""The timing protocol: warm up, time whole estimates, keep their results."""
+"""The timing protocol: warm up, time whole estimates, and return their results."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ import numpy as np
 from bench.model import blocks
 
 LEAST_S = 0.005
-"""Least total seconds of the calls of one timing; fast calls are repeated until then."""
+"""Least total duration of the calls of one timing [s]; fast calls are repeated until it is reached."""
 MOST = 20
-"""Most repetitions of each call."""
+"""Most runs of each call."""
 STEADY = 0.1
-"""Interquartile range over median below which a timing is steady; until then calls are repeated."""
+"""Interquartile range over median up to which a timing is steady; unsteady calls are repeated."""
 NOISY = 0.2
 """Interquartile range over median above which a timing is marked in tables."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds for one estimate: median and interquartile range over calls."""
+    """Time of one estimate [s]: median and interquartile range over calls."""
 
     median_s: float
     iqr_s: float
     samples_s: tuple[float, ...] = ()
-    """Seconds of each call, in order."""
+    """Time of each call [s], in order."""
 
     @property
     def calls(self) -> int:
-        """Calls made, the warm-up included."""
+        """Number of calls, including the warm-up."""
         return len(self.samples_s) + 1
 
     @property
@@ -48,7 +48,7 @@ class Timing:
 
 
 class Pause:
-    """Time that timings exclude: ``with pause:`` around drawing noise, for example."""
+    """Measures time that timings exclude: use ``with pause:`` around drawing noise, for example."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -69,7 +69,7 @@ def timed(
     settle_s: float = 0.0,
     pause: Pause | None = None,
 ) -> tuple[list[np.ndarray], Timing]:
-    """Return results and seconds of ``call(0) ... call(count - 1)``, after one discarded warm-up call.
+    """Return the results and the timing of ``call(0) ... call(count - 1)``, after one discarded warm-up call.
 
     Calls are repeated, each at most ``most`` times, until they take ``least_s`` seconds in total, and then until their
     times are :data:`STEADY` or they take ``settle_s`` seconds in total. Time within ``pause`` is subtracted. Calls must
@@ -90,7 +90,7 @@ def timed(
 
 
 def _must_repeat(seconds: list[float], least_s: float, settle_s: float) -> bool:
-    """Return whether to repeat calls: they are too short in total, or unsteady with settling time left."""
+    """Return whether to repeat calls: below ``least_s`` in total, or unsteady and below ``settle_s`` in total."""
     total = sum(seconds)
     if total < least_s:
         return True
@@ -125,7 +125,7 @@ def load_average() -> list[float] | None:
 
 @cache
 def load_at_start() -> list[float] | None:
-    """Return the load average at the first call of this function."""
+    """Return the load average at the first call of this function; later calls return the same."""
     return load_average()
 
 
@@ -138,14 +138,14 @@ def _processor() -> str:
 
 
 def reset_peak_memory() -> None:
-    """Make :func:`peak_memory_mb` count from now (only on Linux)."""
+    """Reset the peak that :func:`peak_memory_mb` reports to the present memory (only on Linux)."""
     with suppress(OSError):
         # 5 resets the peak VmHWM, see proc_pid_clear_refs(5)
         Path("/proc/self/clear_refs").write_text("5")
 
 
 def peak_memory_mb() -> float:
-    """Return the largest resident set of this process since the reset, libraries included, in MB; NaN if unknown."""
+    """Return the peak resident memory of this process since the reset, libraries included [MB]; NaN if unknown."""
     with suppress(OSError, IndexError, ValueError):
         status = Path("/proc/self/status").read_text()
         return int(status.partition("VmHWM:")[2].split()[0]) / 1024

@@ -1,4 +1,4 @@
-"""The adjoints of a rollout: the derivatives of its cost by each of its states."""
+"""Computes the adjoints of a rollout: the derivatives of its cost by each of its states."""
 
 from __future__ import annotations
 
@@ -9,13 +9,17 @@ from bench.model import Array, Jacobians, LoopOps, Rollout, Unsupported
 
 
 def adjoints(program: Rollout, theta: np.ndarray, w: np.ndarray, path: Jacobians) -> tuple[np.ndarray, np.ndarray]:
-    """Return dL/dx_k along a rollout, ``(T + 1, n)``, and the gradient dL/dtheta that follows from it, ``(d,)``.
+    """Return the adjoints l_k = dL/dx_k of a rollout, ``(T + 1, n)``, and the gradient dL/dtheta from them, ``(d,)``.
 
-    With stage costs c_k(x_k, u_k), control u_k = pi(theta, x_k), and the steps' A_k, B_k (``path`` without batch axis),
-    p_k = dc_k/du + B_k' l_{k+1} and l_k = A_k' l_{k+1} + dc_k/dx + (dpi/dx)' p_k, from l_T = dc_T/dx; then dL/dtheta =
-    (dx_0/dtheta)' l_0 + sum_k (dpi/dtheta)' p_k, and where theta names parameters also sum_k (dF/dtheta)' l_{k+1} and
-    the derivatives of the costs at fixed x and u. Costs and policy are differentiated by JAX, with the steps as batch
-    columns, whichever backend computed the steps. Source: Griewank and Walther 2008, ch. 3.
+    ``path`` has no batch axis. With stage costs c_k(x_k, u_k), controls u_k = pi(theta, x_k) and step Jacobians A_k,
+    B_k,
+
+        p_k = dc_k/du + B_k' l_{k+1},    l_k = A_k' l_{k+1} + dc_k/dx + (dpi/dx)' p_k,    l_T = dc_T/dx,
+        dL/dtheta = (dx_0/dtheta)' l_0 + sum_k (dpi/dtheta)' p_k.
+
+    Where theta contains parameters of the scene, sum_k (dF/dtheta)' l_{k+1} and the derivatives of the costs at fixed x
+    and u are added. JAX differentiates costs and policy, with the steps as batch columns, whichever backend computed
+    the steps. Source: Griewank and Walther 2008, ch. 3.
     """
     import jax
     import jax.numpy as jnp

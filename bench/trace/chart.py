@@ -1,4 +1,4 @@
-"""Writes the files of a trace: one rollout's table, and its chart on a shared time axis."""
+"""Writes the files of a trace: the table of one rollout, and a chart with a shared time axis."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from bench.trace.spikes import MEASURES, align, spikes
 from bench.trace.trace import Trace
 
 PANEL = 1.05
-"""Inches of the height of a panel."""
+"""Height of a panel in inches."""
 BLUE, BLACK, RED, GREEN, PINK = PALETTE[:5]
 SLIPPING: dict[str, Any] = {"color": "#a6a6a6", "alpha": 0.6, "linewidth": 0}
 SWITCH: dict[str, Any] = {"color": GREY, "linewidth": 0.5}
 SPIKED: dict[str, Any] = {"color": RED, "linewidth": 2.4, "solid_capstyle": "butt"}
 DRAWN = 1e30
-"""Size beyond which a diverging quantity is omitted from its panel; the table keeps it."""
+"""Magnitude beyond which a diverging quantity is omitted from its panel, but not from the table."""
 LINEAR = 1e4
-"""Ratio of the largest to the median size beyond which a panel's scale is not linear."""
+"""Ratio of the largest to the median magnitude beyond which a panel's scale is not linear."""
 NAMES = {
     "jacobian_norm": r"$\|\partial x_{k+1} / \partial x_k\|$",
     "adjoint_norm": r"$\|\mathrm{d}L / \mathrm{d}x_k\|$",
@@ -40,9 +40,9 @@ NAMES = {
 
 
 def write(trace: Trace, results_dir: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
-    """Write ``trace.csv``, and the chart in some formats with its plotted data, to ``results_dir/trace/<scene>``.
+    """Write ``trace.csv``, the chart in the given formats and its plotted data; return their paths.
 
-    Raises :class:`StorageError` if they cannot be written.
+    The directory is ``results_dir/trace/<scene>``. Raises :class:`StorageError` if a file cannot be written.
     """
     directory = results_dir / "trace" / trace.scene
     make_directory(directory)
@@ -54,9 +54,10 @@ def write(trace: Trace, results_dir: Path, formats: Sequence[str] = ("png",)) ->
 
 
 def chart(trace: Trace) -> Figure:
-    """Draw gap (or positions), force, |dF/dx|, |dL/dx| and cost against time.
+    """Return a figure of gap (or positions), force, |dF/dx|, |dL/dx| and cost against time.
 
-    Contact switches are thin vertical lines through all panels, states in contact shaded, spikes thick and red.
+    Contact switches are thin vertical lines through all panels, states in contact are shaded, and spikes are thick and
+    red.
     """
     table = trace.table
     contact = bool(table["gap"].notna().any())
@@ -90,7 +91,7 @@ def _legend(table: pd.DataFrame) -> list[Any]:
 
 
 def _contacts(ax: Axes, table: pd.DataFrame) -> None:
-    """Shade the states in contact, slipping ones darker, and mark the switches, each between the differing states."""
+    """Shade the states in contact, darker where a contact slips, and mark each switch between its two states."""
     time = table["time"].to_numpy()
     half = 0.5 * (time[1] - time[0])
     for name, look in (("contacts", SHADE), ("slipping", SLIPPING)):
@@ -171,7 +172,7 @@ def _cost(ax: Axes, table: pd.DataFrame) -> None:
 
 
 def _line(ax: Axes, table: pd.DataFrame, values: pd.Series, colour: str, **look: Any) -> None:
-    """Draw a quantity in time, with a dot for each state if there is room for dots."""
+    """Draw a quantity against time, with a dot for each state if there is space for dots."""
     few = len(table) <= 80
     values = values.where(values.abs() < DRAWN)
     finite = values[np.isfinite(values)].abs()

@@ -1,4 +1,4 @@
-"""Contacts of a rollout, state by state: gaps, forces, which contacts act, and where that changes."""
+"""Computes the contact columns of a trace: gaps, forces, active contacts and contact switches at each state."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ REAL = ("gap", "penetration", "force", "force_peak", "sticking", "slipping")
 
 
 def contact_columns(program: Rollout, path: Jacobians) -> dict[str, np.ndarray]:
-    """Return the columns on contact and on the equations of the steps, ``(T + 1,)`` each."""
+    """Return the columns on contacts and on the equations of the steps, each ``(T + 1,)``; NaN where undefined."""
     scene, law = program.scene, program.contact
     count = len(path.states)
     columns = dict.fromkeys((*REAL, *equations.COLUMNS), np.full(count, np.nan))
@@ -47,9 +47,10 @@ def _touching(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return which contacts act at each state, and their normal forces [N], both ``(n_contacts, T + 1)``.
 
-    A state has the contacts of the step from it, see :func:`bench.measure.contacts.active_contacts`. Under a force law the force
-    is the law's at the state; under an impulse law it is the impulse of the step over dt, the contacts are the measured
-    ones, and the last state keeps those of the step that led to it.
+    A state has the active contacts of the step that starts there, see :func:`bench.measure.contacts.active_contacts`.
+    Under a force law, the force is evaluated at the state. Under an impulse law, the force is the impulse of the step
+    over dt, and the contacts are the measured ones. The last state then has the contacts of the last step, and a force
+    of NaN.
     """
     law, states, controls = program.contact, path.states[..., None], path.controls[..., None]
     if isinstance(law, ForceLaw):
@@ -65,10 +66,10 @@ def _touching(
 
 
 def _impulse_forces(program: Rollout, scene: ContactScene, path: Jacobians, after: np.ndarray | None) -> np.ndarray:
-    """Return normal forces ``(n_contacts, T)`` [N] whose impulses make up the difference to a step without the law.
+    """Return normal forces ``(n_contacts, T)`` [N] whose impulses explain the difference from a step without the law.
 
-    They solve M^-1 J^T lambda dt = v_{k+1} - v_free by least squares, exactly for contacts whose normals are
-    independent.
+    The forces lambda solve M^-1 J^T lambda dt = v_{k+1} - v_free by least squares, exactly where the normals of the
+    contacts are independent.
     """
     q = split(scene, path.states[:-1].T).q
     if after is None:

@@ -1,4 +1,4 @@
-"""Solves the equations of the steps again, to report the remaining residual and the number of iterations."""
+"""Solves the equations of a rollout's steps again, to report residuals and numbers of iterations."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from bench.model import Array, Jacobians, LoopOps, Rollout
 from bench.trace.states import per_state
 
 TOLERANCE, ITERATIONS = 1e-12, 64
-"""Largest accepted Newton step, relative to 1 + |z|, and the most steps."""
+"""Largest last Newton step of a solution, relative to 1 + |z|, and the most Newton steps."""
 COLUMNS = ("solver_residual", "solver_iterations", "solver_mismatch")
 
 
 class Newton(LoopOps):
-    """Operations on JAX arrays whose ``root``, by Newton's method, records residual and iterations of each column."""
+    """Operations on JAX arrays with a Newton ``root`` that records the residual and the iterations of each column."""
 
     def __init__(self) -> None:
         import jax.numpy
@@ -27,7 +27,7 @@ class Newton(LoopOps):
         self.iterations: list[np.ndarray] = []
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Solve for the root by columns; a column stops once its own Newton step is within tolerance."""
+        """Return the root of each column; a column stops once its own Newton step is within tolerance."""
         import jax
         import jax.numpy as jnp
 
@@ -49,7 +49,7 @@ class Newton(LoopOps):
 
 
 def stepped(program: Rollout, path: Jacobians, ops: Newton) -> np.ndarray:
-    """Return the states after each step, ``(n, T)``, computed outside the rollout with the steps as batch columns."""
+    """Return the state after each step of ``path``, ``(n, T)``, computed with the steps as batch columns."""
     import jax.numpy as jnp
 
     before, u = jnp.asarray(path.states[:-1].T), jnp.asarray(path.controls.T)
@@ -57,12 +57,12 @@ def stepped(program: Rollout, path: Jacobians, ops: Newton) -> np.ndarray:
 
 
 def solved_again(program: Rollout, path: Jacobians) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Solve for the states after each step again; return them, ``(n, T)``, and the solver columns derived from them.
+    """Return the state after each step, ``(n, T)``, solved again by Newton's method, and the solver columns ``(T + 1,)``.
 
     A backend's own solver runs inside the compiled rollout and reports nothing. So each step is solved again from its
-    state by Newton's method with the law's own first guess: ``solver_residual`` is the largest remaining component (in the
-    unit of the law's equation), ``solver_iterations`` the Newton steps, including the last one, which is within
-    tolerance; ``solver_mismatch`` is the largest difference to the state that the backend's solver reached.
+    state, with the law's own first guess. ``solver_residual`` is the largest component of the residual (in the unit of
+    the law's equation), ``solver_iterations`` the number of Newton steps, including the last one, which is within
+    tolerance, and ``solver_mismatch`` the largest difference from the state that the backend's solver reached.
     """
     ops = Newton()
     after = stepped(program, path, ops)

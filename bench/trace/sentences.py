@@ -10,12 +10,12 @@ from bench.trace.spikes import LEVEL, MEASURES, SPIKE, Alignment, align, changes
 
 
 def report(table: pd.DataFrame, gradient_error: float) -> list[str]:
-    """Describe contact, the range of the gradient measures, and whether their spikes line up with contact switches."""
+    """Return sentences on contact, on the range of the gradient measures, and on spikes at contact switches."""
     return [_contact_summary(table), _gradient_summary(table, gradient_error), *verdict(table)]
 
 
 def verdict(table: pd.DataFrame) -> list[str]:
-    """Say whether gradient spikes line up with contact switches: a sentence, or one for each measure."""
+    """Return whether gradient spikes line up with contact switches: one sentence, or one for each measure."""
     largest = {name: float(np.exp(changes(table[name]).max())) for name in MEASURES}
     change = " and ".join(f"{MEASURES[name]} by at most {three_digits(factor)}x" for name, factor in largest.items())
     if not table["contacts"].any():
@@ -51,7 +51,7 @@ def _conclusion(alignment: Alignment) -> str:
 
 
 def three_digits(value: float) -> str:
-    """Write a number with three digits, and an exponent only where it is needed.
+    """Return a number as text with three digits, and an exponent only where necessary.
 
     >>> three_digits(0.0126), three_digits(1900.0), three_digits(2.5e7)
     ('0.0126', '1,900', '2.5e+07')

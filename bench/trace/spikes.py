@@ -10,7 +10,7 @@ import numpy as np
 MEASURES = {"jacobian_norm": "|dF/dx|", "adjoint_norm": "|dL/dx|"}
 """Columns whose spikes are compared with the contact switches, and how they are printed."""
 SPIKE = 3.0
-"""Least factor by which a norm changes over one step at a spike; a first stage cost alone may double an adjoint."""
+"""Least factor by which a norm changes over one step at a spike; one stage cost may double an adjoint."""
 TENTH = 0.1
 """Largest share of the steps that can be spikes: those with the largest changes."""
 LEVEL = 0.05
@@ -18,18 +18,18 @@ LEVEL = 0.05
 
 
 class Alignment(NamedTuple):
-    """How many spikes are within one step of a contact switch, compared with chance."""
+    """The number of spikes within one step of a contact switch, compared with chance."""
 
     spikes: int
     near: int
     chance: float
-    """Share of the steps that are within one step of a switch."""
+    """Share of all steps that are within one step of a switch: the share of spikes expected there by chance."""
     p_value: float
-    """p-value of a permutation test: the chance that at least as many spikes at random steps are near a switch."""
+    """p-value of a permutation test: the probability that at least as many spikes at random steps are near a switch."""
 
 
 def changes(values: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return |log ratio| of neighbouring values, ``(T,)`` for ``(T + 1,)``; 0 where one is zero or not finite."""
+    """Return |log ratio| of neighbouring ``values (T + 1,)``, ``(T,)``; 0 where a value is zero or not finite."""
     with np.errstate(all="ignore"):
         steps = np.abs(np.diff(np.log(np.asarray(values, dtype=np.float64))))
     return np.where(np.isfinite(steps), steps, 0.0)
@@ -38,7 +38,7 @@ def changes(values: Sequence[float] | np.ndarray) -> np.ndarray:
 def spikes(values: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return the steps that are spikes, boolean ``(T,)``: changes above :data:`SPIKE` and among the largest tenth.
 
-    Of neighbouring such steps only the largest counts: a rise over several steps is one spike.
+    In a run of neighbouring steps of this kind only the largest counts: a rise over several steps is one spike.
     """
     steps = changes(values)
     largest = np.sort(steps)[-max(1, int(TENTH * len(steps)))]
@@ -51,7 +51,7 @@ def spikes(values: Sequence[float] | np.ndarray) -> np.ndarray:
 
 
 def align(values: Sequence[float] | np.ndarray, switch: Sequence[int] | np.ndarray) -> Alignment:
-    """Compare spikes of ``values (T + 1,)`` with ``switch (T + 1,)``, 1 where contacts differ from the state before."""
+    """Return how spikes of ``values (T + 1,)`` align with ``switch (T + 1,)``, 1 where contacts have just changed."""
     from scipy.stats import hypergeom
 
     spiked = spikes(values)

@@ -1,4 +1,4 @@
-"""Arrays along a rollout: aligns values of the steps with values of the states."""
+"""Aligns values of a rollout's steps with values of its states."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from bench.model import Array
 
 
 def per_state(values: Array) -> np.ndarray:
-    """Extend values of the steps ``(T,)`` to the states, ``(T + 1,)``, by NaN for the last state, which has no step."""
+    """Return values of the steps ``(T,)`` extended to the states, ``(T + 1,)``, with NaN for the last state."""
     return np.append(np.asarray(values, dtype=np.float64), np.nan)

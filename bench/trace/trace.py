@@ -1,7 +1,7 @@
-"""The gradient health of one rollout: contact, step Jacobians and adjoints, step by step.
+"""Traces one rollout step by step: contacts, step Jacobians and adjoints.
 
-A :class:`Trace` shows where gradients explode. It has a row for every state of a rollout, and reports whether the steps
-with the largest changes of |dF/dx| or |dL/dx| are those at which a contact is made or lost.
+A :class:`Trace` shows where gradients explode. It has a row for every state of the rollout, and reports whether the
+largest changes of |dF/dx| or |dL/dx| coincide with steps at which a contact is made or lost.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ COLUMNS = (
     "solver_residual", "solver_iterations", "solver_mismatch", "jacobian_norm", "adjoint_norm", "cost_stage",
     "cost_terminal",
 )  # fmt: skip
-"""Columns of every trace; finer costs (``cost_NAME``), states (``q1``, ``v1``) and controls (``u1``) follow."""
+"""Columns of every trace. Cost terms (``cost_NAME``), states (``q1``, ``v1``) and controls (``u1``) follow."""
 AXES = ("scene", "contact", "integrator", "backend")
-"""The axes of a cell that decide its rollout; a trace needs no estimator."""
+"""The axes of a cell that determine its rollout; a trace needs no estimator."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class Trace:
     title: str
     """Scene, contact law, integrator, backend and noise."""
     table: pd.DataFrame
-    """A row per state, ``horizon + 1`` in all; NaN where a quantity does not exist, as |dF/dx| at the last state."""
+    """``horizon + 1`` rows, one per state; NaN where a quantity does not exist, such as |dF/dx| at the last state."""
     gradient_error: float
-    """|gradient from the adjoints - the program's own gradient|, relative to the latter (absolute where that is 0)."""
+    """|adjoints' gradient - program's gradient| / |program's gradient|; absolute if the program's gradient is 0."""
 
     def report(self) -> list[str]:
         """Describe the trace in sentences."""
@@ -55,17 +55,18 @@ class Trace:
 
 
 def run(experiment: Experiment, seeded: bool) -> list[Trace]:
-    """Make one trace for each scene of the experiment.
+    """Return one trace for each scene of the experiment.
 
-    The noise is w = 0, or with ``seeded`` the first sample of the first repeat that estimators get from that seed.
-    Raises :class:`UserError` where there is no rollout or no step Jacobian to trace.
+    The noise is w = 0, or with ``seeded`` the first sample of the first repeat that estimators get from the cell's
+    seed. Raises :class:`UserError` for a scene without a rollout, for several rollouts of one scene, and for a backend
+    without step Jacobians.
     """
     session = Session(experiment)
     return [_of_cell(session, cell, seeded) for cell in _chosen(experiment)]
 
 
 def _chosen(experiment: Experiment) -> list[Cell]:
-    """Return one cell for each scene, whatever its estimator."""
+    """Return one cell for each scene; raises :class:`UserError` if a scene has several rollouts."""
     unique: dict[str, dict[Any, Cell]] = {}
     for cell in cells(experiment):
         rollouts = unique.setdefault(cell.scene.name, {})
@@ -94,7 +95,7 @@ def _of_cell(session: Session, cell: Cell, seeded: bool) -> Trace:
         raise _cannot(cell, program, refusal[1])
     w = np.zeros((program.n_noise, 1))
     if seeded:
-        # "cells" is the stream of estimators: the trace shows a sample that they see
+        # "cells" is the stream of the estimators, so the trace shows one of their samples
         w = noise.draw(cell.seed, scene.name, 1, 1, program.n_noise, "cells")[0].T
     try:
         table, gradient_error = trace(session.problem(cell), w)
@@ -106,7 +107,7 @@ def _of_cell(session: Session, cell: Cell, seeded: bool) -> Trace:
 
 
 def _cannot(cell: Cell, program: Program, reason: str) -> UserError:
-    """Return why a cell cannot be traced, and the backends that can trace its program."""
+    """Return an error that states why a cell cannot be traced, and which backends can trace its program."""
     able = sorted(name for name in backends_with_jacobians(program) if name != cell.backend.name)
     hint = f"; use backends=[{'] or backends=['.join(able)}]" if able else ""
     return UserError(f"{cell.scene.name} on backend {cell.backend.name} cannot be traced: {reason}{hint}")
@@ -151,7 +152,7 @@ def _norms(matrices: np.ndarray) -> np.ndarray:
 
 
 def _costs(scene: MechanicalScene, path: Jacobians) -> dict[str, np.ndarray]:
-    """Return costs by name, ``(T + 1,)``: stage costs and terms at the states before the steps, terminal cost last."""
+    """Return costs by column, each ``(T + 1,)``: stage costs and terms per step, the terminal cost at the last state."""
     states, u = path.states.T, path.controls.T
     before = split(scene, states[:, :-1])
 

@@ -1,4 +1,4 @@
-"""Why a gradient is wrong, from the ratios of its components to the differences at several thetas."""
+"""Finds why a gradient is wrong, from the ratios of its components to the differences at several thetas."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 
 CONSTANT = 1e-3
-"""Largest relative spread of a ratio that counts as constant, however large its error."""
+"""Largest relative deviation of a ratio that counts as constant, however large the ratio's error."""
 MOSTLY = 0.8
-"""Share of the ratios that has to agree."""
+"""Least share of the ratios that must agree."""
 FINEST = 1e-5
-"""Relative spread of a constant ratio that the program's own rounding explains."""
+"""Relative deviation of a constant ratio that the program's own rounding explains."""
 KNOWN = 10.0
-"""Deviation allowed to a ratio, in errors of its difference."""
+"""Allowed deviation of a ratio, in multiples of its own error."""
 ENOUGH = 3
 """Fewest ratios that can count as constant."""
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """The program's derivative over the difference, and its error from the error of the difference."""
+    """The program's derivative over the difference, and the ratio's error due to the error of the difference."""
 
     value: float
     error: float
@@ -29,17 +29,17 @@ class Ratio:
 def causes_of_ratios(
     components: dict[int, list[Ratio]], directions: list[Ratio], some_right: bool, right_elsewhere: bool = False
 ) -> dict[int | None, str]:
-    """Return the cause of each wrong component, and the cause of wrong directions under None.
+    """Return the cause of each wrong component by index, and the cause of the wrong directions under the key None.
 
-    ``components`` are the ratios of each wrong component to its difference at several thetas, ``directions`` the ratios of
-    the wrong random directions. ``some_right`` says whether other components are right, ``right_elsewhere`` whether the
-    whole gradient is right at other thetas.
+    ``components`` are the ratios of each wrong component to its difference at several thetas, and ``directions`` the
+    ratios of the wrong random directions. ``some_right`` states whether other components are right, and
+    ``right_elsewhere`` whether the whole gradient is right at other thetas.
 
     - ``wrong_factor``: the ratio of each wrong component is the same at all thetas, within its error. A constant ratio
-      next to ratios that vary does not count, since a missing term may act on one input as a factor.
-    - ``missing_term``: the ratio varies, and other components are right, or the gradient is right at thetas where the
-      term does not act, or the ratio lies between 0 and 2, so the gradient has part of the derivative.
-    - ``wrong_adjoint``: neither, or too few ratios to decide.
+      beside a component with a missing term does not count, since a missing term may act on one input as a factor.
+    - ``missing_term``: the ratio varies, and either other components are right, or the gradient is right at thetas
+      where the term does not act, or the ratio lies between 0 and 2, so the gradient has part of the derivative.
+    - ``wrong_adjoint``: neither applies, or there are too few ratios to decide.
     """
     causes: dict[int | None, str] = {}
     some_right = some_right or right_elsewhere
@@ -69,10 +69,10 @@ def _cause(ratios: list[Ratio], some_right: bool) -> str:
 
 
 def _constant(ratios: list[Ratio]) -> bool:
-    """Return whether there are enough ratios and four in five agree; a kink or noise may spoil the others.
+    """Return whether there are enough ratios and four in five of them agree; a kink or noise may change the others.
 
-    A gradient that misses little has ratios near 1 everywhere, and a missing term that hardly varies gives nearly equal
-    ratios. So the ratios have to agree to the accuracy of the differences.
+    The ratios must agree to the accuracy of the differences, because a missing term also causes similar ratios: all
+    near 1 where the term is small, and nearly equal where it hardly varies.
     """
     values, errors = np.array([ratio.value for ratio in ratios]), np.array([ratio.error for ratio in ratios])
     if len(ratios) < ENOUGH or not np.isfinite(values).all():

@@ -23,13 +23,13 @@ Gradient = Callable[[np.ndarray], np.ndarray]
 Modes = Callable[[np.ndarray], Sequence[str]]
 """Names of the contact modes of columns: ``(d, B)`` to ``B`` strings."""
 SUSPICIOUS = 4
-"""Most directions scanned for a staircase."""
+"""Default of :attr:`Options.scanned`."""
 ELSEWHERE = 4
-"""Other thetas at which a wrong component's ratio is taken."""
+"""Most other thetas at which the ratio of a wrong component is computed."""
 FAR = (1.0, 3.0)
-"""Standard deviations, in units of each input's scale, of thetas where a term may not act, such as a contact in flight."""
+"""Standard deviations, in units of each input's scale, of thetas where a term such as a contact may be inactive."""
 PLAINLY = ("smooth", "nonlinear", "mode_crossing")
-"""Verdicts by which a gradient counts as right at such a theta."""
+"""Verdicts that count as right at the thetas drawn with :data:`FAR`."""
 
 
 @dataclass(frozen=True)
@@ -37,21 +37,21 @@ class Options:
     """The scope of a check."""
 
     components: int = 16
-    """Most components checked one by one: those with the largest shares and as many with the smallest, if not all."""
+    """Most components checked one by one; of more, half have the largest |gradient * scale|, half the smallest."""
     directions: int = 2
-    """Random directions, in units of each input's own scale."""
+    """Number of random directions, drawn in units of each input's own scale."""
     draws: int = 8
-    """Other thetas around the given one, each checked along the random directions."""
+    """Number of other thetas around the given theta, each checked along random directions."""
     reach: float = 0.05
-    """Standard deviation of those thetas, in units of each input's own scale."""
+    """Standard deviation of the other thetas, in units of each input's own scale."""
     eps: np.ndarray = field(default_factory=lambda: EPS)
-    """Steps, relative to each input's own scale, falling."""
+    """Steps in falling order, relative to each input's own scale."""
     unit: float = float(np.finfo(np.float64).eps)
     """Declared unit roundoff of the arithmetic; the noise of the cost is measured in addition."""
     scale: np.ndarray | None = None
-    """The scale of each input ``(d,)``; None for :func:`scales`."""
+    """The scale of each input ``(d,)``; None uses :func:`scales`."""
     scanned: int = SUSPICIOUS
-    """Most directions scanned for a staircase, some 450 costs each."""
+    """Most directions scanned for a staircase, at about 450 costs each."""
     seed: int = 0
     """Seed of the random directions and thetas."""
 
@@ -66,9 +66,9 @@ class Part:
     program: float
     """The program's derivative."""
     difference: float
-    """The value that the differences agree on."""
+    """The most reliable difference of costs."""
     uncertainty: float
-    """The error of the difference, from its neighbours and the noise of the cost."""
+    """The error of the difference, from differences at neighbouring steps and the noise of the cost."""
     step: float
     """The step of the difference, in units of the input."""
     left: float
@@ -80,7 +80,7 @@ class Part:
     verdict: str
     sample: Sample
     modes: tuple[Sequence[str], Sequence[str]] = ((), ())
-    """Contact modes at each step, on the minus and on the plus side; empty without any."""
+    """Contact modes at each step, on the minus and on the plus side; empty without contact modes."""
 
     @property
     def ratio(self) -> float:
@@ -111,7 +111,7 @@ class Check:
     noise: float
     """Measured standard deviation of the cost's noise."""
     roundoff: float
-    """The noise relative to the cost: the effective unit roundoff of the arithmetic, at least the declared one."""
+    """Effective unit roundoff: the noise relative to the cost, or the declared unit roundoff if larger."""
     order: float
     """Median order of the Taylor remainder along the random directions, NaN where noise hides it."""
     evaluations: int
@@ -131,7 +131,7 @@ class Check:
 
     @property
     def worst_parts(self) -> tuple[Part, ...]:
-        """The parts with the worst verdict, at theta if there are any, else at other thetas."""
+        """The parts with the worst verdict: at theta if there are any, else at other thetas."""
         here = tuple(part for part in self.parts if part.verdict == self.cause)
         return here or tuple(part for part in self.draws if part.verdict == self.cause)
 
@@ -152,7 +152,7 @@ class Check:
 
 
 def scales(theta: np.ndarray) -> np.ndarray:
-    """Return the scale of each input: its own size, or 1 for one that is 0 or no more than rounding of the largest."""
+    """Return the scale of each input ``(d,)``: its magnitude, or 1 where it is at most 1e-14 of the largest, or of 1."""
     size = np.abs(theta)
     least = 1e-14 * max(1.0, float(size.max(initial=0.0)))
     return np.where(size > least, size, 1.0)
@@ -165,12 +165,12 @@ def check(
     options: Options | None = None,
     modes: Modes | None = None,
 ) -> Check:
-    """Check a gradient against differences of its cost; ``theta (d,)``.
+    """Return the verdict on a gradient at ``theta (d,)``, checked against differences of its cost.
 
     Each component is checked at the steps of ``options.eps``, relative to its own scale. Random directions check all
-    components together, at theta and at other thetas. The gradient is computed at theta first and last, which exposes a
-    cached or random gradient. ``modes`` names contact modes, if there are any. Without a gradient, only the cost is
-    checked.
+    components together, at theta and at other thetas. The gradient is computed at theta before and after the gradients
+    at other thetas, which exposes a cached or random gradient. ``modes`` returns the names of contact modes, if any.
+    Without a gradient, only the cost is checked.
 
     Raises :class:`TypeError` for complex costs or gradients and :class:`ValueError` for wrong shapes.
     """
@@ -178,7 +178,7 @@ def check(
 
 
 class _Checker:
-    """One check: the callables, and the counts of their calls."""
+    """One check: the callables, and the counts of costs and gradients computed."""
 
     def __init__(
         self, cost: Cost, gradient: Gradient | None, theta: np.ndarray, options: Options, modes: Modes | None
@@ -218,7 +218,7 @@ class _Checker:
         around = theta[:, None] + options.reach * self.scale[:, None] * self.random.standard_normal(
             (theta.size, options.draws)
         )
-        # moves only the last digits of theta, so every change of the gradient is rounding
+        # theta changes only in its last digits, so every change of the gradient is rounding
         with np.errstate(invalid="ignore"):
             doubt = np.abs(self.gradient(theta + 4.0 * self.unit * self.scale) - first)
         at_draws = [self.gradient(other) for other in around.T]
@@ -238,7 +238,7 @@ class _Checker:
             draws = self._check_parts(starts, gradients, vectors, np.ones(len(names)), names, none, doubt, twice=False)
         parts, draws = self._with_causes(parts, draws, around, at_draws)
         causes = [part.verdict for part in parts]
-        # at other thetas only faults count: a kink there is not a kink at theta
+        # at other thetas only faults count: a kink at another theta is not a kink at theta
         causes += [part.verdict for part in draws if part.verdict in FAULTS]
         if not np.isfinite(first).all() and self._gradient is not None and np.isfinite(self.cost(theta[:, None])).all():
             causes.append("nan_gradient")
@@ -273,7 +273,8 @@ class _Checker:
     def _directions(self, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Return the direction vectors ``(d, M)`` of chosen components and random directions, and their lengths ``(M,)``.
 
-        A component's derivative is in its own unit, a derivative along a random direction in units of the inputs' scales.
+        A component's derivative is per unit of the input. A derivative along a random direction is per unit of the
+        inputs' scales.
         """
         dim, count = self.theta.size, self.options.directions
         random = self.random.standard_normal((dim, count))
@@ -292,7 +293,7 @@ class _Checker:
         doubt: np.ndarray,
         twice: bool = True,
     ) -> list[Part]:
-        """Check derivatives along ``vectors (d, M)`` at ``thetas (d, M)``, in one batch of costs."""
+        """Return a checked part for each of ``vectors (d, M)``, at ``thetas (d, M)``, from one batch of costs."""
         eps, count = self.options.eps, vectors.shape[1]
         if not count:
             return []
@@ -309,7 +310,7 @@ class _Checker:
         if self._gradient is None:
             program = np.zeros(count)
         doubts = np.abs(vectors).T @ np.nan_to_num(doubt, nan=0.0, posinf=0.0) / lengths
-        # a component this small beside the others may be their rounding, unless it is exactly 0
+        # a component this much smaller than the others may be only their rounding, unless it is exactly 0
         whole = np.abs(np.nan_to_num(gradients, posinf=0.0, neginf=0.0)) * self.scale[:, None]
         doubts += np.where(program != 0.0, np.sqrt(self.unit) * whole.max(axis=0) / lengths, 0.0)
         measured = samples(values, lengths, program, self.unit, eps, minus != plus, repeatable, doubts)
@@ -325,7 +326,7 @@ class _Checker:
         ]
 
     def _sides(self, at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the contact modes at the steps of each direction, on the minus and on the plus side, ``(M, K)``."""
+        """Return the contact modes on the minus side and on the plus side, each ``(M, K)``: directions by steps."""
         eps = self.options.eps.size
         if self._modes is None:
             return np.full((count, eps), ""), np.full((count, eps), "")
@@ -336,10 +337,10 @@ class _Checker:
     def _with_staircases(
         self, thetas: np.ndarray, vectors: np.ndarray, measured: list[Sample], findings: list[Finding]
     ) -> list[Finding]:
-        """Return the findings with the verdict on a staircase for directions along which the cost is one.
+        """Return the findings, replaced for each direction along which the cost is a staircase.
 
-        Directions that are clearly right are not scanned. A derivative of exactly 0 where differences are not 0 is not
-        clearly right: it may be the slope of a tread.
+        Directions that are clearly right are not scanned. A derivative of exactly 0 is not clearly right where
+        differences are not 0, since it may be the slope of a tread.
         """
         clear = ("smooth", "nonlinear", "mode_crossing", "zero", "nonfinite", "nondeterministic")
         to_scan = [
@@ -359,7 +360,7 @@ class _Checker:
         return findings
 
     def _judge_staircase(self, sample: Sample, finding: Finding, row: np.ndarray) -> Finding:
-        """Return the finding on a staircase: ``precision`` where the gradient is right on scales above the treads.
+        """Return the finding on a staircase: ``precision`` where the gradient is right on scales above its treads.
 
         A cast to a shorter float keeps the gradient, a cast to an integer removes it.
         """
@@ -372,7 +373,10 @@ class _Checker:
     def _with_causes(
         self, parts: list[Part], draws: list[Part], around: np.ndarray, at_draws: list[np.ndarray]
     ) -> tuple[list[Part], list[Part]]:
-        """Return the parts with the cause of wrong ones, from their ratios to the differences at theta and at other thetas."""
+        """Return ``parts`` and ``draws`` with the cause of each wrong derivative as its verdict.
+
+        Causes come from the ratios of derivatives to differences at theta and at other thetas.
+        """
         wrong = [part for part in (*parts, *draws) if part.verdict in ("wrong_adjoint", "disconnected")]
         if not wrong:
             return parts, draws
@@ -406,9 +410,10 @@ class _Checker:
         return renamed, [_with_verdict(part, cause[None], ("wrong_adjoint",)) for part in draws]
 
     def _is_right_far_away(self) -> bool:
-        """Return whether the gradient is right at some theta farther away, so the missing term acts only near theta.
+        """Return whether the gradient is right at some theta farther away, so that a missing term acts only near theta.
 
-        Two random directions have to agree there, since one may agree by chance. A slope of exactly 0 does not count.
+        The gradient must be right along two random directions, since one may agree by chance. A slope of exactly 0 does
+        not count.
         """
         count = self.options.draws
         away = np.repeat(FAR, count) * self.scale[:, None]
@@ -425,7 +430,7 @@ class _Checker:
 
 
 def _ratio(part: Part) -> Ratio:
-    """Return a part's ratio, and its error from the error of the difference."""
+    """Return a part's ratio, with the error that follows from the error of its difference."""
     size = abs(part.difference)
     return Ratio(part.ratio, abs(part.ratio) * part.uncertainty / size if size > 0.0 else 0.0)
 

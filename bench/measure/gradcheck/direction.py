@@ -1,9 +1,10 @@
 """Checks the derivative along one direction against differences of the cost over many step sizes.
 
-A central difference of step h errs by h^2 f'''/6 from the curvature of the cost and by about u |f| / h from rounding,
-so its error always rises at both ends (Nocedal and Wright 2006, section 8.1). A difference is trusted where its
-neighbours agree with it and where no smaller step contradicts it by more than the noise of the cost explains. On an
-amplifying rollout, differences over wide steps may agree with each other without approximating the derivative.
+A central difference of step h has an error of h^2 f'''/6 from the curvature of the cost and about u |f| / h from
+rounding, so its error rises at small and at large steps (Nocedal and Wright 2006, section 8.1). A difference is trusted
+where differences at neighbouring steps agree with it and none at a smaller step contradicts it by more than the noise
+of the cost explains. On an amplifying rollout, differences at wide steps may agree without approximating the
+derivative.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ import numpy as np
 EPS = np.logspace(-2, -10, 17)
 """Step sizes, two per decade, in units of the natural scale."""
 GUARD = 64.0
-"""Rounding errors allowed in the cost of a rollout, and in moving theta."""
+"""Allowed rounding error of a rollout's cost and of displaced thetas, in unit roundoffs."""
 MEASURED = 8.0
-"""Standard deviations allowed to a cost whose noise is measured, and rounding errors in addition."""
+"""Allowed error of a cost whose noise is measured, in standard deviations of the noise and in unit roundoffs."""
 RISE = 0.01
-"""Relative error above which an end of the error curve counts as risen."""
+"""Relative error above which the difference at a large step counts as inaccurate."""
 WINDOW = 7
-"""Neighbouring steps (three decades) over which a kink has to be constant."""
+"""Neighbouring steps (three decades) over which the change of slope at a kink must be constant."""
 SHORT_WINDOW = 4
-"""Neighbouring steps over which a slope has to be constant in an exploding rollout, and a jump at the smallest steps."""
+"""Neighbouring steps over which a slope must be constant in an exploding rollout, and a jump at the smallest steps."""
 ALIKE = 0.1
 """Relative spread within which values count as equal."""
 MIN_STEPS = 7
@@ -32,13 +33,13 @@ MIN_STEPS = 7
 
 @dataclass(frozen=True)
 class Sample:
-    """A cost along one direction at one point, and the derivative that the program gives there.
+    """Costs at displacements of a point along one direction, and the program's derivative at the point.
 
-    ``step (K,)`` are displacements, falling; ``minus`` and ``plus (K,)`` are the costs there, and ``centre`` is the cost at
-    the point itself. ``crossing (K,)`` marks where the contact mode differs between the two sides. ``scale`` is the size of
-    theta, ``slope`` the norm of the program's gradient and ``unit`` the unit roundoff of its arithmetic. ``noise`` is
-    the measured standard deviation of the cost's noise (None: not measured) and ``doubt`` the error that the program's
-    derivative has from rounding theta.
+    ``step (K,)`` are displacements in falling order, ``minus`` and ``plus (K,)`` the costs at -step and +step, and
+    ``centre`` is the cost at the point. ``crossing (K,)`` marks steps whose two sides differ in contact mode. ``scale``
+    is the size of theta, ``slope`` the norm of the program's gradient and ``unit`` the unit roundoff of its arithmetic.
+    ``noise`` is the measured standard deviation of the cost's noise (None: not measured), and ``doubt`` the error of
+    the program's derivative from rounding theta.
     """
 
     step: np.ndarray
@@ -78,18 +79,18 @@ class Sample:
 
     @property
     def finite(self) -> np.ndarray:
-        """Where both costs are numbers, ``(K,)``."""
+        """Whether both costs are finite at each step, boolean ``(K,)``."""
         return np.asarray(np.isfinite(self.minus) & np.isfinite(self.plus))
 
     def rounding(self, unit: float) -> np.ndarray:
-        """Return the error of the differences that rounding at that unit roundoff explains, ``(K,)``."""
+        """Return the error of the differences that rounding explains at unit roundoff ``unit``, ``(K,)``."""
         costs = np.maximum(np.maximum(np.abs(self.minus), np.abs(self.plus)), abs(self.centre))
         # numbers below the smallest normal one have no relative precision
         costs = costs + float(np.finfo(np.float64).tiny) / unit
         if self.noise is None:
             return np.asarray(GUARD * unit * (costs + self.slope * self.scale) / self.step)
-        # measured noise includes more than the guess above, and does not rely on the program's gradient; rounding theta
-        # moves the cost by its slope there, which at a minimum is the slope of one side
+        # measured noise covers more than the estimate above and does not rely on the program's gradient. Rounding theta
+        # changes the cost by the slope times the rounding; at a minimum, the slope is that of one side.
         slopes = np.maximum(np.abs(self.left), np.abs(self.right))
         return np.asarray(MEASURED * unit * (costs + slopes * self.scale) / self.step)
 
@@ -99,16 +100,16 @@ class Sample:
         return np.asarray(self.rounding(self.unit) + MEASURED * (self.noise or 0.0) / self.step)
 
     def size(self, index: int) -> float:
-        """Return the larger of derivative and difference at one step, the unit of relative errors."""
+        """Return the larger of |derivative| and |difference| at one step, to which relative errors refer."""
         return max(abs(self.derivative), abs(float(self.differences[index])))
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A verdict, and the numbers that support it; NaN where there are none.
+    """A verdict, and the numbers that support it; NaN where a verdict has no numbers.
 
-    ``difference`` is the trusted slope, with its ``uncertainty``, at the step ``index``; ``left`` and ``right`` are the
-    one-sided slopes there (for a kink, at the step that resolves it best).
+    ``difference`` is the trusted slope, with its ``uncertainty``, at step number ``index``. ``left`` and ``right`` are
+    the one-sided slopes at the same step. For a kink, this step resolves the kink best.
     """
 
     verdict: str
@@ -126,24 +127,26 @@ def best(sample: Sample) -> int:
 
 
 def diagnose(sample: Sample) -> str:
-    """Return the cause of the differences' errors: the verdict of :func:`judge`."""
+    """Return the verdict of :func:`judge` without its numbers."""
     return judge(sample).verdict
 
 
 def judge(sample: Sample) -> Finding:
-    """Return the verdict of the differences on the derivative.
+    """Return the verdict on the program's derivative, from differences of the cost.
 
-    - ``nondeterministic``: the same call returns another cost. ``nonfinite``: the cost at the point or at too many steps
-      is NaN or infinite. ``nan_gradient``: only the derivative is.
-    - ``zero``: derivative and differences are exactly 0. ``disconnected``: only the derivative is.
-    - ``jump``: at the smallest steps the costs differ by a constant. ``kink``: the one-sided slopes do, over three
-      decades of steps. A kink's derivative must lie between the two slopes. Where the slopes are the same over
-      fewer steps, as in an exploding rollout, and the sides meet different contacts, it must be one of the two.
-    - ``unsettled``: the differences agree at no step, or smaller steps contradict them, so they prove nothing.
+    - ``nondeterministic``: the same call returns another cost. ``nonfinite``: the cost at the point or at too many
+      steps is NaN or infinite. ``nan_gradient``: only the derivative is NaN or infinite.
+    - ``zero``: derivative and differences are exactly 0. ``disconnected``: only the derivative is exactly 0.
+    - ``jump``: at the smallest steps, the costs on the two sides differ by a constant. ``kink``: the one-sided slopes
+      differ by a constant over three decades of steps, and the derivative lies between them. Where the slopes are
+      constant over fewer steps, as in an exploding rollout, and the two sides have different contacts, the derivative
+      must equal one of the slopes.
+    - ``unsettled``: the differences agree at no step, or differences at smaller steps contradict them.
     - ``wrong_adjoint``: the differences agree on a value other than the derivative.
-    - the derivative is right, and exactly 0 at the smallest steps only (``saturated``), or its differences have errors at
-      small steps of more than ten times what float64 explains (``rounding``), errors at large steps with a change of
-      contact mode (``mode_crossing``) or without (``nonlinear``), or neither (``smooth``).
+    - Verdicts on a right derivative: ``saturated`` if derivative and differences are exactly 0 at the smallest steps
+      only. ``rounding`` if differences at small steps have more than ten times the error that float64 explains.
+      ``mode_crossing`` if differences at large steps are inaccurate and the contact mode changes, ``nonlinear`` if it
+      does not. Otherwise ``smooth``.
     """
     if not sample.repeatable:
         return Finding("nondeterministic")
@@ -174,12 +177,12 @@ def _judge(sample: Sample) -> Finding:
         )
     index, spread = plateau(sample, noise)
     uncertainty = spread + float(noise[index])
-    # ten times the spread, since the smallest of many spreads is small partly by chance
+    # ten times the spread, since the smallest of many spreads is partly small by chance
     tolerance = 10.0 * spread + float(noise[index]) + _resolution(sample, index) + sample.doubt
     apart = abs(float(sample.differences[index]) - sample.derivative)
     alike, rounding = ALIKE * sample.size(index), GUARD * float(sample.rounding(sample.unit)[index])
     resolved = uncertainty <= max(alike, rounding)
-    # a tolerance as wide as the derivative would pass half of it
+    # a tolerance as large as the derivative would accept half of the derivative
     if apart <= min(tolerance, alike + rounding + sample.doubt) and resolved:
         return _finding(sample, _classify_right(sample, index, still), index, uncertainty)
     if sample.crossing[index]:
@@ -194,10 +197,11 @@ def _finding(sample: Sample, verdict: str, index: int, uncertainty: float) -> Fi
 
 
 def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
-    """Return the index of the step with the most reliable difference, and the disagreement with its neighbours.
+    """Return the index of the most reliable difference, and its disagreement with differences at neighbouring steps.
 
-    Noise counts as disagreement, because differences rounded to 0 agree by accident. A step is excluded where a smaller
-    step contradicts it, and where the contact mode changes across it if three other steps remain.
+    Noise counts as disagreement when steps are compared, because differences rounded to 0 agree by accident. Excluded
+    are steps that a smaller step contradicts, and, if three other steps remain, steps across which the contact mode
+    changes.
     """
     differences = sample.differences
     spread = _spread(differences)
@@ -223,8 +227,9 @@ def _spread(differences: np.ndarray) -> np.ndarray:
 def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:
     """Return whether differences that contradict the derivative are reliable.
 
-    Where the noise exceeds rounding, as in an amplifying rollout, they have to agree to within ALIKE of their own size
-    over SHORT_WINDOW neighbouring steps. Elsewhere a distance of twice the tolerance from the derivative is enough.
+    Where the noise exceeds rounding, as in an amplifying rollout, the differences must agree to within ALIKE of their
+    own size over SHORT_WINDOW neighbouring steps. Elsewhere, a distance of twice the tolerance from the derivative is
+    enough.
     """
     differences = sample.differences
     near = np.asarray(np.abs(differences - differences[index]) <= ALIKE * abs(differences[index]))
@@ -237,9 +242,9 @@ def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: floa
 
 
 def _judge_one_sided(sample: Sample, noise: np.ndarray) -> str:
-    """Return the verdict of one-sided slopes, where the two sides of every difference have different contacts.
+    """Return the verdict from one-sided slopes, for differences whose two sides have different contacts.
 
-    A slope is settled where it is constant over SHORT_WINDOW neighbouring steps. In an exploding rollout that happens
+    A slope is settled where it is constant over SHORT_WINDOW neighbouring steps. In an exploding rollout, slopes settle
     only at the smallest steps, where rounding is amplified like the state, and over fewer steps than a kink needs.
     """
     settled = False
@@ -256,7 +261,7 @@ def _judge_one_sided(sample: Sample, noise: np.ndarray) -> str:
 
 
 def _resolution(sample: Sample, index: int) -> float:
-    """Return u^(1/3) of the derivative's size, the relative step that balances a central difference's two errors."""
+    """Return u^(1/3) times the derivative's size: at the relative step u^(1/3), a difference's two errors balance."""
     return float(np.cbrt(sample.unit)) * sample.size(index)
 
 
@@ -265,9 +270,9 @@ def _classify_wrong(sample: Sample) -> str:
 
 
 def _is_between_slopes(sample: Sample, noise: np.ndarray) -> bool:
-    """Return whether the derivative lies between the one-sided slopes over the smallest step that rounding resolves.
+    """Return whether the derivative lies between the one-sided slopes at the smallest step that rounding resolves.
 
-    The tolerance of a slope is its change since the previous step, which exceeds its error of order h.
+    The tolerance of a slope is its change from the previous step, which exceeds the slope's error of order h.
     """
     resolved = [i for i in range(1, noise.size) if noise[i] <= _resolution(sample, i)]
     finest = resolved[-1] if resolved else int(np.argmin(noise[1:])) + 1
@@ -279,11 +284,11 @@ def _is_between_slopes(sample: Sample, noise: np.ndarray) -> bool:
 
 
 def _has_jump(sample: Sample, noise: np.ndarray) -> bool:
-    """Return whether the cost jumps at theta: a difference of costs there stays however small the step.
+    """Return whether the cost jumps at theta: a difference of costs does not vanish as the step shrinks.
 
-    Two neighbouring steps give the limit of the difference at step 0, since the part linear in the step cancels. The
+    Differences at two neighbouring steps yield the limit at step 0, since the part linear in the step cancels. The
     limit must be constant over the SHORT_WINDOW + 1 smallest steps, and exceed the noise. Unlike
-    :func:`bench.measure.jumps.largest_jump` this needs no further costs.
+    :func:`bench.measure.jumps.largest_jump`, this needs no further costs.
     """
     height = noise * sample.step
     ratio = sample.step[:-1] / sample.step[1:]
@@ -297,9 +302,10 @@ def _has_jump(sample: Sample, noise: np.ndarray) -> bool:
 
 
 def _last_stable_index(values: np.ndarray, noise: np.ndarray) -> int | None:
-    """Return the end of the last window of values that is constant to within ``ALIKE`` and exceeds the noise, or None.
+    """Return the last index of the last window of values that is constant to within ``ALIKE`` and exceeds the noise.
 
-    A window does not count where values at smaller steps contradict it by more than their own noise.
+    None without such a window. A window does not count where values at smaller steps contradict it by more than their
+    own noise.
     """
     windows, noises = _windows(values, WINDOW), _windows(noise, WINDOW).max(axis=1)
     middles = np.median(windows, axis=1)
@@ -314,12 +320,12 @@ def _last_stable_index(values: np.ndarray, noise: np.ndarray) -> int | None:
 
 
 def _windows(values: np.ndarray, size: int) -> np.ndarray:
-    """Return each run of ``size`` neighbouring values, ``(K - size + 1, size)``."""
+    """Return every window of ``size`` neighbouring values, ``(K - size + 1, size)``."""
     return np.lib.stride_tricks.sliding_window_view(values, size)
 
 
 def _classify_right(sample: Sample, index: int, still: np.ndarray) -> str:
-    """Return the verdict on a right derivative, from the errors of its differences at small and at large steps."""
+    """Return the verdict on a right derivative, from the errors of the differences at small and at large steps."""
     if sample.derivative == 0.0 and still[-MIN_STEPS:].all():
         return "saturated"
     errors = np.abs(sample.differences - sample.derivative)

@@ -1,4 +1,4 @@
-"""Roughness of a cost at the smallest scale: the size of its computational noise, and whether it is a staircase."""
+"""Estimates a cost's computational noise, and detects whether the cost is a staircase."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 POINTS = 8
 """Points on either side of theta from which the noise is estimated."""
 SPACING = 64.0
-"""Least spacing of those points, in units in the last place of the input."""
+"""Least spacing of the points for the noise, in units of the input's unit roundoff."""
 FINE = 1.37e-11
-"""Default spacing of those points, relative to the input's scale: below the smallest step, and not a round number."""
+"""Default spacing of the points for the noise, relative to the input's scale: below the smallest step, and not round."""
 SCAN = 65
 """Points of a scan for a staircase."""
 EDGES = 3
-"""Fewest separate edges of a staircase; a cost with fewer has a jump or two."""
+"""Fewest isolated edges of a staircase; with fewer, the cost has single jumps."""
 APART = 3.0
-"""Least ratio of an edge to the differences between increments on the treads."""
+"""Least ratio of an edge to the variation of increments on the treads."""
 
 
 def offsets(unit: float) -> np.ndarray:
@@ -47,10 +47,10 @@ def noise(values: np.ndarray) -> float:
 
 
 def scatter(step: np.ndarray, differences: np.ndarray) -> float:
-    """Return the noise of the cost from its central differences over falling steps ``(K,)``; 0 where they show none.
+    """Return the noise of the cost from its central differences at falling steps, both ``(K,)``; 0 without visible noise.
 
-    Noise moves the differences up and down by its size over the step. A jump, a kink or a bend moves them only one way,
-    or less with each step, and does not count.
+    Noise moves the differences up and down by its size over the step. A jump, a kink or curvature moves the differences
+    in one direction, or less with each step, and does not count.
     """
     moved = (np.diff(differences) * step[1:])[-POINTS:]
     size = np.abs(moved)
@@ -62,17 +62,17 @@ def scatter(step: np.ndarray, differences: np.ndarray) -> float:
 
 
 def staircase_offsets(scale: float, unit: float) -> np.ndarray:
-    """Return displacements for :func:`is_staircase` at seven spacings, a decade apart, ``(7, SCAN)``."""
+    """Return displacements ``(7, SCAN)`` for :func:`is_staircase`, at seven spacings a decade apart."""
     spacings = np.sqrt(unit) * 10.0 ** np.arange(-2.0, 5.0) * scale
     return np.asarray(spacings[:, None] * np.arange(SCAN))
 
 
 def is_staircase(values: np.ndarray, rounding: float) -> bool:
-    """Return whether equally spaced ``values (n,)`` lie on a staircase, perhaps one that is added to a straight line.
+    """Return whether equally spaced ``values (n,)`` lie on a staircase, possibly added to a straight line.
 
-    On a staircase most increments are equal to within ``rounding``, and the others are isolated and exceed the remaining
-    variation by a factor of :data:`APART`. A single jump is not a staircase, nor is a slope with a flat part, nor rounding
-    that a rollout amplifies: its increments have every size.
+    On a staircase most increments are equal to within ``rounding``. The others are isolated and exceed the remaining
+    variation by a factor of :data:`APART`. Not staircases: a single jump, a slope with a flat part, and rounding
+    amplified by a rollout, whose increments have every size.
     """
     if not np.isfinite(values).all():
         return False

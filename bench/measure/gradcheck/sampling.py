@@ -1,4 +1,4 @@
-"""The points at which a gradient check evaluates the cost, in one batch, and the samples made from the values."""
+"""The points at which a gradient check evaluates the cost, in one batch, and the samples computed from the values."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from .roughness import POINTS, noise, offsets, scatter
 
 
 def shifts(unit: float, eps: np.ndarray = EPS) -> np.ndarray:
-    """Return displacements, relative to a direction's length: down, up, none, and those for the noise estimate."""
+    """Return displacements ``(S,)``, relative to a direction's length: -eps, +eps, 0 and the noise estimate's offsets."""
     return np.concatenate([-eps, eps, [0.0], offsets(unit).ravel()])
 
 
 def points(theta: np.ndarray, vectors: np.ndarray, unit: float, eps: np.ndarray = EPS) -> np.ndarray:
-    """Return theta moved along each column of ``vectors (d, M)`` by each of the :func:`shifts`, ``(d, M * S)``.
+    """Return theta displaced along each column of ``vectors (d, M)`` by each of the :func:`shifts`, ``(d, M * S)``.
 
     ``theta`` is ``(d,)``, or ``(d, M)`` for directions that start at different points.
     """
@@ -35,9 +35,10 @@ def samples(
     repeatable: np.ndarray | None = None,
     doubts: np.ndarray | None = None,
 ) -> list[Sample]:
-    """Return a sample per direction from the costs at its :func:`points`, ``values (M, S)``.
+    """Return a sample per direction, from the costs ``values (M, S)`` at :func:`points`.
 
-    A displacement of 1 along direction m has the length ``lengths[m]``, in the units of its ``derivatives[m]``.
+    A displacement of 1 along direction m has the length ``lengths[m]``, in the unit by which ``derivatives[m]`` is
+    taken.
     """
     count = eps.size
     result = []
@@ -60,10 +61,11 @@ def samples(
 
 
 def order(sample: Sample) -> float:
-    """Return the order in h of the Taylor remainder |f(x + h d) - f(x) - h g d|: 2 for a right gradient, 1 for a wrong one.
+    """Return the order in h of the Taylor remainder |f(x + h d) - f(x) - h g d|: 2 for a right gradient, 1 if wrong.
 
-    The order is the median slope, in log scales, over the five smallest steps whose remainder exceeds ten times the noise,
-    on either side. It is NaN where fewer than four do, as for a linear cost. No best step is needed.
+    The order is the median slope, in log scales, over the five smallest steps on either side whose remainder exceeds
+    ten times the noise. It is NaN with fewer than four such steps, as for a linear cost. No choice of a best step is
+    needed.
     """
     slopes: list[float] = []
     for side, sign in ((sample.plus, 1.0), (sample.minus, -1.0)):

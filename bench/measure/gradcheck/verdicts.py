@@ -8,13 +8,13 @@ FAULTS = (
     "nan_gradient", "nondeterministic", "stale_gradient", "staircase", "precision", "disconnected", "wrong_factor",
     "missing_term", "wrong_adjoint",
 )  # fmt: skip
-"""The program's gradient is not the derivative of its cost."""
+"""Verdicts that the program's gradient is not the derivative of its cost."""
 UNDECIDED = ("nonfinite", "unsettled")
-"""The check is inconclusive."""
+"""Verdicts of an inconclusive check."""
 BROKEN = ("jump", "kink")
-"""The cost has no derivative at this point."""
+"""Verdicts that the cost has no derivative at this point."""
 TRUSTED = ("saturated", "rounding", "mode_crossing", "nonlinear", "smooth", "zero")
-"""The gradient is the derivative."""
+"""Verdicts that the gradient is the derivative."""
 UNTRUSTED = (*FAULTS, *UNDECIDED, *BROKEN)
 """Verdicts that end a check with exit status 1."""
 VERDICTS = (*UNTRUSTED, *TRUSTED)
