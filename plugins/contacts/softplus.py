@@ -27,7 +27,7 @@ class Softplus(ForceLaw):
 
     @property
     def continuous(self) -> bool:
-        """True with a smoothed gap or without damping: an unsmoothed damper acts immediately at touch."""
+        """True with a smoothed gap or without damping: an unsmoothed damper acts immediately at first touch."""
         return self.smooths == "gap" or self.damping == 0.0
 
     def spring(self) -> tuple[float, float]:
@@ -35,7 +35,7 @@ class Softplus(ForceLaw):
         return self.stiffness, self.damping
 
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
-        """Return the normal force, positive everywhere."""
+        """Return the normal force, never negative."""
         if self.smooths == "clip":
             penetration = xp.where(gap < 0, -gap, 0.0 * gap)
             damper = xp.where(gap < 0, -self.damping * gap_rate, 0.0 * gap)
@@ -48,5 +48,5 @@ class Softplus(ForceLaw):
 
 
 def _softplus(xp: Any, z: Array, beta: Any) -> Array:
-    # (z + |z|) / 2 instead of a where: at z = 0 the derivatives of both terms then add up to the right value, 1/2
+    # (z + |z|) / 2 instead of xp.where, so that at z = 0 the derivatives of both terms add up to the correct 1/2
     return 0.5 * (z + xp.abs(z)) + xp.log1p(xp.exp(-beta * xp.abs(z))) / beta
