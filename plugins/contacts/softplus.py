@@ -10,11 +10,11 @@ from bench.model import Array, ForceLaw, param
 class Softplus(ForceLaw):
     """The penalty law with max(0, z) replaced by softplus_beta(z) = log(1 + exp(beta z)) / beta.
 
-    ``smooths="clip"``: only the outer clip, force = softplus_beta(k d + c d') with d = max(0, -gap), so that it still
-    has a kink at touch and a force of log(2)/beta at any distance; beta is then per newton.
-    ``smooths="gap"``: the gap as well, force = softplus of (k softplus_beta(-gap) + c d' weighted by the smoothed
-    contact indicator); without damping this is k softplus_beta(-gap), and beta is per metre.
-    As beta grows both tend to ``penalty[damping_mode=clipped]``.
+    ``smooths="clip"``: the outer clip is smoothed, force = softplus_beta(k d + c d') with d = max(0, -gap). A kink
+    remains at first touch, and so does a force of log(2)/beta [N] at any distance. The unit of beta is 1/N.
+    ``smooths="gap"``: the gap is smoothed, force = max(0, k softplus_beta(-gap) + s c d') with the smoothed contact
+    indicator s = 1 / (1 + exp(beta gap)). Without damping, force = k softplus_beta(-gap). The unit of beta is 1/m.
+    As beta grows, both tend to ``penalty[damping_mode=clipped]``.
     """
 
     name = "softplus"

@@ -34,12 +34,13 @@ class Kernel:
 
 
 def compiled(text: str, dtype: str, fresh: bool, count: Compilations) -> Kernel:
-    """Return the kernel of a source, compiled once per process; with ``fresh`` its seconds are those of a compilation.
+    """Return the kernel of the source ``text``, compiled once per process.
 
+    With ``fresh``, a kernel that was loaded from the folder is compiled again, so that ``seconds`` is its compile time.
     Compilations and requests are added to ``count``.
     """
     name = hashlib.sha256(text.encode()).hexdigest()[:16]
-    # one at a time: Numba's compiler holds a lock of its own
+    # one at a time: Numba's compiler has its own lock
     with _busy:
         found = _known.get(name)
         if found is None or (fresh and found.loaded):

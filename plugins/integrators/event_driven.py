@@ -1,4 +1,4 @@
-"""Second-order steps that are split at impacts."""
+"""Second-order time steps, split at the time of impact."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +13,7 @@ LATE = 1e-3
 
 @dataclass(frozen=True)
 class EventDriven(StormerVerlet):
-    """Stormer-Verlet; under an impulse law it flies to the first impact of the step and applies the law from there.
+    """Stormer-Verlet. Under an impulse law, a step is split at its first impact, where the law is applied.
 
     The time of impact is a root of gap + rate t + acceleration t^2 / 2, differentiated in closed form, so that speed
     and time of the impact depend on theta as in the physics: gradients of rigid bounces are right to discretisation

@@ -44,7 +44,10 @@ class Ppo(Population):
         return np.asarray(mean[:, None] + np.exp(log_deviation)[:, None] * noise)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Return the state after ``epochs`` steps on the clipped objective. Points without a finite cost are ignored."""
+        """Return the state after ``epochs`` steps on the clipped objective; unchanged if all costs are equal.
+
+        Points without a finite cost are ignored.
+        """
         assert answer.value is not None
         is_finite = np.isfinite(answer.value)
         cost = answer.value[is_finite]
