@@ -92,7 +92,7 @@ def gradient(problem: Problem, path: Slopes, cut: Cut | None = None) -> np.ndarr
 
 
 def by_actions(path: Slopes, cut: Cut | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of the cost by action ``(T, m, B)`` and by initial state ``(n, B)``, with later feedback."""
+    """Return the cost's derivatives by action ``(T, m, B)``, with later feedback, and by initial state ``(n, B)``."""
     horizon = len(path.a)
     adjoint, by_control = path.cost_x[-1], np.empty_like(path.cost_u)
     for t in range(horizon - 1, -1, -1):

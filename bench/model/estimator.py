@@ -122,7 +122,7 @@ class SampleMean(Estimator):
 
     @property
     def separable(self) -> bool:
-        """Whether each estimate is the mean of its samples' terms: true unless a subclass overrides :meth:`estimate`."""
+        """Whether each estimate is the mean of its terms: true unless a subclass overrides :meth:`estimate`."""
         return type(self).estimate is SampleMean.estimate
 
     @abstractmethod

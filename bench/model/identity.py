@@ -11,7 +11,7 @@ from bench.model.parameters import Plugin, parameters, values
 
 
 def identity(name: str, given: Mapping[str, Any]) -> str:
-    """Return the identity string of a plugin name and parameter values; only the name if there are no values.
+    """Return the identity string of a plugin name and parameter values; only the name if ``given`` is empty.
 
     >>> identity("alpha_order", {"gamma": 0.01, "delta": 0.1})
     'alpha_order[delta=0.1,gamma=0.01]'

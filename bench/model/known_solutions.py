@@ -16,7 +16,7 @@ class KnownOptimum(ABC):
 
     @abstractmethod
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
-        """Return the optimal cost J* under this law and integrator, and the method that computes it; None if unknown."""
+        """Return the optimal cost J* under this law and integrator, and how it was computed; None if unknown."""
 
 
 class KnownValue(ABC):

@@ -21,10 +21,10 @@ class Ops(Protocol):
         """Array namespace following the Python array API standard (numpy, torch via array-api-compat, jax.numpy)."""
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Return the last carry after ``carry = step(carry, x)`` for each x along the leading axis of ``xs``' leaves."""
+        """Return the last carry of ``carry = step(carry, x)`` over the leading axis of the leaves of ``xs``."""
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Return ``z (n, B)`` with ``residual(z, args) = 0``. Column b of the residual must depend on column b of z only.
+        """Return ``z (n, B)`` with ``residual(z, args) = 0``, whose column b must depend on column b of z only.
 
         The derivative is computed by the implicit-function theorem. Raises :class:`Unsupported` on backends without
         ``root``.

@@ -52,7 +52,7 @@ class Plugin(ABC):  # noqa: B024, each kind has its own abstract methods
     """The base class of all plugins: a name, and parameters as dataclass fields."""
 
     kind: ClassVar[str] = ""
-    """Its kind, the plural of its axis: scenes, contacts, integrators, backends, estimators, optimizers, studies, or new."""
+    """Its kind, the plural of its axis: ``scenes``, ``contacts``, ``studies``, ..., or a new one."""
     name: ClassVar[str] = ""
     """Its name on the command line and in tables, legends and caches."""
     requires: ClassVar[tuple[str, ...]] = ()
@@ -133,7 +133,7 @@ def singular(kind: str) -> str:
 
 
 def check(parameter: Parameter, value: Any, where: str) -> Any:
-    """Return ``value`` converted to the parameter's type; raises :class:`UserError` for a wrong type or invalid value."""
+    """Return ``value`` converted to the parameter's type; raises :class:`UserError` for an invalid type or value."""
     kinds = typing.get_args(parameter.type) if isinstance(parameter.type, types.UnionType) else (parameter.type,)
     if value is None and type(None) in kinds:
         return None

@@ -159,7 +159,7 @@ class Problem(ABC):
         )
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
-        """Return states, controls and step Jacobians of rollouts; raises :class:`Unsupported` if the backend has none."""
+        """Return states, controls and step Jacobians; raises :class:`Unsupported` if the backend has none."""
         raise Unsupported(f"{type(self).__name__} gives no step Jacobians: use a backend with jacobians()")
 
     def centred(self, w: np.ndarray) -> np.ndarray:

@@ -267,7 +267,7 @@ class Program(ABC):
         return self.cost(ops, theta, w)
 
     def _own_theta(self, xp: Any, theta: Array, w: Array) -> tuple[Program, Array]:
-        """Return the program with parameter values from noisy theta, each ``(B,)``, and the scene's own theta ``(d', B)``."""
+        """Return the program with parameters from noisy theta, each ``(B,)``, and the scene's own theta ``(d', B)``."""
         noisy = theta + self.scene.sigma * w
         values = {place: noisy[i] for i, place in enumerate(self._named)}
         bound = self._with(values)
@@ -406,7 +406,7 @@ class Rollout(Program):
         yield state, u
 
     def start(self, ops: Ops, theta: Array, w: Array) -> tuple[Array, State, tuple[Array, ...]]:
-        """Return theta plus its noise ``(d, B)``, the initial state, and the control law's inputs, ``(horizon, ...)`` each.
+        """Return theta plus its noise, the initial state, and the control law's inputs, each ``(horizon, n_u, B)``.
 
         The inputs are the open-loop controls, if any, then the noise on the actions or the gusts.
         """

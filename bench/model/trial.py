@@ -94,7 +94,7 @@ def run_child(job: Mapping[str, Any]) -> None:
 
 
 def _call_plugins(module: ModuleType) -> None:
-    """Build a module's plugins and call their methods as when a run is planned. Exceptions are ignored: cells report them."""
+    """Build a module's plugins and call their methods as when a run is planned. Ignore exceptions: cells report them."""
     import numpy as np
 
     from bench.model.backend import CAPABILITIES

@@ -12,8 +12,8 @@ class Guided(Estimator):
     """Approximates grad J_sigma with central differences along v = P w + sqrt(share) (1 - P) w.
 
     P projects onto the span of the gradients of the first ``subspace`` samples. The differences use the other samples.
-    On a linear cost, the expectation is the gradient within the subspace and ``share`` times the gradient outside, while
-    the variance falls from d + 1 to about ``subspace`` + share d squared gradients. This is useful if gradients lie in
+    On a linear cost, the expectation is the gradient inside the subspace and ``share`` times it outside, while the
+    variance falls from d + 1 to about ``subspace`` + share d squared gradients. This is useful if gradients lie in
     the correct subspace with wrong lengths and signs, and useless if they vanish (Maheswaranathan et al. 2019, guided
     evolutionary strategies). Requires costs and gradients, and more samples than ``subspace``. Biased.
     """
@@ -27,7 +27,7 @@ class Guided(Estimator):
     share: float = param(0.1, "share of the gradient outside the subspace in the expectation", low=0.0, high=1.0)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean of the differences along guided directions, ``(R, d)``. Raises ValueError for too few samples."""
+        """Return the mean of the differences along guided directions, ``(R, d)``; ValueError for too few samples."""
         if noise.shape[1] <= self.subspace:
             raise ValueError(f"{self.name} needs more than {self.subspace} samples, got {noise.shape[1]}")
         first, rest = noise[:, : self.subspace], noise[:, self.subspace :]

@@ -37,7 +37,7 @@ class Reinforce(SampleMean):
         return np.asarray(f * problem.score(theta, w) + problem.explicit(theta, w))
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean of the terms over samples, ``(R, d)``. Raises ValueError if the baseline needs more samples."""
+        """Return the mean of the terms over samples, ``(R, d)``; ValueError if the baseline needs more samples."""
         if self.separable:
             return super().estimate(problem, theta, noise)
         if noise.shape[1] < 2:

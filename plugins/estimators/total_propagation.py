@@ -85,7 +85,7 @@ class TotalPropagation(DiagnosticEstimator):
         return result, {"weight": np.moveaxis(weight[..., 0], 2, 0).reshape(repeats, -1)}
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return why ``per=action`` is not supported: actions without own noise, or theta that acts otherwise; or None."""
+        """Return the reason if ``per=action`` lacks noise on every action, or theta acts otherwise; else None."""
         if self.per != "action":
             return None
         one_each = (

@@ -265,7 +265,7 @@ class _Kernel:
         if forward:
             code.add(1, "for t in range(horizon):")
             if history:
-                # a separate loop: with more arrays in one loop the compiler cannot prove that none overlap, and does not vectorise
+                # a separate loop: with more arrays in one loop the compiler cannot prove that none overlap
                 code.add(2, f"past = (horizon - 1 - t) * {len(history) * LANES}")
                 code.add(2, f"for l in range({len(history) * LANES}):")
                 code.add(3, "kept[at(past + l)] = lane[l]")
@@ -349,7 +349,7 @@ class _Kernel:
                 return lines + [f"lane[{slot} + l] = {names[n.number]}" for slot, n in slots]
 
             self._pass(2, backward.inside(), loads | kept_values, store)
-            # a separate loop: with more arrays in one loop the compiler cannot prove that none overlap, and does not vectorise
+            # a separate loop: with more arrays in one loop the compiler cannot prove that none overlap
             for table in backward.tables:
                 code.add(2, f"for l in range({LANES}):")
                 for line in self._written(f"o{table} + l", write, f"lane[{self.slots[f'o{table}']} + l]"):

@@ -13,8 +13,8 @@ class Ppo(Population):
 
     Each coordinate of a sample is an action x_i ~ N(mean_i, deviation_i^2) with its own probability ratio r_i to the
     policy that drew it. All coordinates share the rollout's advantage A: the population's mean cost minus the rollout's
-    cost, in standard deviations. ``epochs`` steps of Adam ascend the mean of min(r_i A, clip(r_i, 1 - clip, 1 + clip) A)
-    over means and log deviations. Since only costs are used, there is neither a value function nor credit assignment to
+    cost, in standard deviations. ``epochs`` steps of Adam ascend the mean of
+    min(r_i A, clip(r_i, 1 - clip, 1 + clip) A) over means and log deviations. Since only costs are used, there is neither a value function nor credit assignment to
     single steps: this is a baseline for other methods, not a benchmark of full PPO implementations.
     """
 

@@ -85,7 +85,7 @@ class BounceOnce(EngineTwin, ContactScene):
             <actuator><motor joint="height"/></actuator>"""
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray | None:
-        """Return (P(z > 0) - restitution P(z < 0)) dz/dtheta for normal z, or None without impulses at the time of impact.
+        """Return (P(z > 0) - restitution P(z < 0)) dz/dtheta, z normal; None without impulses at the time of impact.
 
         This assumes that no sample starts inside the ground, which is 9 standard deviations away with the default
         theta.

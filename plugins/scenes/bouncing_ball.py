@@ -81,7 +81,7 @@ class BouncingBall(EngineTwin, ContactScene):
             <contact><pair geom1="ground" geom2="ball" condim="1"/></contact>"""
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Return grad f for rigid bounces with the scene's restitution, computed bounce by bounce; None if the ball stops."""
+        """Return grad f for rigid bounces with the scene's restitution, event by event; None if the ball stops."""
         final = self._rigid_end()
         return None if final is None else np.asarray(2 * (final[0] - self.target) * final[1])
 

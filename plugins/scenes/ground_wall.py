@@ -73,7 +73,7 @@ class GroundWall(ContactScene):
         return (q[0] - self.target_x) ** 2 + (q[1] - self.target_y) ** 2
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Return grad f for rigid impacts with the scene's restitution, computed impact by impact; None if the ball stops."""
+        """Return grad f for rigid impacts with the scene's restitution, event by event; None if the ball stops."""
         final = self._rigid_end()
         if final is None:
             return None
