@@ -12,10 +12,10 @@ TIE = 1e-9
 class Impulse(ImpulseLaw):
     """Reverses the normal velocity if the predicted position is behind a surface and the velocity is towards it.
 
-    The velocity changes by -(1 + e) v_n; with ``time_of_impact`` the position is also changed as if the impulse had
-    acted when the body reached the surface (Hu et al. 2020, DiffTaichi; Zhong, Han, Brikis 2022). Without it the motion
-    is right to first order in dt, and its derivative has the wrong sign at every dt. The step of an impact switches
-    with theta, so rollouts are not continuous in general.
+    The velocity changes by -(1 + e) v_n. With ``time_of_impact``, the position is also changed as if the impulse had
+    acted when the body reached the surface (Hu et al. 2020, DiffTaichi; Zhong, Han, Brikis 2022). Without it, the
+    motion is correct to first order in dt, but its derivative has the wrong sign at every dt. The step in which an
+    impact occurs changes with theta, so rollouts are not continuous in general.
     """
 
     name = "impulse"
