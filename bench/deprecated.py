@@ -1,4 +1,4 @@
-"""Old names that keep working for one version. Each use raises a DeprecationWarning that gives the new name."""
+"""Old names that remain valid for one version. Each use issues a DeprecationWarning that states the new name."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAMES = {
     "Judged": "ComparisonRule",
     "simulator_of": "load_simulator",
 }
-"""Public classes and functions: old names and new ones."""
+"""New names of public classes and functions, by old name."""
 MEMBERS = {
     "leaves_out": "neglected_effects",
     "across_jumps": "unbiased_at_discontinuities",
@@ -29,7 +29,7 @@ MEMBERS = {
     "lacks": "incompatibility",
     "wants": "required_fields",
 }
-"""Members of plugins: old names and new ones."""
+"""New names of plugin members, by old name."""
 MODULES = {
     "bench.face": ("bench.api",),
     "bench.model.known": ("bench.model.known_solutions",),
@@ -43,11 +43,11 @@ MODULES = {
     "bench.sweep.workers": ("bench.run.pool",),
     "bench.sweep": ("bench.experiment", "bench.run"),
 }
-"""Modules and packages: old names, and the new ones in which their content is looked up in turn."""
+"""New names of modules and packages, by old name. Several new names are tried in order."""
 
 
 def warn(old: str, new: str, level: int = 3) -> None:
-    """Warn that a name will be removed in the next version."""
+    """Issue a DeprecationWarning that an old name will be removed in the next version."""
     warnings.warn(
         f"{old} is now called {new}; the old name will be removed in the next version", DeprecationWarning, level
     )
@@ -66,7 +66,7 @@ def lookup(module: str, namespace: Mapping[str, Any]) -> Callable[[str], Any]:
 
 
 class Alias:
-    """A class's member under its old name. A subclass that calls ``super().old`` gets the member of this class."""
+    """A class member's old name, as a descriptor. ``super().old`` in a subclass resolves to the member of this class."""
 
     def __init__(self, old: str, new: str, member: Any) -> None:
         self.old, self.new, self.member = old, new, member
@@ -78,10 +78,10 @@ class Alias:
 
 
 def rename_members(plugin: type) -> None:
-    """Connect the old and new names of a plugin class's members.
+    """Make a plugin class's renamed members available under both their old and new names.
 
-    A member that the class, or a mixin of it, defines under an old name is also defined under the new one. A member
-    that the class defines under a new name can still be used under the old one.
+    A member that the class or one of its mixins defines under the old name is also defined under the new name. A member
+    that the class defines under the new name remains available under the old name.
     """
     for old, new in MEMBERS.items():
         if not hasattr(plugin, new):
@@ -98,7 +98,7 @@ def rename_members(plugin: type) -> None:
 
 
 def _warn_at(plugin: type, old: str, new: str) -> None:
-    """Warn at the statement that defines the class: the first caller outside the ``__init_subclass__`` chain."""
+    """Issue the warning at the class definition, the first caller outside the ``__init_subclass__`` chain."""
     frame, level = sys._getframe(2), 4
     while frame.f_back is not None and frame.f_code.co_name in ("__init_subclass__", "__new__"):
         frame, level = frame.f_back, level + 1
@@ -129,7 +129,7 @@ class _OldModules(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 def _new_module(name: str) -> importlib.machinery.ModuleSpec | None:
-    """Return the spec of the module that replaces the one of an old name, or None."""
+    """Return the spec of the module that replaces an old module name, or None if the name is not an old one."""
     old = name
     while old and old not in MODULES:
         old = old.rpartition(".")[0]

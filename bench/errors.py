@@ -18,19 +18,19 @@ if sys.platform == "win32":
 Status = Literal["ok", "nonfinite", "diverged", "timeout", "crashed", "unsupported", "unavailable", "error"]
 STATUSES: tuple[str, ...] = get_args(Status)
 INTERRUPTED = threading.Event()
-"""Set from an interrupt until its KeyboardInterrupt is handled, since code in between may swallow the exception."""
+"""Set while a KeyboardInterrupt is pending, since plugin code may swallow the exception before it is handled."""
 
 
 class UserError(Exception):
-    """Bad input. The message says what was given, what is allowed and the nearest valid name."""
+    """Raised for invalid input. The message states the given value, the allowed values and the nearest valid name."""
 
 
 class StorageError(UserError):
-    """Raised when results cannot be written or read. Rows that were stored before are kept."""
+    """Raised when results cannot be written or read. Rows that are already stored remain valid."""
 
 
 class Unsupported(Exception):
-    """Raised for a combination of plugins that does not fit together; its cell gets the status ``unsupported``."""
+    """Raised for an incompatible combination of plugins. Its cell gets the status ``unsupported``."""
 
 
 def printable(text: object) -> str:
@@ -43,7 +43,7 @@ def printable(text: object) -> str:
         line = str(text)
     except KeyboardInterrupt:
         raise
-    except BaseException:  # str() of a plugin's own exception class is code of the plugin
+    except BaseException:  # str() of a plugin's own exception class runs the plugin's code
         line = "(a message that cannot be printed)"
     return " ".join("".join(c if c.isprintable() else " " for c in line).split())
 
@@ -58,7 +58,7 @@ def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:
 
 
 def failure(error: BaseException) -> dict[str, str]:
-    """Return status and reason of a plugin's exception. The reason has its message and the last lines of its traceback."""
+    """Return the row fields ``status`` and ``reason`` for an exception: its message and the last 3 traceback frames."""
     if isinstance(error, Unsupported):
         return {"status": "unsupported", "reason": printable(error)}
     frames = traceback.extract_tb(error.__traceback__, limit=-3)

@@ -1,4 +1,4 @@
-"""Ends the command with one line if Ctrl-C arrives while it is still importing."""
+"""Ends the command with a one-line message if Ctrl-C is pressed during imports."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import sys
 
 
 def exit_on_interrupt() -> None:
-    """Make Ctrl-C end the command immediately, until the command handles signals itself.
+    """Make Ctrl-C end the command immediately, until the command installs its own signal handlers.
 
-    Nothing is running or half written during imports. A program that imports ``bench`` as a library keeps its handlers.
+    This is safe: no run is active and no file is half written during imports. The signal handlers of a program that
+    imports ``bench`` as a library remain unchanged.
     """
     if _is_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _exit)

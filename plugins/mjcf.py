@@ -11,10 +11,10 @@ from bench.model import EngineTwin, MechanicalScene, Program, Unsupported
 from .contacts.penalty import Penalty
 
 MATCH = {"euler": "semi_implicit_euler", "implicitfast": "semi_implicit_euler", "rk4": "rk4"}
-"""The engine's integrators, and the integrator of the scene's program that each one replaces.
+"""The integrator of the scene's program that each engine integrator replaces.
 
-``euler`` is the same map. ``implicitfast`` evaluates joint and tendon damping at the end of the step and is otherwise
-the same map.
+``euler`` is the same map. ``implicitfast`` is the same map, except that it evaluates joint and tendon damping at the
+end of the step.
 """
 
 
@@ -36,7 +36,7 @@ def unsupported_reason(backend: Any, program: Program) -> str | None:
 
 
 def build(backend: Any, program: Program) -> Any:
-    """Build the twin as an ``mujoco.MjModel`` with the scene's time step, the law's springs and the backend's solver.
+    """Return the twin as a ``mujoco.MjModel`` with the scene's time step, the law's springs and the backend's solver.
 
     Raises :class:`Unsupported` for programs that the backend does not support.
     """
@@ -64,10 +64,10 @@ def build(backend: Any, program: Program) -> Any:
 
 
 def _set_springs(model: Any, law: Penalty, impedance: float) -> None:
-    """Set each contact pair's solref and solimp so that its force is that of ``law``, for an impedance near 0.
+    """Set each contact pair's solref and solimp so that its force equals the force of ``law``, for an impedance near 0.
 
-    The engine gives a contact the acceleration a = (1 - d) a_free - (k r + c r') A, with the impedance d and the
-    inverse mass A of the pair: a spring of k [N/m] that cancels the share d of all other forces.
+    The engine's acceleration at a contact is a = (1 - d) a_free - (k r + c r') A, with impedance d and inverse mass A
+    of the pair: a spring of k [N/m] that cancels the share d of all other forces.
     """
     bodies = model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2])]
     inverse_mass = model.body_invweight0[bodies, 0].sum(axis=0)
@@ -79,9 +79,9 @@ def _set_springs(model: Any, law: Penalty, impedance: float) -> None:
 def _cone_factor(model: Any) -> Any:
     """Return the factor on each pair's spring that accounts for the edges of its friction cone, ``(n_pairs,)``.
 
-    With a pyramidal cone a contact with friction is the sum of four edges (two with one direction of friction), each a
-    spring with the inverse mass A (1 + mu^2) instead of A. The engine uses 2 mu^2 of that for the regularisation of an
-    edge at small impedances, so that the total normal force is 2 / (mu^2 (1 + mu^2)) times that of one spring
+    With a pyramidal cone, a contact with friction is the sum of four edges (two with one direction of friction), each a
+    spring with the inverse mass A (1 + mu^2) instead of A. At small impedances, the engine uses 2 mu^2 of this inverse
+    mass to regularise an edge, so that the total normal force is 2 / (mu^2 (1 + mu^2)) times the force of one spring
     (MuJoCo, Computation, "Pyramidal cones": R of all edges is one value, derived from the friction coefficients).
     """
     import mujoco
@@ -93,9 +93,9 @@ def _cone_factor(model: Any) -> Any:
 
 
 def _disabled(bit: Any, model: Any, lean: bool) -> int:
-    """Return flags for features that no twin may use and, with ``lean``, for features that this twin does not use.
+    """Return the disable flags of features that no twin may use and, with ``lean``, of features that it does not use.
 
-    Steps must depend on the state only (no warm start), damp like the scene (not implicitly), keep diverging states
+    Steps must depend on the state only (no warm start), damp like the scene (not implicitly), preserve diverging states
     (no reset) and accept any spring (no refsafe).
     """
     off = bit.mjDSBL_WARMSTART | bit.mjDSBL_EULERDAMP | bit.mjDSBL_AUTORESET | bit.mjDSBL_REFSAFE | bit.mjDSBL_CLAMPCTRL
@@ -107,7 +107,7 @@ def _disabled(bit: Any, model: Any, lean: bool) -> int:
         bit.mjDSBL_CONSTRAINT: model.npair,
         bit.mjDSBL_CONTACT: model.npair,
         bit.mjDSBL_GRAVITY: model.opt.gravity.any(),
-        # one entry, because MJX switches off both for either flag
+        # one entry, because MJX disables both features for either flag
         bit.mjDSBL_SPRING | bit.mjDSBL_DAMPER: springs or dampers,
         bit.mjDSBL_ACTUATION: model.nu,
         bit.mjDSBL_EQUALITY: model.neq,
@@ -124,7 +124,7 @@ def _disabled(bit: Any, model: Any, lean: bool) -> int:
 
 
 def has_friction(program: Program) -> bool:
-    """Return whether a contact of the scene's twin has more than its normal direction."""
+    """Return whether a contact of the scene's twin has friction directions."""
     import mujoco
 
     assert isinstance(program.scene, EngineTwin)

@@ -1,10 +1,10 @@
-"""The contracts between the parts: everything that plugin authors import.
+"""The contracts that plugins implement and use: everything that plugin authors import.
 
 A plugin is a frozen dataclass. Its fields are its parameters, declared with :func:`param` (default, meaning, unit,
 bounds). Its class variables declare its properties, which the conformance kit verifies.
 
 Arrays are component-first and batch-last: generalised positions ``q (n_q, B)``, velocities ``v (n_v, B)``, controls
-``(m, B)``, ``theta (d, B)``, noise ``w (n_w, B)``, costs ``(B,)``. Scenes, contact laws and integrators are written
+``(n_u, B)``, ``theta (d, B)``, noise ``w (n_w, B)``, costs ``(B,)``. Scenes, contact laws and integrators are written
 once and use the array namespace ``ops.xp`` of the backend that runs them. A parameter annotated ``float`` may be a
 traced value, so Python code must not branch on it. All other types are static.
 """

@@ -1,4 +1,4 @@
-"""The adjoint of a rollout, step by step. A caller may modify it between steps, for example to truncate the gradient."""
+"""The adjoint of a rollout, step by step. A caller may modify the adjoint between steps, for example to truncate it."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ from bench.model.problem import Jacobians, Problem
 from bench.model.program import Program, Rollout, rollout
 
 DIFFERENCE_STEP = 1e-6
-"""Step of central differences, relative to the size of a number or to 1 if that is larger: error about 1e-10."""
+"""Step of central differences relative to max(1, |x|), for an error of about 1e-10."""
 
 Cut = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
-"""Return the adjoint ``(n, B)`` to propagate backwards from step t >= 1, given t, the state at t and its adjoint."""
+"""Signature (t, state, adjoint) -> the adjoint ``(n, B)`` to propagate backwards from step t >= 1."""
 
 
 class Slopes(NamedTuple):
-    """Derivatives along rollouts; n states x = (q, v), m controls, B columns."""
+    """Derivatives along B rollouts of T steps; n is the length of the state x = (q, v), m of the control."""
 
     states: np.ndarray
     """``(T + 1, n, B)``."""
     a: np.ndarray
-    """Next state by state at constant control, ``(T, n, n, B)``."""
+    """d next state / d state at constant control, ``(T, n, n, B)``."""
     b: np.ndarray
-    """Next state by control, ``(T, n, m, B)``."""
+    """d next state / d control, ``(T, n, m, B)``."""
     cost: np.ndarray
     """Stage costs and terminal cost, ``(T + 1, B)``."""
     cost_x: np.ndarray
-    """Derivatives of the costs by state at constant control, ``(T + 1, n, B)``."""
+    """d cost / d state at constant control, ``(T + 1, n, B)``."""
     cost_u: np.ndarray
-    """Derivatives of the stage costs by control, ``(T, m, B)``."""
+    """d stage cost / d control, ``(T, m, B)``."""
     feedback_x: np.ndarray | None
-    """Feedback by state, ``(T, m, n, B)``; None without feedback."""
+    """d feedback / d state, ``(T, m, n, B)``; None without feedback."""
     theta: np.ndarray
     """Theta plus its noise, ``(d, B)``."""
 
 
 def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
-    """Return derivatives along the rollouts of ``theta (d,)`` under ``w (n_w, B)``.
+    """Return derivatives along the rollouts of ``theta (d,)`` or ``(d, B)`` under noise ``w (n_w, B)``.
 
-    Step Jacobians come from the backend if it provides them, else from central differences of the steps in NumPy.
-    Derivatives of costs and feedback are central differences. Raises :class:`Unsupported` for a plain function, and if
-    a step solves an equation and the backend provides no Jacobians.
+    Step Jacobians are the backend's if it provides them, else central differences of the steps in NumPy. Derivatives of
+    costs and feedback are central differences. Raises :class:`Unsupported` for a plain function, and for a step that
+    solves an equation if the backend provides no Jacobians.
     """
     program = rollout(problem.program)
     full = np.repeat(np.reshape(theta, (program.dim, -1)), w.shape[1] if np.ndim(theta) == 1 else 1, axis=1)
@@ -83,16 +83,16 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
 
 
 def gradient(problem: Problem, path: Slopes, cut: Cut | None = None) -> np.ndarray:
-    """Return per-sample gradients ``(d, B)``. ``cut`` may modify the adjoint at each step; with None it stays as it is.
+    """Return the gradient of each sample, ``(d, B)``, with the adjoint at each step modified by ``cut`` if given.
 
     Without ``cut`` the result is the derivative of the cost. The adjoint at step t is the derivative of all costs from
-    step t on by the state at t.
+    step t onwards with respect to the state at t.
     """
     return by_theta(problem, path, *by_actions(path, cut))
 
 
 def by_actions(path: Slopes, cut: Cut | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of the cost by each action ``(T, m, B)``, later feedback included, and by the first state."""
+    """Return the cost's derivatives by action ``(T, m, B)``, with later feedback, and by initial state ``(n, B)``."""
     horizon = len(path.a)
     adjoint, by_control = path.cost_x[-1], np.empty_like(path.cost_u)
     for t in range(horizon - 1, -1, -1):
@@ -106,7 +106,7 @@ def by_actions(path: Slopes, cut: Cut | None = None) -> tuple[np.ndarray, np.nda
 
 
 def by_theta(problem: Problem, path: Slopes, by_control: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
-    """Return the gradient ``(d, B)`` from derivatives by actions ``(T, m, B)`` and by the first state ``(n, B)``."""
+    """Return the gradient ``(d, B)`` from derivatives by action ``(T, m, B)`` and by initial state ``(n, B)``."""
     program = rollout(problem.program)
     scene, horizon = program.scene, len(path.a)
     if scene.open_loop:
@@ -130,7 +130,7 @@ def by_theta(problem: Problem, path: Slopes, by_control: np.ndarray, adjoint: np
 
 
 def _difference_jacobians(program: Rollout, theta: np.ndarray, w: np.ndarray) -> Jacobians:
-    """Return the step Jacobians by central differences of all steps and columns together."""
+    """Return the step Jacobians, computed by central differences of all steps and columns together."""
     ops = LoopOps()
     with np.errstate(all="ignore"):
         path = list(program.steps(ops, theta, w))
@@ -168,18 +168,16 @@ def _central_differences(function: Callable[[np.ndarray], np.ndarray], x: np.nda
 def _theta_differences(
     function: Callable[[np.ndarray], np.ndarray | None], theta: np.ndarray, weight: np.ndarray
 ) -> np.ndarray:
-    """Return the derivatives ``(d, B)`` by theta of the sum of weight times ``function(theta)``, column by column.
+    """Return the derivatives ``(d, B)`` of sum(weight * function(theta)) with respect to each column of theta.
 
-    The columns of theta repeat along the last axis of the function's value where that is longer.
+    If the last axis of the function's value is longer than B, the columns of theta repeat along it.
     """
     if function(theta) is None:
         return np.zeros_like(theta)
     moved = function(theta + DIFFERENCE_STEP * np.maximum(1.0, np.abs(theta)))
     back = function(theta - DIFFERENCE_STEP * np.maximum(1.0, np.abs(theta)))
     if np.array_equal(np.asarray(moved), np.asarray(back)):
-        return np.zeros_like(
-            theta
-        )  # the function does not depend on theta: no need to differentiate by its d coordinates
+        return np.zeros_like(theta)  # the function does not depend on theta: skip the differences by its d coordinates
     result, count = np.empty_like(theta), theta.shape[1]
     for i in range(len(theta)):
         h = DIFFERENCE_STEP * np.maximum(1.0, np.abs(theta[i]))
@@ -187,7 +185,7 @@ def _theta_differences(
         ahead[i] += h
         behind[i] -= h
         change = weight * (np.asarray(function(ahead)) - np.asarray(function(behind)))
-        # sums over the axes before the last, then over the repetitions of the columns
+        # sum over all axes except the last, then over the repetitions of the columns
         result[i] = change.reshape(-1, change.shape[-1]).sum(axis=0).reshape(-1, count).sum(axis=0) / (2 * h)
     return result
 

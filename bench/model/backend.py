@@ -26,10 +26,10 @@ class Backend(Plugin):
     - ``surrogate``: computes the gradient that a contact law declares in place of the derivative.
     - ``simulator``: runs only users' own simulators, see :class:`CallableScene`.
     - ``physics``: steps a scene's :meth:`~EngineTwin.mjcf` twin with the engine's integrator and contact solver. Its
-      programs differ from those of other backends and need their own reference gradients.
+      programs differ from other backends' programs and need their own reference gradients.
     """
     compiles: ClassVar[bool] = False
-    """Whether each new batch shape is compiled, so that estimates are best computed one by one."""
+    """Whether each new batch shape requires a compilation, so that estimates are best computed one by one."""
     reference_rank: ClassVar[int | None] = None
     """Priority for computing reference gradients, smallest first; None: never used."""
 
@@ -40,11 +40,11 @@ class Backend(Plugin):
         """Return the program compiled as a problem."""
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return why this backend cannot run the program, or None."""
+        """Return why this backend's own limits exclude the program, or None."""
         return None
 
     def incompatibility(self, program: Program) -> str | None:
-        """Return why this backend cannot run the program, or None. Covers the scene's and the backend's own limits."""
+        """Return why this backend cannot run the program, or None. Checks the scene's limits and the backend's own."""
         only = program.scene.backends
         if only and self.name not in only:
             return f"scene {program.scene.name} runs on {' and '.join(only)} only"

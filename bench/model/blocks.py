@@ -1,4 +1,4 @@
-"""Splits batches into equal blocks that fit a core's cache and need one compilation, and runs them on several cores."""
+"""Splits batches into equal blocks that fit a core's cache and compile once, and runs the blocks on several cores."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 MIN_COLUMNS = 512
-"""Fewest columns per thread for which another thread pays off, unless a problem sets its own number."""
+"""Minimum columns per thread for which another thread saves time; a problem may set its own minimum."""
 MAX_COLUMNS = 1 << 14
-"""Columns beyond which a larger block saves nothing."""
+"""Maximum columns per block: larger blocks save no time."""
 
 
 def cores() -> int:
@@ -27,7 +27,7 @@ def cores() -> int:
 
 @cache
 def cache_bytes() -> int:
-    """Return the bytes of a core's second-level cache and its share of the third-level cache; 4 MiB if unknown."""
+    """Return the size in bytes of a core's level-2 cache plus its share of the level-3 cache; 4 MiB if unknown."""
     total = 0
     for index in Path("/sys/devices/system/cpu/cpu0/cache").glob("index*"):
         try:
@@ -46,7 +46,7 @@ def _n_listed(ranges: str) -> int:
 
 
 def columns_in_cache(column_bytes: int, grain: int) -> int:
-    """Return the number of columns that fill half of a core's cache, a multiple of ``grain``."""
+    """Return the number of columns that fill half of a core's cache, as a multiple of ``grain``."""
     columns = cache_bytes() // 2 // max(column_bytes, 1)
     return max(1, min(max(columns, MIN_COLUMNS), MAX_COLUMNS) // grain) * grain
 
@@ -57,9 +57,9 @@ def n_threads(count: int, threads: int, least: int) -> int:
 
 
 def block_size(count: int, most: int, grain: int, threads: int) -> int:
-    """Return the number of columns of each block: a multiple of ``grain``, about ``most`` at the most.
+    """Return the number of columns per block: a multiple of ``grain``, and at most about ``most``.
 
-    The number of blocks is a multiple of ``threads``.
+    It splits the ``count`` columns into a multiple of ``threads`` blocks.
     """
     parts = math.ceil(max(1, count / most) / threads) * threads
     return max(1, math.ceil(count / parts / grain)) * grain
@@ -73,7 +73,7 @@ def evaluate(
     threads: int,
     lead: tuple[int, ...],
 ) -> np.ndarray:
-    """Evaluate ``function(theta, w)``, ``(*lead, B)``, in blocks of ``columns`` columns.
+    """Return ``function(theta, w)``, ``(*lead, B)``, evaluated in blocks of ``columns`` columns.
 
     ``theta`` is ``(d, 1)`` or ``(d, B)``. The last block is padded with copies of its last column.
     """
@@ -111,14 +111,14 @@ def _run_blocks(block: Callable[[int], None], starts: Sequence[int], threads: in
         work()
     finally:
         queue.clear()
-        # a thread that has not started yet has nothing left to do
+        # a task that has not started can be cancelled: the queue is empty
         errors = [future.exception() for future in futures if not future.cancel()]
     for error in filter(None, errors):
         raise error
 
 
 def _pad(part: np.ndarray, columns: int) -> np.ndarray:
-    """Repeat the last column until there are ``columns`` columns."""
+    """Return ``part`` padded to ``columns`` columns by repeating its last column."""
     missing = columns - part.shape[1]
     return np.concatenate([part, np.repeat(part[:, -1:], missing, axis=1)], axis=1) if missing else part
 

@@ -20,18 +20,18 @@ class CallableScene(Scene):
     """A scene whose cost is a user's function of theta, or of theta and its own noise.
 
     f(theta, w) = cost(theta + sigma u, v) with w = (u, v): d numbers of noise on theta, then the cost's own noise. The
-    cost counts as discontinuous, since it may be.
+    cost is declared discontinuous, since it may have jumps.
     """
 
     continuous: ClassVar[bool] = False
 
     @abstractmethod
     def simulator(self) -> Simulator:
-        """Return the cost and its gradient as functions of columns; the same object at each call."""
+        """Return the cost and its gradient as functions of batches ``(d, B)``; the same object at each call."""
 
     @abstractmethod
     def files(self) -> tuple[Path, ...]:
-        """Return the files whose code decides the cost. When one changes, the scene's cells run again."""
+        """Return the source files of the cost. If one changes, the scene's cells run again."""
 
     def theta0(self) -> np.ndarray:
         """Return the simulator's theta as a vector, ``(d,)``."""

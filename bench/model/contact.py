@@ -17,7 +17,7 @@ class ContactLaw(Plugin):
 
     kind: ClassVar[str] = "contacts"
     smoothing: ClassVar[str] = ""
-    """Name of the parameter that smooths the law, if it has one (``beta``, ``kappa``)."""
+    """Name of the parameter that smooths the law (``beta``, ``kappa``), or an empty string."""
     surrogate: ClassVar[bool] = False
     """Whether automatic differentiation of a step intentionally gives a gradient other than the step's derivative."""
     needs_root: ClassVar[bool] = False
@@ -38,7 +38,7 @@ class ForceLaw(ContactLaw):
         """Return the normal force ``(n_contacts, B)`` [N], positive if the bodies repel each other."""
 
     def spring(self) -> tuple[float, float] | None:
-        """Return stiffness [N/m] and damping [N s/m] of the linear spring that the law tends to in deep contact, or None."""
+        """Return stiffness [N/m] and damping [N s/m] of the law's linear spring limit in deep contact, or None."""
         return None
 
 
@@ -67,11 +67,12 @@ class ImpulseLaw(ContactLaw):
 
     @abstractmethod
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: Any) -> State:
-        """Return the changes over one step: of velocity, and of position beyond ``dt`` times the change of velocity.
+        """Return the changes of velocity and position over one step, as a :class:`State`.
 
-        ``before`` is the state at the start of the step, ``free`` the state after a step without contact.
+        The position change is in addition to ``dt`` times the velocity change. ``before`` is the state at the start of
+        the step, ``free`` the state after a step without contact.
         """
 
     def finds_time_of_impact(self) -> bool:
-        """Return whether a free flight into one surface ends as if the impulse acted exactly at the time of impact."""
+        """Return whether, after free flight into one surface, the impulse acts exactly at the time of impact."""
         return False

@@ -10,7 +10,7 @@ from bench.model.scene import ContactScene, FrictionScene, MechanicalScene
 
 
 class Dynamics:
-    """Accelerations, contact forces included, and impulses of a scene under a contact law or none."""
+    """Accelerations (with contact forces) and impulses of a scene under a contact law; None: without contact."""
 
     def __init__(self, ops: Ops, scene: MechanicalScene, law: ContactLaw | None) -> None:
         self.ops = ops
@@ -20,7 +20,7 @@ class Dynamics:
         self._impulse_law = law if isinstance(law, ImpulseLaw) and touching else None
 
     def acceleration(self, q: Array, v: Array, u: Array) -> Array:
-        """Return v' including the force of a :class:`ForceLaw`, ``(n_v, B)``."""
+        """Return the acceleration v', including the forces of a :class:`ForceLaw`, ``(n_v, B)``."""
         xp, scene = self.ops.xp, self._scene
         smooth = scene.acceleration(xp, q, v, u)
         if self._force_law is None or not isinstance(scene, ContactScene):
@@ -40,11 +40,11 @@ class Dynamics:
         return self._scene.contact(self.ops.xp)
 
     def carried(self, v: Array) -> Array:
-        """Return the velocity after the scene's numerical damping, ``(n_v, B)``, from which a step starts."""
+        """Return the velocity at which a step starts, after the scene's numerical damping, ``(n_v, B)``."""
         return self._scene.carried(v)
 
     def with_impulse(self, before: State, free: State, dt: Any) -> State:
-        """Return the state ``free`` after a step without contact, corrected by the impulse law if there is one."""
+        """Return ``free``, the state after a step without contact, corrected by the impulse law if there is one."""
         contact, law = self.contact, self._impulse_law
         if contact is None or law is None:
             return free

@@ -1,4 +1,4 @@
-"""The contract of an estimator, which turns sampled costs, gradients and scores into estimates of grad J."""
+"""The contract of an estimator, which computes estimates of grad J from sampled costs, gradients and scores."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from bench.model.problem import Problem
 from bench.model.program import Program
 
 Auxiliaries = Mapping[str, np.ndarray]
-"""Diagnostics of estimates, such as weights, by name."""
+"""Diagnostics of estimates, such as weights: arrays by name."""
 
 
 @dataclass(frozen=True)
 class Smoothing:
-    """A smoothing of the cost other than J_sigma's: ``gaussian`` with standard deviation ``radius``, or a ``ball``."""
+    """A smoothing other than J_sigma's: ``gaussian`` of standard deviation ``radius``, or uniform in a ``ball``."""
 
     shape: str
     radius: float
@@ -31,25 +31,25 @@ class Estimator(Plugin):
 
     kind: ClassVar[str] = "estimators"
     needs: ClassVar[frozenset[str]] = frozenset({"value"})
-    """Backend capabilities used, a subset of ``value``, ``grad`` and ``score``."""
+    """Required backend capabilities, a subset of ``value``, ``grad`` and ``score``."""
     target: ClassVar[str] = "smoothed"
     """The estimated quantity: ``smoothed`` for grad J_sigma, ``plain`` for grad f."""
     unbiased: ClassVar[bool] = True
     """Whether the expectation equals the target for continuous costs."""
     unbiased_at_discontinuities: ClassVar[bool] = False
-    """Whether it is also unbiased for costs with jumps in theta."""
+    """Whether the estimator is also unbiased for costs with jumps in theta."""
     diagnostics: ClassVar[tuple[str, ...]] = ()
-    """Names of the arrays that :meth:`estimate_with_diagnostics` returns with the estimates, for example a weight."""
+    """Names of the arrays that :meth:`estimate_with_diagnostics` returns in addition, for example ``weight``."""
     includes_explicit_derivative: ClassVar[bool] = False
-    """Whether it adds :meth:`Problem.explicit` to cost times score.
+    """Whether the estimator adds :meth:`Problem.explicit` to cost times score.
 
-    Without this term, cost times score is biased where theta sets the initial state and noise is on the actions, so the
-    estimator is not supported there.
+    Without this term, cost times score is biased if theta sets the initial state and noise is on the actions, so the
+    estimator is not supported for such programs.
     """
     needs_directions: ClassVar[bool] = False
-    """Whether it takes a direction in theta space from each sample, which needs at least d normal numbers per sample."""
+    """Whether it uses each sample's noise as a direction in theta space, which needs at least d numbers per sample."""
     gives_gradient: ClassVar[bool] = True
-    """Whether it estimates a gradient, along which an optimizer can descend."""
+    """Whether the estimate is a gradient that an optimizer can use."""
 
     @abstractmethod
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -61,27 +61,27 @@ class Estimator(Plugin):
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates, and by name one array ``(R,)`` or ``(R, d)`` for each of :attr:`diagnostics`.
+        """Return the estimates ``(R, d)`` and the :attr:`diagnostics` by name, each ``(R,)`` or ``(R, k)``.
 
         An estimator with diagnostics derives from :class:`DiagnosticEstimator` and defines this method.
         """
         return self.estimate(problem, theta, noise), {}
 
     def declares_unbiased(self, program: Program) -> bool:
-        """Return whether its declarations imply that its expectation is grad J_sigma of the program."""
+        """Return whether the estimator declares that its expectation is grad J_sigma of the program."""
         derivative = program.continuous and not program.surrogate
         return self.unbiased and self.target == "smoothed" and (derivative or self.unbiased_at_discontinuities)
 
     def smoothing(self, program: Program) -> Smoothing | None:
-        """Return the smoothing whose gradient is the reference of its rows; None for J_sigma."""
+        """Return the smoothing whose gradient is the reference for this estimator's rows; None: J_sigma."""
         return None
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return why this estimator cannot be used on the program, or None."""
+        """Return why this estimator's own limits exclude the program, or None."""
         return None
 
     def incompatibility(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
-        """Return why it cannot be used on a program with a backend of these capabilities, or None."""
+        """Return why the estimator cannot run on a program with the backend's capabilities ``provides``, or None."""
         missing = self.needs - provides
         if missing:
             return f"{self.name} needs {', '.join(sorted(missing))}, which {backend} lacks"
@@ -103,17 +103,17 @@ class Estimator(Plugin):
 
 @dataclass(frozen=True)
 class DiagnosticEstimator(Estimator):
-    """An estimator with diagnostics, whose :meth:`estimate` is the first part of :meth:`estimate_with_diagnostics`."""
+    """An estimator with diagnostics. It defines :meth:`estimate_with_diagnostics` instead of :meth:`estimate`."""
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the estimates without diagnostics."""
+        """Return the estimates ``(R, d)`` without diagnostics."""
         return self.estimate_with_diagnostics(problem, theta, noise)[0]
 
     @abstractmethod
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates, and by name one array ``(R,)`` or ``(R, d)`` for each of :attr:`diagnostics`."""
+        """Return the estimates ``(R, d)`` and the :attr:`diagnostics` by name, each ``(R,)`` or ``(R, k)``."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class SampleMean(Estimator):
 
     @property
     def separable(self) -> bool:
-        """Whether an estimate is the mean of the terms: true unless a subclass overrides :meth:`estimate`."""
+        """Whether each estimate is the mean of its terms: true unless a subclass overrides :meth:`estimate`."""
         return type(self).estimate is SampleMean.estimate
 
     @abstractmethod
@@ -130,7 +130,7 @@ class SampleMean(Estimator):
         """Return per-sample terms ``(d, B)`` for noise ``w (n_w, B)``."""
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean of the terms over the samples of each repeat."""
+        """Return the mean of the terms over the samples of each repeat, ``(R, d)``."""
         return np.asarray(per_repeat(self.terms(problem, theta, columns(noise)), noise).mean(axis=1))
 
 
@@ -148,7 +148,7 @@ def per_repeat(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 
 def halves(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return first-order terms of the first half of the samples and zeroth-order terms of the rest, each ``(R, N/2, d)``.
+    """Return first-order terms of the first half of the samples, zeroth-order terms of the rest, each ``(R, N/2, d)``.
 
     The zeroth-order terms are (f - f at w = 0) times the score, plus the explicit derivative. Raises ValueError for
     fewer than 4 samples.

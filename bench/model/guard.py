@@ -1,4 +1,4 @@
-"""Protects the process from its plugins: working folder, forked copies, child processes and terminal output."""
+"""Protects the process from side effects of plugins: working folder, forks, child processes and terminal output."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from collections.abc import Iterator
 from bench.errors import INTERRUPTED, printable
 
 MAX_CAPTURED_CHARACTERS = 300
-"""Characters of a plugin's output that are quoted."""
+"""Maximum number of characters of a plugin's output that are quoted."""
 
 
 def exit_if_forked(pid: int) -> None:
-    """Exit this process if it is a copy that a plugin has forked from process ``pid``."""
+    """Exit this process if it is a fork: its id is not ``pid``, the id of the original process."""
     if os.getpid() != pid:
         os._exit(0)
 
 
 @contextlib.contextmanager
 def protect_process() -> Iterator[None]:
-    """Restore the working folder after plugin code has run, and end copies of the process that it has forked.
+    """Restore the working folder after plugin code in the block, and exit processes that the plugin has forked.
 
-    An interrupt that the plugin has swallowed is raised at the end.
+    Raises KeyboardInterrupt at the end if the plugin has swallowed one.
     """
     pid, folder = os.getpid(), _working_folder()
     try:
@@ -40,7 +40,7 @@ def protect_process() -> Iterator[None]:
 
 
 def raise_pending_interrupt() -> None:
-    """Raise the KeyboardInterrupt that a plugin, a callback from C or a finaliser has swallowed."""
+    """Raise the KeyboardInterrupt that a plugin, a callback from C or a finaliser has swallowed, if any."""
     if INTERRUPTED.is_set():
         INTERRUPTED.clear()
         raise KeyboardInterrupt
@@ -48,10 +48,10 @@ def raise_pending_interrupt() -> None:
 
 @contextlib.contextmanager
 def capture_output(source: str) -> Iterator[None]:
-    """Capture what a plugin prints, and quote its start, without control characters, on one line of stderr.
+    """Capture output printed in the block, and quote its start, without control characters, on one line of stderr.
 
-    File descriptors are redirected instead of ``sys.stdout``, since libraries write to them directly and a plugin may
-    keep a reference to the stream.
+    File descriptors are redirected instead of ``sys.stdout``, since libraries write to descriptors directly and a
+    plugin may store a reference to the stream.
     """
     _flush()
     with contextlib.ExitStack() as stack:
@@ -89,9 +89,9 @@ def _working_folder() -> str:
 
 
 def kill_children() -> None:
-    """Kill the processes that a plugin has started from this one and left running."""
+    """Kill all child processes of this process, which a plugin has left running."""
     try:
-        # raises if there are no children, which saves the search through all processes
+        # raises ChildProcessError if there are no children, which avoids a search through all processes
         os.waitpid(-1, os.WNOHANG)
     except ChildProcessError:
         return

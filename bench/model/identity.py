@@ -1,4 +1,4 @@
-"""Plugins as text: short identity strings for people, and JSON with every parameter for programs."""
+"""Plugins as strings or JSON: short identity strings for people, and all parameters for programs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bench.model.parameters import Plugin, parameters, values
 
 
 def identity(name: str, given: Mapping[str, Any]) -> str:
-    """Return an identity string, or the bare name without values.
+    """Return the identity string of a plugin name and parameter values; only the name if ``given`` is empty.
 
     >>> identity("alpha_order", {"gamma": 0.01, "delta": 0.1})
     'alpha_order[delta=0.1,gamma=0.01]'
@@ -38,7 +38,7 @@ def _short(value: Any) -> str:
 
 
 def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
-    """Return the name and raw values of an identity string; raises :class:`UserError` when it is malformed."""
+    """Return the name and the unvalidated values of an identity string; raises :class:`UserError` if malformed."""
     import yaml
 
     name, bracket, rest = str(text).partition("[")
@@ -52,7 +52,7 @@ def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
                 raise UserError(f"'{item}' in '{text}' is not parameter=value")
             try:
                 raw[key.strip()] = yaml.safe_load(value)
-            except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: a date that does not exist
+            except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: an invalid date
                 raise UserError(
                     f"'{value}' in '{printable(text)[:200]}' is not a value: write parameter=value"
                 ) from None
@@ -60,7 +60,7 @@ def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
 
 
 def changed(plugin: Plugin, given: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return the parameters that differ from their defaults, or from ``given``."""
+    """Return the parameter values that differ from ``given``, or from the default if ``given`` lacks the parameter."""
     given = given or {}
     return {
         name: getattr(plugin, name)
@@ -70,14 +70,14 @@ def changed(plugin: Plugin, given: Mapping[str, Any] | None = None) -> dict[str,
 
 
 def label(plugin: Plugin | None, given: Mapping[str, Any] | None = None, without: tuple[str, ...] = ()) -> str:
-    """Return the identity string of a plugin without the parameters ``without``; ``none`` for no plugin."""
+    """Return a plugin's identity string, omitting unchanged parameters and those in ``without``; ``none`` for None."""
     if plugin is None:
         return "none"
     return identity(plugin.name, {k: v for k, v in changed(plugin, given).items() if k not in without})
 
 
 def described(plugin: Plugin | None) -> dict[str, Any] | None:
-    """Return the name and all parameters of a plugin for strict JSON, with infinities as strings; None for no plugin."""
+    """Return a plugin's name and all parameters for strict JSON, with infinities as strings; None for None."""
     if plugin is None:
         return None
     return {"name": plugin.name} | {name: _plain(value) for name, value in values(plugin).items()}

@@ -31,7 +31,7 @@ class Integrator(Plugin):
 
     @abstractmethod
     def amplification(self, z: complex) -> complex:
-        """Return the stability function: the factor of one step of v' = a v (without positions) with z = a dt."""
+        """Return the stability function R(z), z = a dt: one step of v' = a v, without positions, multiplies v by R."""
 
     @abstractmethod
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Roles of scenes with known solutions: the optimal cost, the optimal cost-to-go, and parameters to identify."""
+"""Roles (mixins) of scenes with known solutions: the optimal cost, the optimal cost-to-go, parameters to identify."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from bench.model.parameters import Plugin
 
 
 class KnownOptimum(ABC):
-    """A role: the scene knows its optimal cost over theta, without noise."""
+    """A role: the scene's optimal cost over theta, without noise, is known."""
 
     @abstractmethod
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
-        """Return J* under this law and integrator and the method that gives it, or None if it is not known."""
+        """Return the optimal cost J* under this law and integrator, and how it was computed; None if unknown."""
 
 
 class KnownValue(ABC):
-    """A role: the scene knows its optimal cost-to-go, which a short window can use as its terminal cost."""
+    """A role: the scene's optimal cost-to-go is known, for use as the terminal cost of a shorter horizon."""
 
     @abstractmethod
     def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:
-        """Return the optimal cost-to-go from the state before ``step``, without noise, ``(B,)``, in NumPy."""
+        """Return the optimal cost-to-go from the state before ``step``, without noise, ``(B,)``."""
 
 
 class Identified(ABC):
     """A role: some parameters of the scene are to be identified from a record of its motion."""
 
     unknowns: ClassVar[tuple[str, ...]]
-    """Names of the parameters to identify, unless the user names others."""
+    """Default names of the parameters to identify."""
     measured: ClassVar[tuple[int, ...] | None] = None
     """Indices of the positions measured after each step; None for all."""
     end_only: ClassVar[bool] = False

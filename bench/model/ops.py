@@ -21,27 +21,27 @@ class Ops(Protocol):
         """Array namespace following the Python array API standard (numpy, torch via array-api-compat, jax.numpy)."""
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Fold ``carry = step(carry, x)`` over the leading axis of each leaf of ``xs``; return the last carry."""
+        """Return the last carry of ``carry = step(carry, x)`` over the leading axis of the leaves of ``xs``."""
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Return ``z (n, B)`` with ``residual(z, args) = 0``; column b of the residual depends only on column b of z.
+        """Return ``z (n, B)`` with ``residual(z, args) = 0``, whose column b must depend on column b of z only.
 
-        The derivative follows from the implicit-function theorem. Raises :class:`Unsupported` on backends without
+        The derivative is computed by the implicit-function theorem. Raises :class:`Unsupported` on backends without
         ``root``.
         """
 
 
 class LoopOps:
-    """Operations of a backend without equation solver, for any array namespace: ``scan`` is a Python loop.
+    """Operations of a backend without a root finder, for any array namespace: ``scan`` is a Python loop.
 
-    Raises :class:`Unsupported` if a program solves an equation.
+    :meth:`root` raises :class:`Unsupported`.
     """
 
     def __init__(self, xp: Any = np) -> None:
         self.xp = xp
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Fold over the leading axis in a Python loop."""
+        """Return the last carry of a Python loop over the leading axis of ``xs``."""
         for t in range(length):
             carry = step(carry, tuple(x[t] for x in xs))
         return carry

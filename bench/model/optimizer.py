@@ -15,7 +15,7 @@ State = dict[str, Any]
 
 
 class Answer(NamedTuple):
-    """Values at the points that an optimizer has asked for; None for fields that it did not require."""
+    """Costs, gradients and residuals at the points of :meth:`Optimizer.ask`; None for fields that were not required."""
 
     value: np.ndarray | None = None
     """Costs, ``(B,)``."""
@@ -24,7 +24,7 @@ class Answer(NamedTuple):
     residual: np.ndarray | None = None
     """Residuals of a least-squares cost, ``(m, B)``. The cost is half the sum of their squares."""
     jacobian: np.ndarray | None = None
-    """Derivatives of the residuals by theta, ``(m, d, B)``."""
+    """Derivatives of the residuals with respect to theta, ``(m, d, B)``."""
 
 
 WANTED = frozenset(Answer._fields)
@@ -41,14 +41,14 @@ class Optimizer(Plugin):
 
     kind: ClassVar[str] = "optimizers"
     needs: ClassVar[frozenset[str]] = frozenset({"gradient"})
-    """The fields of :class:`Answer` that it uses in at least one step."""
+    """The fields of :class:`Answer` that the optimizer uses in at least one step."""
 
     def start(self, theta: np.ndarray) -> State:
         """Return the state before the first step, starting from ``theta (d,)``."""
         return {"theta": np.array(theta, dtype=np.float64)}
 
     def draws(self, dim: int) -> int:
-        """Return the number of columns of normal numbers that :meth:`ask` needs; 0 unless it samples."""
+        """Return the number of columns of ``noise`` that :meth:`ask` needs; 0 for an optimizer that does not sample."""
         return 0
 
     @abstractmethod
@@ -61,12 +61,12 @@ class Optimizer(Plugin):
 
     @abstractmethod
     def tell(self, state: State, theta: np.ndarray, answer: Answer) -> State:
-        """Return the state after the answer at the points ``theta (d, B)``, without changing the old state."""
+        """Return the next state, given the answer at the points ``theta (d, B)``; the old state is not modified."""
 
 
 @dataclass(frozen=True)
 class Descent(Optimizer):
-    """An optimizer that evaluates one gradient at its current theta and moves from there."""
+    """An optimizer that takes each step from one gradient at its current theta."""
 
     def ask(self, state: State, noise: np.ndarray) -> np.ndarray:
         """Return the current theta, ``(d, 1)``."""

@@ -1,4 +1,4 @@
-"""Plugins and their parameters: declaration, validation, and building from values."""
+"""Plugins and their parameters: declaration, validation, and construction from values."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from bench import deprecated
 from bench.errors import UserError, printable, unknown
 
 LARGEST = 2**53
-"""The largest integer up to which all integers are exact in float64, the type of number columns."""
+"""The largest allowed integer: all integers up to it are exact in float64, the type of numeric result columns."""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def remember(function: Function) -> Function:
-    """Cache a function like ``functools.cache``, but keep its type for type checkers."""
+    """Cache a function like ``functools.cache``, but preserve its type for type checkers."""
     return cast(Function, cache(function))
 
 
@@ -36,7 +36,7 @@ def param(
     high: float | None = None,
     choices: tuple[str, ...] | None = None,
 ) -> Any:
-    """Declare a plugin parameter: its default, meaning and unit, and the values it may take.
+    """Declare a plugin parameter: its default, meaning, unit and allowed values.
 
     ``positive`` requires a value above 0, ``low`` and ``high`` are inclusive bounds, and ``choices`` are the allowed
     strings.
@@ -52,7 +52,7 @@ class Plugin(ABC):  # noqa: B024, each kind has its own abstract methods
     """The base class of all plugins: a name, and parameters as dataclass fields."""
 
     kind: ClassVar[str] = ""
-    """The plural of its axis: scenes, contacts, integrators, backends, estimators, optimizers, studies, or a new kind."""
+    """Its kind, the plural of its axis: ``scenes``, ``contacts``, ``studies``, ..., or a new one."""
     name: ClassVar[str] = ""
     """Its name on the command line and in tables, legends and caches."""
     requires: ClassVar[tuple[str, ...]] = ()
@@ -96,7 +96,7 @@ def values(plugin: Plugin) -> dict[str, Any]:
 
 
 def traced(plugin: Plugin) -> list[str]:
-    """Return the names of the float parameters, which a backend may trace and theta may name."""
+    """Return the names of the float parameters, which a backend may trace and theta may include."""
     return [f.name for f in dataclasses.fields(plugin) if f.type in ("float", float)]
 
 
@@ -124,7 +124,7 @@ def build(plugin: type[Plugin], values: Mapping[str, Any]) -> Plugin:
 
 
 def singular(kind: str) -> str:
-    """Return the axis of a kind: ``scene`` for ``scenes``, ``study`` for ``studies``.
+    """Return the axis name of a kind: ``scene`` for ``scenes``, ``study`` for ``studies``.
 
     >>> singular("scenes"), singular("studies")
     ('scene', 'study')
@@ -133,7 +133,7 @@ def singular(kind: str) -> str:
 
 
 def check(parameter: Parameter, value: Any, where: str) -> Any:
-    """Return ``value`` in the parameter's type; raises :class:`UserError` for a wrong type or a value out of bounds."""
+    """Return ``value`` converted to the parameter's type; raises :class:`UserError` for an invalid type or value."""
     kinds = typing.get_args(parameter.type) if isinstance(parameter.type, types.UnionType) else (parameter.type,)
     if value is None and type(None) in kinds:
         return None

@@ -1,4 +1,4 @@
-"""A compiled program: costs, gradients and scores of batches of rollouts, and the work they took."""
+"""A compiled program: costs, gradients and scores of batches of rollouts, and their computational cost."""
 
 from __future__ import annotations
 
@@ -56,17 +56,17 @@ class Usage:
 
 @dataclass
 class Compilations:
-    """The compilations of one session: their number, and the folder in which compiled programs are stored.
+    """Compilation counts of one session, and the folder in which compiled programs are stored.
 
-    Backends that compile count here. Code that builds several problems passes the same object to all of them.
+    Compiling backends update the counts. Code that builds several problems passes the same object to all of them.
     """
 
     folder: Path | None = None
     """Folder in which compiled programs are stored between runs; None to store none."""
     made: int = 0
-    """Number of compilations, without programs loaded from the folder."""
+    """Number of compilations, excluding programs loaded from the folder."""
     shapes: set[str] = field(default_factory=set)
-    """Requested programs: one hash per program structure, function and shape."""
+    """Hashes of the requested programs, one per program structure, function and shape."""
 
     def restart(self) -> None:
         """Reset the counts to zero."""
@@ -77,9 +77,9 @@ class Compilations:
 class Problem(ABC):
     """A compiled program: costs, gradients and scores of batches of rollouts, in NumPy float64 arrays.
 
-    ``theta`` is ``(d,)`` for one theta shared by all samples or ``(d, B)``; ``w`` is ``(n_w, B)``. Batches larger than
-    ``block`` columns are evaluated in blocks to limit memory. Blocks are padded to a multiple of ``grain`` columns, so
-    that few shapes occur. Up to ``threads`` blocks run in parallel, each with about ``least`` columns or more.
+    ``theta`` is ``(d,)``, shared by all samples, or ``(d, B)``; ``w`` is ``(n_w, B)``. To limit memory, batches larger
+    than ``block`` columns are split into blocks. Blocks are padded to a multiple of ``grain`` columns, to limit the
+    number of compiled shapes. Up to ``threads`` blocks run in parallel, each with about ``least`` columns or more.
     """
 
     block: int = 1 << 16
@@ -89,7 +89,7 @@ class Problem(ABC):
     device: str = "cpu"
     """The device that the program runs on."""
     provides: frozenset[str] = frozenset({"value", "grad", "score"})
-    """Capabilities of the backend that compiled it."""
+    """Capabilities of the backend that compiled the program."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -99,13 +99,13 @@ class Problem(ABC):
         self._measured = False
 
     def reset_usage(self) -> None:
-        """Reset usage to zero. From now on, programs are compiled again instead of loaded from the folder."""
+        """Reset usage to zero. From then on, programs are compiled instead of loaded from the folder."""
         self._measured = True
         self.usage = Usage()
         self._charged.clear()
 
     def fit_blocks(self, column_bytes: int) -> None:
-        """Set the block size so that a block fits in a core's cache, at ``column_bytes`` per rollout."""
+        """Set the block size so that a block fills half of a core's cache, at ``column_bytes`` per rollout."""
         self.block, self.threads = blocks.columns_in_cache(column_bytes, self.grain), blocks.cores()
 
     @property
@@ -120,7 +120,7 @@ class Problem(ABC):
 
     @property
     def noise_on_theta(self) -> bool:
-        """Whether the noise of J is noise on theta: true except for action noise under a feedback policy."""
+        """Whether the noise in J acts on theta: true except for action noise under a feedback policy."""
         return self.program.noise_on_theta
 
     def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -129,12 +129,12 @@ class Problem(ABC):
         return self._blocks(self._value, theta, w, ())
 
     def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return per-sample gradients df/dtheta, ``(d, B)``."""
+        """Return the gradient df/dtheta of each sample, ``(d, B)``."""
         self.usage.gradients += w.shape[1]
         return self._blocks(self._grad, theta, w, (self.dim,))
 
     def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return per-sample scores d log p(actions | theta)/dtheta, ``(d, B)``; w / sigma where noise is on theta."""
+        """Return the score d log p(actions | theta)/dtheta of each sample, ``(d, B)``: w / sigma for noise on theta."""
         if self.noise_on_theta:
             return w[: self.dim] / self.sigma
         if self.program.explicit and type(self)._explicit is Problem._explicit:
@@ -142,10 +142,10 @@ class Problem(ABC):
         return self._blocks(self._score, theta, w, (self.dim,))
 
     def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return per-sample derivatives of the cost by theta along every path except the actions, ``(d, B)``.
+        """Return each sample's explicit derivative, ``(d, B)``: of the cost with respect to theta at given actions.
 
-        The gradient is the mean of cost times score plus these derivatives. They are 0 unless the program is
-        :attr:`~Program.explicit`; then they count as gradients in :attr:`usage`.
+        The gradient of J is the mean of cost times score plus the explicit derivative, which is 0 unless the program is
+        :attr:`~Program.explicit`. Then it counts as a gradient in :attr:`usage`.
         """
         if not self.program.explicit:
             return np.zeros((self.dim, w.shape[1]))
@@ -153,24 +153,24 @@ class Problem(ABC):
         return self._blocks(self._explicit, theta, w, (self.dim,))
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """Return states and controls along each rollout; raises :class:`Unsupported` without time steps."""
+        """Return states and controls along each rollout; raises :class:`Unsupported` if the backend has none."""
         raise Unsupported(
             f"{type(self).__name__} does not expose the states of a rollout: use a backend with trajectory()"
         )
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
-        """Return states, controls and step Jacobians along each rollout; raises :class:`Unsupported` without steps."""
+        """Return states, controls and step Jacobians; raises :class:`Unsupported` if the backend has none."""
         raise Unsupported(f"{type(self).__name__} gives no step Jacobians: use a backend with jacobians()")
 
     def centred(self, w: np.ndarray) -> np.ndarray:
-        """Return noise ``(n_w, B)`` with zeros for theta or the actions, and the scene's own noise unchanged."""
+        """Return noise ``(n_w, B)`` with the noise on theta or actions set to 0, and the scene's own noise unchanged."""
         centred = np.zeros_like(w)
         if count := self.program.exogenous:
             centred[-count:] = w[-count:]
         return centred
 
     def directions(self, w: np.ndarray) -> np.ndarray:
-        """Return standard normal directions in theta space, ``(d, B)``, taken from ``w``.
+        """Return standard normal directions in theta space, ``(d, B)``: the first d rows of ``w``.
 
         Raises :class:`Unsupported` if a sample has fewer than d normal numbers.
         """

@@ -22,16 +22,16 @@ from bench.model.parameters import Plugin, traced
 from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, MechanicalScene, ProcessNoiseScene, Scene
 
 SURROGATE = "the gradient is a surrogate, not the derivative of the program"
-"""The remark in rows, tables and charts if :attr:`Program.surrogate` is true."""
+"""The note in rows, tables and charts if :attr:`Program.surrogate` is true."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """The meaning of theta, and the point at which gradients are taken.
+    """The choice of theta, and the point at which gradients are computed.
 
-    Without ``names`` theta is the scene's own decision variable. With ``names`` it consists of these float parameters
-    of the scene or its contact law (``mass``, or ``pushing.mass`` and ``penalty.stiffness`` if both have the name), and
-    noise is on theta. ``at`` replaces the scene's own value of theta.
+    Without ``names``, theta is the scene's own decision variable. With ``names``, theta consists of these float
+    parameters of the scene or its contact law, and noise is on theta. A name is ``mass``, or ``pushing.mass`` if scene
+    and law both have a parameter ``mass``. ``at`` replaces the scene's own value of theta.
     """
 
     names: tuple[str, ...] = ()
@@ -39,9 +39,9 @@ class Decision:
 
 
 N_TRIALS = 8
-"""Number of random thetas per size at which the initial state is compared with that of theta0."""
+"""Number of random thetas per perturbation size at which the initial state is compared with the one at theta0."""
 OWN = Decision()
-"""The scene's own theta at the scene's own value."""
+"""The default decision: the scene's own theta at its own value."""
 
 
 class Program(ABC):
@@ -59,10 +59,10 @@ class Program(ABC):
         self.decision = decision
         self._named = tuple(self._place(name) for name in decision.names)
         self._varying: tuple[tuple[str, str], ...] = ()
-        """Parameters (axis, name) that are arrays ``(B,)``: those in theta, after :meth:`_own_theta` has set them."""
+        """(axis, name) of the parameters whose values are arrays ``(B,)``, set from theta by :meth:`_own_theta`."""
         if isinstance(contact, ImpulseLaw) and integrator is not None and not integrator.takes_impulses:
             raise Unsupported(f"integrator {integrator.name} cannot apply the impulses of contact law {contact.name}")
-        # computed here, since the parameters of a bound program may be traced values
+        # computed before binding, since the parameters of a bound program may be traced values
         self._scene_theta0 = scene.theta0() if self._named else np.empty(0)
         if decision != OWN:
             self._check_decision()
@@ -104,12 +104,12 @@ class Program(ABC):
 
     @property
     def surrogate(self) -> bool:
-        """Whether its contact law replaces the derivative of the program by a surrogate gradient."""
+        """Whether the contact law replaces the derivative of the program by a surrogate gradient."""
         return self.contact is not None and self.contact.surrogate
 
     @cached_property
     def theta0(self) -> np.ndarray:
-        """The decision variable at which gradients are taken, ``(d,)``."""
+        """The theta at which gradients are computed, ``(d,)``."""
         if self.decision.at is not None:
             return np.array(self.decision.at, dtype=np.float64)
         if self._named:
@@ -133,7 +133,7 @@ class Program(ABC):
 
     @property
     def noise_on_theta(self) -> bool:
-        """Whether the noise of J is noise on theta, so that the score is w / sigma.
+        """Whether the noise in J acts on theta, so that the score is w / sigma.
 
         True for parameter noise, and for action noise if theta is the sequence of controls. False under a feedback
         policy.
@@ -142,9 +142,9 @@ class Program(ABC):
 
     @property
     def explicit(self) -> bool:
-        """Whether theta affects the cost, or the input of a policy, other than through the mean of the actions.
+        """Whether theta affects the cost, or the states that a policy observes, other than through the mean actions.
 
-        Then E[f score] lacks the derivative of f along that path, see :meth:`explicit_cost`.
+        E[f score] then lacks the explicit derivative of f, see :meth:`explicit_cost`.
         """
         return False
 
@@ -155,12 +155,12 @@ class Program(ABC):
 
     @property
     def n_noise(self) -> int:
-        """n_w, the number of normal numbers of one rollout."""
+        """n_w, the number of normal numbers per rollout."""
         return self.dim + self.exogenous
 
     @cached_property
     def structure(self) -> tuple[Any, ...]:
-        """All that determines the computation graph: programs of equal structure differ only in :meth:`parameters`."""
+        """A key for the computation graph: programs with equal keys differ only in :meth:`parameters`."""
         parts = []
         for axis, plugin in self.parts.items():
             changing = set(traced(plugin))
@@ -169,22 +169,22 @@ class Program(ABC):
         return (*parts, self._named, self._scene_theta0.tobytes()) if self._named else tuple(parts)
 
     def parameters(self) -> np.ndarray:
-        """Return the float parameters of all plugins, which may be traced, ``(p,)``."""
+        """Return the float parameters of all plugins, which a backend may trace, ``(p,)``."""
         return np.array(
             [getattr(plugin, name) for plugin in self.parts.values() for name in traced(plugin)], dtype=np.float64
         )
 
     def bind(self, parameters: Any) -> Program:
-        """Return a copy of this program with other values, possibly traced, for :meth:`parameters`."""
-        _ = self.explicit  # cached in the copy, since it cannot be computed from traced values
+        """Return a copy of this program with the values ``parameters (p,)``, possibly traced, see :meth:`parameters`."""
+        _ = self.explicit  # caches the value for the copy, in which it cannot be computed from traced values
         places = [(axis, name) for axis, plugin in self.parts.items() for name in traced(plugin)]
         return self._with(dict(zip(places, parameters, strict=False)))
 
     def _with(self, values: dict[tuple[str, str], Any]) -> Program:
-        """Return a copy of this program with other values for some parameters, by axis and name."""
+        """Return a copy of this program with new parameter values, given by (axis, name)."""
         bound = copy.copy(self)
         for axis, plugin in self.parts.items():
-            # plugins are frozen: values are set on a copy that belongs to this program only
+            # plugins are frozen: values are set on a copy that only this program uses
             twin = copy.copy(plugin)
             for name in traced(plugin):
                 if (axis, name) in values:
@@ -193,7 +193,7 @@ class Program(ABC):
         return bound
 
     def _place(self, name: str) -> tuple[str, str]:
-        """Return the axis and parameter that a name in theta refers to; raises :class:`UserError` if there is none."""
+        """Return (axis, parameter) of a name in theta; raises :class:`UserError` if it is unknown or ambiguous."""
         owner, _, parameter = name.rpartition(".")
         parts = {axis: part for axis, part in (("scene", self.scene), ("contact", self.contact)) if part is not None}
         known = {axis: [f for f in traced(part) if f != "sigma"] for axis, part in parts.items()}
@@ -209,7 +209,7 @@ class Program(ABC):
         return places[0], parameter
 
     def _check_moves_program(self, parameter: str) -> None:
-        """Raise :class:`UserError` for a parameter that only sets the scene's own theta, since its derivative would be 0."""
+        """Raise :class:`UserError` if a parameter sets the scene's own theta0 only, since its derivative would be 0."""
         value = getattr(self.scene, parameter)
         if not np.isfinite(value):
             return
@@ -225,41 +225,41 @@ class Program(ABC):
 
     @property
     def _as_declared(self) -> bool:
-        """Whether the scene's known solutions at its own theta0 apply to this program."""
+        """Whether theta and theta0 are the scene's own, so that its known solutions apply to this program."""
         at = self.decision.at
         return not self._named and (at is None or bool(np.array_equal(at, self.scene.theta0())))
 
     def closed_form_gradient(self) -> np.ndarray | None:
-        """Return grad J_sigma at theta0, ``(d,)``, or None if the scene does not know it."""
+        """Return the closed form of grad J_sigma at theta0, ``(d,)``, or None if unknown."""
         return self.scene.closed_form_gradient(self.contact, self.integrator) if self._as_declared else None
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Return grad f of the physics at theta0, ``(d,)``, or None if the scene does not know it."""
+        """Return grad f of the physics (rigid contact, dt -> 0) at theta0, ``(d,)``, or None if unknown."""
         return self.scene.physical_gradient() if self._as_declared else None
 
     def physical_cost(self) -> float | None:
-        """Return f of the physics at theta0, or None if the scene does not know it."""
+        """Return f of the physics (rigid contact, dt -> 0) at theta0, or None if unknown."""
         return self.scene.physical_cost() if self._as_declared else None
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return, per coordinate of theta, the known positions of jumps and kinks of the cost."""
+        """Return, per coordinate of theta, the known positions of the cost's jumps and kinks."""
         return () if self._named else self.scene.breakpoints()
 
     # ------------------------------------------------------------------------------------------ evaluation
 
     @abstractmethod
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
-        """Return f(theta, w) for ``theta (d, 1)`` or ``(d, B)`` and ``w (n_w, B)``: ``(B,)``."""
+        """Return the costs f(theta, w) for ``theta (d, 1)`` or ``(d, B)`` and ``w (n_w, B)``: ``(B,)``."""
 
     def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
-        """Return ``(B,)`` whose gradient by ``theta_scored`` at ``theta_scored = theta`` is the score.
+        """Return numbers ``(B,)`` whose gradient with respect to ``theta_scored``, at theta, is the score.
 
-        By default this is w . theta_scored / sigma, for noise on theta.
+        By default, for noise on theta, they are w . theta_scored / sigma.
         """
         return ops.xp.sum(w[: self.dim] * theta_scored, axis=0) / self.scene.sigma
 
     def explicit_cost(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> Array:
-        """Return the cost at ``theta_moved`` under the actions that theta and w determine, ``(B,)``.
+        """Return the cost at ``theta_moved`` under the actions of a rollout with theta and w, ``(B,)``.
 
         With E over the actions, grad J = E[f score + d explicit_cost / d theta_moved] (Williams 1992 for the score,
         Schulman et al. 2015, eq. 3, for both). Needed only if the program is :attr:`explicit`.
@@ -267,7 +267,7 @@ class Program(ABC):
         return self.cost(ops, theta, w)
 
     def _own_theta(self, xp: Any, theta: Array, w: Array) -> tuple[Program, Array]:
-        """Return the program with the parameter values from theta, ``(B,)`` each, and the scene's own theta ``(d', B)``."""
+        """Return the program with parameters from noisy theta, each ``(B,)``, and the scene's own theta ``(d', B)``."""
         noisy = theta + self.scene.sigma * w
         values = {place: noisy[i] for i, place in enumerate(self._named)}
         bound = self._with(values)
@@ -283,7 +283,7 @@ class FunctionProgram(Program):
     scene: FunctionScene
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
-        """Return the scene's cost at theta + sigma w, ``(B,)``; with its own noise, w are the first d numbers."""
+        """Return the scene's cost at theta + sigma w, ``(B,)``; the scene's own noise follows the first d rows of w."""
         if self.exogenous:
             w, own_noise = w[: self.dim], w[self.dim :]
         bound, own = self._own_theta(ops.xp, theta, w) if self._named else (self, theta + self.scene.sigma * w)
@@ -323,7 +323,7 @@ class Rollout(Program):
 
     @property
     def noise_on_theta(self) -> bool:
-        """Whether noise is on theta: parameter noise, or action noise if theta is the sequence of controls only."""
+        """Whether noise is on theta: parameter noise, or action noise if theta is only the sequence of controls."""
         return not self.action_noise or (self.scene.open_loop and self._only_controls and not self._moves_start)
 
     @property
@@ -333,13 +333,13 @@ class Rollout(Program):
 
     @property
     def _only_controls(self) -> bool:
-        """Whether u_t = theta_t + sigma w_t. A scene that defines its control law may use theta differently."""
+        """Whether the scene uses the default control law, without feedback: u_t = theta_t + sigma w_t if open-loop."""
         scene = type(self.scene)
         return all(getattr(scene, law) is getattr(MechanicalScene, law) for law in ("planned_controls", "feedback"))
 
     @cached_property
     def _moves_start(self) -> bool:
-        """Whether the initial state depends on theta, tested at theta0 and at random thetas near to it and far from it."""
+        """Whether the initial state depends on theta, tested at theta0 and at random thetas near and far from it."""
         draw = np.random.default_rng(0)
         theta = self.scene.theta0()[:, None]
         sizes = np.repeat([1e-3, self.scene.sigma, 1.0 + float(np.abs(theta).max(initial=0.0))], N_TRIALS)
@@ -350,7 +350,7 @@ class Rollout(Program):
 
     @property
     def n_noise(self) -> int:
-        """n_w: one number per control, or one per coordinate of theta and one per gust."""
+        """n_w: for action noise one number per control; else d, plus the process-noise values."""
         return self.scene.controls * self.scene.n_u if self.action_noise else self.dim + self.exogenous
 
     @property
@@ -364,12 +364,12 @@ class Rollout(Program):
         return program._rollout(ops, theta, w, None)[0]
 
     def log_probability(self, ops: Ops, theta: Array, theta_scored: Array, w: Array) -> Array:
-        """Return sum_t w_t . pi(theta_scored, x_t) / sigma along the states x_t of theta and w, ``(B,)``.
+        """Return sum_t w_t . pi(theta_scored, x_t) / sigma along the rollout's states x_t, ``(B,)``.
 
-        This is the part of log p(actions) that is linear in the change of the policy. If the program is
-        :attr:`explicit`, the states are those of ``theta_scored`` under the same actions.
+        This is the part of log p(actions) that is linear in the change of the policy pi. The rollout uses theta and w.
+        If the program is :attr:`explicit`, it starts at the initial state of ``theta_scored`` with the same actions.
         """
-        # a control that is held is drawn once but counted at each of its steps
+        # a held control is drawn once, but the sum contains it at each of its steps
         scale = self.scene.sigma * (self.scene.horizon // self.scene.controls)
         if self.explicit:
             return self._replayed(ops, theta, theta_scored, w)[1] / scale
@@ -380,7 +380,7 @@ class Rollout(Program):
         return self._replayed(ops, theta, theta_moved, w)[0]
 
     def resolved(self, ops: Ops, theta: Array, w: Array) -> tuple[Rollout, Array, Array]:
-        """Return program, theta and noise after setting the parameters in theta; unchanged if theta names none."""
+        """Return program, theta and noise with the named parameters set from theta; unchanged if none are named."""
         if not self._named:
             return self, theta, w
         bound, own = self._own_theta(ops.xp, theta, w[: self.dim])
@@ -389,7 +389,7 @@ class Rollout(Program):
         return bound, own, ops.xp.concat([no_noise, w[self.dim :]], axis=0) if self.exogenous else no_noise
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
-        """Return the state after one step."""
+        """Return the state after one integrator step under the control ``u (n_u, B)``."""
         if self._varying and self.needs_root:
             ops = _VaryingOps(ops, [(self.parts[axis], name) for axis, name in self._varying])
         return self.integrator.step(Dynamics(ops, self.scene, self.contact), state, u, self.scene.dt)
@@ -406,9 +406,9 @@ class Rollout(Program):
         yield state, u
 
     def start(self, ops: Ops, theta: Array, w: Array) -> tuple[Array, State, tuple[Array, ...]]:
-        """Return theta plus its noise, the initial state, and the control law's inputs of each step.
+        """Return theta plus its noise, the initial state, and the control law's inputs, each ``(horizon, n_u, B)``.
 
-        The inputs are the plan and the noise on the actions or the gusts.
+        The inputs are the open-loop controls, if any, then the noise on the actions or the gusts.
         """
         scene, xp = self.scene, ops.xp
         shape = (scene.horizon, scene.n_u, w.shape[1])
@@ -423,12 +423,12 @@ class Rollout(Program):
         if planned is not None:
             scanned.insert(0, xp.broadcast_to(planned, shape))
         start = scene.initial_state(xp, theta)
-        # theta (d, 1) gives a single column, but the carry of the scan has all B
+        # theta (d, 1) yields a single column, but the scan's carry needs all B columns
         state = State(*(xp.broadcast_to(part, (part.shape[0], w.shape[1])) for part in start))
         return theta, state, tuple(scanned)
 
     def control(self, ops: Ops, theta: Array, state: State, slices: tuple[Array, ...]) -> Array:
-        """Return u_t = plan + feedback + sigma w_t, ``(n_u, B)``, with the scene's gusts instead of sigma w_t if it has any."""
+        """Return u_t = plan + feedback + sigma w_t (or plus gusts, under process noise), ``(n_u, B)``."""
         scene, xp = self.scene, ops.xp
         parts = list(slices)
         if self.action_noise:
@@ -443,7 +443,7 @@ class Rollout(Program):
         theta, state, scanned = self.start(ops, theta, w)
         planned_scored = None if theta_scored is None else scene.planned_controls(xp, theta_scored)
         extra = () if planned_scored is None else (planned_scored,)
-        # a scan's carry must keep its shape and type from the first step on
+        # a scan's carry must have a constant shape and type
         zero = xp.zeros_like(w[0, :])
 
         def step(carry: tuple[State, Array, Array], slices: tuple[Array, ...]) -> tuple[State, Array, Array]:
@@ -460,7 +460,10 @@ class Rollout(Program):
         return cost + scene.terminal_cost(xp, state.q, state.v), logp
 
     def _replayed(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> tuple[Array, Array]:
-        """Return cost and sum_t w_t . pi(theta_moved, x_t) along the states of ``theta_moved`` under theta's actions."""
+        """Return cost and sum_t w_t . pi(theta_moved, x_t), each ``(B,)``, along the states x_t.
+
+        The states start at the initial state of ``theta_moved``, under the actions of a rollout with theta and w.
+        """
         scene, xp = self.scene, ops.xp
         theta, first, scanned = self.start(ops, theta, w)
         theta_moved, second, scanned_moved = self.start(ops, theta_moved, w)
@@ -478,17 +481,17 @@ class Rollout(Program):
             cost = cost + scene.stage_cost(xp, moved.q, moved.v, u)
             return self.step(ops, state, u), self.step(ops, moved, u), cost, logp
 
-        # of the moved program only the plan is needed in addition, since its noise is the same
+        # the second rollout needs only its own plan, since both have the same noise
         inputs = scanned + scanned_moved[:-1]
         _, last, cost, logp = ops.scan(step, (first, second, zero, zero), inputs, scene.horizon)
         return cost + scene.terminal_cost(xp, last.q, last.v), logp
 
 
 class _VaryingOps:
-    """Operations for a program in which some parameters differ between columns.
+    """Operations for a program whose named parameters differ between columns.
 
-    A residual reads its parameters from the scene and the law. A solver that processes columns one by one would read
-    the values of all columns, so the solver gets the values as arguments and each residual uses those of its column.
+    A residual reads parameters from the scene and the law, with the values of all columns. A solver that processes
+    columns one by one needs the values of one column, so they are passed as arguments of the residual.
     """
 
     def __init__(self, ops: Ops, places: list[tuple[Plugin, str]]) -> None:
@@ -501,11 +504,11 @@ class _VaryingOps:
         return self._ops.xp
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Call the backend's ``scan``."""
+        """Return the last carry of the backend's ``scan``."""
         return self._ops.scan(step, carry, xs, length)
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Call the backend's ``root`` with the parameters among the arguments."""
+        """Return the backend's ``root``, with the parameter values passed as additional arguments."""
         whole = [getattr(plugin, name) for plugin, name in self._places]
 
         def of_columns(z: Array, both: Any) -> Array:
@@ -519,7 +522,7 @@ class _VaryingOps:
         return self._ops.root(of_columns, guess, (args, whole))
 
     def _set(self, values: list[Array]) -> None:
-        # the plugins are copies that belong to one evaluation, see Program._with
+        # the plugins are copies that only this evaluation uses, see Program._with
         for (plugin, name), value in zip(self._places, values, strict=True):
             object.__setattr__(plugin, name, value)
 
@@ -527,7 +530,7 @@ class _VaryingOps:
 def compose(
     scene: Scene, contact: ContactLaw | None = None, integrator: Integrator | None = None, decision: Decision = OWN
 ) -> Program:
-    """Return the program of a scene with a contact law and an integrator, each None if the scene has none.
+    """Return the program of a scene, contact law and integrator; law and integrator are None if the scene has none.
 
     Raises :class:`Unsupported` for an invalid combination and :class:`UserError` for an invalid theta.
     """

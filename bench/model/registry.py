@@ -1,9 +1,9 @@
-"""Finds plugins and reports whether they are available.
+"""The registry of plugins: finds plugins and reports whether they are available.
 
-Built-in plugins are the files under ``plugins/<kind>/`` and the folders under ``bench/studies/``; others come from
+Built-in plugins are the files under ``plugins/<kind>/`` and the folders under ``bench/studies/``. Others come from
 folders passed to :func:`add_folder` and from the entry-point group ``bench.plugins``, in which each entry names a
-plugin class. Importing a plugin must stay cheap: it names heavy libraries in ``requires`` and imports them when it is
-used.
+plugin class. Importing a plugin must be fast: a plugin lists heavy libraries in ``requires`` and imports them only when
+it runs.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from bench.model import guard, trial
 from bench.model.parameters import Plugin, build, parameters, remember, singular
 
 CORE = "bench.studies"
-"""The package of the built-in studies, whose import is not tried in a separate process."""
+"""The package of the built-in studies, which are imported without a trial in a separate process."""
 BUILT_IN = ("bench.plugins", CORE)
 KINDS = ("scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "studies")
-"""The kinds that come with the package, in the order in which they are listed; a plugin may declare another."""
+"""The built-in kinds, in listing order. A plugin may declare another kind."""
 ENTRY_POINT_GROUP = "bench.plugins"
 NAME = re.compile(r"\w[\w.-]*")
-"""Names of plugins. Brackets, commas and spaces have a meaning in identity strings, so names contain none."""
+"""Pattern of plugin names. Brackets, commas and spaces are syntax of identity strings, so names contain none."""
 MAX_REASON_CHARACTERS = 1000
-"""Characters of a reason that are kept."""
+"""Maximum length of a stored reason."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Entry:
 
     @property
     def available(self) -> bool:
-        """Whether it can be used."""
+        """Whether the plugin is loaded and its required modules are installed."""
         return not self.reason
 
 
@@ -63,7 +63,7 @@ _folders: list[Path] = []
 
 
 def add_folder(path: Path) -> None:
-    """Register the plugins in a folder's ``.py`` files and its subfolders; raises :class:`UserError` for a non-folder."""
+    """Register the plugins in a folder and its subfolders; raises :class:`UserError` if ``path`` is not a folder."""
     path = path.expanduser().absolute()
     if not path.is_dir():
         raise UserError(f"plugins={path} is not a folder")
@@ -81,7 +81,7 @@ def folders() -> tuple[Path, ...]:
 
 
 def _package(path: Path) -> str:
-    """Return a package name unique to the folder and equal in every process, so that its plugins can be pickled."""
+    """Return the folder's package name, which is unique and the same in every process, so that plugins can be pickled."""
     return f"bench_folder_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
 
 
@@ -108,7 +108,7 @@ def entries() -> Table:
                 raise TypeError(f"{point.value} is not a plugin class")
         except KeyboardInterrupt:
             raise
-        except BaseException as error:  # even a plugin that exits at import must not end the command
+        except BaseException as error:  # includes SystemExit: a plugin must not end the command
             _add_unavailable(table, _guess_kind(point.name), point.name, error)
         else:
             _add(table, plugin)
@@ -116,10 +116,10 @@ def entries() -> Table:
 
 
 def entries_with(kind: str, package: str) -> dict[str, Entry]:
-    """Return the plugins of one kind by name: those of a package, of the entry points ``bench.KIND``, and registered ones.
+    """Return all plugins of one kind by name: from a package, from entry points ``bench.KIND`` and from the registry.
 
-    For a kind that only one command uses: no other command imports the package. An entry point names a plugin class or a
-    module of several.
+    For a kind that only one command uses, so that other commands do not import the package. An entry point names a
+    plugin class or a module with several.
     """
     table: Table = {kind: {}}
     for _, module in _modules(importlib.import_module(package)):
@@ -144,12 +144,12 @@ def entries_with(kind: str, package: str) -> dict[str, Entry]:
 
 
 def kinds() -> list[str]:
-    """Return the kinds of all plugins, those that come with the package first."""
+    """Return the kinds of all plugins, built-in kinds first."""
     return list(entries())
 
 
 def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
-    """Yield the kind (the name of its folder) and the full name of each module of a package and of its folders."""
+    """Yield (kind, full name) of each module in a package and its subfolders; the kind is the module's folder name."""
     for module in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
         name = f"{package.__name__}.{module.name}"
         if module.name in KINDS:
@@ -157,7 +157,7 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
         else:
             yield package.__name__.rpartition(".")[2], name
     for folder in sorted(path for place in package.__path__ for path in Path(place).iterdir()):
-        # folders without __init__.py are packages too, and pkgutil does not list them
+        # folders without __init__.py are (namespace) packages too, but pkgutil does not list them
         bare = folder.is_dir() and folder.name.isidentifier() and not (folder / "__init__.py").exists()
         if bare and any(folder.glob("*.py")):
             space = importlib.import_module(f"{package.__name__}.{folder.name}")
@@ -173,14 +173,14 @@ def _load_module(table: Table, kind: str, path: str, fatal: str) -> None:
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        # a broken plugin is listed with its error: it must not hide the others, nor end the command by sys.exit()
+        # a broken plugin is listed with its error, so that it neither hides the others nor ends the command (sys.exit)
         _add_unavailable(table, kind if kind in table else "estimators", path.rpartition(".")[2], error)
         return
     _add_members(table, kind, module)
 
 
 def _add_members(table: Table, kind: str, module: ModuleType) -> None:
-    """Add the plugin classes that a module defines."""
+    """Add the plugin classes that a module defines to the table."""
     for name, plugin in list(vars(module).items()):
         try:
             own = isinstance(plugin, type) and str(plugin.__module__).startswith(module.__name__)
@@ -198,7 +198,7 @@ def _guess_kind(name: str) -> str:
 
 def _add_unavailable(table: Table, kind: str, name: str, error: BaseException, problem: str = "import failed") -> None:
     message = printable(error)[:MAX_REASON_CHARACTERS]
-    while name in table[kind]:  # an available plugin keeps its name
+    while name in table[kind]:  # do not replace an entry of the same name
         name += " (another)"
     table[kind][name] = Entry(kind, name, None, f"{problem}: {type(error).__name__}: {message}")
 
@@ -213,7 +213,7 @@ def _add(table: Table, plugin: type[Plugin]) -> None:
         _add_unavailable(table, kind, where, error, "cannot be used")
         return
     if faults:
-        # listed by its module: its own name may be invalid, and classes of several files may share a name
+        # listed by its full class path: its own name may be invalid, and classes of several files may share a name
         kind_entries[where] = Entry(kind, where, None, f"cannot be used: {faults}")
         return
     taken = kind_entries.get(plugin.name)
@@ -230,7 +230,7 @@ def _add(table: Table, plugin: type[Plugin]) -> None:
 
 
 def _faults(plugin: type[Plugin]) -> str:
-    """Return why a class cannot be a plugin, or an empty string. Reading its parameters may raise any exception."""
+    """Return why a class is not a valid plugin, or an empty string. Reading its parameters may raise any exception."""
     if not (isinstance(plugin.kind, str) and plugin.kind.isidentifier()):
         return f"kind={printable(repr(plugin.kind))[:MAX_REASON_CHARACTERS]} must be a name"
     if not (isinstance(plugin.name, str) and NAME.fullmatch(plugin.name)):
@@ -254,7 +254,7 @@ def _missing(plugin: type[Plugin]) -> str:
 
 
 def installed(module: str) -> bool:
-    """Return whether a module can be imported, without importing it or its parents."""
+    """Return whether a module is installed, without importing the module or its parents."""
     first, *inner = module.split(".")
     spec = importlib.util.find_spec(first)
     for part in inner:
@@ -265,7 +265,7 @@ def installed(module: str) -> bool:
 
 
 def find(kind: str, name: str) -> Entry:
-    """Return the entry of that name; raises :class:`UserError` with the nearest name if there is none."""
+    """Return the entry of a plugin; raises :class:`UserError` with the nearest name if there is none."""
     table = entries().get(kind, {})
     if name not in table:
         raise unknown(singular(kind), name, table)
@@ -273,7 +273,7 @@ def find(kind: str, name: str) -> Entry:
 
 
 def usable(kind: str, name: str) -> type[Plugin]:
-    """Return the plugin class of that name; raises :class:`UserError` if there is none or it could not be loaded."""
+    """Return a plugin class; raises :class:`UserError` if the name is unknown or the class could not be loaded."""
     entry = find(kind, name)
     if entry.plugin is None:
         raise UserError(f"{singular(kind)} '{name}' cannot be used: {entry.reason}")
@@ -281,12 +281,12 @@ def usable(kind: str, name: str) -> type[Plugin]:
 
 
 def make(kind: str, name: str, values: Mapping[str, Any] | None = None) -> Any:
-    """Return an instance of the plugin of that name with checked parameter values."""
+    """Return an instance of a plugin with validated parameter values; raises :class:`UserError` if invalid."""
     return build(usable(kind, name), values or {})
 
 
 def kind_of(axis: str) -> str:
-    """Return the kind of plugins on an axis: ``scenes`` for ``scene``; raises :class:`UserError` if there is none."""
+    """Return the kind of an axis: ``scenes`` for ``scene``; raises :class:`UserError` for an unknown axis."""
     known = _by_axis(tuple(kinds()))
     if axis not in known:
         raise unknown("axis", axis, known)

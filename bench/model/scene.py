@@ -1,4 +1,4 @@
-"""The contract of a scene, a minimal physical problem, and its roles: contact, friction, damping, engine twin, ..."""
+"""The contract of a scene, a minimal physical problem, and its roles (mixins): contact, friction, engine twin, ..."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bench.model.parameters import Plugin, param
 
 @dataclass(frozen=True)
 class Scene(Plugin):
-    """A problem with decision variable theta, noise and cost. It models only the effects that its question needs.
+    """A problem with decision variable theta, noise and cost. It models only the effects that it studies.
 
     ``J_sigma(theta) = E_w f(theta, w)`` with ``w ~ N(0, I)``; ``sigma`` always multiplies w.
     """
@@ -26,11 +26,11 @@ class Scene(Plugin):
     neglected_effects: ClassVar[str] = ""
     """The effects that the scene does not model, in a few words."""
     backends: ClassVar[tuple[str, ...]] = ()
-    """Names of the backends that can run it; empty for all backends with an array namespace."""
+    """Names of the backends that can run the scene; empty: all backends with an array namespace."""
     continuous: ClassVar[bool] = True
     """Whether the cost is continuous in theta, provided that the contact law is continuous."""
     identifies: ClassVar[bool] = False
-    """Whether theta consists of parameters of the scene to be identified, with a cost that compares it with a record."""
+    """Whether theta consists of scene parameters to be identified, and the cost compares the motion with a record."""
 
     sigma: float = param(0.1, "standard deviation of the Gaussian noise in J", positive=True)
     noise: str = param("parameter", "whether noise is on theta or on the actions of each step", choices=("parameter",))
@@ -40,19 +40,19 @@ class Scene(Plugin):
         """Return the decision variable at which gradients are estimated, ``(d,)``."""
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return, per coordinate of theta, the positions of jumps and kinks of the cost, as edges of quadrature panels."""
+        """Return, per coordinate of theta, the positions of the cost's jumps and kinks, which split quadrature panels."""
         return ()
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray | None:
-        """Return grad J_sigma at :meth:`theta0` of the *program* (the scene with this law and integrator), or None."""
+        """Return grad J_sigma of the *program* (scene, law and integrator) at :meth:`theta0`, ``(d,)``, or None."""
         return None
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Return grad f at :meth:`theta0`, without noise, of the *physics* (rigid contact, dt -> 0), or None."""
+        """Return grad f of the *physics* (rigid contact, dt -> 0) at :meth:`theta0`, without noise, ``(d,)``, or None."""
         return None
 
     def physical_cost(self) -> float | None:
-        """Return f at :meth:`theta0`, without noise, of the physics (rigid contact, dt -> 0), or None."""
+        """Return f of the physics (rigid contact, dt -> 0) at :meth:`theta0`, without noise, or None."""
         return None
 
 
@@ -62,15 +62,15 @@ class FunctionScene(Scene):
 
     @abstractmethod
     def cost(self, xp: Any, x: Array) -> Array:
-        """Return f at ``x (d, B)``: ``(B,)``."""
+        """Return the cost f at ``x (d, B)``: ``(B,)``."""
 
 
 @dataclass(frozen=True)
 class DisturbedScene(FunctionScene):
     """A role: a plain function with its own noise in addition to the noise on theta.
 
-    ``J_sigma(theta) = E f(theta + sigma u, e)`` over both: d normal numbers u, then ``exogenous`` numbers e of the
-    scene. No estimator shifts e for smoothing, and no score depends on it.
+    ``J_sigma(theta) = E f(theta + sigma u, e)``: the mean over d normal numbers u and the scene's ``exogenous`` normal
+    numbers e. Smoothing estimators do not shift e, and the score does not depend on it.
     """
 
     exogenous: ClassVar[int]
@@ -78,31 +78,31 @@ class DisturbedScene(FunctionScene):
 
     @abstractmethod
     def disturbed_cost(self, xp: Any, x: Array, e: Array) -> Array:
-        """Return f at ``x (d, B)`` under the scene's own noise ``e (exogenous, B)``: ``(B,)``."""
+        """Return the cost f at ``x (d, B)`` under the scene's own noise ``e (exogenous, B)``: ``(B,)``."""
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """Return f without the scene's own noise, ``(B,)``."""
+        """Return the cost f without the scene's own noise, ``(B,)``."""
         return self.disturbed_cost(xp, x, xp.zeros((self.exogenous, x.shape[1]), dtype=x.dtype))
 
 
 @dataclass(frozen=True)
 class MechanicalScene(Scene):
-    """A scene with dynamics ``q' = v``, ``v' = acceleration(q, v, u) + contact``, ``horizon`` steps of ``dt``.
+    """A scene with dynamics ``q' = v``, ``v' = acceleration(q, v, u) + contact``, over ``horizon`` steps of ``dt``.
 
-    Derive from :class:`ContactScene` for bodies in contact and from :class:`FrictionScene` for Coulomb friction. Mix in
-    :class:`EngineTwin` for a physics engine's model of the scene and :class:`Oscillator` if its motion is linear.
+    Derive from :class:`ContactScene` for bodies in contact, from :class:`FrictionScene` for Coulomb friction, from
+    :class:`EngineTwin` for a physics engine's model of the scene, and from :class:`Oscillator` for linear motion.
     """
 
     n_q: ClassVar[int]
     n_v: ClassVar[int | None] = None
-    """Length of v if it differs from that of q: n_q = 0 with n_v = 1 is a first-order scene v' = acceleration(v)."""
+    """Length of v; None: n_q. A scene with n_q = 0 and n_v = 1 is first-order: v' = acceleration(v)."""
     n_u: ClassVar[int] = 0
     n_contacts: ClassVar[int] = 0
     """Number of contacts; more than 0 only in a :class:`ContactScene` or an :class:`EngineScene`."""
     open_loop: ClassVar[bool] = False
     """Whether theta is the sequence of controls, step by step."""
     contact_values: ClassVar[Mapping[str, Any]] = {}
-    """Values for parameters of any contact law of the scene, unless the user sets them."""
+    """Default values for parameters of the scene's contact laws; the user's values have priority."""
 
     horizon: int = param(100, "number of time steps", "steps", positive=True)
     dt: float = param(0.01, "length of a time step", "s", positive=True)
@@ -135,15 +135,15 @@ class MechanicalScene(Scene):
 
     @property
     def controls(self) -> int:
-        """Number of controls in a rollout: one per step unless a :class:`ZeroOrderHoldScene` holds them."""
+        """Number of controls in a rollout: one per step, except in a :class:`ZeroOrderHoldScene`."""
         return self.horizon
 
     def held(self, xp: Any, values: Array) -> Array:
-        """Repeat values per control, ``(controls, ...)``, for each step, ``(horizon, ...)``."""
+        """Return values per control, ``(controls, ...)``, repeated for each step, ``(horizon, ...)``."""
         return values
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array | None:
-        """Return the feedback part of the control law, ``(n_u, B)``, added to the planned one, or None."""
+        """Return the feedback part of the control law, ``(n_u, B)``, or None. It is added to the open-loop part."""
         return None
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array | float:
@@ -151,12 +151,12 @@ class MechanicalScene(Scene):
         return 0.0
 
     def cost_terms(self, xp: Any, q: Array, v: Array, u: Array) -> Mapping[str, Array]:
-        """Return parts of the stage cost by name, each ``(B,)``, that ``trace`` shows separately; none by default."""
+        """Return parts of the stage cost by name, each ``(B,)``, for separate display by ``trace``; none by default."""
         return {}
 
     def carried(self, v: Array) -> Array:
-        """Return the velocity from which a step starts, ``(n_v, B)``, after numerical damping if there is any."""
-        # the factor 1 keeps the compiled operations, and therefore the last digit of stored results, unchanged
+        """Return the velocity at which a step starts, ``(n_v, B)``, after any numerical damping."""
+        # the factor 1 preserves the compiled operations, and therefore the last digit of stored results
         return 1.0 * v
 
 
@@ -175,9 +175,9 @@ class DampedScene(MechanicalScene):
 class ProcessNoiseScene(MechanicalScene):
     """A role: process noise on every control of every step, in addition to the noise on theta.
 
-    ``u_t = plan + feedback + gust e_t`` with ``horizon * n_u`` normal numbers e, which follow the d numbers on theta,
-    so that J averages over both. No estimator shifts e for smoothing, and no score depends on it. The scene decides
-    what u does: a channel may be a wind force, or the relative error of a mass or stiffness in that step.
+    ``u_t = plan + feedback + gust e_t`` with ``horizon * n_u`` normal numbers e, which follow the d numbers on theta.
+    J averages over both. Smoothing estimators do not shift e, and the score does not depend on it. The scene defines
+    the effect of u: a channel may be a wind force, or the relative error of a mass or stiffness in that step.
     """
 
     noise: str = param("parameter", "sigma is the noise on theta; gusts are added to it", choices=("parameter",))
@@ -191,10 +191,10 @@ class ProcessNoiseScene(MechanicalScene):
 
 @dataclass(frozen=True)
 class ZeroOrderHoldScene(MechanicalScene):
-    """A role: each control of an open loop, and its noise, is held over ``hold`` steps (zero-order hold).
+    """A role: each open-loop control, with its noise, is held constant over ``hold`` steps (zero-order hold).
 
-    The step can then be refined at constant theta, noise and duration: multiply ``horizon`` and ``hold`` and divide
-    ``dt`` by the same factor. Divide the stage cost by ``hold`` to keep the objective constant too.
+    The time step can then be refined at constant theta, noise and duration: multiply ``horizon`` and ``hold`` and
+    divide ``dt`` by the same factor. If the stage cost is divided by ``hold``, the objective is constant too.
     """
 
     hold: int = param(1, "steps over which each control and its noise are held", "steps", positive=True)
@@ -214,7 +214,7 @@ class ZeroOrderHoldScene(MechanicalScene):
         return self.horizon // self.hold
 
     def held(self, xp: Any, values: Array) -> Array:
-        """Repeat the values of each control ``hold`` times."""
+        """Return values per control, ``(controls, ...)``, each repeated ``hold`` times, ``(horizon, ...)``."""
         if self.hold == 1:
             return values
         rest = values.shape[1:]
@@ -224,7 +224,7 @@ class ZeroOrderHoldScene(MechanicalScene):
 
 @dataclass(frozen=True)
 class ContactScene(MechanicalScene):
-    """A role: bodies in contact. Set ``n_contacts`` and define the gaps and the effect of contact forces."""
+    """A role: bodies in contact. Set ``n_contacts`` and define the gaps and the accelerations by contact forces."""
 
     restitution: float = param(1.0, "restitution of impulse laws", low=0.0, high=1.0)
 
@@ -267,23 +267,24 @@ class FrictionScene(ContactScene):
 
 
 class EngineTwin(ABC):
-    """A role: the scene also exists as a physics engine's model, its twin."""
+    """A role: the scene also has a physics engine's model, its twin."""
 
     twin_difference: ClassVar[float] = 1e-9
-    """Largest allowed relative difference between the costs of the twin and of the scene's program with ``penalty``."""
+    """Maximum relative difference between the costs of the twin and of the scene's program with ``penalty``."""
 
     @abstractmethod
     def mjcf(self) -> str:
         """Return the scene's twin for physics engines, as the content of an MJCF ``<mujoco>`` element.
 
-        The twin's joints (slides and hinges) are q in order, its motors take u, and its contact pairs are the contacts.
-        The backend sets time step, solver and contact springs. Gravity is zero unless an ``<option>`` sets it.
+        The twin's joints (slides and hinges) are q in order, its motors receive u, and its contact pairs are the
+        scene's contacts. The backend sets time step, solver and contact springs. Gravity is 0 unless an ``<option>``
+        sets it.
         """
 
 
 @dataclass(frozen=True)
 class EngineScene(EngineTwin, MechanicalScene):
-    """A role: the scene exists only as its twin, so that only backends with ``physics`` can run it."""
+    """A role: the scene exists only as an engine's model, so that only backends with ``physics`` can run it."""
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """Raise :class:`Unsupported`: only the engine computes the acceleration."""
@@ -293,8 +294,11 @@ class EngineScene(EngineTwin, MechanicalScene):
 
 
 class Oscillator(ABC):
-    """A role: the scene is a linear oscillator, so that its stability has a closed form."""
+    """A role: the scene is a linear oscillator, whose stability has a closed form."""
 
     @abstractmethod
     def oscillator(self) -> tuple[float, float, float]:
-        """Return stiffness [1/s^2] and damping [1/s] per unit of mass, and velocity factor, for transition matrices."""
+        """Return stiffness [1/s^2] and damping [1/s] per unit of mass, and the velocity factor per step.
+
+        They are the arguments of :meth:`Integrator.transition`.
+        """

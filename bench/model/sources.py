@@ -1,4 +1,4 @@
-"""Hashes of the code that a result depends on: modules, and all that they import from their own package and from bench."""
+"""Hashes of the code that a result depends on: modules and their imports from their own package and from bench."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from bench.model.parameters import remember
 
 
 def code_of(modules: Iterable[str], harmless: Collection[str] = ()) -> dict[str, Path]:
-    """Return the files of modules and of all that they import from their own package and from bench, by module name.
+    """Return the files of modules and of all their imports from their own package and from bench, by module name.
 
-    Modules in or below ``harmless`` are left out, and so is what only they import. Imports for type checking do not
-    count. ``from package import name`` leads to the module that defines the name where the package only passes it on.
+    Modules in or below ``harmless`` are excluded, with the modules that only they import. Imports for type checking are
+    ignored. If a package only re-exports a name, ``from package import name`` counts as an import of the defining
+    module.
     """
     paths: dict[str, Path] = {}
     waiting = list(modules)
@@ -32,7 +33,7 @@ def code_of(modules: Iterable[str], harmless: Collection[str] = ()) -> dict[str,
 
 
 def is_below(module: str, packages: Iterable[str]) -> bool:
-    """Return whether a module is one of some packages or in one.
+    """Return whether a module is one of the packages or lies inside one of them.
 
     >>> is_below("bench.report.tables", ["bench.report"]), is_below("bench.reports", ["bench.report"])
     (True, False)
@@ -41,7 +42,7 @@ def is_below(module: str, packages: Iterable[str]) -> bool:
 
 
 def hash_of(paths: Iterable[Path]) -> str:
-    """Return the hash of the code in files, ignoring their names, docstrings and comments."""
+    """Return one hash of the code in all files, ignoring file names, docstrings and comments."""
     digest = hashlib.sha256()
     for code in sorted(code_hash(path) for path in paths):
         digest.update(code.encode())
@@ -50,35 +51,35 @@ def hash_of(paths: Iterable[Path]) -> str:
 
 @remember
 def code_hash(path: Path) -> str:
-    """Return the hash of a file's syntax tree without docstrings, so that rewording one reruns no cell."""
+    """Return the hash of a file's syntax tree without docstrings, so that a reworded docstring reruns no cell."""
     return hash_of_tree(ast.parse(path.read_bytes()))
 
 
 def hash_of_tree(tree: ast.Module) -> str:
-    """Return the hash of a syntax tree without docstrings, which are removed from it."""
+    """Return the hash of a syntax tree without docstrings. Removes the docstrings from ``tree``."""
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
-            # a body of only a docstring becomes `pass`, as if it had been written that way
+            # a body with only a docstring becomes `pass`, so that it equals a body written as `pass`
             code = [part for part in body if not _is_text(part)]
             node.body = code or [ast.Pass()]  # type: ignore[attr-defined]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
 
 
 def _is_text(node: ast.stmt) -> bool:
-    """Return whether a statement is a string on its own: a docstring, also one of an attribute."""
+    """Return whether a statement is only a string: a docstring, or the docstring of an attribute."""
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
 @cache
 def imports(module: str) -> tuple[str, ...]:
-    """Return the modules that a module imports, at its top or later, from its own package and from bench."""
+    """Return the modules that a module imports, at its top or inside functions, from its own package and from bench."""
     path = file_of(module)
     return () if path is None else tuple(imports_of_tree(ast.parse(path.read_bytes()), module, path))
 
 
 def imports_of_tree(tree: ast.AST, module: str, path: Path) -> Iterator[str]:
-    """Yield the modules that a part of a module's syntax tree imports from its own package and from bench."""
+    """Yield the modules that a syntax tree, or a part of it, imports from the module's own package and from bench."""
     packages = {module.partition(".")[0], "bench"}
     parent = module if path.name == "__init__.py" else module.rpartition(".")[0]
     for node in _run_time_nodes(tree):
@@ -113,7 +114,7 @@ def _origins(base: str, name: str) -> list[str]:
 
 @cache
 def _passed_on(package: str) -> dict[str, list[str]]:
-    """Return the names that a package's ``__init__`` imports from elsewhere, each with the modules that define it."""
+    """Return the names that a package's ``__init__`` re-exports, each with the modules that define it."""
     path = file_of(package)
     assert path is not None
     names: dict[str, list[str]] = {}
@@ -128,7 +129,7 @@ def _passed_on(package: str) -> dict[str, list[str]]:
 
 @remember
 def file_of(module: str) -> Path | None:
-    """Return the Python file of a module; None where there is none. Imports nothing."""
+    """Return the Python file of a module, or None if it has none."""
     parent = module.rpartition(".")[0]
     try:
         if parent and parent not in sys.modules:

@@ -1,9 +1,10 @@
-"""Imports new plugin files in a separate process first, so that a file which ends its process cannot end a command.
+"""Imports new plugin files in a separate trial process first, so that a crashing file cannot end a command.
 
-A crash, ``os._exit`` or an endless loop cannot be caught where it happens. The trial process therefore imports each new
-file, builds its plugins with their defaults and calls the methods that planning a run calls. A file that passes is not
-tried again until its text changes: its hash is stored in ``$XDG_CACHE_HOME/bench/imported`` (by default under
-``~/.cache``). If that folder cannot be written, each command tries the files again, which takes about a second.
+A crash, ``os._exit`` or an endless loop cannot be caught within its own process. The trial process therefore imports
+each new file, builds its plugins with their defaults and calls the methods that are called when a run is planned. A
+file that passes is not tried again until its content changes: its hash is stored in ``$XDG_CACHE_HOME/bench/imported``
+(by default under ``~/.cache``). If that file cannot be written, each command repeats the trial, which takes about a
+second.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from typing import Any
 from bench.model import guard
 
 TIMEOUT_S = 60.0
-"""Seconds that one module may take."""
+"""Time limit of each stage of a module's trial, in seconds."""
 STAGES = {b".": "when it was imported", b",": "when it was built with its defaults and called as for a plan"}
-"""The stage that each byte from the trial process announces."""
+"""Stage of a module's trial, by the byte that the trial process writes at its start."""
 CHILD_CODE = (
     "import json, sys; job = json.load(sys.stdin); sys.path[:] = job['path']; "
     "import bench.model.trial as trial; trial.run_child(job)"
@@ -41,9 +42,9 @@ def find_fatal_modules(
     packages: Mapping[str, Path] = MappingProxyType({}),
     timeout_s: float | None = None,
 ) -> dict[str, str]:
-    """Return, for each module whose import ended or blocked the trial process, what happened.
+    """Return the failure message of each module that ended or blocked the trial process, by module name.
 
-    ``modules`` maps module names to the hashes of their files (:func:`file_hash`), ``packages`` the package names of
+    ``modules`` maps module names to the hashes of their files (:func:`file_hash`). ``packages`` maps package names of
     plugin folders to the folders. A module that only raises an exception is not fatal.
     """
     passed = _load_digests()
@@ -52,7 +53,7 @@ def find_fatal_modules(
     while remaining:
         n_started, failure = _try_imports(remaining, packages, TIMEOUT_S if timeout_s is None else timeout_s)
         if failure and not n_started:
-            return fatal  # the trial process did not start: nothing is known, and the import itself reports the cause
+            return fatal  # the trial process did not start, so the import itself must report the cause
         n_passed = n_started - 1 if failure else len(remaining)
         _store_digests([_digest(name, modules[name]) for name in remaining[:n_passed]])
         if failure:
@@ -62,7 +63,7 @@ def find_fatal_modules(
 
 
 def file_hash(module: str) -> str:
-    """Return the hash of a module's file, or an empty string if there is no file to read."""
+    """Return the hash of a module's file, or an empty string if the file cannot be read."""
     try:
         spec = importlib.util.find_spec(module)
         return hashlib.sha256(Path(spec.origin).read_bytes()).hexdigest() if spec and spec.origin else ""
@@ -71,7 +72,7 @@ def file_hash(module: str) -> str:
 
 
 def run_child(job: Mapping[str, Any]) -> None:
-    """Import and call modules one by one in the trial process, and announce each stage by a byte on the pipe."""
+    """Run the trial process: import and call modules one by one, writing a byte to the pipe before each stage."""
     pid = os.getpid()
     pipe = os.dup(1)
     null = os.open(os.devnull, os.O_RDWR)
@@ -89,11 +90,11 @@ def run_child(job: Mapping[str, Any]) -> None:
         guard.exit_if_forked(pid)
         guard.kill_children()
     os.write(pipe, b"!")
-    os._exit(0)  # does not wait for threads that a plugin has left running
+    os._exit(0)  # without waiting for threads that a plugin has left running
 
 
 def _call_plugins(module: ModuleType) -> None:
-    """Build the plugins of a module and call the methods that planning calls. Exceptions are left to the cells."""
+    """Build a module's plugins and call their methods as when a run is planned. Ignore exceptions: cells report them."""
     import numpy as np
 
     from bench.model.backend import CAPABILITIES
@@ -126,7 +127,7 @@ def _call_plugins(module: ModuleType) -> None:
 
 
 def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: float) -> tuple[int, str]:
-    """Return how many modules a trial process started, and how the last one ended it; empty if all passed."""
+    """Return the number of modules started in a trial process, and how the last one failed (empty if all passed)."""
     command = [sys.executable, "-c", CHILD_CODE]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     job = {
@@ -160,7 +161,7 @@ def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: 
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> None:
-    """Wait a moment for the process to exit, then kill it and the processes that it has started."""
+    """Wait up to 0.5 s for the process to exit, then kill it and the processes that it has started."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(0.5)
     with contextlib.suppress(ProcessLookupError):
@@ -174,7 +175,7 @@ def _exit_description(status: int) -> str:
 
 
 def _digest(name: str, text: str) -> str:
-    """Return the hash under which a module that passed is stored: of its last name, its text and the Python version."""
+    """Return the stored hash of a module that passed: of its last name, its file hash and the Python version."""
     return hashlib.sha256(f"asked {name.rpartition('.')[2]} {text} {sys.version}".encode()).hexdigest()[:24]
 
 

@@ -10,7 +10,7 @@ from bench.model import Backend, CallableProgram, Problem, Program, Unsupported,
 
 @dataclass(frozen=True)
 class CallableBackend(Backend):
-    """Gradients: from the user's own function or library, or central differences of the cost if there is none."""
+    """Gradients: the user's own function or library, or central differences of the cost if there is none."""
 
     name = "callable"
     provides = Backend.provides | {"simulator"}

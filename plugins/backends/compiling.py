@@ -32,10 +32,10 @@ def compiled(
     fresh: bool,
     count: Compilations,
 ) -> Compiled:
-    """Return the executable of ``function`` for arguments of these shapes; ``key`` identifies program and shapes.
+    """Return the executable of ``function`` for the shapes of ``arguments``; ``key`` identifies program and shapes.
 
-    With ``fresh`` the seconds are those of a real compilation: the folder of ``count`` is bypassed, and an executable
-    loaded from it is compiled again. Compilations and requests are added to ``count``.
+    With ``fresh``, the folder of ``count`` is bypassed and an executable loaded from it is compiled again, so that the
+    seconds are a true compile time. Compilations and requests are added to ``count``.
     """
     # one at a time, since JAX's cache folder is a global setting
     with _busy:
@@ -50,9 +50,9 @@ def compiled(
 
 
 def _compile(name: str, function: Callable[..., Any], arguments: tuple[Any, ...], folder: str | None) -> Compiled:
-    """Compile a function and measure the time.
+    """Return the executable of a function, with its compile times.
 
-    Single operations on constants that libraries compile meanwhile add to the seconds but are not counted.
+    Libraries may compile single operations on constants meanwhile. Their time is included, but they are not counted.
     """
     import jax
 

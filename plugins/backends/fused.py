@@ -19,10 +19,10 @@ from .jax import Jax, JaxOps, JaxProblem, use_double_precision
 class Fused(Backend):
     """Gradients: exact derivative of the program by JAX's rules for single operations; float64 or float32; no roots.
 
-    JAX traces the program once for one rollout. The step and its adjoint become scalar code with the loop over time
-    inside, and rollouts are the lanes of vector instructions, so that states stay in registers and cache. Results equal
-    those of ``jax`` up to rounding, ties included. Trajectories, step Jacobians and explicit derivatives come from
-    ``jax`` itself. Programs with an operation that has no scalar form are not supported.
+    JAX traces the program once for one rollout. The step and its adjoint become scalar code with an inner time loop,
+    and rollouts are the lanes of vector instructions, so that states remain in registers and cache. Results equal the
+    results of ``jax`` up to rounding, also at ties. Trajectories, step Jacobians and explicit derivatives are computed
+    by ``jax``. Programs with an operation that has no scalar form are not supported.
     """
 
     name = "fused"
@@ -31,7 +31,7 @@ class Fused(Backend):
     provides = Jax.provides - {"surrogate"}
 
     def compile(self, program: Program) -> Problem:
-        """Return the program as a problem; its kernels are compiled at the first call of each function, for any batch."""
+        """Return the program as a problem. A function's kernel is compiled at its first call, for all batch sizes."""
         use_double_precision()
         return FusedProblem(program, JaxOps(), self.dtype, "reverse")
 
@@ -59,14 +59,14 @@ class _PlainOps(LoopOps):
         super().__init__(jax.numpy)
 
     def scan(self, step: Any, carry: Any, xs: Any, length: int) -> Any:
-        """Run lax.scan."""
+        """Return the last carry of lax.scan."""
         import jax
 
         return jax.lax.scan(lambda state, x: (step(state, x), None), carry, xs, length)[0]
 
 
 class _Structure:
-    """A program that equals other programs of the same structure, as a key of caches."""
+    """A cache key for a program, equal to the keys of all programs with the same structure."""
 
     def __init__(self, program: Program) -> None:
         self.program, self.key = program, program.structure
@@ -114,7 +114,7 @@ class FusedProblem(JaxProblem):
     """A program as compiled kernels for any batch and horizon; float parameters are arguments."""
 
     grain = emit.LANES
-    # fewer columns are finished before another thread has started
+    # a thread with fewer columns takes less time than starting it
     least = 4096
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -129,10 +129,10 @@ class FusedProblem(JaxProblem):
         return self._kernel("score", theta, w, self.dim)[0]
 
     def _kernel(self, function: str, theta: np.ndarray, w: np.ndarray, rows: int) -> tuple[np.ndarray, bool]:
-        """Return a kernel's result ``(rows, B)``, and whether all slopes are so small that all costs must be finite."""
+        """Return a kernel's result ``(rows, B)``, and whether all derivatives are so small that all costs are finite."""
         batch = w.shape[1]
         if batch % self.grain:
-            # a batch below one block is not padded yet
+            # a batch that is smaller than a block is not padded yet
             missing = -batch % self.grain
             padded = [np.pad(x, ((0, 0), (0, missing)), mode="edge") if x.shape[1] == batch else x for x in (theta, w)]
             result, is_bounded = self._kernel(function, padded[0], padded[1], rows)
@@ -140,7 +140,7 @@ class FusedProblem(JaxProblem):
         if not batch:
             return np.empty((rows, 0)), True
         source = _source(_Structure(self.program), function, self._dtype.name)
-        # contiguous: the distant rows of a large batch would each need their own memory page
+        # contiguous, since the rows of a large batch are so far apart that each needs its own memory page
         w, noise_row = self._flat(np.ascontiguousarray(w))
         if theta.shape[1] == 1:
             theta = np.repeat(theta, self.grain, axis=1)
@@ -159,7 +159,7 @@ class FusedProblem(JaxProblem):
         return out.astype(np.float64, copy=False), is_bounded
 
     def _flat(self, array: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return a flat view from the first entry, and the stride of its rows in entries."""
+        """Return a flat view of a 2-D array from its first entry, and the stride between rows in entries."""
         array = np.asarray(array, dtype=self._dtype)
         size = array.itemsize
         if array.strides[1] != size or array.strides[0] % size or array.strides[0] < 0:

@@ -15,15 +15,15 @@ from .jax import Jax, JaxOps, use_double_precision
 ROUNDING = 8.0
 """Units in the last place of the unknown below which a residual counts as rounding error."""
 MIN_ITERATIONS = 8
-"""Iterations before a residual may count as rounding error. Newton's method needs fewer where it converges."""
+"""Iterations before a residual may count as rounding error. Newton's method needs fewer if it converges."""
 
 
 @dataclass(frozen=True)
 class Implicit(Jax):
     """Gradients: reverse mode through the rollout, implicit-function theorem at each solve, never through the solver.
 
-    optimistix finds the root by Newton's method and lineax solves the linear systems. Programs without an equation run
-    as on ``jax``. Float64 or float32. Forward mode is available too, although it is not the solver's adjoint.
+    optimistix computes the root by Newton's method and lineax solves the linear systems. Programs without an equation
+    run as on ``jax``. Float64 or float32. Forward mode is also available, although it is not the solver's adjoint.
     """
 
     name = "implicit"
@@ -48,12 +48,12 @@ class ImplicitOps(JaxOps):
     """JAX operations, and ``root`` through optimistix."""
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Return the root by Newton's method, ``(n, B)``. Columns are independent, so a failure does not affect others.
+        """Return the root by Newton's method, ``(n, B)``. A failure in one column does not affect other columns.
 
-        Converged means a residual below 1e-12 (1e-6 in float32) and the unknown to the same absolute and relative
-        tolerance, or a residual at the rounding error of the unknown, since stiff equations do not reach 1e-12. Columns
-        that do not converge in 64 iterations have NaN values and gradients, so that their rollouts are ``nonfinite``
-        instead of wrong.
+        A column has converged if the residual is below 1e-12 (1e-6 in float32) and the unknown changes by less than the
+        same absolute and relative tolerance, or if the residual is at the rounding error of the unknown, since stiff
+        equations do not reach 1e-12. Columns that do not converge in 64 iterations have NaN values and gradients, so
+        that their rollouts are ``nonfinite`` instead of wrong.
         """
         import jax
         import jax.numpy as jnp
@@ -62,7 +62,7 @@ class ImplicitOps(JaxOps):
 
         tolerance = 1e-12 if guess.dtype == jnp.float64 else 1e-6
         scalar = guess.shape[0] == 1
-        # one unknown per column: a division instead of a factorisation
+        # one unknown per column needs a division instead of a factorisation
         linear: Any = lineax.Diagonal(well_posed=True) if scalar else lineax.LU()
         newton: Any = _newton()(rtol=tolerance, atol=tolerance, linear_solver=linear)
 
@@ -77,7 +77,7 @@ class ImplicitOps(JaxOps):
                 tags=frozenset({lineax.diagonal_tag} if scalar else ()),
             )  # fmt: skip
             solved = solution.result == optimistix.RESULTS.successful
-            # a factor, since jnp.where(solved, value, NaN) would keep the gradient of the value
+            # a factor, since jnp.where(solved, value, NaN) would have the gradient of the value
             return solution.value * jnp.where(solved, 1.0, jnp.nan).astype(guess.dtype)
 
         axes = jax.tree.map(lambda a: -1 if jnp.ndim(a) else None, args)
@@ -87,7 +87,7 @@ class ImplicitOps(JaxOps):
 
 @cache
 def _newton() -> Any:
-    """Return optimistix's Newton with a termination test that does not depend on the units of the residual."""
+    """Return optimistix's Newton class with a termination test that does not depend on the residual's units."""
     import equinox
     import jax.numpy as jnp
     import optimistix
@@ -97,18 +97,18 @@ def _newton() -> Any:
 
         A residual that multiplies a gap by dt^2 k / m = 1e11 has rounding errors of 1e-5 at the root, and Newton's
         method may alternate between two adjacent numbers with and without contact. The steepest slope so far is stored
-        in a field of the state that is not used otherwise.
+        in ``diffsize_prev``, a field of the state that is otherwise unused.
         """
 
         def step(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> Any:
-            """Take a step and store the steepest slope."""
+            """Return the results of a Newton step, with the steepest slope stored in the state."""
             after, new_state, aux = super().step(fn, y, args, options, state, tags)
             slope = jnp.abs(new_state.f).max() / jnp.maximum(jnp.abs(new_state.diff).max(), jnp.finfo(y.dtype).tiny)
             steepest = jnp.maximum(state.diffsize_prev, jnp.where(jnp.isfinite(slope), slope, 0.0))
             return after, equinox.tree_at(lambda s: s.diffsize_prev, new_state, steepest.astype(y.dtype)), aux
 
         def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> Any:
-            """Return whether to terminate, and the result."""
+            """Return whether to terminate, and the result code."""
             done, result = super().terminate(fn, y, args, options, state, tags)
             return done | self._is_rounding(y, state), result
 

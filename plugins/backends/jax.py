@@ -50,7 +50,7 @@ class Jax(Backend):
 
 
 def use_double_precision() -> None:
-    """Let JAX compute in float64 where arrays are float64."""
+    """Enable float64 in JAX, which otherwise computes in float32."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -65,7 +65,7 @@ class JaxOps(LoopOps):
         super().__init__(jax.numpy)
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Run lax.scan over rows. The backward pass stores only the carries and recomputes each step."""
+        """Return the last carry of lax.scan over rows. The backward pass stores only carries and recomputes each step."""
         import jax
 
         leaves, tree = jax.tree.flatten(carry)
@@ -80,7 +80,7 @@ class JaxOps(LoopOps):
         def body(state: list[Any], x: list[Any]) -> tuple[list[Any], None]:
             return rows.evaluate(traced.jaxpr, traced.consts, [*state, *x]), None
 
-        # inside a scan XLA cannot merge the two evaluations, so CSE need not be prevented
+        # within a scan XLA cannot merge the two evaluations, so common-subexpression elimination need not be prevented
         recomputed = jax.checkpoint(body, prevent_cse=False)
         last, _ = jax.lax.scan(
             recomputed, [rows.split(x) for x in leaves], [rows.split(x, axis=1) for x in slices], length
@@ -95,7 +95,7 @@ def _platform() -> str:
 
 
 def _numbers(program: Program) -> int:
-    """Estimate the count of numbers stored for one rollout's gradient: carries, controls, gradients, theta, noise."""
+    """Return an estimate of the numbers stored per rollout gradient: carries, controls, gradients, theta and noise."""
     stored = 2 * program.dim + program.n_noise
     if isinstance(program, Rollout):
         scene = program.scene
@@ -104,10 +104,10 @@ def _numbers(program: Program) -> int:
 
 
 class JaxProblem(Problem):
-    """A program compiled once per batch shape; float parameters are traced, so that sweeping them compiles nothing.
+    """A program compiled once per batch shape. Float parameters are traced, so that new values need no compilation.
 
-    Each block runs on one thread of XLA and blocks run in parallel, which uses all cores without synchronisation at
-    every step.
+    Each block runs on one XLA thread and blocks run in parallel, which uses all cores without synchronisation at every
+    step.
     """
 
     grain = 128
@@ -217,10 +217,9 @@ class JaxProblem(Problem):
         return self._derivative(cost, theta, w.shape[1])
 
     def _derivative(self, function: Callable[[Array], Array], theta: Array, batch: int) -> Array:
-        """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; NaN where b has no value.
+        """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; NaN for nonfinite values.
 
-        A rollout can fail where the derivative is not looking: a choice between NaN and a number passes on the
-        number's.
+        Without this rule, a choice between NaN and a number would have the number's derivative.
         """
         import jax
         import jax.numpy as jnp

@@ -15,9 +15,9 @@ from .. import mjcf
 from .jax import Jax, JaxProblem
 
 FORWARD_UP_TO = 8
-"""Length of theta up to which forward mode is cheaper, since reverse mode costs as much as this many directions."""
+"""Maximum length of theta for forward mode: reverse mode costs as much as this number of directions."""
 LARGEST = 1e10
-"""Largest valid number of a state; MuJoCo stops a rollout at larger ones (``mjMAXVAL``)."""
+"""Maximum absolute value in a state; MuJoCo stops a rollout at larger values (``mjMAXVAL``)."""
 
 
 @dataclass(frozen=True)
@@ -91,19 +91,19 @@ class MjxProgram(Rollout):
 
     @property
     def structure(self) -> tuple[Any, ...]:
-        """The program's structure, the engine's settings, and the parts of the model that are not traceable numbers."""
+        """A key: the program's structure, the engine's settings, and the parts of the model that cannot be traced."""
         # only floats are traced: any other leaf is compiled in and must be part of the key
         fixed = tuple(leaf.tobytes() for leaf in self._leaves if leaf.dtype.kind != "f")
         return (*super().structure, self._settings, self._tree, fixed)
 
     def parameters(self) -> np.ndarray:
-        """Return the float parameters of the parts, then those of the model, ``(p,)``."""
+        """Return the float parameters of the plugins, followed by the floats of the MJX model, ``(p,)``."""
         return np.concatenate(
             [super().parameters(), *(leaf.ravel() for leaf in self._leaves if leaf.dtype.kind == "f")]
         )
 
     def bind(self, parameters: Any) -> Program:
-        """Return a copy of this program, model included, with other values for :meth:`parameters`."""
+        """Return a copy of this program and its model with the values ``parameters (p,)``."""
         import jax
         import jax.numpy as jnp
 
@@ -121,7 +121,7 @@ class MjxProgram(Rollout):
         return bound
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
-        """Return the state after one step of MJX per column; NaN beyond MuJoCo's limit, where MuJoCo would stop."""
+        """Return the state after one MJX step per column; NaN beyond MuJoCo's limit, at which MuJoCo would stop."""
         import jax
         import jax.numpy as jnp
 

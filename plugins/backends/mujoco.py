@@ -32,7 +32,7 @@ from .torch import TorchOps
 
 @dataclass(frozen=True)
 class Mujoco(Backend):
-    """Gradients: an adjoint pass over finite-difference Jacobians of each step (or differences of rollouts); float64.
+    """Gradients: adjoint pass over finite-difference Jacobians of each step, or finite differences of rollouts; float64.
 
     Steps the scene's MJCF twin with MuJoCo's own integrator and contact solver, on all cores. Costs, policy and noise
     are the scene's.
@@ -131,7 +131,7 @@ class Engine:
         import mujoco
         from mujoco.rollout import Rollout
 
-        # by default MuJoCo writes a log file about a diverging rollout, which NaN reports already
+        # by default MuJoCo writes a log file for a diverging rollout; NaN states report the divergence instead
         mujoco.set_mju_user_warning(lambda message: None)
         self._mujoco, self._model = mujoco, model
         self._data = [mujoco.MjData(model) for _ in range(cores())]
@@ -140,7 +140,7 @@ class Engine:
     def rollout(self, first: np.ndarray, controls: np.ndarray) -> np.ndarray:
         """Return states ``(T + 1, n, B)`` from ``first (n, B)`` under controls ``(T, n_u, B)``.
 
-        MuJoCo stops a rollout and its time at the first number beyond 1e10. The states after it are NaN.
+        MuJoCo stops a rollout at the first state value beyond 1e10. All later states are NaN.
         """
         start = np.concatenate([np.zeros((1, first.shape[1])), first]).T
         controls = np.ascontiguousarray(np.moveaxis(controls, -1, 0))
@@ -155,7 +155,7 @@ class Engine:
     def jacobians(
         self, states: np.ndarray, controls: np.ndarray, eps: float, central: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return each step's derivatives by state ``(T, n, n, B)`` and by control ``(T, n_u, n, B)``, on threads."""
+        """Return each step's derivatives by state ``(T, n, n, B)`` and by control ``(T, n, n_u, B)``."""
         horizon, n_u, batch = controls.shape
         n = states.shape[1]
         a, b = np.full((batch, horizon, n, n), np.nan), np.full((batch, horizon, n, n_u), np.nan)
@@ -166,7 +166,7 @@ class Engine:
             nq = self._model.nq
             for c in columns:
                 for t in range(horizon):
-                    # all later states are nonfinite too, and their Jacobians stay NaN
+                    # all later states are also nonfinite, and their Jacobians remain NaN
                     if not np.isfinite(points[c, t]).all():
                         break
                     data.qpos, data.qvel, data.ctrl = points[c, t, :nq], points[c, t, nq:], inputs[c, t]
@@ -179,10 +179,10 @@ class Engine:
 
 
 class Recorded(Rollout):
-    """A program along recorded states of an engine; with Jacobians, its linearisation about these states.
+    """A program that replays recorded engine states; with Jacobians, linearised about these states.
 
-    Its cost and gradient are those of the engine's rollouts: reverse mode through it is the adjoint pass
-    lambda_t = A_t^T lambda_{t+1} + ..., feedback and stage costs included.
+    Its cost and gradient equal the cost and gradient of the engine's rollouts: reverse mode through it is the adjoint
+    pass lambda_t = A_t^T lambda_{t+1} + ..., including feedback and stage costs.
     """
 
     def __init__(
@@ -198,7 +198,7 @@ class Recorded(Rollout):
         self._times: Iterator[int] = iter(range(len(states) - 1))
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
-        """Return the next recorded state, linearised if there are Jacobians. A rollout can run only once."""
+        """Return the next recorded state, linearised if there are Jacobians. The recorded rollout can run only once."""
         t, xp = next(self._times), ops.xp
         after = xp.asarray(self._states[t + 1])
         if self._a is not None and self._b is not None and self._controls is not None:
@@ -219,7 +219,7 @@ def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -
     ops = TorchOps()
     result = program.log_probability(ops, fixed, free, noise) if scored else program.cost(ops, free, noise)
     (gradient,) = torch.autograd.grad(result.sum(), free, materialize_grads=True)
-    # torch.where between NaN and a number would keep the number's derivative
+    # torch.where between NaN and a number would have the number's derivative
     return np.asarray(gradient.masked_fill(~torch.isfinite(result.detach()), float("nan")))
 
 

@@ -1,4 +1,4 @@
-"""NumPy: costs from the program itself, derivatives by batched central differences."""
+"""NumPy: costs by running the program, derivatives by batched central differences."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Numpy(Backend):
 
     def compile(self, program: Program) -> Problem:
         """Return the program as a problem; nothing is compiled."""
-        # about the cube root of the rounding error, which balances rounding and truncation errors
+        # about the cube root of the unit roundoff, which balances rounding and truncation errors
         step = self.step or {"float64": 1e-6, "float32": 5e-3}[self.dtype]
         return NumpyProblem(program, self.dtype, step)
 
@@ -64,7 +64,7 @@ class NumpyProblem(Problem):
         return Trajectory(np.stack(states).astype(np.float64), np.stack(controls).astype(np.float64))
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        # counted as gradients, since the cost of a gradient in rollouts is measured separately
+        # usage counts gradients here, not rollouts: the cost of a gradient in rollouts is measured separately
         return self._differences(lambda moved, w: self._value(moved, w), theta, w)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -89,7 +89,7 @@ class NumpyProblem(Problem):
     def _differences(
         self, function: Callable[[np.ndarray, np.ndarray], np.ndarray], theta: np.ndarray, w: np.ndarray
     ) -> np.ndarray:
-        """Return (function(theta + h e_i) - function(theta - h e_i)) / 2h for all i, several i per batch."""
+        """Return (function(theta + h e_i) - function(theta - h e_i)) / 2h for all i, ``(d, B)``, several i per batch."""
         dim, batch = self.dim, w.shape[1]
         theta = np.broadcast_to(theta, (dim, batch))
         rows = np.empty((dim, batch))

@@ -1,7 +1,7 @@
-"""Evaluates JAX code row by row: an array ``(n, B)`` of few rows becomes a tuple of n arrays ``(B,)``.
+"""Evaluates JAX code row by row: an array ``(n, B)`` with few rows becomes a tuple of n arrays ``(B,)``.
 
-Model code stacks and slices rows, and XLA compiles a stack to a loop that checks the row of each element. The same
-operations row by row are long loops without branches, which vectorise. Results do not change, since each element is
+Model code stacks and slices rows, and XLA compiles a stack to a loop that checks the row of each element. Row by row,
+the same operations are long loops without branches, which vectorise. Results are identical, since each element is
 computed by the same operations in the same order.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 from bench.model import Array
 
 MAX_ROWS = 16
-"""Arrays with more rows are not split."""
+"""Maximum number of rows of arrays that are split."""
 ELEMENTWISE = {
     "abs", "acos", "acosh", "add", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
     "convert_element_type", "cos", "cosh", "div", "eq", "erf", "exp", "exp2", "expm1", "floor", "ge", "gt",
@@ -32,14 +32,14 @@ def split(array: Array, axis: int = 0) -> Any:
 
 
 def join(value: Any) -> Array:
-    """Stack a tuple of rows to an array; return an array unchanged."""
+    """Return a tuple of rows stacked to an array ``(n, B)``; return an array unchanged."""
     import jax.numpy as jnp
 
     return jnp.stack(value) if isinstance(value, tuple) else value
 
 
 def evaluate(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
-    """Return the outputs of a jaxpr for arguments split into rows, splitting each ``(n, B)`` output of few rows."""
+    """Return the outputs of a jaxpr for arguments split into rows; ``(n, B)`` outputs with few rows are split too."""
     known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
 
     def read(atom: Any) -> Any:
@@ -52,7 +52,7 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> lis
 
 
 def _apply(equation: Any, values: list[Any]) -> list[Any]:
-    """Return the outputs of one equation."""
+    """Return the outputs of one equation of a jaxpr, split into rows if possible."""
     name, parameters, primitive = equation.primitive.name, equation.params, equation.primitive
     out = equation.outvars[0].aval
     if name in ("jit", "pjit"):
@@ -85,7 +85,7 @@ def _rows(name: str, parameters: Any, primitive: Any, values: list[Any], out: An
 
 
 def _repeated(value: Any, count: int) -> tuple[Any, ...]:
-    """Return the operand of each of ``count`` rows: its own row, the only row, or the same number."""
+    """Return the operand for each of ``count`` rows: the row itself, or a single row or number repeated."""
     if getattr(value, "ndim", 0) == 2:
         value = split(value)
     rows = value if isinstance(value, tuple) else (value,)

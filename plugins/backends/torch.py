@@ -34,8 +34,8 @@ class TorchOps(LoopOps):
         super().__init__(array_api_compat.torch)
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Loop over the leading axis."""
-        # one graph node for all steps, while indexing would create one per step
+        """Return the last carry of a Python loop over the leading axis of ``xs``."""
+        # unbind adds one graph node for all steps, while indexing would add one per step
         slices = [x.unbind(0) for x in xs]
         for t in range(length):
             carry = step(carry, tuple(x[t] for x in slices))
@@ -83,9 +83,10 @@ class TorchProblem(Problem):
         return self._derivative(lambda full, w: self.program.explicit_cost(self._ops, fixed, full, w), theta, w)
 
     def _derivative(self, function: Callable[[Array, Array], Array], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; zero if disconnected.
+        """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; 0 if it is independent.
 
-        It is NaN where the value of b is not finite, since torch.where between NaN and a number keeps the derivative.
+        The derivative is set to NaN if the value of column b is not finite: torch.where between NaN and a number would
+        have the number's derivative.
         """
         full = self._tensor(np.broadcast_to(theta, (self.dim, w.shape[1]))).requires_grad_()
         result = function(full, self._tensor(w))

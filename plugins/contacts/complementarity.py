@@ -8,10 +8,10 @@ from bench.model import Array, Contact, ImpulseLaw, Ops, State, param
 
 @dataclass(frozen=True)
 class Complementarity(ImpulseLaw):
-    """0 <= lambda, y >= 0, lambda y = kappa at the end of the step, with y = gap + lambda / stiffness.
+    """Solves lambda y = kappa, lambda >= 0, y >= 0 at the end of the step, with y = gap + lambda / stiffness.
 
-    kappa -> 0 is hard contact, and infinite stiffness rigid: inelastic impacts, whatever the scene's restitution.
-    A finite stiffness is the penalty spring of that stiffness evaluated at the end of the step instead of its start.
+    kappa -> 0 is hard contact, and infinite stiffness rigid contact: impacts are inelastic, and the scene's restitution
+    is ignored. A finite stiffness is a penalty spring evaluated at the end of the step instead of its start.
     Solved through the Fischer-Burmeister function p + y - sqrt(p^2 + y^2 + 2 c kappa), whose root lies on the
     central path, with p = c lambda the gap that the force opens in a step (c = dt^2 J M^-1 J^T).
     """
@@ -24,7 +24,7 @@ class Complementarity(ImpulseLaw):
     stiffness: float = param(float("inf"), "force per remaining penetration; inf: rigid", "N/m", positive=True)
 
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: float) -> State:
-        """Return the velocity change over the step, from which the positions follow."""
+        """Return the velocity change over the step, without an additional position change."""
         xp = ops.xp
         opened = dt * dt * contact.response(xp, before.q)
 
@@ -48,9 +48,9 @@ class Complementarity(ImpulseLaw):
 
 
 def _central_path_force(xp: Any, a: Array, c: Array, kappa: Any) -> Array:
-    """Return lambda >= 0 with (a + c lambda) lambda = kappa: exact for one contact whose gap is linear in position."""
+    """Return lambda >= 0 with (a + c lambda) lambda = kappa, the force of one contact whose gap is linear in position."""
     root = xp.sqrt(a * a + 4.0 * c * kappa)
-    # two forms of the same root, each without cancellation on its side
+    # two forms of the same root, each without cancellation for its sign of a
     separated = 2.0 * kappa / (xp.abs(a) + root)
     pressed = (xp.abs(a) + root) / (2.0 * c)
     return xp.where(a > 0, separated, pressed)

@@ -23,7 +23,7 @@ class Penalty(ForceLaw):
 
     @property
     def continuous(self) -> bool:
-        """True only without damping: a damper acts immediately at touch, so the force jumps."""
+        """True only without damping: a damper acts immediately at first touch, so the force jumps."""
         return self.damping == 0.0
 
     def spring(self) -> tuple[float, float]:

@@ -10,11 +10,11 @@ from bench.model import Array, ForceLaw, param
 class Softplus(ForceLaw):
     """The penalty law with max(0, z) replaced by softplus_beta(z) = log(1 + exp(beta z)) / beta.
 
-    ``smooths="clip"``: only the outer clip, force = softplus_beta(k d + c d') with d = max(0, -gap), so that it still
-    has a kink at touch and a force of log(2)/beta at any distance; beta is then per newton.
-    ``smooths="gap"``: the gap as well, force = softplus of (k softplus_beta(-gap) + c d' weighted by the smoothed
-    contact indicator); without damping this is k softplus_beta(-gap), and beta is per metre.
-    As beta grows both tend to ``penalty[damping_mode=clipped]``.
+    ``smooths="clip"``: the outer clip is smoothed, force = softplus_beta(k d + c d') with d = max(0, -gap). A kink
+    remains at first touch, and so does a force of log(2)/beta [N] at any distance. The unit of beta is 1/N.
+    ``smooths="gap"``: the gap is smoothed, force = max(0, k softplus_beta(-gap) + s c d') with the smoothed contact
+    indicator s = 1 / (1 + exp(beta gap)). Without damping, force = k softplus_beta(-gap). The unit of beta is 1/m.
+    As beta grows, both tend to ``penalty[damping_mode=clipped]``.
     """
 
     name = "softplus"
@@ -27,7 +27,7 @@ class Softplus(ForceLaw):
 
     @property
     def continuous(self) -> bool:
-        """True with a smoothed gap or without damping: an unsmoothed damper acts immediately at touch."""
+        """True with a smoothed gap or without damping: an unsmoothed damper acts immediately at first touch."""
         return self.smooths == "gap" or self.damping == 0.0
 
     def spring(self) -> tuple[float, float]:
@@ -35,7 +35,7 @@ class Softplus(ForceLaw):
         return self.stiffness, self.damping
 
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
-        """Return the normal force, positive everywhere."""
+        """Return the normal force, never negative."""
         if self.smooths == "clip":
             penetration = xp.where(gap < 0, -gap, 0.0 * gap)
             damper = xp.where(gap < 0, -self.damping * gap_rate, 0.0 * gap)
@@ -48,5 +48,5 @@ class Softplus(ForceLaw):
 
 
 def _softplus(xp: Any, z: Array, beta: Any) -> Array:
-    # (z + |z|) / 2 instead of a where: at z = 0 the derivatives of both terms then add up to the right value, 1/2
+    # (z + |z|) / 2 instead of xp.where, so that at z = 0 the derivatives of both terms add up to the correct 1/2
     return 0.5 * (z + xp.abs(z)) + xp.log1p(xp.exp(-beta * xp.abs(z))) / beta

@@ -1,4 +1,4 @@
-"""One law in the forward pass, another in the backward pass."""
+"""Different contact laws in the forward and backward passes."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -11,12 +11,12 @@ from bench.model import Array, ForceLaw, param, stopped
 
 @dataclass(frozen=True)
 class StraightThrough(ForceLaw):
-    """The forces of ``forward``, which automatic differentiation replaces by those of ``backward`` at the same states.
+    """Applies the forces of law ``forward``, with the derivatives of law ``backward`` at the same states.
 
-    Its gradient is a surrogate, not the derivative of the program: each step is differentiated as if ``backward`` had
-    acted there. With a hard forward law and a softplus in the backward pass, the gradient includes contacts from a
-    distance between bodies that miss each other, and the motion is not smoothed. ``none`` differentiates
-    contact forces as constants. Source: Paulus et al. 2025; straight-through estimators, Bengio et al. 2013.
+    The gradient is a surrogate, not the derivative of the program: each step is differentiated as if ``backward`` acted
+    in it. With a hard forward law and a softplus backward law, the gradient includes forces between bodies that miss
+    each other, while the motion is not smoothed. With ``none``, contact forces are differentiated as constants.
+    Source: Paulus et al. 2025; straight-through estimators, Bengio et al. 2013.
     """
 
     name = "straight_through"

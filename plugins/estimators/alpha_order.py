@@ -41,7 +41,10 @@ class AlphaOrder(DiagnosticEstimator):
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates with alpha and eps, each ``(R,)``. Raises ValueError for fewer than 4 samples, or 2 shared ones."""
+        """Return the estimates ``(R, d)`` with alpha and eps, each ``(R,)``.
+
+        Raises ValueError for fewer than 4 samples, or fewer than 2 with ``sharing=shared``.
+        """
         if self.sharing == "split":
             first, zeroth = halves(problem, theta, noise)
         elif noise.shape[1] < 2:
@@ -58,10 +61,10 @@ class AlphaOrder(DiagnosticEstimator):
         eps = np.sqrt(2 * per_sample * log_term / n) + 2 * largest / (3 * n) * log_term
         gamma = self.ratio * eps if self.gamma is None else self.gamma
         total = v0 + v1
-        # if both variances are 0, any weight is right
+        # if both variances are 0, any weight is correct
         alpha = np.divide(v0, total, out=np.ones_like(total), where=total > 0)
         distance = np.linalg.norm(fobg - zobg, axis=-1)
-        margin = np.maximum(gamma - eps, 0.0)  # 0 if the zeroth order is not known to within gamma
+        margin = np.maximum(gamma - eps, 0.0)  # 0 if the zeroth-order mean is not known to within gamma
         cap = np.divide(margin, distance, out=np.full_like(distance, np.inf), where=distance > 0)
         alpha = np.minimum(alpha, cap)
         weight = alpha[:, None]

@@ -33,13 +33,13 @@ class Clipped(DiagnosticEstimator):
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates, and the share of clipped sizes, ``(R,)``."""
+        """Return the estimates ``(R, d)``, and the share of clipped sizes as ``cut``, ``(R,)``."""
         terms = first_order(problem, theta, noise)
         sizes = np.abs(terms) if self.by == "element" else np.linalg.norm(terms, axis=-1, keepdims=True)
         limit = np.quantile(sizes, self.quantile, axis=1, keepdims=True) if self.limit is None else self.limit
         if self.by == "batch":
             terms = terms.mean(axis=1, keepdims=True)
             sizes = np.linalg.norm(terms, axis=-1, keepdims=True)
-        # a size of 0 stays 0 with any factor
+        # a size of 0 is 0 with any factor
         factor = np.minimum(1.0, np.divide(limit, sizes, out=np.ones_like(sizes), where=sizes > 0))
         return (factor * terms).mean(axis=1), {"cut": (factor < 1.0).mean(axis=(1, 2))}

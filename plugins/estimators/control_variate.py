@@ -27,7 +27,7 @@ class ControlVariate(DiagnosticEstimator):
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates, and the coefficient ``(R,)``."""
+        """Return the estimates ``(R, d)``, and ``coefficient``, ``(R,)``. Raises ValueError for fewer than 4 samples."""
         if noise.shape[1] < 4:
             raise ValueError(f"{self.name} needs at least 4 samples, got {noise.shape[1]}")
         centre = problem.grad(theta, np.zeros((noise.shape[2], 1)))[:, 0]
@@ -45,12 +45,12 @@ class ControlVariate(DiagnosticEstimator):
         return np.concatenate(corrected, axis=1).mean(axis=1), {"coefficient": np.mean(coefficients, axis=0)}
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return a reason for noise that is not on theta, where the expectation of (g . w) w is not g; else None."""
+        """Return the reason if noise is not on theta, since E[(g . w) w] is then not g; else None."""
         return None if program.noise_on_theta else f"{self.name} needs noise on theta, not on a policy's actions"
 
 
 def _slope(control: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the regression coefficient of values on the control over samples, one per repeat, 0 without spread."""
+    """Return the regression coefficient of values on the control over samples, ``(R,)``; 0 for a constant control."""
     control = control - control.mean(axis=1, keepdims=True)
     covariance, variance = (np.einsum("rnd,rnd->r", control, other) for other in (values, control))
     return np.asarray(np.divide(covariance, variance, out=np.zeros_like(variance), where=variance > 0))

@@ -22,7 +22,7 @@ class FiniteDifference(SampleMean):
     step: float = param(1e-3, "half the distance of the two points, in units of theta", positive=True)
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return (f(theta + h e_i, w) - f(theta - h e_i, w)) / 2h for every coordinate i."""
+        """Return (f(theta + h e_i, w) - f(theta - h e_i, w)) / 2h for every coordinate i, ``(d, B)``."""
         rows = []
         for i in range(problem.dim):
             shift = np.zeros((problem.dim, 1))

@@ -18,5 +18,5 @@ class Fobg(SampleMean):
     needs = frozenset({"grad"})
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return df/dtheta of each sample."""
+        """Return df/dtheta of each sample, ``(d, B)``."""
         return problem.grad(theta, w)

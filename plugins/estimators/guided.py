@@ -11,10 +11,10 @@ from bench.model import Estimator, Problem, columns, first_order, param, per_rep
 class Guided(Estimator):
     """Approximates grad J_sigma with central differences along v = P w + sqrt(share) (1 - P) w.
 
-    P projects on the span of the gradients of the first ``subspace`` samples. The differences use the other samples.
-    The expectation is the gradient itself inside the subspace and ``share`` times it outside, on a linear cost, while
-    the variance falls from d + 1 to about ``subspace`` + share d squared gradients: useful if gradients lie in the
-    right subspace with wrong lengths and signs, useless if they vanish (Maheswaranathan et al. 2019, guided
+    P projects onto the span of the gradients of the first ``subspace`` samples. The differences use the other samples.
+    On a linear cost, the expectation is the gradient inside the subspace and ``share`` times it outside, while the
+    variance falls from d + 1 to about ``subspace`` + share d squared gradients. This is useful if gradients lie in
+    the correct subspace with wrong lengths and signs, and useless if they vanish (Maheswaranathan et al. 2019, guided
     evolutionary strategies). Requires costs and gradients, and more samples than ``subspace``. Biased.
     """
 
@@ -27,13 +27,13 @@ class Guided(Estimator):
     share: float = param(0.1, "share of the gradient outside the subspace in the expectation", low=0.0, high=1.0)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean of the differences along guided directions."""
+        """Return the mean of the differences along guided directions, ``(R, d)``; ValueError for too few samples."""
         if noise.shape[1] <= self.subspace:
             raise ValueError(f"{self.name} needs more than {self.subspace} samples, got {noise.shape[1]}")
         first, rest = noise[:, : self.subspace], noise[:, self.subspace :]
         gradients = first_order(problem, theta, first)
         _, sizes, basis = np.linalg.svd(gradients, full_matrices=False)
-        # directions that are rounding errors do not count, and a gradient of 0 spans nothing
+        # exclude directions that are only rounding errors; gradients of 0 span no direction
         basis = basis * (sizes > 1e-9 * sizes.max(axis=1, keepdims=True))[..., None]
         w = rest[..., : problem.dim]
         inside = np.einsum("rkd,rke,rne->rnd", basis, basis, w)

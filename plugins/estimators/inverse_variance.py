@@ -26,11 +26,11 @@ class InverseVariance(DiagnosticEstimator):
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates, and the first-order weights ``(R, d)``."""
+        """Return the estimates and the first-order weights, each ``(R, d)``."""
         first, zeroth = halves(problem, theta, noise)
         v1 = first.var(axis=1, ddof=1) / first.shape[1]
         v0 = zeroth.var(axis=1, ddof=1) / zeroth.shape[1]
         total = v0 + v1
-        # if both variances are 0, any weight is right
+        # if both variances are 0, any weight is correct
         weight = np.divide(v0, total, out=np.full_like(total, 0.5), where=total > 0)
         return weight * first.mean(axis=1) + (1 - weight) * zeroth.mean(axis=1), {"weight": weight}

@@ -21,7 +21,7 @@ class MeasureValued(SampleMean):
     unbiased_at_discontinuities = True
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return the scaled difference of both costs for every coordinate."""
+        """Return the scaled difference of both costs for every coordinate, ``(d, B)``."""
         from scipy.special import log_ndtr
 
         radius = np.sqrt(-2.0 * log_ndtr(w))
@@ -35,5 +35,5 @@ class MeasureValued(SampleMean):
         return np.asarray(np.stack(rows) / (problem.sigma * np.sqrt(2.0 * np.pi)))
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return a reason for noise that is not on theta, where each action would need its own differences; else None."""
+        """Return the reason if noise is not on theta, since each action would need its own differences; else None."""
         return None if program.noise_on_theta else f"{self.name} needs noise on theta, not on a policy's actions"

@@ -29,11 +29,11 @@ class Orthogonal(Estimator):
         return self.lengths == "drawn"
 
     def declares_unbiased(self, program: Program) -> bool:
-        """Return whether its smoothing is that of J_sigma, which needs noise on theta."""
+        """Return whether its expectation is grad J_sigma: for drawn lengths and noise on theta."""
         return program.noise_on_theta and super().declares_unbiased(program)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean of central differences along the rotated directions."""
+        """Return the mean of central differences along the rotated directions, ``(R, d)``."""
         d, s = problem.dim, problem.sigma
         normal = noise[..., :d]
         v = np.concatenate([_rotated(normal[:, i : i + d]) for i in range(0, noise.shape[1], d)], axis=1)
@@ -45,8 +45,9 @@ class Orthogonal(Estimator):
 
 
 def _rotated(normal: np.ndarray) -> np.ndarray:
-    """Return orthonormal vectors, uniform over rotations except for their signs, from normal ones ``(R, m, d)``, m <= d.
+    """Return random orthonormal vectors from normal vectors ``(R, m, d)``, m <= d, of the same shape.
 
-    The factorisation chooses the signs, on which a central difference times its direction does not depend.
+    They are uniform over rotations except for their signs, which the QR factorisation chooses. A central difference
+    times its direction does not depend on the sign.
     """
     return np.moveaxis(np.linalg.qr(np.moveaxis(normal, 1, 2))[0], 2, 1)

@@ -32,7 +32,7 @@ class RandomizedSmoothing(SampleMean):
     )
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return one directional difference per sample, along its own direction."""
+        """Return one finite difference per sample, times its direction, ``(d, B)``."""
         s = problem.sigma if self.radius is None else self.radius
         direction = problem.directions(w)
         centred = problem.centred(w)
@@ -43,14 +43,14 @@ class RandomizedSmoothing(SampleMean):
         return np.asarray((ahead - problem.value(theta, centre)) * direction / s)
 
     def declares_unbiased(self, program: Program) -> bool:
-        """Return whether its smoothing is that of its reference: noise on theta, and J_sigma's radius or its own."""
+        """Return whether its smoothing equals its reference's: noise on theta, and J_sigma's radius or its own."""
         if self.smoothing(program) is not None:
             return True
         is_other = self.radius is not None and self.radius != program.scene.sigma
         return program.noise_on_theta and not is_other and super().declares_unbiased(program)
 
     def smoothing(self, program: Program) -> Smoothing | None:
-        """Return the Gaussian of its own radius if that is the reference and noise is on theta; else None."""
+        """Return the Gaussian of the estimator's radius if it is the reference and noise is on theta; else None."""
         if self.reference == "sigma" or self.radius is None or not program.noise_on_theta:
             return None
         return Smoothing("gaussian", self.radius)

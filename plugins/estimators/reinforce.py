@@ -11,7 +11,7 @@ from bench.model import Problem, SampleMean, columns, param, per_repeat
 class Reinforce(SampleMean):
     """Approximates grad J_sigma with the mean of (f - b) d log p(actions)/dtheta (Williams 1992).
 
-    If theta also sets the initial state, the derivative of f along that path, at given actions, is added.
+    If theta also sets the initial state, the explicit derivative of f, at given actions, is added.
 
     Baseline b: ``none``; ``center``, f at w = 0; ``leave_one_out``, the mean cost of the other samples of the batch.
     Requires costs and scores. Unbiased for any cost, even with jumps.
@@ -26,18 +26,18 @@ class Reinforce(SampleMean):
 
     @property
     def separable(self) -> bool:
-        """Whether the term of a sample depends on this sample only."""
+        """Whether the term of each sample depends on that sample only."""
         return self.baseline != "leave_one_out"
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return (f - b) * score, and the explicit derivative, of each sample."""
+        """Return (f - b) * score plus the explicit derivative of each sample, ``(d, B)``."""
         f = problem.value(theta, w)
         if self.baseline == "center":
             f = f - problem.value(theta, np.zeros((w.shape[0], 1)))
         return np.asarray(f * problem.score(theta, w) + problem.explicit(theta, w))
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean over samples of (f - b) * score."""
+        """Return the mean of the terms over samples, ``(R, d)``; ValueError if the baseline needs more samples."""
         if self.separable:
             return super().estimate(problem, theta, noise)
         if noise.shape[1] < 2:

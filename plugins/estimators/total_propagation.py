@@ -1,4 +1,4 @@
-"""First and zeroth order weighted per step."""
+"""First and zeroth order, weighted per time step."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -52,7 +52,10 @@ class TotalPropagation(DiagnosticEstimator):
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
-        """Return the estimates, and the first-order weights ``(R, d)``. Raises ValueError for a single sample."""
+        """Return the estimates ``(R, d)`` and the first-order weights. Raises ValueError for a single sample.
+
+        The weights are ``(R, d)``, or ``(R, horizon * n_u)`` with ``per=action``.
+        """
         if noise.shape[1] < 2:
             raise ValueError(f"{self.name} needs at least 2 samples, got 1")
         if self.per == "action":
@@ -82,7 +85,7 @@ class TotalPropagation(DiagnosticEstimator):
         return result, {"weight": np.moveaxis(weight[..., 0], 2, 0).reshape(repeats, -1)}
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return a reason for ``per=action`` unless each action has its own noise and theta acts through actions only."""
+        """Return the reason if ``per=action`` lacks noise on every action, or theta acts otherwise; else None."""
         if self.per != "action":
             return None
         one_each = (
@@ -94,18 +97,18 @@ class TotalPropagation(DiagnosticEstimator):
 
 
 def _weight(v0: np.ndarray, v1: np.ndarray) -> np.ndarray:
-    """Return v0 / (v0 + v1), or 1/2 if both are 0, where any weight is right."""
+    """Return v0 / (v0 + v1), or 1/2 if both are 0, where any weight is correct."""
     total = v0 + v1
     return np.asarray(np.divide(v0, total, out=np.full_like(total, 0.5), where=total > 0))
 
 
 def _controls(program: Program) -> int:
-    """Return the number of coordinates of theta that belong to one step: its controls, or all of theta."""
+    """Return the number of coordinates of theta per step: n_u for a sequence of controls, otherwise d."""
     scene = program.scene
     return scene.n_u if isinstance(scene, MechanicalScene) and scene.open_loop else program.dim
 
 
 def _summed(variances: np.ndarray, part: int) -> np.ndarray:
-    """Replace each of the variances ``(R, d)`` by the sum over its part of ``part`` neighbours."""
+    """Return variances ``(R, d)`` in which each is replaced by the sum over its group of ``part`` neighbours."""
     sums = variances.reshape(len(variances), -1, part).sum(axis=2)
     return np.repeat(sums, part, axis=1)

@@ -24,15 +24,16 @@ from bench.model import (
 
 @dataclass(frozen=True)
 class Windowed(Estimator):
-    """Approximates grad J_sigma with first-order gradients through windows of ``steps`` steps; no gradient crosses a window's end.
+    """Approximates grad J_sigma with first-order gradients within windows of ``steps`` time steps.
 
-    The terminal value of a window is ``none`` (0: truncated backpropagation through time), ``exact`` (the scene's
-    optimal cost-to-go), or ``learned`` (the cost-to-go of the batch's rollouts, fitted by a quadratic in the state per
-    window and repeat; the idea of SHAC, Xu et al. 2022). With the exact value the optimal control is a fixed point at
-    every length. With none, the first control of a window of H steps is that of H Riccati steps from 0. ``cut`` also
-    ends a window where the distance of a step's Jacobian from the identity exceeds it (the idea of AHAC, Georgiev et
-    al. 2024). Short windows have low variance and high bias, long windows the reverse. On plain functions, and with one
-    window, it is ``fobg``. Requires gradients.
+    No gradient crosses a window's end. The terminal value of a window is ``none`` (0: truncated backpropagation through
+    time), ``exact`` (the scene's optimal cost-to-go), or ``learned`` (the cost-to-go of the batch's rollouts, fitted by
+    a quadratic in the state per window and repeat; the idea of SHAC, Xu et al. 2022). With the exact value, the optimal
+    control is a fixed point at every window length. Without a value, the first control of a window of H steps equals
+    the control after H Riccati steps from 0. A window also ends where the distance of a step's Jacobian from the
+    identity exceeds ``cut`` (the idea of AHAC, Georgiev et al. 2024). Short windows have low variance and high bias,
+    long windows the reverse. On plain functions, and with a single window, the estimate equals ``fobg``. Requires
+    gradients.
     """
 
     name = "windowed"
@@ -47,7 +48,7 @@ class Windowed(Estimator):
     ridge: float = param(1e-3, "ridge penalty of the fitted value, per sample", positive=True)
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return a reason for an exact value that the scene does not know, and for a theta of named parameters; else None."""
+        """Return the reason if the exact value is unknown or theta consists of named parameters; else None."""
         if self.terminal == "exact" and not isinstance(program.scene, KnownValue | FunctionScene):
             return f"{self.name}[terminal=exact] needs a scene that knows its cost-to-go, and {program.scene.name} does not"
         if program.decision.names and isinstance(program, Rollout):
@@ -55,7 +56,7 @@ class Windowed(Estimator):
         return None
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean over samples of the gradient through windows."""
+        """Return the mean over samples of the windowed gradient, ``(R, d)``."""
         program, w = problem.program, columns(noise)
         if not isinstance(program, Rollout) or (self.steps >= program.scene.horizon and self.cut is None):
             return np.asarray(per_repeat(problem.grad(theta, w), noise).mean(axis=1))
@@ -80,7 +81,7 @@ class Windowed(Estimator):
         return ends
 
     def _value(self, problem: Problem, path: Slopes, shape: tuple[int, ...]) -> Callable[[int, np.ndarray], np.ndarray]:
-        """Return a function of step t and state ``(n, B)`` that gives the value's derivative by the state, ``(n, B)``."""
+        """Return a function of step t and states ``(n, B)`` that returns the derivative of the terminal value, ``(n, B)``."""
         scene = problem.program.scene
         if self.terminal == "exact":
             assert isinstance(scene, KnownValue)
@@ -93,16 +94,16 @@ class Windowed(Estimator):
 
 
 def _slope(value: Callable[[np.ndarray], np.ndarray], x: np.ndarray, step: float = 1e-5) -> np.ndarray:
-    """Return central differences ``(n, B)``, exact up to rounding for a quadratic value."""
+    """Return the derivative of ``value`` at ``x (n, B)`` by central differences, ``(n, B)``; exact for a quadratic."""
     shifts = step * np.eye(len(x))[:, :, None]
     return np.stack([(value(x + shift) - value(x - shift)) / (2 * step) for shift in shifts])
 
 
 def _fitted_slope(x: np.ndarray, to_go: np.ndarray, shape: tuple[int, ...], ridge: float) -> np.ndarray:
-    """Return the slope at ``x (n, R N)`` of a ridge fit to costs-to-go in standardised states, per repeat.
+    """Return the derivative at ``x (n, R N)`` of a ridge fit to costs-to-go in standardised states, per repeat.
 
     The fit is quadratic if a repeat has at least twice as many samples as coefficients, else linear. Coordinates that
-    do not vary have slope 0.
+    do not vary have derivative 0.
     """
     (repeats, samples), n = shape, len(x)
     slope = np.zeros((n, repeats, samples))

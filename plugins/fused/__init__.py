@@ -1,1 +1,1 @@
-"""Rollouts as one native loop: scalar code from a traced step, its adjoint, and the loops around both."""
+"""Code generation for the ``fused`` backend: scalar code of a traced step, its adjoint, and the loops around both."""

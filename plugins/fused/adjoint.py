@@ -1,4 +1,4 @@
-"""Reverse mode on scalar expressions, each operation by JAX's own rule, so that ties and kinks are treated alike."""
+"""Reverse-mode differentiation of scalar expressions by JAX's own rules, so that derivatives at ties and kinks agree."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .graph import Graph, Node, Refused, reached
 
 @cache
 def _rule(op: str, data: Any, count: int, which: int) -> Any:
-    """Return JAX's pullback of an operation to one of its arguments, as a jaxpr of (arguments, cotangent)."""
+    """Return JAX's pullback of an operation to argument number ``which``, as a jaxpr of (arguments, cotangent)."""
     import jax
     from jax import lax
 
@@ -41,15 +41,15 @@ SMOOTH = frozenset({
     "expm1", "log", "log1p", "logistic", "max", "min", "mul", "neg", "pow", "rem", "rsqrt", "sin", "sinh", "sqrt",
     "stop_gradient", "sub", "tan", "tanh",
 })  # fmt: skip
-"""Operations whose derivative JAX gives under their own name in jax.lax."""
+"""Operations that JAX differentiates, under their names in jax.lax."""
 FLAT = frozenset({
     "and", "ceil", "eq", "floor", "ge", "gt", "is_finite", "le", "lt", "ne", "not", "or", "sign", "stop_gradient", "xor",
 })  # fmt: skip
-"""Operations whose derivative is 0 everywhere."""
+"""Operations whose derivative is 0 wherever it exists."""
 
 
 def active(nodes: list[Node], wanted: Callable[[Node], bool]) -> set[int]:
-    """Return the numbers of the nodes that depend on a wanted one, through operations that have a derivative."""
+    """Return the numbers of the nodes with a derivative by a wanted node. ``nodes`` is ordered, arguments first."""
     found: set[int] = set()
     for node in nodes:
         if wanted(node) or (node.op not in FLAT and any(arg.number in found for arg in _differentiable(node))):
@@ -62,9 +62,9 @@ def _differentiable(node: Node) -> tuple[Node, ...]:
 
 
 def pullback(graph: Graph, seeds: list[tuple[Node, Node]], wanted: Callable[[Node], bool]) -> dict[Node, Node]:
-    """Return the derivative by each wanted node of sum over seeds of (node * cotangent); those that are 0 are missing.
+    """Return the derivatives of the sum over seeds of node * cotangent with respect to the wanted nodes.
 
-    What lies behind a wanted node is not followed.
+    Nodes whose derivative is 0 are omitted. The arguments of a wanted node are not traversed.
     """
     nodes = reached([node for node, _ in seeds], wanted)
     live = active(nodes, wanted)
@@ -92,7 +92,7 @@ def pullback(graph: Graph, seeds: list[tuple[Node, Node]], wanted: Callable[[Nod
 
 
 def _pulled(graph: Graph, node: Node, which: int, cotangent: Node) -> Node:
-    """Return the cotangent of one argument of a node."""
+    """Return the cotangent of argument number ``which`` of a node."""
     jaxpr = _rule(node.op, node.data, len(node.args), which).jaxpr
     known: dict[Any, Node] = dict(zip(jaxpr.invars, [*node.args, cotangent], strict=True))
 
@@ -118,7 +118,7 @@ def _evaluate(graph: Graph, jaxpr: Any, known: dict[Any, Node], read: Callable[[
         elif name in ("copy", "broadcast_in_dim", "reshape"):
             results = [args[0]]
         elif node.op == "select_n" and name == "gt" and args[0] is node.args[0]:
-            results = [args[0]]  # the condition is true or false already
+            results = [args[0]]  # the condition is Boolean already
         else:
             name = "add" if name == "add_any" else name
             results = [graph.apply(name, *args, data=equation.params.get("y"))]

@@ -1,8 +1,8 @@
-"""Source code of a kernel: loops over time around loops over lanes, one rollout in each lane.
+"""Source code of a kernel: loops over time steps around loops over lanes, with one rollout per lane.
 
-A number is computed in the outermost place where it is known: once per call if it depends on parameters alone, once per
-step if it is the same in all lanes, once per lane before or after the loop over time, else in each step of each lane. A
-forward pass keeps the carries that the backward pass reads; the backward pass computes the rest of a step again.
+Each value is computed in the outermost possible loop: once per call if it depends only on parameters, once per step if
+it is the same in all lanes, once per lane before or after the time loop, otherwise in each step of each lane. The
+forward pass stores the carries that the backward pass reads. The backward pass recomputes the other values of a step.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .graph import Node, reached
 from .trace import Loop
 
 LANES = 32
-"""Rollouts in the innermost loop; batches are multiples of this."""
+"""Number of rollouts in the innermost loop; batch sizes are multiples of it."""
 HEAD = '''\
 """{title}"""
 import math
@@ -43,7 +43,10 @@ ARGUMENTS = ("theta", "scored", "noise")
 
 
 def source(loop: Loop, dtype: str, wrt: str | None, rows: int, title: str, cache: bool) -> str:
-    """Return a module whose ``kernel`` computes the function, or its ``(rows, B)`` derivative by theta or scored."""
+    """Return source of a module whose ``kernel`` computes the function, or its derivative ``(rows, B)`` by ``wrt``.
+
+    ``wrt`` is None, ``theta`` or ``scored``.
+    """
     return _Kernel(loop, wrt, rows).text(dtype, title, cache)
 
 
@@ -56,41 +59,41 @@ class _Code:
 
 
 class _Kernel:
-    """Writes the statements of each place once, in order."""
+    """Generates the body of a kernel, statement by statement."""
 
     def __init__(self, loop: Loop, wrt: str | None, rows: int) -> None:
         self.loop, self.graph, self.wrt, self.rows = loop, loop.graph, wrt, rows
         self.code = _Code()
         self.slots: dict[str, int] = {}
-        """Numbers of a lane that outlive one pass over the lanes, by name."""
+        """Offset in the array ``lane`` of each per-lane value that is stored between loops over lanes, by name."""
         self.uniform_names: dict[int, str] = {}
         self.wide: dict[int, bool] = {}
         self.timed: dict[int, bool] = {}
 
-    # ----------------------------------------------------------------------------------- what depends on what
+    # ----------------------------------------------------------------------------------- dependence
 
     def is_wide(self, node: Node) -> bool:
-        """Return whether a number differs between lanes."""
+        """Return whether a node's value differs between lanes."""
         if node.number not in self.wide:
             leaves = (*ARGUMENTS, *(f"{name}@" for name in ARGUMENTS), "carry", "final", "adjoint", "total", "before")
             self.wide[node.number] = node.op in leaves or any(self.is_wide(arg) for arg in node.args)
         return self.wide[node.number]
 
     def is_timed(self, node: Node) -> bool:
-        """Return whether a number differs between steps."""
+        """Return whether a node's value differs between steps."""
         if node.number not in self.timed:
             leaves = ("table", "carry", "adjoint", *(f"{name}@" for name in ARGUMENTS))
             self.timed[node.number] = node.op in leaves or any(self.is_timed(arg) for arg in node.args)
         return self.timed[node.number]
 
     def text(self, dtype: str, title: str, cache: bool) -> str:
-        """Return the module."""
+        """Return the source of the module."""
         loop = self.loop
         assert loop.result is not None
         self.kept = self._needed([loop.result]) if loop.length else []
         backward = self._backward() if self.wrt else None
         if backward:
-            # the cost itself, say, is read by no derivative
+            # the derivative may need fewer carries: for example, it does not read the accumulated cost
             self.kept = self._needed(
                 [*backward.seeds.values(), *backward.ends.values(), *(loop.step[i] for i in backward.history)],
                 backward.history,
@@ -113,7 +116,7 @@ class _Kernel:
         return text + _renumbered("\n".join("    " + line for line in body)) + "\n"
 
     def _needed(self, roots: Iterable[Node], carries: Iterable[int] = ()) -> list[int]:
-        """Return the carries that numbers after the loop, and some carries, depend on."""
+        """Return the numbers of the carries on which ``roots`` (after the loop) and ``carries`` depend."""
         loop = self.loop
         found = {node.data for node in reached(roots) if node.op == "final"} | set(carries)
         while True:
@@ -141,7 +144,7 @@ class _Kernel:
         if not loop.length:
             return _Backward({}, {}, {}, {}, {node.data: ct for node, ct in direct.items()}, [])
 
-        # numbers from before the loop whose derivative the steps add up
+        # values from before the loop whose cotangents are summed over the steps
         whole = reached([loop.step[i] for i in self.kept])
         depends = active(whole, lambda n: n.op in (fixed, varying) or (n.op == "carry" and n.data in live))
         outer = {n.number for n in whole if n.number in depends and not self.is_timed(n)}
@@ -158,7 +161,7 @@ class _Kernel:
             adjoints = {i: constant[i] if i in constant else graph.leaf("adjoint", i) for i in {*constant, *moving}}
             found = pullback(graph, [(loop.step[i], ct) for i, ct in adjoints.items()], wanted)
             step = {node.data: ct for node, ct in found.items() if node.op == "carry"}
-            # a cotangent that the step hands on unchanged, such as that of the cost, is a constant of the loop
+            # a cotangent that a step does not change, such as the accumulated cost's, is constant over the loop
             broken = {i for i in constant if step.get(i) is not constant[i]}
             if broken or set(step) - {*constant, *moving}:
                 moving |= broken | (set(step) - set(constant))
@@ -180,7 +183,7 @@ class _Kernel:
         return _Backward({i: seeds.get(i, zero) for i in step}, step, totals, tables, ends, history)
 
     def _live_carries(self, fixed: str, varying: str) -> set[int]:
-        """Return the carries that depend on the wanted argument."""
+        """Return the numbers of the carries that depend on the argument ``wrt``."""
         loop = self.loop
         found = {i for i in self.kept if active(reached([loop.first[i]]), lambda n: n.op == fixed)}
         while True:
@@ -196,13 +199,13 @@ class _Kernel:
     # --------------------------------------------------------------------------------------------- the loops
 
     def _uniforms(self, everything: list[Node]) -> None:
-        """Write what is the same in all lanes and steps."""
+        """Write the values that are the same in all lanes and steps."""
         for node in everything:
             if not self.is_wide(node) and not self.is_timed(node):
                 name = f"u{node.number}"
                 self.code.add(0, f"{name} = {self._formula(node, self.uniform_names)}")
                 self.uniform_names[node.number] = name
-        # divisions by such numbers become products
+        # divisions by these values become products with their reciprocals
         self.reciprocals: dict[int, str] = {}
         for node in everything:
             if node.op == "div" and (self.is_wide(node) or self.is_timed(node)):
@@ -227,7 +230,7 @@ class _Kernel:
         crossing = self._crossing(early, inside, [n for n in after if n is not None])
 
         history = {i: j for j, i in enumerate(backward.history)} if backward else {}
-        # the carries that the backward pass reads come first and together
+        # the carries that the backward pass reads must be first and contiguous
         rows: list[str] = [f"c{i}" for i in (*history, *(i for i in forward if i not in history))]
         rows += [f"k{n.number}" for n in crossing]
         if backward:
@@ -262,7 +265,7 @@ class _Kernel:
         if forward:
             code.add(1, "for t in range(horizon):")
             if history:
-                # a loop of its own: beside so many other arrays the compiler gives up proving that none overlap
+                # a separate loop: with more arrays in one loop the compiler cannot prove that none overlap
                 code.add(2, f"past = (horizon - 1 - t) * {len(history) * LANES}")
                 code.add(2, f"for l in range({len(history) * LANES}):")
                 code.add(3, "kept[at(past + l)] = lane[l]")
@@ -292,24 +295,24 @@ class _Kernel:
         code.add(0, "return small, tame")
 
     def _crossing(self, early: list[Node], inside: list[Node], after: list[Node]) -> list[Node]:
-        """Return the numbers computed before the loop over time that are read in it or after it."""
+        """Return the values computed before the time loop that are read within it or after it."""
         known = {n.number for n in early}
         users = [n for n in reached([*inside, *after]) if n.number not in known]
         read = {a.number for n in users for a in n.args} | {n.number for n in [*inside, *after]}
         if not self.loop.length:
             return []
-        # leaves are read where they are needed
+        # includes leaves: they are stored like computed values
         return [n for n in early if n.number in read]
 
     def covers(self, backward: _Backward) -> bool:
-        """Return whether the steps write every entry of the result, each in one step."""
+        """Return whether every entry of the result is written by exactly one step."""
         if len(backward.tables) != 1:
             return False
         table = self.loop.indices[next(iter(backward.tables))]
         return np.array_equal(np.sort(table), np.arange(self.rows))
 
     def _clear(self) -> None:
-        """Write zeros to which the backward pass adds."""
+        """Write zeros to the result, to which the backward pass adds."""
         self.code.add(1, "for i in range(rows):")
         self.code.add(2, f"for l in range({LANES}):")
         self.code.add(3, "out[at(i * out_row + b + l)] = F(0.0)")
@@ -323,7 +326,7 @@ class _Kernel:
                 f"lane[{self.slots[f'a{i}']} + l] = {names[n.number]}" for i, n in seeds.items()
             ])  # fmt: skip
         if backward.inside():
-            # the history lies in the order in which it is read: loops over falling addresses do not vectorise
+            # the history is stored in reading order, since loops over decreasing addresses are not vectorised
             code.add(1, "for back in range(horizon):")
             code.add(2, "t = horizon - 1 - back")
             self._at_step(2, backward.inside())
@@ -346,7 +349,7 @@ class _Kernel:
                 return lines + [f"lane[{slot} + l] = {names[n.number]}" for slot, n in slots]
 
             self._pass(2, backward.inside(), loads | kept_values, store)
-            # a loop of its own: beside so many other arrays the compiler gives up proving that none overlap
+            # a separate loop: with more arrays in one loop the compiler cannot prove that none overlap
             for table in backward.tables:
                 code.add(2, f"for l in range({LANES}):")
                 for line in self._written(f"o{table} + l", write, f"lane[{self.slots[f'o{table}']} + l]"):
@@ -363,7 +366,7 @@ class _Kernel:
             ])  # fmt: skip
 
     def _written(self, place: str, write: str, value: str) -> list[str]:
-        """Write a value to the result, or add it; where it is a slope by theta, remember one that is too large."""
+        """Return statements that write or add ``value`` to the result and, for derivatives by theta, flag large ones."""
         if "wild" not in self.slots:
             return [f"out[at({place})] {write} {value}"]
         wild = f"lane[{self.slots['wild']} + l]"
@@ -374,7 +377,7 @@ class _Kernel:
         ]  # fmt: skip
 
     def _at_step(self, depth: int, roots: Iterable[Node]) -> None:
-        """Write what is the same in all lanes of one step, and where the arrays of the step begin."""
+        """Write the values that are the same in all lanes of a step, and the offsets of the step's arrays."""
         self.step_names = dict(self.uniform_names)
         for node in reached(roots):
             if node.op.endswith("@"):
@@ -387,7 +390,7 @@ class _Kernel:
 
     def _pass(self, depth: int, roots: list[Node], loads: dict[int, str],
               store: Callable[[dict[int, str]], list[str]]) -> None:  # fmt: skip
-        """Write one pass over the lanes: read, compute, store."""
+        """Write one loop over the lanes: read, compute, store."""
         if not roots:
             return
         self.code.add(depth, f"for l in range({LANES}):")
@@ -443,25 +446,28 @@ class _Backward:
     """The expressions of a backward pass."""
 
     seeds: dict[int, Node]
-    """Cotangents of the last carries."""
+    """Cotangents of the carries after the last step."""
     step: dict[int, Node]
     """Cotangents of the carries before a step."""
     totals: dict[Node, Node]
-    """What each step adds to the cotangent of a number from before the loop."""
+    """Contribution of each step to the cotangent of a value from before the loop."""
     tables: dict[int, Node]
-    """What each step adds to the result, at the index of a table."""
+    """Contribution of each step to the result, at the step's index in the table."""
     ends: dict[int, Node]
-    """What is added to each entry of the result after the loop."""
+    """Contribution to each entry of the result after the loop."""
     history: list[int]
-    """The carries that the pass reads."""
+    """Numbers of the carries that the backward pass reads."""
 
     def inside(self) -> list[Node]:
-        """Return what is computed in each step."""
+        """Return the expressions that are computed in each step."""
         return [*self.step.values(), *self.totals.values(), *self.tables.values()]
 
 
 def _renumbered(code: str) -> str:
-    """Return code with its names numbered in order: nodes also count inputs, of which a longer horizon has more."""
+    """Return code with names renumbered in order of use, so that it does not depend on the number of inputs.
+
+    A longer horizon has more inputs, which shift the numbers of all later nodes.
+    """
     known: dict[str, str] = {}
     return re.sub(r"\b([rsuv])(\d+)\b", lambda m: m[1] + known.setdefault(m[2], str(len(known))), code)
 

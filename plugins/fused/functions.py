@@ -1,8 +1,8 @@
-"""Functions that kernels call: those of which Python has none, and sine and cosine that compute in lanes.
+"""Source of helper functions for kernels: functions that Python lacks, and vectorisable sine and cosine.
 
 Sine and cosine reduce the angle by multiples of pi/2 in three parts (Cody, Waite 1980) and sum Taylor series to the
 order at which the next term is below 1e-18. The first two parts have 33 bits, so that their products with a multiple
-below 2^20 are exact; beyond that angle a kernel reports it and is run again with the C library's functions.
+below 2^20 are exact. A kernel reports larger angles and is then run again with the C library's functions.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from decimal import Decimal, localcontext
 from fractions import Fraction
 
 LIMIT = 1.6e6
-"""Largest angle [rad] of the fast sine and cosine."""
+"""Maximum angle [rad] of the fast sine and cosine."""
 
 
 def _half_pi() -> Fraction:
@@ -32,7 +32,7 @@ def _half_pi() -> Fraction:
 
 
 def _parts() -> list[float]:
-    """Return three numbers that add up to pi / 2, the first two with 33 bits."""
+    """Return three floats that add up to pi / 2, the first two with 33 bits each."""
     left, parts = _half_pi(), []
     for bits in (33, 33, 53):
         exponent = math.frexp(float(left))[1] - bits
@@ -43,7 +43,7 @@ def _parts() -> list[float]:
 
 
 def _series(first: int, last: int) -> str:
-    """Return the Taylor series in z = r^2 from 1/first!, with alternating signs, in Horner's form."""
+    """Return source for the sum of (-1)^i z^i / n! over n = first, first + 2, ..., last, in Horner's form, z = r^2."""
     orders = list(range(first, last + 1, 2))
     text = ""
     for i, order in reversed(list(enumerate(orders))):
@@ -104,16 +104,16 @@ def sin_(x):
 def cos_(x):
     return math.cos(x)
 """
-"""Sine and cosine of the C library, for any angle."""
+"""Source of sine and cosine by the C library, for any angle."""
 FAST = _trigonometry()
 
 
 class HELPERS:
-    """The text of helper functions."""
+    """The source of helper functions."""
 
     @staticmethod
     def text(used: Iterable[str]) -> str:
-        """Return the definitions of the functions used."""
+        """Return the source of the functions named in ``used``."""
         used = set(used)
         angles = used & {"sin_", "cos_"}
         if angles:

@@ -1,4 +1,4 @@
-"""Scalar expressions as a graph in which equal ones exist once, folded and simplified without changing a number."""
+"""Graph of scalar expressions: equal expressions share a node, and simplifications change no computed value."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 
 MOST = 20_000
-"""Most nodes of a graph: beyond it, code without loops would be too long to compile."""
+"""Maximum number of operations in a graph: longer straight-line code would take too long to compile."""
 
 
 class Refused(Exception):
-    """Raised where a program has no form as a loop of scalar code; the message names the primitive."""
+    """Raised if a program cannot be expressed as a loop of scalar code. The message names the primitive or limit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A number: a leaf, or an operation on other nodes. Arguments have smaller numbers than their users."""
+    """A scalar: a leaf, or an operation on other nodes. A node's ``number`` is larger than its arguments' numbers."""
 
     number: int
     op: str
     args: tuple[Node, ...] = ()
     data: Any = None
-    """Of a leaf its index or value, of an operation its parameters."""
+    """A leaf's index or value, or an operation's parameters."""
 
     @property
     def value(self) -> Any:
@@ -45,27 +45,27 @@ FOLD: dict[str, Callable[..., Any]] = {
     "sqrt": np.sqrt, "square": np.square, "stop_gradient": lambda x: x, "sub": np.subtract, "tan": np.tan,
     "tanh": np.tanh, "xor": np.logical_xor,
 }  # fmt: skip
-"""Operations on single numbers, as NumPy computes them."""
+"""NumPy functions that evaluate operations on constants, by operation."""
 
 
 @dataclass
 class Graph:
-    """Nodes; equal ones are the same object."""
+    """The nodes of an expression graph. Equal nodes are the same object."""
 
     nodes: list[Node] = field(default_factory=list)
     _known: dict[Any, Node] = field(default_factory=dict)
 
     def leaf(self, op: str, data: Any = None) -> Node:
-        """Return a leaf."""
+        """Return the leaf of a kind ``op`` with its index or value."""
         return self._node(op, (), data)
 
     def literal(self, value: Any) -> Node:
-        """Return a constant; -0.0 and 0.0, True and 1.0 are different constants."""
+        """Return a constant. -0.0 and 0.0 are different constants, as are True and 1.0."""
         value = bool(value) if isinstance(value, bool | np.bool_) else float(value)
         return self._node("literal", (), value)
 
     def apply(self, op: str, *args: Node, data: Any = None) -> Node:
-        """Return an operation on nodes, simplified where that changes no number (the sign of a zero may change)."""
+        """Return an operation on nodes, simplified without changing its value (except for the sign of a zero)."""
         if op == "integer_pow":
             return self._power(args[0], data)
         if op not in FOLD:
@@ -78,14 +78,14 @@ class Graph:
 
     def _simpler(self, op: str, args: tuple[Node, ...], values: list[Any]) -> Node | None:
         if op == "stop_gradient":
-            # kept as an operation of its own, since its derivative is 0
+            # remains a separate operation, since its derivative is 0
             return None
         if op in ("add", "mul"):
             neutral = 0.0 if op == "add" else 1.0
             for value, other in zip(values, reversed(args), strict=True):
                 if value == neutral:
                     return other
-            # constants last, so that formulas of different steps have the same form; else as written the first time
+            # constants last, so that formulas of different steps have the same form; else in the order first used
             if args[0].op == "literal" or (op, (args[1].number, args[0].number), None) in self._known:
                 return self._node(op, (args[1], args[0]), None)
         if op in ("sub", "div") and values[1] == (0.0 if op == "sub" else 1.0):
@@ -137,7 +137,7 @@ class Graph:
 
 
 def reached(roots: Iterable[Node], stop: Callable[[Node], bool] = lambda node: False) -> list[Node]:
-    """Return the nodes that roots are computed from, arguments first; what lies behind a node to stop at is left out."""
+    """Return the roots and all nodes that they depend on, arguments first; arguments of ``stop`` nodes are omitted."""
     seen: dict[int, Node] = {}
     waiting = list(roots)
     while waiting:

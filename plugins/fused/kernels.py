@@ -1,4 +1,4 @@
-"""Compiled kernels: their source is kept in a folder by its text, and Numba keeps the machine code beside it."""
+"""Compiled kernels. A folder stores each kernel's source under its hash, with Numba's machine code beside it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _busy = threading.Lock()
 
 @dataclass(frozen=True)
 class Kernel:
-    """A compiled kernel, the seconds that compiling took, and whether it was loaded from a folder."""
+    """A compiled kernel, its compile time in seconds, and whether it was loaded from a folder."""
 
     name: str
     call: Callable[..., tuple[bool, bool]]
@@ -34,12 +34,13 @@ class Kernel:
 
 
 def compiled(text: str, dtype: str, fresh: bool, count: Compilations) -> Kernel:
-    """Return the kernel of a source, compiled once per process; with ``fresh`` its seconds are those of a compilation.
+    """Return the kernel of the source ``text``, compiled once per process.
 
+    With ``fresh``, a kernel that was loaded from the folder is compiled again, so that ``seconds`` is its compile time.
     Compilations and requests are added to ``count``.
     """
     name = hashlib.sha256(text.encode()).hexdigest()[:16]
-    # one at a time: Numba's compiler holds a lock of its own
+    # one at a time: Numba's compiler has its own lock
     with _busy:
         found = _known.get(name)
         if found is None or (fresh and found.loaded):
@@ -51,7 +52,7 @@ def compiled(text: str, dtype: str, fresh: bool, count: Compilations) -> Kernel:
 
 
 def exact(text: str) -> str:
-    """Return the source with the C library's sine and cosine, for angles beyond the range of the fast ones."""
+    """Return the source with the C library's sine and cosine, for angles beyond the range of the fast functions."""
     return text.replace(FAST, SLOW)
 
 
@@ -90,14 +91,14 @@ def _compile(name: str, text: str, dtype: str, folder: Path | None) -> Kernel:
 
 
 def _module(name: str, text: str, folder: Path | None) -> ModuleType:
-    """Return the module of a source: from a file that Numba can keep machine code for, or from memory."""
+    """Return the module of a source: from a file, for which Numba stores machine code, or from memory if no folder."""
     full = f"_bench_fused_{name}"
     if folder is None:
         module = ModuleType(full)
         exec(compile(text, f"<{full}>", "exec"), vars(module))
         return module
     path = folder / f"{name}.py"
-    # Numba asks whether the source is older than the machine code: an existing file stays as it is
+    # never rewrite an existing file: Numba discards machine code older than its source
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
         handle, draft = tempfile.mkstemp(dir=folder, suffix=".draft")

@@ -1,4 +1,4 @@
-"""JAX code as scalar expressions: a program is traced for one column, and each array becomes its numbers one by one."""
+"""JAX code as scalar expressions: a program is traced for one column, and each array entry becomes its own node."""
 
 from __future__ import annotations
 
@@ -11,17 +11,20 @@ import numpy as np
 from .graph import FOLD, Graph, Node, Refused
 
 BRANCHES = 4
-"""Most different formulas that one input of a step may have along the horizon."""
+"""Maximum number of different formulas for one input of a step along the horizon."""
 
 
 @dataclass
 class Loop:
-    """A function of one rollout: numbers before the loop, one step, and the result after it.
+    """The expression graph of a function of one rollout: the carries before the loop, one step, and the result.
 
-    Without steps (``length`` 0, no carries) the result follows from the inputs directly. Leaves: ``parameter``,
-    ``theta``, ``scored``, ``noise`` (an index each), ``carry`` and ``final`` (number of the carry, in a step and after
-    the last one), ``table`` (number of a table with one constant per step), and ``theta@``, ``scored@``, ``noise@``
-    (number of a table with one index per step).
+    A function without steps has ``length`` 0 and no carries. Each leaf has a kind and a number:
+
+    - ``parameter``, ``theta``, ``scored``, ``noise``: an input and its index.
+    - ``carry``, ``final``: a carry within a step or after the last step, and its number.
+    - ``table``: one constant per step, and the number of the table in ``constants``.
+    - ``theta@``, ``scored@``, ``noise@``: an input whose index differs per step, and the number of the table in
+      ``indices``.
     """
 
     graph: Graph
@@ -29,7 +32,7 @@ class Loop:
     first: list[Node] = field(default_factory=list)
     """The carries before the first step."""
     step: list[Node] = field(default_factory=list)
-    """The carries after a step, from the ``carry`` leaves."""
+    """The carries after a step, as functions of the ``carry`` leaves."""
     result: Node | None = None
     constants: list[np.ndarray] = field(default_factory=list)
     """Tables ``(length,)`` of constants."""
@@ -38,9 +41,9 @@ class Loop:
 
 
 def traced(function: Callable[..., Any], shapes: dict[str, int]) -> Loop:
-    """Return the scalar form of ``function(**columns)``, which returns one number per column.
+    """Return the scalar form of ``function(**columns)``, which must return one number per column.
 
-    ``shapes`` gives the length of each argument, all of them ``(n, 1)`` except ``parameter``, which is ``(n,)``. The
+    ``shapes`` maps each argument to its length n. Arguments have shape ``(n, 1)``, except ``parameter (n,)``. The
     function may contain one scan. Raises :class:`Refused` with the name of a primitive without a scalar form.
     """
     import jax
@@ -68,7 +71,7 @@ def _objects(items: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
 
 
 class _Tracer:
-    """Evaluates jaxprs on arrays of nodes; arrays without any are plain NumPy arrays."""
+    """Evaluates jaxprs on arrays of nodes. Arrays of constants remain plain NumPy arrays."""
 
     def __init__(self) -> None:
         self.loop = Loop(Graph())
@@ -79,7 +82,7 @@ class _Tracer:
         return [x if isinstance(x, Node) else graph.literal(x) for x in np.asarray(array).ravel()]
 
     def run(self, jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Return the outputs of a jaxpr."""
+        """Return the outputs of a jaxpr as arrays of nodes or constants."""
         known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(np.asarray, consts), *arguments], strict=True))
 
         def read(atom: Any) -> np.ndarray:
@@ -191,12 +194,12 @@ class _Tracer:
         return result
 
     def _slice(self, x: np.ndarray) -> np.ndarray:
-        """Return one step's slice of an array ``(length, ...)``: formulas that hold for every step."""
+        """Return one step's slice of an array ``(length, ...)``, as formulas that are valid at every step."""
         steps = [self.nodes(row) for row in x]
         return _objects([self._along([row[i] for row in steps]) for i in range(len(steps[0]))], x.shape[1:])
 
     def _along(self, nodes: list[Node]) -> Node:
-        """Return one node that stands for a number's value at every step."""
+        """Return one node that equals the given nodes, one per step, at their steps."""
         first, graph = nodes[0], self.loop.graph
         if all(node is first for node in nodes):
             return first
@@ -214,7 +217,7 @@ class _Tracer:
         )
 
     def _branches(self, nodes: list[Node]) -> Node:
-        """Return a choice by step between formulas of different form."""
+        """Return a node that selects, at each step, between formulas of different form."""
         kinds = [(node.op, node.data if node.args else None) for node in nodes]
         distinct = list(dict.fromkeys(kinds))
         if len(distinct) > BRANCHES:
@@ -241,7 +244,7 @@ class _Tracer:
 
 
 LOGICAL = frozenset({"and", "eq", "ge", "gt", "is_finite", "le", "lt", "ne", "not", "or", "xor"})
-"""Operations that give true or false."""
+"""Operations with a Boolean result."""
 REDUCTIONS = {
     "reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_or": "or",
     "reduce_and": "and",
@@ -276,4 +279,4 @@ MOVES: dict[str, Callable[..., np.ndarray]] = {
     "stack": lambda p, out, *values: np.stack(values, axis=p["axis"]),
     "transpose": lambda p, out, value: np.transpose(value, p["permutation"]),
 }
-"""Operations that move numbers and compute none."""
+"""Operations that only rearrange array entries."""

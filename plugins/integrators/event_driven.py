@@ -1,4 +1,4 @@
-"""Second-order steps that are split at impacts."""
+"""Second-order time steps, split at the time of impact."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,24 +13,24 @@ LATE = 1e-3
 
 @dataclass(frozen=True)
 class EventDriven(StormerVerlet):
-    """Stormer-Verlet; under an impulse law it flies to the first impact of the step and applies the law from there.
+    """Stormer-Verlet. Under an impulse law, a step is split at its first impact, where the law is applied.
 
     The time of impact is a root of gap + rate t + acceleration t^2 / 2, differentiated in closed form, so that speed
-    and time of the impact depend on theta as in the physics: gradients of rigid bounces are right to discretisation
-    error, and exact under constant acceleration, which no correction of a whole step achieves.
-    The law reverses the velocity at the impact, and the rest of the step starts from the new velocity.
+    and time of the impact depend on theta as in the physics. Gradients of rigid bounces are correct to discretisation
+    error, and exact under constant acceleration, which no correction of a whole step achieves. The law reverses the
+    velocity at the impact, and the remainder of the step starts from the new velocity.
 
     Each contact has at most one impact per step: a body that returns earlier (coming to rest) sinks slowly, by less
-    than dt^2 g / 2 per step. The gap's acceleration neglects the gap's curvature in q. The law alone handles further
-    contacts in the rest of a step and steps without an impact. Intended for rigid laws; without one it is
-    Stormer-Verlet.
+    than dt^2 g / 2 per step. The gap's acceleration neglects the gap's curvature in q. Further contacts in the
+    remainder of a step, and steps without an impact, are handled by the law as in other integrators. Intended for rigid
+    laws; without an impulse law it equals Stormer-Verlet.
     """
 
     name = "event_driven"
     takes_impulses = True
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """Step to the impact if there is one, then to the end of the step."""
+        """Return the state after a step to the impact, if there is one, and then to the end of the step."""
         q, v = state.q, dynamics.carried(state.v)
         contact = dynamics.contact
         if contact is None:
@@ -45,8 +45,8 @@ def _first_impact(xp: Any, contact: Contact, state: State, a: Array, dt: Any) ->
     """Return the time from the start of the step to its first impact, ``(1, B)`` [s]; 0 without one."""
     gap, rate, bend = contact.gap(state.q), contact.gap_rate(*state), contact.gap_rate(state.q, a)
     square = rate * rate - 2.0 * bend * gap
-    # the untaken branch of a where is differentiated too: sqrt(<= 0) or a division by 0 would put NaN into that
-    # column's gradient, so the root's argument and both divisors are 1 where they are not used
+    # the unused branch of xp.where is differentiated too: sqrt(<= 0) or a division by 0 would make that column's
+    # gradient NaN, so the root's argument and both divisors are 1 where they are not used
     crossing = square > 0
     speed = xp.sqrt(xp.where(crossing, square, 0.0 * square + 1.0))
     approaching, pulled = rate < 0, bend < 0

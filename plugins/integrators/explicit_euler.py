@@ -11,14 +11,14 @@ from bench.model import Array, Dynamics, Integrator, State
 class ExplicitEuler(Integrator):
     """q+ = q + dt v, v+ = v + dt a(q, v, u).
 
-    On an undamped oscillator it gains energy at every dt.
+    It increases the energy of an undamped oscillator at every dt.
     """
 
     name = "explicit_euler"
     order = 1
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """Take one step, evaluating all terms at its start."""
+        """Return the state after one step, with all terms evaluated at its start."""
         v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)
         return State(state.q + dt * state.v, v)
 
@@ -27,5 +27,5 @@ class ExplicitEuler(Integrator):
         return 1 + z
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """Return the matrix with both rows evaluated at the old state."""
+        """Return the matrix ``(2, 2)`` of one step, both rows evaluated at the old state."""
         return np.array([[1.0, dt], [-dt * stiffness, factor - dt * damping]])

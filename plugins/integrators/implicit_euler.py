@@ -25,7 +25,7 @@ class ImplicitEuler(Integrator):
     needs_root = True
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """Take one step by solving one equation for the displacement dt v+."""
+        """Return the state after one step, which solves one equation for the displacement dt v+."""
 
         def residual(moved: Array, args: Any) -> Array:
             q, carried, u, dt = args
@@ -42,6 +42,6 @@ class ImplicitEuler(Integrator):
         return 1 / (1 - z)
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """Return the matrix of v+ = (d v - dt stiffness q) / (1 + dt damping + dt^2 stiffness) and q+ = q + dt v+."""
+        """Return the matrix for v+ = (d v - dt stiffness q) / (1 + dt damping + dt^2 stiffness) and q+ = q + dt v+."""
         row = np.array([-dt * stiffness, factor]) / (1.0 + dt * damping + dt**2 * stiffness)
         return np.array([[1.0, 0.0] + dt * row, row])

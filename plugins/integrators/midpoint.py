@@ -11,15 +11,15 @@ from bench.model import Array, Dynamics, Integrator, State
 class Midpoint(Integrator):
     """Half an explicit Euler step, then a full step with the derivatives at the midpoint: second-order Runge-Kutta.
 
-    The velocity factor multiplies the velocity at the start of the step, before all stages. On an undamped oscillator
-    of frequency w it gains energy at every dt, by a factor 1 + (w dt)^4 / 4 per step.
+    The velocity factor multiplies the velocity at the start of the step, before all stages. The energy of an undamped
+    oscillator of frequency w grows at every dt, by a factor 1 + (w dt)^4 / 4 per step.
     """
 
     name = "midpoint"
     order = 2
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """Take one step with two accelerations."""
+        """Return the state after one step, with two evaluations of the acceleration."""
         q, v = state.q, dynamics.carried(state.v)
         middle = v + 0.5 * dt * dynamics.acceleration(q, v, u)
         return State(q + dt * middle, v + dt * dynamics.acceleration(q + 0.5 * dt * v, middle, u))

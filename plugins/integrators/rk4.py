@@ -19,7 +19,7 @@ class Rk4(Integrator):
     order = 4
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """Take one step with four accelerations."""
+        """Return the state after one step, with four evaluations of the acceleration."""
         q, v1 = state.q, dynamics.carried(state.v)
         a1 = dynamics.acceleration(q, v1, u)
         v2 = v1 + 0.5 * dt * a1

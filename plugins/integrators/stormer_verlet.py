@@ -21,7 +21,7 @@ class StormerVerlet(Integrator):
     order = 2
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """Take one step with two accelerations."""
+        """Return the state after one step, with two evaluations of the acceleration."""
         return flight(dynamics, State(state.q, dynamics.carried(state.v)), u, dt)
 
     def amplification(self, z: complex) -> complex:
@@ -29,7 +29,7 @@ class StormerVerlet(Integrator):
         return 1 + z + z * z / 2
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """Return the matrix, built row by row as in the step, after the velocity factor."""
+        """Return the matrix ``(2, 2)`` of one step, computed row by row as in :meth:`step`, after the velocity factor."""
         position, velocity = np.eye(2)
         before = -stiffness * position - damping * velocity
         moved = position + dt * velocity + 0.5 * dt**2 * before
@@ -38,7 +38,7 @@ class StormerVerlet(Integrator):
 
 
 def flight(dynamics: Dynamics, state: State, u: Array, dt: Array | float) -> State:
-    """Take the step without velocity factor; ``dt`` may differ between columns, ``(1, B)``."""
+    """Return the state after one step without velocity factor; ``dt`` may differ between columns, ``(1, B)``."""
     q, v = state
     a = dynamics.acceleration(q, v, u)
     moved = q + dt * (v + 0.5 * dt * a)

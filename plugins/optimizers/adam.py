@@ -13,7 +13,7 @@ from .clipped import Clipped
 class Adam(Clipped):
     """Adam (Kingma, Ba 2015): theta - rate m / (sqrt(v) + eps) with bias-corrected means m of g and v of g^2.
 
-    Its steps are about ``rate`` per element for gradients of any size, so that a rate suits scenes of any scale.
+    The step is about ``rate`` per element for gradients of any size, so that one rate suits costs of any scale.
     """
 
     name = "adam"
@@ -23,11 +23,11 @@ class Adam(Clipped):
     eps: float = param(1e-8, "added to the square root", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start with both means at 0."""
+        """Return the initial state, with both means at 0."""
         return super().start(theta) | {"mean": np.zeros(len(theta)), "square": np.zeros(len(theta))}
 
     def step(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
-        """Update both means by the clipped gradient and move."""
+        """Return the state after updating both means with the clipped gradient and taking a step."""
         i, g = state["iteration"] + 1, self.clipped(gradient)
         mean = self.beta1 * state["mean"] + (1 - self.beta1) * g
         square = self.beta2 * state["square"] + (1 - self.beta2) * g * g

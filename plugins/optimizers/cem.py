@@ -9,11 +9,11 @@ from bench.model import Answer, OptimizerState, Population, param
 
 @dataclass(frozen=True)
 class Cem(Population):
-    """The cross-entropy method (Rubinstein 1999): repeatedly fit a diagonal normal to the best points.
+    """The cross-entropy method (Rubinstein 1999): repeatedly fits a diagonal normal distribution to the best points.
 
     On a linear cost with elite share rho and z the normal quantile of rho, the mean moves by -sigma phi(z) / rho and
-    the variance falls by 1 - z phi(z) / rho - (phi(z) / rho)^2. The variance of the elites is about the ``new`` mean,
-    or about the ``old`` one, which adds the squared step and keeps the search wide (``spread``).
+    the variance is multiplied by 1 - z phi(z) / rho - (phi(z) / rho)^2. By ``spread``, the variance of the elites is
+    computed about the ``new`` mean or about the ``old`` mean, which adds the squared step and slows the narrowing.
     """
 
     name = "cem"
@@ -25,7 +25,7 @@ class Cem(Population):
     spread: str = param("new", "mean about which the variance is computed", choices=("new", "old"))
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start at theta with the initial width."""
+        """Return the initial state: mean theta, standard deviation ``width``."""
         return super().start(theta) | {"deviation": np.full(len(theta), self.width)}
 
     def draws(self, dim: int) -> int:
@@ -33,11 +33,11 @@ class Cem(Population):
         return self.population
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return the population."""
+        """Return the points of one iteration, ``(d, population)``."""
         return np.asarray(state["theta"][:, None] + state["deviation"][:, None] * noise)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Fit mean and variance to the elites; points without a finite cost are ranked last."""
+        """Return mean and standard deviation of the elites as state; points without a finite cost rank last."""
         assert answer.value is not None
         cost = np.where(np.isfinite(answer.value), answer.value, np.inf)
         elite = theta[:, np.argsort(cost, kind="stable")[: min(self.elites, theta.shape[1])]]

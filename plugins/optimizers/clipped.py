@@ -1,4 +1,4 @@
-"""The base of the gradient methods: clipping, and a decreasing rate."""
+"""The base class of the gradient methods: gradient clipping and a decreasing rate."""
 
 from dataclasses import dataclass
 
@@ -17,11 +17,11 @@ class Clipped(Descent):
     clip_by: str = param("norm", "whether the norm or each element is limited", choices=("norm", "element"))
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start at iteration 0."""
+        """Return the initial state, at iteration 0."""
         return super().start(theta) | {"iteration": 0}
 
     def clipped(self, gradient: np.ndarray) -> np.ndarray:
-        """Return the gradient with its norm or its elements limited to ``clip``."""
+        """Return the gradient ``(d,)`` with its norm or its elements limited to ``clip``."""
         if self.clip is None:
             return gradient
         if self.clip_by == "element":
@@ -30,5 +30,5 @@ class Clipped(Descent):
         return gradient if norm <= self.clip else gradient * (self.clip / norm)
 
     def rate_at(self, iteration: int) -> float:
-        """Return the rate of an iteration; the first iteration is 1."""
+        """Return the rate of an iteration, counted from 1."""
         return float(self.rate / iteration**self.decay)

@@ -12,8 +12,8 @@ from bench.model import Answer, OptimizerState, Population, param
 class Constants(NamedTuple):
     """The strategy's constants for a dimension and a population (Hansen 2016, arXiv 1604.00772, table 1).
 
-    ``c_sigma`` has the denominator d + mu_eff + 3, as in the author's own program, while the table has 5, and is at
-    most 1/2.
+    ``c_sigma`` has the denominator d + mu_eff + 3, as in the author's own program, instead of the table's d + mu_eff
+    + 5, and is at most 1/2.
     """
 
     weights: np.ndarray
@@ -28,7 +28,7 @@ class Constants(NamedTuple):
 
 
 def constants(dim: int, population: int) -> Constants:
-    """Return the default constants, with the weights of the better half only."""
+    """Return the default constants, with weights for the better half of the population only."""
     raw = math.log((population + 1) / 2) - np.log(np.arange(1, population // 2 + 1))
     weights = raw / raw.sum()
     mu_eff = float(1 / (weights**2).sum())
@@ -43,7 +43,7 @@ def constants(dim: int, population: int) -> Constants:
 
 @dataclass(frozen=True)
 class CmaEs(Population):
-    """CMA-ES (Hansen 2016): adapts the mean, the step size and the whole covariance of a normal to the better half.
+    """CMA-ES (Hansen 2016): adapts mean, step size and full covariance of a normal distribution to the better half.
 
     Stores d^2 numbers and needs d^3 operations per iteration. Points without a finite cost are ranked last.
     """
@@ -54,7 +54,7 @@ class CmaEs(Population):
     width: float = param(0.3, "initial step size, in units of theta", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start with the unit covariance."""
+        """Return the initial state: mean theta, step size ``width``, unit covariance."""
         d = len(theta)
         paths = {"path_sigma": np.zeros(d), "path_c": np.zeros(d)}
         root = {"covariance": np.eye(d), "axes": np.eye(d), "lengths": np.ones(d)}
@@ -65,12 +65,12 @@ class CmaEs(Population):
         return self.population or 4 + math.floor(3 * math.log(dim))
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return the population."""
+        """Return the points of one iteration, ``(d, population)``."""
         moved = state["axes"] @ (state["lengths"][:, None] * noise)
         return np.asarray(state["theta"][:, None] + state["sigma"] * moved)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Update mean, paths, covariance and step size."""
+        """Return the state with updated mean, evolution paths, covariance and step size."""
         assert answer.value is not None
         d, i = theta.shape[0], state["iteration"] + 1
         k = constants(d, theta.shape[1])

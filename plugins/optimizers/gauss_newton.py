@@ -10,7 +10,7 @@ from bench.model import Answer, Optimizer, OptimizerState, param
 
 @dataclass(frozen=True)
 class GaussNewton(Optimizer):
-    """Minimises |r|^2 / 2 by steps of (J'J + damping diag(J'J))^-1 J'r (Levenberg 1944, Marquardt 1963).
+    """Minimises |r|^2 / 2 by steps -(J'J + damping diag(J'J))^-1 J'r (Levenberg 1944, Marquardt 1963).
 
     Requires residuals and their Jacobian. A step that increases the cost is rejected and the damping multiplied by ten.
     A step that decreases it divides the damping by ten. If J'J is singular, the shortest least-squares step is taken.
@@ -22,15 +22,15 @@ class GaussNewton(Optimizer):
     damping: float = param(1e-3, "initial damping, relative to the diagonal of J'J", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start with the initial damping and no known point."""
+        """Return the initial state: the initial damping and no evaluated point."""
         return super().start(theta) | {"damping": self.damping, "known": None, "next": np.array(theta, dtype=float)}
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return the next point."""
+        """Return the next point, ``(d, 1)``."""
         return np.array(state["next"][:, None])
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Accept the point if it is better, and step from the best point."""
+        """Return the state after accepting or rejecting the point, with the next step from the best point."""
         assert answer.residual is not None
         assert answer.jacobian is not None
         residual, jacobian = answer.residual[:, 0], answer.jacobian[..., 0]

@@ -11,11 +11,11 @@ from .clipped import Clipped
 
 @dataclass(frozen=True)
 class GradientDescent(Clipped):
-    """theta - rate g. On a curvature k with gradient variance v it settles at E J - J* = rate v / (2 (2 - rate k))."""
+    """theta - rate g. At curvature k and gradient variance v, it converges to E J - J* = rate v / (2 (2 - rate k))."""
 
     name = "gradient_descent"
 
     def step(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
-        """Move against the clipped gradient."""
+        """Return the state after a step against the clipped gradient."""
         i = state["iteration"] + 1
         return {"theta": state["theta"] - self.rate_at(i) * self.clipped(gradient), "iteration": i}

@@ -13,8 +13,8 @@ from .searching import Searching
 class Lbfgs(Searching):
     """L-BFGS by the two-loop recursion (Nocedal, Wright 2006, algorithm 7.4) with Armijo backtracking from step 1.
 
-    For gradients without noise. Pairs with y.s <= 1e-10 |y||s| are skipped, and before the first pair the direction is
-    the negative gradient scaled to ``first_move``.
+    For gradients without noise. Pairs of step s and gradient change y with y.s <= 1e-10 |y||s| are skipped. Before the
+    first pair, the direction is the negative gradient scaled to length ``first_move``.
     """
 
     name = "lbfgs"
@@ -27,7 +27,7 @@ class Lbfgs(Searching):
     first_move: float = param(0.1, "length of the first step", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start without pairs."""
+        """Return the initial state, without pairs."""
         return super().start(theta) | {"steps": [], "changes": [], "last": None}
 
     def with_gradient(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
@@ -42,7 +42,7 @@ class Lbfgs(Searching):
         }  # fmt: skip
 
     def direction(self, state: OptimizerState) -> np.ndarray:
-        """Return minus the approximate inverse Hessian times the gradient."""
+        """Return minus the approximate inverse Hessian times the gradient, ``(d,)``."""
         q = np.array(state["gradient"])
         pairs = list(zip(state["steps"], state["changes"], strict=True))
         if not pairs:

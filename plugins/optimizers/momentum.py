@@ -19,11 +19,11 @@ class Momentum(Clipped):
     nesterov: bool = param(False, "Nesterov momentum (Nesterov 1983)")
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start with speed 0."""
+        """Return the initial state, with momentum 0."""
         return super().start(theta) | {"speed": np.zeros(len(theta))}
 
     def step(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
-        """Keep a share of the last step and add the clipped gradient."""
+        """Return the state after a step along a share of the last step plus the clipped gradient."""
         i, g = state["iteration"] + 1, self.clipped(gradient)
         speed = self.momentum * state["speed"] + g
         move = g + self.momentum * speed if self.nesterov else speed

@@ -11,9 +11,9 @@ from bench.model import Answer, OptimizerState, Population, param
 class Mppi(Population):
     """The mean of normal samples weighted by exp(-cost / temperature) (Williams et al. 2017).
 
-    On (u - u*)'H (u - u*) / 2 with variance S and infinitely many samples it moves from mu to
-    (H / temperature + S^-1)^-1 (H u* / temperature + S^-1 mu). At a high temperature it is a zeroth-order gradient
-    step of length S / temperature; at a low one the best sample.
+    On the cost (u - u*)'H (u - u*) / 2, with variance S and infinitely many samples, the mean moves from mu to
+    (H / temperature + S^-1)^-1 (H u* / temperature + S^-1 mu). At a high temperature this is a zeroth-order gradient
+    step with rate S / temperature; at a low temperature it is the best sample.
     """
 
     name = "mppi"
@@ -28,11 +28,11 @@ class Mppi(Population):
         return self.population
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return the samples."""
+        """Return the samples, ``(d, population)``."""
         return np.asarray(state["theta"][:, None] + self.width * noise)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Move to the weighted mean; points without a finite cost have no weight."""
+        """Return the weighted mean as state; points without a finite cost have weight 0."""
         assert answer.value is not None
         is_finite = np.isfinite(answer.value)
         if not is_finite.any():

@@ -9,13 +9,13 @@ from bench.model import Answer, OptimizerState, Population, param
 
 @dataclass(frozen=True)
 class Ppo(Population):
-    """PPO (Schulman et al. 2017, arXiv 1707.06347, equation 7) whose policy is a normal per coordinate of theta.
+    """PPO (Schulman et al. 2017, arXiv 1707.06347, equation 7) with a normal distribution per coordinate as policy.
 
-    Each coordinate of a sample is an action x_i ~ N(mean_i, deviation_i^2) with a ratio r_i of its own to the policy
-    that drew it, and the advantage A of its rollout, its cost below the population's mean in standard deviations.
-    ``epochs`` steps of Adam ascend the mean of min(r_i A, clip(r_i, 1 - clip, 1 + clip) A) by means and logarithms of
-    the deviations. It uses costs only: without states there is neither a value function nor credit assignment to single
-    steps. It is a point of comparison for other methods, not a benchmark of full PPO implementations.
+    Each coordinate of a sample is an action x_i ~ N(mean_i, deviation_i^2) with its own probability ratio r_i to the
+    policy that drew it. All coordinates share the rollout's advantage A: the population's mean cost minus the rollout's
+    cost, in standard deviations. ``epochs`` steps of Adam ascend the mean of
+    min(r_i A, clip(r_i, 1 - clip, 1 + clip) A) over means and log deviations. Since only costs are used, there is neither a value function nor credit assignment to
+    single steps: this is a baseline for other methods, not a benchmark of full PPO implementations.
     """
 
     name = "ppo"
@@ -28,7 +28,7 @@ class Ppo(Population):
     least: float = param(1e-6, "smallest standard deviation", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start at theta with the initial width, and with Adam's means at 0."""
+        """Return the initial state: mean theta, standard deviation ``width``, Adam's means at 0."""
         policy = np.stack([np.array(theta, dtype=np.float64), np.full(len(theta), np.log(self.width))])
         return {
             "theta": policy[0], "policy": policy, "mean": 0.0 * policy, "square": 0.0 * policy, "step": 0,
@@ -39,12 +39,15 @@ class Ppo(Population):
         return self.population
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return the population."""
+        """Return the points of one iteration, ``(d, population)``."""
         mean, log_deviation = state["policy"]
         return np.asarray(mean[:, None] + np.exp(log_deviation)[:, None] * noise)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Ascend the surrogate. Points without a finite cost are ignored, and equal costs change nothing."""
+        """Return the state after ``epochs`` steps on the clipped objective; unchanged if all costs are equal.
+
+        Points without a finite cost are ignored.
+        """
         assert answer.value is not None
         is_finite = np.isfinite(answer.value)
         cost = answer.value[is_finite]
@@ -61,9 +64,10 @@ class Ppo(Population):
         return {"theta": policy[0], "policy": policy, "mean": mean, "square": square, "step": step}
 
     def slope(self, policy: np.ndarray, old: np.ndarray, points: np.ndarray, advantage: np.ndarray) -> np.ndarray:
-        """Return the surrogate's derivative by means and logarithms of deviations, ``(2, d)``, summed over coordinates.
+        """Return the derivative of the clipped objective by means and by log deviations, ``(2, d)``.
 
-        ``old (2, d)`` drew the points ``(d, B)``, whose advantages are ``(B,)``.
+        The objective is a sum over coordinates. The policy ``old (2, d)`` drew the points ``(d, B)``, whose advantages
+        are ``(B,)``.
         """
         away, before = (
             (points - mean[:, None]) / np.exp(log_deviation)[:, None] for mean, log_deviation in (policy, old)

@@ -1,4 +1,4 @@
-"""The base of the line-search methods, which evaluate several step lengths in one batch."""
+"""The base class of the line-search methods, which evaluate several step lengths in one batch."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from bench.model import Answer, Optimizer, OptimizerState, param
 
 @dataclass(frozen=True)
 class Searching(Optimizer):
-    """A method that asks for a gradient, then for the costs of shrinking steps along a direction, in one batch.
+    """A method that alternates between requesting a gradient and the costs of several steps along a direction.
 
-    It takes the longest step with f <= f0 + slope step g.direction (Armijo 1966). Without such a step theta stays. The
-    batch begins with theta itself, so that all compared costs come from the same noise.
+    It takes the longest step with f <= f0 + slope step g.direction (Armijo 1966). Without such a step, theta does not
+    change. The batch of steps includes theta itself, so that all compared costs use the same noise.
     """
 
     needs: ClassVar[frozenset[str]] = frozenset({"value", "gradient"})
@@ -25,22 +25,22 @@ class Searching(Optimizer):
     tries: int = param(8, "number of trial steps", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Start by asking for a gradient."""
+        """Return the initial state, which requests a gradient."""
         return super().start(theta) | {"gradient": None}
 
     def required_fields(self, state: OptimizerState) -> frozenset[str]:
-        """Return the gradient and the costs, in alternation."""
+        """Return ``gradient`` and ``value`` alternately."""
         return frozenset({"gradient"} if state["gradient"] is None else {"value"})
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return theta, or theta and the steps from it."""
+        """Return theta, ``(d, 1)``, or theta and the trial points, ``(d, 1 + tries)``."""
         theta = state["theta"][:, None]
         if state["gradient"] is None:
             return np.array(theta)
         return np.asarray(theta + self.direction(state)[:, None] * np.concatenate([[0.0], self.steps(state)]))
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Store the gradient, or take the longest step that descends enough."""
+        """Return the state with a new gradient, or after the longest step with sufficient descent."""
         if state["gradient"] is None:
             assert answer.gradient is not None
             return self.with_gradient(state, answer.gradient[:, 0])
@@ -51,7 +51,7 @@ class Searching(Optimizer):
         return state | {"theta": np.array(moved), "gradient": None}
 
     def steps(self, state: OptimizerState) -> np.ndarray:
-        """Return the trial steps, longest first."""
+        """Return the lengths of the trial steps, longest first, ``(tries,)``."""
         return self.first * self.shrink ** np.arange(self.tries)
 
     def with_gradient(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:

@@ -1,4 +1,4 @@
-"""One ball is pushed at another. If it misses, the gradient is exactly zero."""
+"""One ball is pushed towards another. If it misses, the gradient is exactly zero."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,11 +11,11 @@ from bench.model import Array, ContactScene, State, param
 
 @dataclass(frozen=True)
 class Billiard(ContactScene):
-    """Two equal balls on a frictionless table; a force (4, u0) acts on the first during the first step.
+    """Two equal balls on a frictionless table; a force (4, u0) [N] acts on the first ball during the first step.
 
     q = (x1, y1, x2, y2); theta = u0 (d = 1), with parameter noise; f = squared distance of the second ball from the
-    origin at T. Straight at the other ball it hits while |u0| < 4 tan(asin(2 radius / distance)), 2.189 N; beyond that
-    it misses, f does not depend on u0, and the derivative is exactly 0. Source: Paulus et al. 2025.
+    origin at T. The first ball hits if |u0| < 4 tan(asin(2 radius / distance)) = 2.189 N. Otherwise it misses, f does
+    not depend on u0, and the derivative is exactly 0. Source: Paulus et al. 2025.
     """
 
     name = "billiard"
@@ -38,7 +38,7 @@ class Billiard(ContactScene):
         return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Place the balls at rest on the x axis, 0.175 m apart."""
+        """Return the balls at rest on the x axis, centres 0.175 m apart."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero - 0.375, zero, zero - 0.2, zero]), xp.stack([zero, zero, zero, zero]))
 
@@ -49,7 +49,7 @@ class Billiard(ContactScene):
         return xp.concat([first, later], axis=0)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the force on the first ball per mass."""
+        """Return the force on the first ball over its mass."""
         return xp.concat([u / self.mass, 0.0 * u], axis=0)
 
     def gap(self, xp: Any, q: Array) -> Array:
@@ -62,7 +62,7 @@ class Billiard(ContactScene):
         return (xp.sum(apart * relative, axis=0) / _distance(xp, q))[None]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Push both balls apart along the line of centres."""
+        """Return accelerations that push both balls apart along the line of centres."""
         normal = (q[2:4] - q[0:2]) / _distance(xp, q)
         pushed = normal * force / self.mass
         return xp.concat([-pushed, pushed], axis=0)

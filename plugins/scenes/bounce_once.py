@@ -42,7 +42,7 @@ class BounceOnce(EngineTwin, ContactScene):
         return np.array([self.height, self.velocity, self.force])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at the height and velocity of theta."""
+        """Return the height and velocity in theta."""
         return State(theta[0:1], theta[1:2])
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
@@ -64,7 +64,7 @@ class BounceOnce(EngineTwin, ContactScene):
         return v
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Push upwards."""
+        """Return the upward acceleration by the contact force."""
         return force / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
@@ -85,7 +85,7 @@ class BounceOnce(EngineTwin, ContactScene):
             <actuator><motor joint="height"/></actuator>"""
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray | None:
-        """With impulses at the time of impact, return (P(z > 0) - restitution P(z < 0)) dz/dtheta, z being normal.
+        """Return (P(z > 0) - restitution P(z < 0)) dz/dtheta, z normal; None without impulses at the time of impact.
 
         This assumes that no sample starts inside the ground, which is 9 standard deviations away with the default
         theta.

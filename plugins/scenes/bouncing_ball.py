@@ -18,8 +18,8 @@ class BouncingBall(EngineTwin, ContactScene):
     The default lands at 0.45 s and is on its way down again at T = 1 s.
 
     Under gravity, an impulse that uses the velocity at a step boundary has a wrong derivative at every dt, with or
-    without time of impact: the impact speed then depends on theta only in jumps, through the step of the impact.
-    Differences over a range of theta that moves the impact by many steps are right.
+    without time of impact: the impact speed then depends on theta only through jumps of the step in which the impact
+    occurs. Finite differences over a range of theta that moves the impact by many steps are correct.
     """
 
     name = "bouncing_ball"
@@ -44,7 +44,7 @@ class BouncingBall(EngineTwin, ContactScene):
         return np.array([self.height, self.velocity])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at theta."""
+        """Return the height and velocity in theta."""
         return State(theta[0:1], theta[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
@@ -60,7 +60,7 @@ class BouncingBall(EngineTwin, ContactScene):
         return v
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Push upwards."""
+        """Return the upward acceleration by the contact force."""
         return force / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
@@ -68,7 +68,7 @@ class BouncingBall(EngineTwin, ContactScene):
         return (q[0] - self.target) ** 2
 
     def mjcf(self) -> str:
-        """Return a sphere on a vertical slide, over a plane; its own position is that of its lowest point."""
+        """Return a sphere on a vertical slide, over a plane; its joint position is its lowest point."""
         return f"""
             <option gravity="0 0 {-self.gravity}"/>
             <worldbody>
@@ -81,17 +81,17 @@ class BouncingBall(EngineTwin, ContactScene):
             <contact><pair geom1="ground" geom2="ball" condim="1"/></contact>"""
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Return grad f of rigid bounces with the scene's restitution, event by event; None if the ball stops."""
+        """Return grad f for rigid bounces with the scene's restitution, event by event; None if the ball stops."""
         final = self._rigid_end()
         return None if final is None else np.asarray(2 * (final[0] - self.target) * final[1])
 
     def physical_cost(self) -> float | None:
-        """Return f of the same bounces."""
+        """Return f for rigid bounces with the scene's restitution; None if the ball stops."""
         final = self._rigid_end()
         return None if final is None else (final[0] - self.target) ** 2
 
     def _rigid_end(self) -> tuple[float, np.ndarray] | None:
-        """Return the height at T and its slope by theta, ``(2,)``."""
+        """Return the height at T and its derivative by theta, ``(2,)``; None if the ball stops."""
         g, end, e = self.gravity, self.horizon * self.dt, self.restitution
         start = np.array([0.0, self.velocity, self.height])  # time, velocity and height after the last impact
         slopes = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])  # derivatives by theta

@@ -10,9 +10,9 @@ from bench.model import CallableScene, load_simulator, param, simulator_files
 
 @dataclass(frozen=True)
 class Callable(CallableScene):
-    """f(theta, w) = cost(theta + sigma u, v), with a function of a file as the cost; w = (u, v).
+    """f(theta, w) = cost(theta + sigma u, v), with a function from a user's file as the cost; w = (u, v).
 
-    theta comes from the file or from ``theta0=[..]``. Without ``grad``, gradients are central differences.
+    theta is defined in the file or by ``theta0=[..]``. Without ``grad``, gradients are central differences.
     """
 
     name = "callable"
@@ -30,7 +30,7 @@ class Callable(CallableScene):
         return _loaded(self.cost, self.theta, self.grad, self.batch, self.own_noise)
 
     def files(self) -> tuple[Path, ...]:
-        """Return the file of the cost."""
+        """Return the file that defines the cost."""
         return simulator_files(self.cost)
 
 

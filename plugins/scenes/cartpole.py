@@ -15,7 +15,7 @@ class Cartpole(EngineTwin, MechanicalScene):
     State (x, a, x', a') with the angle a from upright, starting at rest at ``angle``; theta = K (d = 4).
     x'' = (u + m sin a (l a'^2 - g cos a)) / (M + m sin^2 a) and a'' = (g sin a - x'' cos a) / l.
     f = dt sum (x^2 + 10 a^2 + 0.01 u^2) plus x^2 + 10 a^2 + 0.1 x'^2 + 0.1 a'^2 at the end.
-    ``noise=action`` perturbs the force of each step, so that the score sums over the states visited;
+    ``noise=action`` perturbs the force of each step, so that the score is a sum over the visited states.
     ``noise=parameter`` perturbs the gains by the same sigma.
     """
 
@@ -39,7 +39,7 @@ class Cartpole(EngineTwin, MechanicalScene):
         return np.array([-3.0, -40.0, -4.0, -8.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at rest, the pole leaning by ``angle``."""
+        """Return the state at rest, with the pole leaning by ``angle``."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero + self.angle]), xp.stack([zero, zero]))
 

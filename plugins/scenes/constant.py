@@ -19,7 +19,7 @@ class Constant(FunctionScene):
     value: float = param(3.0, "the cost")
 
     def theta0(self) -> np.ndarray:
-        """Space theta evenly from 0.5 to 1.5."""
+        """Return numbers evenly spaced from 0.5 to 1.5."""
         return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:

@@ -12,7 +12,7 @@ from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
 class Cubic(FunctionScene):
     """f = sum_i x_i^3 / 3, with x = theta + sigma w.
 
-    grad J = theta^2 + sigma^2, where the gradient of f itself is theta^2. theta is spaced evenly from 0.5 to 1.5.
+    grad J = theta^2 + sigma^2, while the gradient of f is theta^2. theta is spaced evenly from 0.5 to 1.5.
     """
 
     name = "cubic"
@@ -21,7 +21,7 @@ class Cubic(FunctionScene):
     dimension: int = param(5, "d, length of theta", positive=True)
 
     def theta0(self) -> np.ndarray:
-        """Space theta evenly from 0.5 to 1.5."""
+        """Return numbers evenly spaced from 0.5 to 1.5."""
         return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:

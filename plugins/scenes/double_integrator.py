@@ -1,4 +1,4 @@
-"""A mass pushed along a line: dynamics with a closed form of all results."""
+"""A mass pushed along a line: dynamics for which gradient and variance have closed forms."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -33,7 +33,7 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
         return np.full(self.horizon, self.control)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at rest at 0."""
+        """Return the state at rest at 0."""
         zero = 0.0 * theta[:1]
         return State(zero, zero)
 

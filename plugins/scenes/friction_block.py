@@ -11,16 +11,18 @@ from bench.model import Array, FrictionScene, State, param
 
 @dataclass(frozen=True)
 class FrictionBlock(FrictionScene):
-    """A block lies on the ground by gravity and is dragged by a spring whose other end is pulled in jerks; q = (x, z).
+    """A block on the ground is dragged by a spring whose other end is pulled in jerks; q = (x, z).
 
-    The end is at p(t) = V (t - a sin(w t) / w): pulled at speed V on average, and for a = 1 at rest once per period 2
-    pi / w. theta = (V, a), with parameter noise; f = half the squared distance of the end position from (goal, 0). The
-    normal force comes from the contact law, the block starting at the depth that balances its weight under the scene's
-    stiffness; friction is regularised Coulomb, mu lambda tanh(slip / slip_speed), so that a sticking block creeps. At a
-    = 0 the end moves at constant speed. With one coefficient for stick and slip, the block sticks until the spring
-    pulls with mu m g and then moves at V (1 - cos(sqrt(k/m) t)), at rest only for moments: longer sticking would need a
-    coefficient that decreases with speed. Explicit steps are stable up to dt mu g < 2 slip_speed. Impulse laws have no
-    friction, so the block slides freely.
+    The spring's end is at p(t) = V (t - a sin(w t) / w): its mean speed is V, and for a = 1 it is at rest once per
+    period 2 pi / w; for a = 0 its speed is constant. theta = (V, a), with parameter noise; f = half the squared
+    distance of the block's final position from (goal, 0).
+
+    The contact law computes the normal force lambda. The block starts at the depth that balances its weight under the
+    scene's stiffness. Friction is regularised Coulomb, mu lambda tanh(slip / slip_speed), so that a sticking block
+    creeps. The coefficient is the same for stick and slip: the block sticks until the spring pulls with mu m g and then
+    moves at V (1 - cos(sqrt(k/m) t)), at rest only for moments. Longer sticking would need a coefficient that decreases
+    with speed. Explicit steps are stable up to dt mu g < 2 slip_speed. Impulse laws have no friction, so that the block
+    slides freely.
     """
 
     name = "friction_block"
@@ -52,12 +54,12 @@ class FrictionBlock(FrictionScene):
         return np.array([self.pull, self.jerk])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at rest, the spring without force."""
+        """Return the state at rest, with the spring unstretched."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero - self.depth]), xp.stack([zero, zero]))
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """Return p, the position of the spring's end."""
+        """Return p, the position of the spring's end at each step, ``(horizon, 1, B)``."""
         time = self.dt * xp.astype(xp.arange(self.horizon), theta.dtype)[:, None]
         return (theta[0] * (time - theta[1] * xp.sin(self.frequency * time) / self.frequency))[:, None, :]
 
@@ -74,7 +76,7 @@ class FrictionBlock(FrictionScene):
         return v[1:2]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Push upwards."""
+        """Return the upward acceleration by the normal force."""
         return xp.stack([0.0 * force[0], force[0] / self.mass])
 
     def slip(self, xp: Any, q: Array, v: Array) -> Array:
@@ -82,7 +84,7 @@ class FrictionBlock(FrictionScene):
         return v[0:1]
 
     def friction_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Push along x."""
+        """Return the acceleration along x by the friction force."""
         return xp.stack([force[0] / self.mass, 0.0 * force[0]])
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:

@@ -12,13 +12,13 @@ from bench.model import Array, ContactScene, State, param
 
 @dataclass(frozen=True)
 class GroundWall(ContactScene):
-    """A ball of mass 1 bounces off the ground, y = 0, and off a wall to its right; q = (x, y) is its centre.
+    """A ball bounces off the ground, y = 0, and off a wall to its right; q = (x, y) is its centre.
 
     State (q, v); theta = initial velocity (d = 2), with parameter noise; f = squared distance to the target at T.
-    Contacts are (ground, wall), both frictionless, so that x and y do not interact. Under gravity the impulse law has a
-    wrong derivative by vy at every dt (see ``bouncing_ball``), while its derivative by vx is right with the time of
-    impact and has the wrong sign without it. The penalty's damper acts immediately at touch, so that the program jumps
-    by O(dt) where contact begins on a step boundary, and the mean of its gradients is not the gradient of its mean.
+    Contacts are (ground, wall), both frictionless, so that x and y do not interact. Under gravity, the impulse law has
+    a wrong derivative by vy at every dt (see ``bouncing_ball``). Its derivative by vx is correct with the time of
+    impact and has the wrong sign without it. The penalty's damper acts immediately at first touch, so that the program
+    jumps by O(dt) where contact begins on a step boundary: the mean of its gradients is not the gradient of its mean.
     Source: Zhong, Han, Brikis 2022, task 2.
     """
 
@@ -48,7 +48,7 @@ class GroundWall(ContactScene):
         return np.array([self.velocity_x, self.velocity_y])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at the fixed position, moving with theta."""
+        """Return the fixed initial position, with velocity theta."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero + self.start_x, zero + self.start_y]), theta)
 
@@ -65,7 +65,7 @@ class GroundWall(ContactScene):
         return xp.stack([v[1], -v[0]])
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Push up from the ground and left from the wall."""
+        """Return the accelerations, upwards by the ground and to the left by the wall."""
         return xp.stack([-force[1], force[0]]) / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
@@ -73,7 +73,7 @@ class GroundWall(ContactScene):
         return (q[0] - self.target_x) ** 2 + (q[1] - self.target_y) ** 2
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Return grad f of rigid impacts with the scene's restitution, event by event; None if the ball stops."""
+        """Return grad f for rigid impacts with the scene's restitution, event by event; None if the ball stops."""
         final = self._rigid_end()
         if final is None:
             return None
@@ -81,12 +81,12 @@ class GroundWall(ContactScene):
         return np.array([2 * (x - self.target_x) * x_slope, 2 * (y - self.target_y) * y_slope])
 
     def physical_cost(self) -> float | None:
-        """Return f of the same impacts."""
+        """Return f for rigid impacts with the scene's restitution; None if the ball stops."""
         final = self._rigid_end()
         return None if final is None else (final[0][0] - self.target_x) ** 2 + (final[1][0] - self.target_y) ** 2
 
     def _rigid_end(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
-        """Return x at T and its slope by vx, y at T and its slope by vy."""
+        """Return (x, dx/dvx) and (y, dy/dvy) at T; None if the ball stops."""
         end, e = self.horizon * self.dt, self.restitution
         from_wall = _bounced(self.wall - self.radius - self.start_x, -self.velocity_x, 0.0, e, end)
         from_ground = _bounced(self.start_y - self.radius, self.velocity_y, self.gravity, e, end)

@@ -11,7 +11,7 @@ from bench.model import Array, ContactLaw, Plugin, ProcessNoiseScene, State, par
 
 @dataclass(frozen=True)
 class GustyCart(ProcessNoiseScene):
-    """A constant force theta (d = 1) pushes a cart from rest; a gust adds to it at every step; f = max(0, q_N - edge)^2.
+    """A constant force theta (d = 1) plus a gust per step pushes a cart from rest; f = max(0, q_N - edge)^2.
 
     q_N = c (theta + sigma u) + b . gust e, with b_i = dt^2 (N - i) / mass for semi-implicit and dt^2 (N - i - 1) / mass
     for explicit Euler, and c the sum of b. So q_N is normal with mean m = c theta and variance s^2 = c^2 sigma^2 + gust^2
@@ -37,7 +37,7 @@ class GustyCart(ProcessNoiseScene):
         return np.array([self.force])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at rest at 0."""
+        """Return the state at rest at 0."""
         return State(0.0 * theta[:1], 0.0 * theta[:1])
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:

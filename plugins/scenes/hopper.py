@@ -1,4 +1,4 @@
-"""Hopping on one leg: contact made and broken many times, under feedback."""
+"""Hopping on one leg: repeated landing and lift-off, under feedback."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ class Hopper(EngineTwin, ContactScene):
     gains; f = mean of (h - target)^2 over the steps, plus ``effort`` times the mean of u^2, plus (h - target)^2 at
     the end.
 
-    The default lands and lifts off four times. Under a penalty the light foot rebounds within a stance, under
-    ``complementarity`` it stays down; the hops are the same. The ``impulse`` law does not support hopping: it uses
-    the velocity before the step, so that a loaded foot sinks at dt times the acceleration of the load.
+    The default lands and lifts off four times. Within a stance, the light foot rebounds under a penalty and remains on
+    the ground under ``complementarity``; the hops are the same. The ``impulse`` law does not support hopping: it uses
+    the velocity before the step, so that a loaded foot sinks at a speed of dt times the load's acceleration.
     """
 
     name = "hopper"
@@ -48,11 +48,11 @@ class Hopper(EngineTwin, ContactScene):
     restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
-        """Return 100 N s/m^2 and 400 N s/m^3, which keep the default body hopping, a little below target."""
+        """Return 100 N s/m^2 and 400 N s/m^3, with which the default body hops a little below target."""
         return np.array([100.0, 400.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at rest in the air, the leg at its rest length."""
+        """Return the state at rest in the air, with the leg at its rest length."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero + self.drop + self.leg, zero + self.drop]), xp.stack([zero, zero]))
 
@@ -75,7 +75,7 @@ class Hopper(EngineTwin, ContactScene):
         return v[1:2]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Push the foot upwards."""
+        """Return the upward acceleration of the foot by the contact force."""
         return xp.stack([0.0 * force[0], force[0] / self.foot_mass])
 
     def mjcf(self) -> str:

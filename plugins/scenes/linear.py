@@ -22,7 +22,7 @@ class Linear(FunctionScene):
     slope: float = param(2.0, "the largest of the slopes a_i")
 
     def theta0(self) -> np.ndarray:
-        """Space theta evenly from 0.5 to 1.5."""
+        """Return numbers evenly spaced from 0.5 to 1.5."""
         return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:

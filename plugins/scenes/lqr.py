@@ -41,7 +41,7 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
         return np.full(self.horizon, self.control)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at rest."""
+        """Return the state at rest at ``start``."""
         zero = 0.0 * theta[:1]
         return State(zero + self.start, zero)
 
@@ -50,7 +50,7 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
         return u
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the weighted squares before the step."""
+        """Return the weighted squares of the state before the step and of the control."""
         return self.position * q[0] ** 2 + self.speed * v[0] ** 2 + self.effort * u[0] ** 2
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
@@ -58,20 +58,20 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
         return self.end_position * q[0] ** 2 + self.end_speed * v[0] ** 2
 
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
-        """Return x0'P x0, for semi-implicit Euler."""
+        """Return x0'P x0 for semi-implicit Euler, None for other integrators."""
         if integrator is None or integrator.name != "semi_implicit_euler":
             return None
         return float(self.start**2 * _values(self)[0][0, 0]), "Riccati recursion"
 
     def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:
-        """Return x'P x with the P of that step."""
+        """Return x'P x with the matrix P of ``step``, ``(B,)``."""
         x = np.concatenate([q, v])
         return np.asarray(np.einsum("ib,ij,jb->b", x, _values(self)[step], x))
 
 
 @cache
 def _values(scene: Lqr) -> list[np.ndarray]:
-    """Return P of every step, the last being the terminal weights, for semi-implicit Euler."""
+    """Return the matrices P of all steps, ending with the terminal weights, for semi-implicit Euler."""
     h = scene.dt
     a, b = np.array([[1.0, h], [0.0, 1.0]]), np.array([[h * h], [h]])
     p = np.diag([scene.end_position, scene.end_speed])

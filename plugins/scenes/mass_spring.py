@@ -38,7 +38,7 @@ class MassSpring(Oscillator, DampedScene):
         return np.array([self.stretch, self.rate])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at theta."""
+        """Return the stretch and rate in theta."""
         return State(theta[0:1], theta[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
@@ -65,7 +65,10 @@ class MassSpring(Oscillator, DampedScene):
         return self._gradient(np.linalg.matrix_power(step, self.horizon)[0])
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Use r = first row of exp(T A), A the oscillator's matrix; None with a velocity factor (not physical)."""
+        """Return 2 (r . theta) r with r the first row of exp(T A), A the oscillator's matrix.
+
+        None with a velocity factor, which is not physical.
+        """
         if self.velocity_factor != 1.0:
             return None
         stiffness, damping, _ = self.oscillator()

@@ -38,16 +38,16 @@ class MassSpringDamper(Identified, MechanicalScene):
         return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at rest at theta."""
+        """Return the state at rest at theta."""
         return State(theta[:1], 0.0 * theta[:1])
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """Return sin t at the middle of each step, independent of theta."""
+        """Return sin t at the middle of each step, independent of theta, ``(horizon, 1, B)``."""
         time = self.dt * (xp.astype(xp.arange(self.horizon), theta.dtype)[:, None] + 0.5)
         return (xp.sin(time) + 0.0 * theta[0])[:, None, :]
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return spring, damper and force over the mass."""
+        """Return the sum of the spring, damper and external forces over the mass."""
         return (self.force * u - self.stiffness * q - self.damping * v) / self.mass
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:

@@ -38,12 +38,12 @@ class Pendulum(EngineTwin, MechanicalScene):
         return np.full(self.horizon, self.torque)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start hanging at rest."""
+        """Return the state hanging at rest."""
         zero = 0.0 * theta[:1]
         return State(zero, zero)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return torque, damping and gravity over the moment of inertia."""
+        """Return the torques of control, damping and gravity over the moment of inertia."""
         inertia = self.mass * self.length * self.length
         return (u - self.damping * v) / inertia - self.gravity / self.length * xp.sin(q)
 
@@ -64,5 +64,5 @@ class Pendulum(EngineTwin, MechanicalScene):
         return self.effort * self.dt * u[0] * u[0]
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the height missing to the top, in rod lengths, plus a tenth of the squared velocity."""
+        """Return the distance below the top in rod lengths, plus a tenth of the squared velocity."""
         return 1.0 + xp.cos(q[0]) + 0.1 * v[0] * v[0]

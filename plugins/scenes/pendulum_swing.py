@@ -1,4 +1,4 @@
-"""Swinging up a pendulum with a running cost: an optimum that is known to ten digits."""
+"""Swinging up a pendulum with a stage cost: a problem with a precisely known minimum."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -12,10 +12,11 @@ from bench.model import Array, MechanicalScene, State, param
 class PendulumSwing(MechanicalScene):
     """A pendulum of unit constants, q'' = -sin q + u, is swung from rest at q = 0 to rest at q = pi.
 
-    State (q, q'); theta is the torque of each step (d = horizon). f = sum over the steps of (q - pi)^2 + q'^2 + u^2,
-    evaluated before each step, plus ``terminal`` times (q - pi)^2 + q'^2 at the end. Smooth and not convex, with one
-    known minimum: J* = 349.490460 at the default, reached by Newton's method with |gradient| < 1e-9. Source: Suh et al.
-    2021, *Bundled gradients*, whose curve ends 2.2% above it, since it minimises other weights than the reported ones.
+    State (q, q'); theta is the torque of each step (d = horizon). f = sum over the steps of (q - pi)^2 + q'^2 +
+    ``effort`` u^2, evaluated before each step, plus ``terminal`` times (q - pi)^2 + q'^2 at the end. f is smooth and
+    not convex, with one known minimum: J* = 349.490460 at the default, computed by Newton's method to |gradient| <
+    1e-9. Source: Suh et al. 2021, *Bundled gradients*, whose curve ends 2.2% above J*, since it minimises other weights
+    than the reported ones.
     """
 
     name = "pendulum_swing"
@@ -37,7 +38,7 @@ class PendulumSwing(MechanicalScene):
         return np.full(self.horizon, self.torque)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start hanging at rest."""
+        """Return the state hanging at rest."""
         zero = 0.0 * theta[:1]
         return State(zero, zero)
 
@@ -46,7 +47,7 @@ class PendulumSwing(MechanicalScene):
         return u - xp.sin(q)
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the squared distance from rest upright, plus the squared torque."""
+        """Return the squared distance from rest upright, plus the weighted squared torque."""
         return self._distance(q, v) + self.effort * u[0] ** 2
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:

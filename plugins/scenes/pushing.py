@@ -11,7 +11,7 @@ from bench.model import Array, ContactScene, DampedScene, EngineTwin, State, Zer
 
 @dataclass(frozen=True)
 class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
-    """Two bodies on a line, the first pushed by an open-loop force; they touch when closer than 1 m.
+    """Two bodies on a line, the first pushed by an open-loop force; they are in contact when closer than 1 m.
 
     State (x1, x2, v1, v2); theta is the force sequence (d = horizon / hold). f = sum over steps of the Q-weighted
     squared distance to the goal before the step plus u^2, divided by ``hold``, plus the same distance of the last
@@ -44,12 +44,12 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
         return np.full(self.controls, self.push)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start with the bodies just touching, the first moving at ``speed``."""
+        """Return the bodies just touching, the first moving at ``speed``."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero + 1.0]), xp.stack([zero + self.speed, zero]))
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the push on the first body as accelerations."""
+        """Return the accelerations by the push on the first body."""
         return xp.stack([u[0] / self.mass, 0.0 * u[0]])
 
     def gap(self, xp: Any, q: Array) -> Array:
@@ -61,11 +61,11 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
         return v[1:2] - v[0:1]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Push both bodies with equal and opposite force."""
+        """Return the accelerations by equal and opposite forces on the bodies."""
         return xp.stack([-force[0] / self.mass, force[0] / self.mass])
 
     def mjcf(self) -> str:
-        """Return two spheres of radius 0.5 m on a line; joint damping (1 - velocity_factor) m / dt is numerical."""
+        """Return two spheres of radius 0.5 m on a line, with joint damping (1 - velocity_factor) m / dt."""
         damping = (1.0 - self.velocity_factor) * self.mass / self.dt
         bodies = "".join(
             f"""
@@ -86,5 +86,5 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
         return (self.terminal_cost(xp, q, v) + u[0] * u[0]) / self.hold
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Weight the squared distance to x = (1, 2), v = (speed, 0) by (0.1, 10, 0.1, 0.1)."""
+        """Return the squared distance to x = (1, 2), v = (speed, 0), weighted by (0.1, 10, 0.1, 0.1)."""
         return 0.1 * (q[0] - 1.0) ** 2 + 10.0 * (q[1] - 2.0) ** 2 + 0.1 * (v[0] - self.speed) ** 2 + 0.1 * v[1] ** 2

@@ -23,11 +23,11 @@ class Quadratic(FunctionScene):
     condition: float = param(10.0, "largest curvature over the smallest", positive=True)
 
     def theta0(self) -> np.ndarray:
-        """Space theta evenly from 0.5 to 1.5."""
+        """Return numbers evenly spaced from 0.5 to 1.5."""
         return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """Return the weighted squares."""
+        """Return the sum of the weighted squares, ``(B,)``."""
         exponents = xp.asarray(_exponents(self.dimension)[:, None], dtype=x.dtype)
         return 0.5 * xp.sum(self.condition**exponents * x * x, axis=0)
 

@@ -12,10 +12,9 @@ from bench.model import Array, Identified, MechanicalScene, State, param
 class SlidingBlock(Identified, MechanicalScene):
     """x'' = -friction g until the block stops; f = (x_T - goal)^2. theta is the initial speed, with parameter noise.
 
-    It slides d = v0^2 / (2 friction g) = 1.529052 m at the default, with dd/dfriction = -5.096840. A step ends at speed
-    0 if the block would turn back, which shortens d by dt v0 / 2: a friction fitted to the true d is too low by the
-    factor 1 - dt friction g / v0 and valid for its time step only. After the block has stopped, further time changes
-    nothing.
+    By default it slides d = v0^2 / (2 friction g) = 1.529052 m, with dd/dfriction = -5.096840. A step ends at speed 0
+    if the block would turn back, which shortens d by dt v0 / 2: a friction fitted to the true d is too low by the
+    factor 1 - dt friction g / v0 and valid for its time step only. A stopped block remains at rest.
     """
 
     name = "sliding_block"
@@ -37,11 +36,11 @@ class SlidingBlock(Identified, MechanicalScene):
         return np.array([self.speed])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at 0."""
+        """Return position 0 and the speed in theta."""
         return State(0.0 * theta[:1], theta[:1])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the deceleration by friction, at most the one that stops the block within the step."""
+        """Return the deceleration by friction, limited to the deceleration that stops the block within the step."""
         most, stop = self.friction * self.gravity, v / self.dt
         return -xp.where(stop < most, stop, most + 0.0 * v)
 

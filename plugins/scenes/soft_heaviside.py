@@ -34,7 +34,7 @@ class SoftHeaviside(FunctionScene):
         return xp.where(z > 1, flat + 1.0, xp.where(z < -1, flat - 1.0, z))
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return both ends of the ramp."""
+        """Return the positions of both ends of the ramp."""
         return ((-self.nu / 2, self.nu / 2),)
 
     def probability(self) -> float:

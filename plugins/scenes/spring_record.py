@@ -12,10 +12,10 @@ from bench.model import Array, ContactLaw, KnownOptimum, MechanicalScene, Plugin
 class SpringRecord(KnownOptimum, MechanicalScene):
     """x'' = -k x - c x' from rest at 1; theta = (k, c) is to be identified; f = mean of (x - record)^2 over the steps.
 
-    The record is the same motion with ``stiffness`` and ``damping`` in the same steps, so that J* = 0. It is q[1], and
-    x is q[0]. theta starts with ``guess`` times the stiffness and no damping. Without damping two frequencies D apart
-    differ by 1 - sin(DT) / (DT) on average over a record of length T: from further away than D = 4.4934 / T, descent
-    ends in a wrong local minimum.
+    The record q[1] is the same motion with ``stiffness`` and ``damping``, in the same steps, so that J* = 0; x is q[0].
+    theta starts with ``guess`` times the stiffness and no damping. Without damping, the mean squared difference of two
+    motions whose frequencies differ by D, over a record of length T, is 1 - sin(DT) / (DT): from a difference above
+    4.4934 / T, descent ends in a wrong local minimum.
     """
 
     name = "spring_record"
@@ -36,16 +36,16 @@ class SpringRecord(KnownOptimum, MechanicalScene):
         return np.array([self.guess * self.stiffness, 0.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start both motions at rest at 1."""
+        """Return both motions at rest at 1."""
         zero = 0.0 * theta[:2]
         return State(zero + 1.0, zero)
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """Return theta for each step."""
+        """Return theta for each step, ``(horizon, 2, B)``."""
         return xp.zeros((self.horizon, 1, 1), dtype=theta.dtype) + theta
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return spring and damper of theta, then those of the record."""
+        """Return the acceleration with theta's spring and damper, then with the record's."""
         return xp.stack([-u[0] * q[0] - u[1] * v[0], -self.stiffness * q[1] - self.damping * v[1]])
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:

@@ -32,7 +32,7 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
 
     @property
     def n_q(self) -> int:  # type: ignore[override]
-        """The number of copies. The positions are sums of x, on which nothing depends."""
+        """The number of copies. The positions are sums of x and affect nothing."""
         return self.copies
 
     @property
@@ -45,7 +45,7 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
         return (self.gain * np.eye(self.copies)).ravel()
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at (1, .., 1)."""
+        """Return x = (1, .., 1), as the velocity."""
         zero = 0.0 * theta[:1]
         return State(xp.concat([zero] * self.copies), xp.concat([zero + 1.0] * self.copies))
 
@@ -67,7 +67,7 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
         return self.end * xp.sum(v * v, axis=0)
 
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
-        """Return the least cost over one constant gain k in [-2, 0], by a grid search refined eight times."""
+        """Return the minimum cost over one constant gain k in [-2, 0], by a grid search refined eight times."""
         cost = self.cost_of(np.linspace(-2.0, 0.0, 201))
         low, high = np.linspace(-2.0, 0.0, 201)[[max(int(cost.argmin()) - 1, 0), min(int(cost.argmin()) + 1, 200)]]
         for _ in range(8):
@@ -77,13 +77,13 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
         return float(self.copies * self.cost_of(np.array([0.5 * (low + high)]))[0]), "grid search over a constant gain"
 
     def cost_of(self, k: np.ndarray) -> np.ndarray:
-        """Return the cost of one copy under u = k x: a geometric sum."""
+        """Return the cost of one copy under u = k x, a geometric sum, for an array of gains k."""
         factor = (1.0 + self.dt * k) ** 2
         powers = factor[None] ** np.arange(self.horizon + 1)[:, None]
         return np.asarray((1.0 + self.effort * k * k) * powers[:-1].sum(axis=0) + self.end * powers[-1])
 
     def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:
-        """Return p x'x with the p of that step, from the scalar Riccati recursion."""
+        """Return p x'x, ``(B,)``, with the p of ``step`` from the scalar Riccati recursion."""
         p = self.end
         for _ in range(self.horizon - step):
             p = 1.0 + p - (self.dt * p) ** 2 / (self.effort + self.dt**2 * p)

@@ -13,9 +13,9 @@ from bench.model import Array, ContactLaw, Integrator, MechanicalScene, Plugin, 
 class StiffDecay(MechanicalScene):
     """x' = rate x, a first-order scene whose state is the velocity; theta = x_0, with parameter noise; f = x_N.
 
-    One step multiplies x by the integrator's stability function R(rate dt), so that grad J = R^N for any sigma. At
-    the default, rate dt = -2.5, it is -1.5 for explicit Euler and 1 / 3.5 for implicit Euler; the physics has
-    e^-2.5 per step. Outside the stability region the derivative is exact for its program and useless.
+    One step multiplies x by the integrator's stability function R(rate dt), so that grad J = R^N for any sigma. At the
+    default, rate dt = -2.5, R is -1.5 for explicit Euler and 1 / 3.5 for implicit Euler; the exact factor per step is
+    e^-2.5. Outside the stability region, the derivative is exact for its program but useless.
     """
 
     name = "stiff_decay"

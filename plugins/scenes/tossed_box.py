@@ -40,7 +40,7 @@ class TossedBox(EngineScene):
         return np.array([self.speed, 0.0, self.spin])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start level, at ``height``, with velocity theta."""
+        """Return the box level at ``height``, with velocity theta."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero + self.height, zero]), theta)
 
@@ -49,7 +49,7 @@ class TossedBox(EngineScene):
         return (q[0] - self.target) ** 2
 
     def mjcf(self) -> str:
-        """Return a box's mass with a small sphere in each corner, over a plane."""
+        """Return a body with a box's inertia and a small sphere in each corner, over a plane."""
         inertia = self.mass * self.side**2 / 6
         radius, half = 0.05 * self.side, 0.45 * self.side
         corners = {f"corner{i}{j}": (i * half, j * half) for i in (-1, 1) for j in (-1, 1)}

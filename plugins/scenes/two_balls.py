@@ -44,7 +44,7 @@ class TwoBalls(KnownOptimum, ContactScene):
         return np.full(2 * self.horizon, self.force)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at rest at (-2, -2) and (-1, -1)."""
+        """Return the balls at rest at (-2, -2) and (-1, -1)."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero - 2.0, zero - 2.0, zero - 1.0, zero - 1.0]), xp.stack([zero] * 4))
 
@@ -53,16 +53,16 @@ class TwoBalls(KnownOptimum, ContactScene):
         return xp.stack([u[0], u[1], 0.0 * u[0], 0.0 * u[0]])
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Return the distance of the surfaces."""
+        """Return the distance between the surfaces."""
         return xp.sqrt((q[2:3] - q[0:1]) ** 2 + (q[3:4] - q[1:2]) ** 2) - 2.0 * self.radius
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the speed at which the centres part."""
+        """Return the speed at which the centres separate."""
         x, y = self._normal(xp, q)
         return x * (v[2:3] - v[0:1]) + y * (v[3:4] - v[1:2])
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Push both balls apart along the line of their centres."""
+        """Return accelerations that push both balls apart along the line of centres."""
         x, y = self._normal(xp, q)
         return xp.concat([-x * force, -y * force, x * force, y * force])
 
@@ -75,7 +75,10 @@ class TwoBalls(KnownOptimum, ContactScene):
         return q[2] ** 2 + q[3] ** 2
 
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
-        """Return the least f(s, v) over impact times s, by grid search, or 2 where no push pays; None without rigid laws."""
+        """Return the minimum of f(s, v) by grid search over the impact time s, or 2 if no push reduces the cost.
+
+        None unless the law is an impulse law with restitution 1.
+        """
         if not isinstance(contact, ImpulseLaw) or self.restitution != 1.0:
             return None
         end, gap, eps = self.horizon * self.dt, 1.0 - math.sqrt(2.0) * self.radius, self.effort

@@ -1,4 +1,4 @@
-"""A point that hits a soft wall: the step size alone makes a penalty gradient wrong."""
+"""A point that hits a soft wall: the finite step size is enough to make a penalty gradient wrong."""
 
 import math
 from collections.abc import Mapping
@@ -15,10 +15,10 @@ class WallPenalty1d(EngineTwin, ContactScene):
     """A point of mass 1 at q0 > 0 moves at velocity -1 into a wall at q = 0, which pushes with -v - 50 q, unclipped.
 
     State (q, v); theta = q0 (d = 1), with parameter noise; f = |q_T - 1| with T = horizon dt = 2 s. The wall is a
-    penalty law with the values of ``contact_values``; unlike in other scenes the softness is part of the physics, whose
-    gradient is that of dt -> 0. The damper acts from first touch, so that the program jumps by O(dt) each time
-    q0 grows by one step's travel: its derivative tends to the physical one for rollouts that leave the wall again, not
-    for those that end in it. Source: Paulus et al. 2025, toy example.
+    penalty law with the values of ``contact_values``. Unlike in other scenes, the softness is part of the physics, so
+    the physical gradient is the limit dt -> 0 with this wall. The damper acts from first touch, so that the program
+    jumps by O(dt) each time q0 grows by one step's travel. As dt -> 0 its derivative tends to the physical one only for
+    rollouts that leave the wall again, not for rollouts that end in it. Source: Paulus et al. 2025, toy example.
     """
 
     name = "wall_penalty_1d"
@@ -38,7 +38,7 @@ class WallPenalty1d(EngineTwin, ContactScene):
         return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Start at q0, moving towards the wall at 1 m/s."""
+        """Return position q0, moving towards the wall at 1 m/s."""
         return State(theta[0:1], 0.0 * theta[0:1] - 1.0)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
@@ -54,7 +54,7 @@ class WallPenalty1d(EngineTwin, ContactScene):
         return v
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Push away from the wall, with mass 1."""
+        """Return the acceleration away from the wall, for mass 1."""
         return force
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
@@ -62,7 +62,7 @@ class WallPenalty1d(EngineTwin, ContactScene):
         return xp.abs(q[0] - 1.0)
 
     def mjcf(self) -> str:
-        """Return a sphere on a slide, in front of a plane; its own position is that of the point that touches.
+        """Return a sphere on a slide, in front of a plane; its joint position is its point nearest to the wall.
 
         An engine's contact never pulls, so this is the twin of the wall with ``damping_mode=clipped``, not of the
         default wall.
@@ -78,7 +78,10 @@ class WallPenalty1d(EngineTwin, ContactScene):
             <contact><pair geom1="wall" geom2="point" condim="1"/></contact>"""
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return the physics' kinks: start in touch; end at q = 1 bounced, leaving, touching, at q = 1 untouched.
+        """Return the kinks of the physical cost, as values of q0.
+
+        In order: the point starts at the wall, ends at q = 1 after a bounce, ends as it leaves the wall, ends at first
+        touch, and ends at q = 1 without touching the wall.
 
         A program also jumps, by O(dt), wherever contact begins or ends on the boundary between two steps.
         """
@@ -94,11 +97,11 @@ class WallPenalty1d(EngineTwin, ContactScene):
         return np.array([slope if reached > 1.0 else -slope])
 
     def physical_cost(self) -> float | None:
-        """Return f under the same conditions."""
+        """Return f for dt -> 0 under the penalty wall; None for a start inside the wall."""
         return None if self.start < 0.0 else abs(self._soft_end()[0] - 1.0)
 
     def _soft_end(self) -> tuple[float, float]:
-        """Return q_T and its slope by q0, for a start outside the wall."""
+        """Return q_T and its derivative by q0, for a start outside the wall."""
         rate, duration, speed = self._wall()
         inside = self.horizon * self.dt - self.start  # time since first touch
         if inside <= 0.0:

@@ -1,4 +1,4 @@
-"""A user's cost and gradient as functions of columns: theta of any shape, batches, libraries, counted and timed calls."""
+"""A user's cost and gradient as batched functions, for theta of any structure and any array library."""
 
 from bench.model.simulator.clock import Clock, OutOfTime, parse_duration
 from bench.model.simulator.imports import load_attribute, load_module, load_simulator, simulator_files

@@ -1,4 +1,4 @@
-"""A time budget that every call of the user's code counts against."""
+"""A time budget for all calls of the user's code."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from types import FrameType
 from bench.errors import UserError
 
 UNITS = {"ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "": 1.0}
-"""Units of a budget, in seconds."""
+"""Seconds per unit of a budget."""
 MIN_ALARM_S, ALARM_INTERVAL_S = 1e-3, 1.0
-"""Shortest delay of the alarm, and the interval at which it repeats, in seconds."""
+"""Minimum delay of the alarm, and the interval at which the alarm repeats, in seconds."""
 PROGRESS_INTERVAL_S = 0.2
-"""Shortest time between two updates of the progress line, in seconds."""
+"""Minimum time between two updates of the progress line, in seconds."""
 
 
 class OutOfTime(BaseException):
-    """Raised when the budget is spent, also inside a call. Not an Exception, which a simulator may catch."""
+    """Raised when the budget is spent, also inside a call. A BaseException, since a simulator may catch Exception."""
 
 
 def parse_duration(budget: float | str) -> float:
-    """Return a budget in seconds: ``60``, ``"60s"``, ``"2m"``; raises :class:`UserError` otherwise.
+    """Return a budget such as ``60``, ``"60s"`` or ``"2m"`` in seconds; raises :class:`UserError` if invalid.
 
     >>> parse_duration("2m"), parse_duration(0.5)
     (120.0, 0.5)
@@ -48,9 +48,9 @@ class Clock:
         self.start = time.perf_counter()
         self.budget = budget
         self.costs = self.gradients = 0
-        """Calls, counted per sample."""
+        """Number of evaluated costs and gradients, one per sample."""
         self.cost_s = self.gradient_s = 0.0
-        """Seconds in these calls, except the first call of each shape."""
+        """Seconds spent in cost and gradient calls, except the first call of each shape."""
         self._timed = {"costs": 0, "gradients": 0}
         self._shown = shown and sys.stderr.isatty()
         self._stage, self._last_shown = "", 0.0
@@ -63,15 +63,15 @@ class Clock:
 
     @property
     def remaining(self) -> float:
-        """Seconds that remain of the budget."""
+        """Remaining seconds of the budget."""
         return self.budget - self.spent
 
     def limit(self, share: float) -> None:
-        """Limit the following calls to this share of the remaining budget."""
+        """Limit subsequent calls to ``share`` (0 to 1) of the remaining budget."""
         self._deadline = self.spent + share * max(self.remaining, 0.0)
 
     def check(self) -> None:
-        """Raise :class:`OutOfTime` if the budget or the limit is spent."""
+        """Raise :class:`OutOfTime` if the budget or the limit of :meth:`limit` is spent."""
         if self.spent > min(self.budget, self._deadline):
             raise OutOfTime
 
@@ -79,8 +79,8 @@ class Clock:
     def interrupt_when_over(self) -> Iterator[None]:
         """Raise :class:`OutOfTime` inside the block when the budget is spent.
 
-        A call of compiled code is interrupted only when it returns. Only the main thread can be interrupted, and only
-        if no other code uses the alarm.
+        Compiled code is interrupted only when it returns. Only the main thread can be interrupted, and only if no other
+        code uses the alarm signal.
         """
         free = threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
         if not (free and math.isfinite(self.budget) and signal.getsignal(signal.SIGALRM) in (signal.SIG_DFL, None)):
@@ -100,7 +100,7 @@ class Clock:
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
 
     def count(self, kind: str, calls: int, taken: float, warm: bool) -> None:
-        """Count calls, and their time in seconds unless they compiled something."""
+        """Add ``calls`` samples of ``kind`` (costs or gradients), and their seconds if ``warm`` (nothing was compiled)."""
         if kind == "costs":
             self.costs += calls
             self.cost_s += taken if warm else 0.0
@@ -111,11 +111,11 @@ class Clock:
         self._show_progress()
 
     def per_cost(self) -> float:
-        """Return the seconds of one cost, NaN before any was timed."""
+        """Return the mean seconds per cost, NaN before the first timed call."""
         return self.cost_s / self._timed["costs"] if self._timed["costs"] else math.nan
 
     def per_gradient(self) -> float:
-        """Return the seconds of one gradient, NaN before any was timed."""
+        """Return the mean seconds per gradient, NaN before the first timed call."""
         return self.gradient_s / self._timed["gradients"] if self._timed["gradients"] else math.nan
 
     def start_stage(self, name: str) -> None:

@@ -1,4 +1,4 @@
-"""The smallest simulator with its own gradient: a bowl with a wave and a step, in columns."""
+"""A minimal example of a simulator with its own gradient: a smooth function plus a step, on columns ``(2, B)``."""
 
 from __future__ import annotations
 
@@ -14,5 +14,5 @@ def cost(x: np.ndarray) -> np.ndarray:
 
 
 def gradient(x: np.ndarray) -> np.ndarray:
-    """Return the derivative, which omits the step, ``(2, B)``."""
+    """Return the derivative without the step's contribution, ``(2, B)``."""
     return np.stack([np.cos(x[0]) * x[1], np.sin(x[0]) + 2 * x[1]])

@@ -1,4 +1,4 @@
-"""Functions of a user's file, named as on the command line: ``mysim.py:cost`` or ``package.module:cost``."""
+"""Loads functions from a user's file, given as on the command line: ``mysim.py:cost`` or ``package.module:cost``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bench.model.simulator.tree import ParameterTree
 
 
 def load_attribute(text: str, module: ModuleType | None = None) -> Any:
-    """Return the object that ``FILE:NAME`` or ``MODULE:NAME`` names; a name without a file is looked up in ``module``.
+    """Return the object ``FILE:NAME`` or ``MODULE:NAME``; a name without a file is looked up in ``module``.
 
     Raises :class:`UserError` if the file or name does not exist, or if the file cannot be imported.
     """
@@ -36,7 +36,7 @@ def load_attribute(text: str, module: ModuleType | None = None) -> Any:
 
 
 def load_module(place: str) -> ModuleType:
-    """Import a file or a module once. A file can import from its own folder, as when Python runs it."""
+    """Import a file or module once and return it. A file can import from its own folder, as when Python runs it."""
     if not place.endswith(".py"):
         try:
             return importlib.import_module(place)
@@ -74,7 +74,10 @@ def load_module(place: str) -> ModuleType:
 
 
 def load_simulator(cost: str, theta: str = "theta", grad: str = "", batch: str = "", noise: int = 0) -> Simulator:
-    """Return the simulator of the cost ``FILE:NAME``. Theta and gradient are named in the same file."""
+    """Return the simulator of the cost ``FILE:NAME``. ``theta`` and ``grad`` are names in the same file.
+
+    ``grad`` may also be ``jax`` or ``torch``, or empty for a simulator without a gradient.
+    """
     module = load_module(cost.rpartition(":")[0])
     start = load_attribute(theta, module)
     gradient = grad if grad in LIBRARIES else load_attribute(grad, module) if grad else None
@@ -83,5 +86,5 @@ def load_simulator(cost: str, theta: str = "theta", grad: str = "", batch: str =
 
 
 def simulator_files(cost: str) -> tuple[Path, ...]:
-    """Return the file of the cost ``FILE:NAME``."""
+    """Return the file that defines the cost ``FILE:NAME``."""
     return (Path(str(load_module(cost.rpartition(":")[0]).__file__)),)

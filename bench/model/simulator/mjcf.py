@@ -1,6 +1,6 @@
-"""A user's MuJoCo model as a cost of theta: free joints, quaternions and motors, in C or in MJX.
+"""A user's MuJoCo model as a cost of theta, run by MuJoCo (C) or MJX. Free joints and quaternions are supported.
 
-Start and cost are functions of (model, data) and work for both engines: ``start`` returns fields of the data by name.
+The user's functions of (model, data) work with both engines: ``start`` returns fields of the data by name.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from bench.errors import UserError, unknown
 ENGINES = {"mujoco": "mujoco", "mjx": "mujoco-mjx"}
 """The engines and the distributions that provide them."""
 STEP = 1e-6
-"""Step of the finite differences, in the model's units."""
+"""Step of the finite differences, in the units of the state, control or theta."""
 
 
 class Mjcf:
     """A rollout of a model: ``sim(theta)`` is its cost, ``sim.gradient(theta)`` the engine's derivative, ``(d,)``.
 
-    ``model`` is MJCF text or a file. ``start(model, data, theta)`` returns fields to set before the first step, as
-    ``{"qvel": theta}``; ``cost(model, data)`` is a number from the data after ``steps`` steps and a forward pass;
-    ``control(model, data, theta, t)``, if given, returns the controls ``(nu,)`` of step t.
+    ``model`` is an MJCF string or a file. ``start(model, data, theta)`` returns the fields to set before the first
+    step, such as ``{"qvel": theta}``. ``cost(model, data)`` returns a number, given the data after ``steps`` steps and
+    a forward pass. ``control(model, data, theta, t)``, if given, returns the controls ``(nu,)`` of step t.
 
     ``mujoco`` chains finite differences of single steps in the tangent space of the state, so that nq and nv may
-    differ. ``mjx`` differentiates in forward mode, which the constraint solver's loops allow. Raises
-    :class:`bench.UserError` where the engine is missing or the model cannot be read.
+    differ. ``mjx`` differentiates in forward mode, the only mode that the constraint solver's loops allow. Raises
+    :class:`bench.UserError` if the engine is not installed or the model cannot be read.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Mjcf:
         return self._final_cost(data)
 
     def gradient(self, theta: Any) -> np.ndarray:
-        """Return the derivative of the cost by theta, ``(d,)``."""
+        """Return the derivative of the cost with respect to theta, ``(d,)``."""
         if self._engine is not None:
             return self._engine.slope(theta)
         theta = np.asarray(theta, dtype=np.float64)
@@ -112,7 +112,7 @@ class Mjcf:
 
     def _set_control(self, data: Any, theta: Any, t: int) -> None:
         if self._control is not None:
-            # updates the positions of bodies to the current state
+            # update body positions to the current state
             self._mujoco.mj_forward(self.model, data)
             data.ctrl[:] = self._control(self.model, data, theta, t)
 
@@ -121,7 +121,7 @@ class Mjcf:
         return float(self._cost(self.model, data))
 
     def _initial_slopes(self, theta: np.ndarray) -> np.ndarray:
-        """Return the derivative of the initial state by theta, in the state's tangent space, ``(2 nv + na, d)``."""
+        """Return d initial state / d theta in the state's tangent space, ``(2 nv + na, d)``."""
         columns = []
         for i in range(theta.size):
             states = []
@@ -137,7 +137,7 @@ class Mjcf:
         return np.stack(columns, axis=1)
 
     def _displaced(self, data: Any, index: int, by: float) -> Any:
-        """Return the state displaced along one direction of its tangent space."""
+        """Return a copy of the data, displaced by ``by`` along one direction of the state's tangent space."""
         nv, probe = self.model.nv, self._probe
         self._mujoco.mj_copyData(probe, self.model, data)
         if index < nv:
@@ -151,7 +151,7 @@ class Mjcf:
         return probe
 
     def _control_slopes(self, data: Any, theta: np.ndarray, t: int, slopes: np.ndarray) -> np.ndarray:
-        """Return the derivative of the controls by theta, directly and through the state, ``(nu, d)``."""
+        """Return the total derivative of the controls with respect to theta, also through the state, ``(nu, d)``."""
         if self._control is None:
             return np.zeros((self.model.nu, theta.size))
 
@@ -166,7 +166,7 @@ class Mjcf:
 
 
 class _Mjx:
-    """The same rollout in MJX, compiled."""
+    """The rollout of an :class:`Mjcf` in MJX, compiled by JAX."""
 
     def __init__(self, simulator: Mjcf) -> None:
         try:
@@ -199,7 +199,7 @@ class _Mjx:
 
 
 def _promoted(data: Any) -> Any:
-    """Return data in JAX's default precision, since MJX may use a lower one."""
+    """Return MJX data with all floats in JAX's default precision, since MJX may use a lower one."""
     import jax
 
     wide = jax.numpy.zeros(()).dtype

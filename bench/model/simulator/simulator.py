@@ -1,4 +1,4 @@
-"""A user's cost and gradient as functions of columns. Each call is counted and timed."""
+"""A user's cost and gradient as functions of batches of columns, with every call counted and timed."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from bench.model.simulator.clock import Clock
 from bench.model.simulator.tree import ParameterTree, as_numpy
 
 BATCHES = ("loop", "vmap", "columns", "rows")
-"""How a cost evaluates several thetas: one by one, by the library's vmap, as ``(d, B)`` or as ``(B, d)``."""
+"""Batching modes of a cost: one theta per call, the library's vmap, arrays ``(d, B)``, arrays ``(B, d)``."""
 LIBRARIES = ("jax", "torch")
-"""Libraries that differentiate a cost."""
+"""Libraries that can differentiate a cost."""
 BLOCK = 16
-"""Columns of a compiled batch: few enough for an expensive simulator, and one shape, so that it compiles once."""
+"""Columns per compiled batch: one size, so that it compiles once, and small, since a simulator may be expensive."""
 CHUNK = 256
-"""Columns of a batch that is not compiled."""
+"""Columns per batch that is not compiled."""
 
 
 def _without_exit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a user's function so that ``sys.exit`` raises RuntimeError; a test that exits would pass with status 0."""
+    """Wrap a user's function so that ``sys.exit`` raises RuntimeError: a test must not pass by exiting with status 0."""
 
     def call(*arguments: Any) -> Any:
         try:
@@ -36,10 +36,10 @@ def _without_exit(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class Simulator:
-    """A cost f(theta) or f(theta, w) and optionally its gradient, both in NumPy columns.
+    """A cost f(theta) or f(theta, w) and optionally its gradient, on NumPy batches with one sample per column.
 
-    ``noise`` is the length of w, 0 for a cost without its own noise. A call that raises an exception counts as NaN,
-    except the first call, whose exception becomes a :class:`UserError`.
+    ``noise`` is the length of w, 0 for a cost without its own noise. An exception in a call yields NaN, except in the
+    first call, where it becomes a :class:`UserError`.
     """
 
     def __init__(
@@ -63,13 +63,13 @@ class Simulator:
             )
         self.layout, self.noise, self.clock = layout, noise, clock or Clock(float("inf"))
         self.notes: list[str] = []
-        """Remarks on how the cost is called, for the user."""
+        """Notes for the user on how the cost is called."""
         self.raised: dict[str, int] = {}
-        """Exceptions of later calls of the cost, and their counts."""
+        """Number of failed calls of the cost, after the first call, by exception."""
         self.gradient_error = ""
         """The first exception of the gradient, or an empty string."""
         self.precision = "float64"
-        """Floating-point type of the cost's value."""
+        """Floating-point type that the cost returns."""
         self._cost, self._grad = _without_exit(cost), _without_exit(grad) if callable(grad) else grad
         self._shapes: set[Any] = set()
         self._single: Callable[..., Any] | None = None
@@ -87,12 +87,12 @@ class Simulator:
 
     @property
     def width(self) -> int:
-        """Number of thetas in one call."""
+        """Number of thetas per call."""
         return 1 if self.batch == "loop" else BLOCK if self.library == "jax" else CHUNK
 
     @property
     def has_gradient(self) -> bool:
-        """Whether there is a gradient."""
+        """Whether the user has given a gradient or a library that differentiates the cost."""
         return self._grad is not None
 
     def costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
@@ -162,7 +162,7 @@ class Simulator:
         return libraries.pop() if libraries else "numpy"
 
     def _build_theta(self, vector: Any) -> Any:
-        """Return the argument of the user's function for a vector ``(d,)``."""
+        """Return a vector ``(d,)`` in the form in which the user's function receives theta."""
         if self.library == "jax":
             return self.layout.unflatten(vector, lambda part, leaf: part)
         if self.library == "torch":
@@ -191,7 +191,7 @@ class Simulator:
         return self._cost(theta) if w is None else self._cost(theta, w)
 
     def _detect_batch(self, batch: str | None) -> str:
-        """Return the cost's batching mode, detected by calling it once."""
+        """Return the cost's batching mode, detected by trial calls."""
         vector = self.layout.vector
         w = np.zeros(self.noise) if self.noise else None
         if batch in ("columns", "rows"):
@@ -214,7 +214,7 @@ class Simulator:
         raise UserError(f"the cost cannot be called at theta: {problem}. It must accept theta and return one number")
 
     def _call_once(self, vector: np.ndarray, w: np.ndarray | None) -> np.ndarray:
-        """Call the cost with a single theta, and record whether it modifies its argument."""
+        """Return the cost of a single theta as an array, and note whether the cost modifies its argument."""
         began = time.perf_counter()
         theta = self._build_theta(self._array(vector))
         try:
@@ -240,11 +240,11 @@ class Simulator:
             return True
 
     def _rounded(self, vector: np.ndarray) -> np.ndarray:
-        """Return a vector after rounding to the type in which the cost receives it."""
+        """Return a vector ``(d,)`` rounded to the floating-point type in which the cost receives it."""
         return self.layout.flatten(self._build_theta(self._array(vector)), "theta")
 
     def _check_cost(self, cost: np.ndarray) -> None:
-        """Record the precision of a cost; raises :class:`UserError` unless it is a real number."""
+        """Record the precision of the cost's value; raises :class:`UserError` unless it is a real number."""
         if cost.dtype.kind == "c":
             raise UserError(f"the cost is complex ({cost.dtype}): it must be one real number")
         if cost.dtype.kind == "O" and cost.size == 1 and cost.ravel()[0] is None:
@@ -255,7 +255,7 @@ class Simulator:
             self.precision = str(cost.dtype)
 
     def _detect_vmap(self, vector: np.ndarray, value: float, batch: str | None) -> str:
-        """Return ``vmap`` if the library can map the cost over thetas with the same result, else ``loop``."""
+        """Return ``vmap`` if the library's vmap of the cost yields the same values, else ``loop``."""
         if self.library == "jax" and batch in (None, "vmap"):
             try:
                 columns = np.repeat(vector[:, None], BLOCK, axis=1)
@@ -326,7 +326,7 @@ class Simulator:
         return as_numpy(self._call_batch(thetas.copy(), None if w is None else w.copy(), self.batch))
 
     def _torch_values(self, thetas: Any, w: Any) -> Any:
-        """Return the costs as a tensor ``(B,)`` that is still attached to the graph."""
+        """Return the costs as a tensor ``(B,)`` that is attached to the autograd graph."""
         import torch
 
         if self.batch in ("columns", "rows"):
@@ -362,7 +362,7 @@ class Simulator:
         return self._call_compiled(self._single, self._eager[0], thetas, w, batch)
 
     def _call_compiled(self, compiled: Any, eager: Any, thetas: np.ndarray, w: np.ndarray | None, batch: str) -> Any:
-        """Call a compiled function, or the same one uncompiled where JAX cannot trace it."""
+        """Return a compiled function's values; one theta per call runs uncompiled if JAX cannot trace the function."""
         import jax
 
         arguments = [self._array(part) for part in (thetas, w) if part is not None]

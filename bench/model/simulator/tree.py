@@ -16,9 +16,9 @@ import numpy as np
 from bench.errors import UserError
 
 ROUNDING = 1e-14
-"""Size of a number, relative to its array, below which it counts as a 0 with rounding errors."""
+"""Size relative to the array's root mean square up to which a number counts as 0 with rounding errors."""
 MAX_SIZE = 100_000
-"""Largest number of entries of theta. Some thousand thetas are stored at the same time."""
+"""Maximum number of entries of theta: several thousand thetas are stored at the same time."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Leaf:
         return int(np.prod(self.shape, dtype=int))
 
     def names(self) -> list[str]:
-        """Return the name of each entry."""
+        """Return the name of each entry, such as ``gains[3]``."""
         path = self.path or "theta"
         if not self.shape:
             return [path]
@@ -87,7 +87,7 @@ class ParameterTree:
         return len(self.leaves) == 1 and len(self.leaves[0].shape) == 1 and not self.leaves[0].path
 
     def scales(self) -> np.ndarray:
-        """Return the scale of each entry, ``(d,)``: its own size, for 0 the root mean square of its array, else 1."""
+        """Return the scale of each entry, ``(d,)``: |entry|; for 0 the array's nonzero RMS; 1 if the array is all 0."""
         scale = np.abs(self.vector)
         for leaf in self.leaves:
             part = scale[leaf.start : leaf.start + leaf.size]
@@ -104,9 +104,9 @@ class ParameterTree:
         return _fill(self._example, parts)
 
     def flatten(self, value: Any, what: str = "the gradient") -> np.ndarray:
-        """Return a value of theta's structure, or a vector ``(d,)``, as a vector ``(d,)``.
+        """Return ``value``, which has theta's structure or is a vector ``(d,)``, as a vector ``(d,)``.
 
-        Raises :class:`UserError` for a value of another structure or size.
+        Raises :class:`UserError` if it has another structure or size.
         """
         try:
             leaves = [(path, as_numpy(part)) for path, part in _traverse(value, "")]
@@ -115,7 +115,7 @@ class ParameterTree:
         parts = self._reorder(value, leaves)
         sizes = [leaf.size for leaf in self.leaves]
         total = sum(part.size for part in parts)
-        # a list of single numbers is a vector, whichever library the numbers come from
+        # a list of single numbers is a vector, for numbers from any library
         flat = len(parts) == 1 or (len(self.leaves) == 1 and _is_structure(value))
         if total == self.vector.size and ([part.size for part in parts] == sizes or flat):
             return np.concatenate([part.ravel() for part in parts])
@@ -124,12 +124,12 @@ class ParameterTree:
         raise UserError(f"{what} has shape {shapes}, and theta has {expected}")
 
     def _reorder(self, value: Any, leaves: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
-        """Return the arrays in theta's order. Names decide where there are any, since some libraries sort them."""
+        """Return the arrays in theta's order, matched by path if possible, since some libraries sort dict keys."""
         named = dict(leaves)
         paths = [leaf.path for leaf in self.leaves]
         if set(named) == set(paths):
             return [named[path] for path in paths]
-        # other names than those of theta belong to other numbers
+        # a structure with other names than theta's contains other numbers
         return [] if isinstance(value, Mapping) or _named_fields(value) else [part for _, part in leaves]
 
 
@@ -153,7 +153,7 @@ def _library(value: Any) -> str:
 
 
 def _restore(part: np.ndarray, leaf: Leaf) -> Any:
-    """Return a part of the vector in its original form: a number, or an array of the same library and type."""
+    """Return a leaf's part of the vector in its original form: a number, or an array of the same library and type."""
     if leaf.library == "number":
         return float(part)
     if leaf.library == "jax":
@@ -174,7 +174,7 @@ def _named_fields(value: Any) -> list[str] | None:
 
 
 def _is_structure(value: Any) -> bool:
-    """Return whether a value is a list or tuple that is part of the structure. One of plain numbers is an array."""
+    """Return whether a value is a list or tuple of parts; a list or tuple of plain numbers is an array instead."""
     if not isinstance(value, list | tuple):
         return False
     return not all(isinstance(part, int | float) for part in value)
