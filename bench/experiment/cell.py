@@ -116,9 +116,8 @@ class Cell:
         """Hash of everything that decides the cell's numbers, except library versions, which have a column."""
         counts = [self.samples, self.repeats, self.seed, self.timing]
         reference = None if self.budget is None else [self.reference_key, module_hash(REFERENCE)]
-        best = fingerprint(
-            next(iter(self.ranked_backends), None)
-        )  # a study may use this backend besides the cell's own
+        # a study may use this backend besides the cell's own
+        best = fingerprint(next(iter(self.ranked_backends), None))
         return hashed(
             {axis: fingerprint(part) for axis, part in self.parts.items()}, counts, reference, best, self._budget(),
             self._theta(), fingerprint(self.study), module_hash(PROGRAM),
@@ -138,8 +137,12 @@ class Cell:
                 f"study {self.study.name} computes no reference: add a column `reference_method` to its columns to get one"
             )
         budget = [self.budget.samples, self.budget.tolerance]
-        smoothing = self.smoothing()
-        radius = [] if smoothing is None else [[smoothing.shape, smoothing.radius]]
+        radius = []
+        with suppress(
+            Exception
+        ):  # a combination without meaning has no smoothing; an error shows up in the cell's own row
+            smoothing = self.smoothing()
+            radius = [] if smoothing is None else [[smoothing.shape, smoothing.radius]]
         return hashed(self.program_key, budget, fingerprint(self.reference_backends[0]), *radius)
 
     @property
@@ -162,10 +165,7 @@ class Cell:
     def smoothing(self) -> Smoothing | None:
         """Return the smoothing of the objective that the estimator is compared with; None for J_sigma."""
         estimator = self.parts.get("estimator")
-        try:
-            return estimator.smoothing(self.program()) if isinstance(estimator, Estimator) else None
-        except (Unsupported, UserError):  # a combination without meaning has no reference
-            return None
+        return estimator.smoothing(self.program()) if isinstance(estimator, Estimator) else None
 
     @cached_property
     def parameters(self) -> dict[str, Any]:

@@ -83,11 +83,11 @@ def write_tables(
 # ----------------------------------------------------------------------------------------------------- terminal
 
 
-def open_console(experiment: Experiment, rows: pd.DataFrame) -> Console:
+def open_console(experiment: Experiment, rows: pd.DataFrame, width: int = TERMINAL_WIDTH) -> Console:
     """Print the experiment's question and the number of cells by status; return the console for further output."""
     console = Console(highlight=False, markup=False, emoji=False)
     if not console.is_terminal:
-        console.width = max(console.width, TERMINAL_WIDTH)
+        console.width = max(console.width, width)
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
     console.print(f"{counted(len(rows), 'cell')}: " + ", ".join(f"{n} {status}" for status, n in counts.items()))

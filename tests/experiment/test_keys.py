@@ -201,3 +201,14 @@ def test_a_study_of_one_file_is_known_by_all_but_what_shows_rows(tmp_path, monke
     assert hash_after("small_reworded", doc="length") == plain
     assert hash_after("small_shown", written="1") == plain
     assert hash_after("small_changed", gain="2.0") != plain
+
+
+def test_an_estimator_whose_smoothing_fails_has_a_key_and_no_reference(cells, monkeypatch):
+    def fail(self, program):
+        raise ZeroDivisionError("no radius")
+
+    cell = cells["fobg"]
+    monkeypatch.setattr(type(cell.estimator), "smoothing", fail)
+    assert replace(cell).key
+    with pytest.raises(ZeroDivisionError, match="no radius"):
+        replace(cell).smoothing()

@@ -17,6 +17,7 @@ from bench.experiment.axes import Axis
 from bench.experiment.experiment import Experiment
 from bench.measure.statistics import UNEXPLAINED, is_unexplained
 from bench.report.problems import ProblemRows
+from bench.report.study_tables import open_console
 from bench.report.text import axis_value, duration, number, one_line
 from bench.report.views import (
     UNSTEADY,
@@ -44,12 +45,7 @@ FULL_ROWS = 40
 
 def show(experiment: Experiment, rows: pd.DataFrame) -> None:
     """Print the question, the counts, the main table (condensed if long) and the findings."""
-    console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal:
-        console.width = max(console.width, WIDTH)
-    console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
-    counts = rows["status"].value_counts()
-    console.print(f"{len(rows)} cells: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
+    console = open_console(experiment, rows, WIDTH)
     parts = problems_by_axis(arrange(experiment, with_errors_at_equal_cost(rows)))
     condensed = len(rows) > FULL_ROWS
     for axis, group in parts:
