@@ -225,10 +225,9 @@ def _finish(finished: Finished, words: Sequence[str]) -> tuple[int, pd.DataFrame
 
 
 def _show(experiment: Experiment, rows: pd.DataFrame, paths: Sequence[Path]) -> int:
-    from bench.experiment.study import study_of
-    from bench.report.finish import shown
+    from bench.report.finish import show, shown
 
-    study_of(experiment).show(experiment, shown(rows))
+    show(experiment, shown(rows))
     _print_written(paths)
     return 1 if (rows["status"] == "error").any() else 0
 

@@ -17,7 +17,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
+
+import pandas as pd
 
 import bench
 from bench.errors import UserError
@@ -71,9 +73,18 @@ def gallery_entry(experiment: Experiment, folder: Path) -> str:
     if rows.empty:
         return ""
     finding = escape_markdown(content(experiment, rows).finding)
-    chart = main_chart(experiment, study_of(experiment).chart(experiment, rows))
+    chart = main_chart(experiment, _chart_names(experiment, rows))
     picture = f"![{experiment.name}]({Path(os.path.relpath(chart, folder)).as_posix()})" if chart else ""
     return "\n\n".join(filter(None, [f"`{experiment.name}`", experiment.question, picture, finding]))
+
+
+def _chart_names(experiment: Experiment, rows: pd.DataFrame) -> Sequence[str]:
+    study: Any = study_of(experiment)
+    if hasattr(study, "chart"):
+        names: Sequence[str] = study.chart(experiment, rows)
+        return names
+    views = study.views(experiment, rows)
+    return [chart.name for chart in views.charts] if views else [experiment.name, study.name]
 
 
 def main_chart(experiment: Experiment, names: Sequence[str]) -> Path | None:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Kind = Literal["number", "text", "list"]
+Format = Literal["number", "seconds", "percent", "setting"]
+"""How a number is shown: rounded, as a time, as a percentage, or as a setting, whose digits are all known."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class ComparisonRule:
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a study's rows."""
+    """A quantity: its name in the rows, its meaning, and how every table, chart, page and terminal shows it."""
 
     name: str
     doc: str = ""
@@ -58,11 +60,31 @@ class Column:
     """Whether the value depends on the machine and its load; it is missing if cells are not timed."""
     judged: InitVar[ComparisonRule | None] = None
     """The old name of ``comparison``."""
+    label: str = field(default="", kw_only=True)
+    """The name in headings and on axes; by default the column's name with spaces."""
+    format: Format = field(default="number", kw_only=True)
+    digits: int = field(default=2, kw_only=True)
+    """Significant digits in tables for readers."""
+    low: str = field(default="", kw_only=True)
+    high: str = field(default="", kw_only=True)
+    """The columns with the ends of the 95% interval, empty if there is none."""
+    limit: str = field(default="", kw_only=True)
+    """The column that is true where the value is an upper limit."""
+    log: bool | None = field(default=None, kw_only=True)
+    """Whether its axis is logarithmic; None: if all values are positive and span a factor of 8."""
+    above_one: str = field(default="", kw_only=True)
+    """The meaning of values above 1; charts shade that area."""
 
     def __post_init__(self, judged: ComparisonRule | None) -> None:
         if judged is not None:
             deprecated.warn("Column(judged=...)", "comparison", 4)
             object.__setattr__(self, "comparison", judged)
+
+    @property
+    def heading(self) -> str:
+        """The label with its unit: ``time step [s]``."""
+        label = self.label or self.name.replace("_", " ")
+        return f"{label} [{self.unit}]" if self.unit and self.format != "seconds" else label
 
 
 def text(name: str, doc: str = "", **more: Any) -> Column:
@@ -84,19 +106,19 @@ FIRST = (
     text("estimator", "name of the estimator"),
     text("estimator_params", "parameters of the estimator that differ from their defaults"),
     text("noise", "what the noise perturbs: `parameter` (theta) or `action`"),
-    Column("horizon", "number of time steps T", "steps"),
-    Column("dt", "length of a time step", "s"),
-    Column("stiffness", "stiffness of the contact law, or of the scene without one", "N/m"),
-    Column("sigma", "standard deviation of the noise in J"),
-    Column("smoothing", "smoothing parameter of the contact law: beta, kappa"),
-    Column("samples", "samples N in one estimate"),
-    Column("repeats", "independent estimates R that measure bias and variance"),
-    Column("seed", "seed of the noise"),
+    Column("horizon", "number of time steps T", "steps", format="setting"),
+    Column("dt", "length of a time step", "s", format="setting"),
+    Column("stiffness", "stiffness of the contact law, or of the scene without one", "N/m", format="setting"),
+    Column("sigma", "standard deviation of the noise in J", format="setting"),
+    Column("smoothing", "smoothing parameter of the contact law: beta, kappa", format="setting"),
+    Column("samples", "samples N in one estimate", format="setting"),
+    Column("repeats", "independent estimates R that measure bias and variance", format="setting"),
+    Column("seed", "seed of the noise", format="setting"),
     text("dtype", "floating-point type of the simulation"),
 )
 IDENTITY = tuple(column.name for column in FIRST[1:])
 """The columns that show which cell a row is. The cell's whole identity is in ``parameters``."""
-DIM = Column("dim", "length d of theta")
+DIM = Column("dim", "length d of theta", format="setting")
 STATUS = (
     text("status", "ok, or how the cell failed"),
     text("reason", "reason of a failure, or a remark about the numbers"),

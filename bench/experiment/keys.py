@@ -40,7 +40,7 @@ REFERENCE = "bench.run.references"
 """The module that computes reference gradients."""
 PROGRAM = "bench.model.program"
 """The module that composes scene, contact law and integrator."""
-DISPLAY = ("write", "show", "page", "chart", "faults")
+DISPLAY = ("views", "write", "show", "page", "chart", "faults")
 """Methods of a study that only show its rows."""
 
 _fingerprints: dict[int, tuple[Plugin, str]] = {}
@@ -114,7 +114,22 @@ def _file(module: str) -> Path:
 
 def _class_hash(study: type[Plugin]) -> str:
     """Return the hash of the modules that define a study, without what only shows rows."""
-    return "".join(hash_of_tree(_measuring(module)) for module in _defining(study) if not is_below(module, HARMLESS))
+    return "".join(
+        hash_of_tree(_without_imports(_measuring(module)))
+        for module in _defining(study)
+        if not is_below(module, HARMLESS)
+    )
+
+
+def _without_imports(tree: ast.Module) -> ast.Module:
+    """Return a module's tree without its imports: the files that they import are hashed themselves."""
+    tree.body = [
+        node
+        for node in tree.body
+        if not isinstance(node, ast.Import | ast.ImportFrom)
+        and not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test))
+    ]
+    return tree
 
 
 def _measuring(module: str) -> ast.Module:

@@ -1,11 +1,9 @@
-"""The contract of a study: what it measures in each cell, and how it presents the rows."""
+"""The contract of a study: what it measures in each cell, and what it shows of the rows."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.errors import UserError
@@ -13,6 +11,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.columns import Columns
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
+from bench.experiment.views import Views
 from bench.model.parameters import Plugin
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Study(Plugin):
-    """Measures each cell, and turns rows into tables, charts and a page.
+    """Measures each cell, and says what to show of the rows: findings, tables and charts, as data.
 
     A study is registered like any plugin: as a folder under ``bench/studies``, in a plugin folder of the user, or by an
     entry point.
@@ -47,20 +46,9 @@ class Study(Plugin):
         """Return why the study cannot measure a cell, or None; called when a run is planned."""
         return None
 
-    @abstractmethod
-    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write tables and charts from rows, and return the files' paths. It must not print."""
-
-    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print a summary of the rows for the terminal."""
-
-    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the page's :class:`bench.report.web.content.Content`; None for a table and a chart of any two numbers."""
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views | None:
+        """Return what the study shows of its rows, as data; None for a table and a chart of any two of its numbers."""
         return None
-
-    def chart(self, experiment: Experiment, rows: pd.DataFrame) -> Sequence[str]:
-        """Return the chart's file names in a gallery, without ending, best first."""
-        return [experiment.name, self.name]
 
     def faults(self, rows: pd.DataFrame) -> int:
         """Return the number of rows with a fault, such as a wrong gradient: ``gradcheck`` then exits with 1."""

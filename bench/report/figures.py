@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import pandas as pd
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -29,13 +30,14 @@ def styled() -> Iterator[None]:
         yield
 
 
-def save(figure: Figure, stem: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
+def save(figure: Figure, stem: Path, formats: Sequence[str] = ("png",), data: pd.DataFrame | None = None) -> list[Path]:
     """Write a figure as ``stem`` in some formats, and its data as ``stem.plotted.csv``; return the files' paths.
 
     Equal figures give equal files, because the files contain no dates. Fonts are embedded, as outlines in SVG and as
     TrueType in PDF.
     """
-    contents = {"plotted.csv": plotted(figure).to_csv(index=False, lineterminator="\n", float_format="%.9g").encode()}
+    data = plotted(figure) if data is None else data
+    contents = {"plotted.csv": data.to_csv(index=False, lineterminator="\n", float_format="%.9g").encode()}
     for suffix in formats:
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix, dpi=150, metadata=METADATA[suffix])

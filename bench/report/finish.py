@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -12,8 +13,9 @@ from bench.errors import UserError, printable
 from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
+from bench.experiment.views import Views
 from bench.model import guard
-from bench.report import averages, web
+from bench.report import averages, generic, web, writer
 from bench.report.cores import run_tasks
 from bench.report.views import newest_rows
 from bench.run.execute import Finished, store_of
@@ -45,14 +47,44 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
         guard.capture_output("a plugin"),
         guard.protect_process(),
     ):  # building the commands that repeat cells runs code of plugins
-        writers = (study_of(experiment).write, _page, averages.write)
-        return [
-            path for paths in run_tasks([partial(writer, experiment, rows) for writer in writers]) for path in paths
+        views = views_of(experiment, rows)
+        tasks = [
+            partial(_files, experiment, rows, views),
+            partial(_page, experiment, rows, views),
+            partial(averages.write, experiment, rows),
         ]
+        return [path for paths in run_tasks(tasks) for path in paths]
 
 
-def _page(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    return [web.write(experiment, rows)]
+def show(experiment: Experiment, rows: pd.DataFrame) -> None:
+    """Print a summary of an experiment's rows."""
+    views = views_of(experiment, rows)
+    if views is None:
+        study: Any = study_of(experiment)
+        study.show(experiment, rows)
+    else:
+        writer.show(experiment, rows, views)
+
+
+def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
+    """Return what the study shows of its rows; None if the study writes its files itself, as in older versions."""
+    study = study_of(experiment)
+    if hasattr(study, "write"):
+        return None
+    views = study.views(experiment, rows.reset_index(drop=True))
+    return generic.views(experiment, rows) if views is None else views
+
+
+def _files(experiment: Experiment, rows: pd.DataFrame, views: Views | None) -> list[Path]:
+    if views is None:
+        study: Any = study_of(experiment)
+        paths: list[Path] = study.write(experiment, rows)
+        return paths
+    return writer.write(experiment, views)
+
+
+def _page(experiment: Experiment, rows: pd.DataFrame, views: Views | None) -> list[Path]:
+    return [web.write(experiment, rows, views)]
 
 
 def shown(rows: pd.DataFrame) -> pd.DataFrame:

@@ -129,6 +129,15 @@ def value_text(value: Any) -> str:
     return value if isinstance(value, str) else axis_value(value)
 
 
+def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:
+    """Return, per row, the values of some text columns joined by commas, without empty values and ``none``."""
+    return pd.Series(
+        [", ".join(text for text in map(str, row) if text not in ("", "none")) for row in rows[list(names)].to_numpy()],
+        index=rows.index,
+        dtype=object,
+    )
+
+
 def _with_name(column: Any, value: Any) -> str:
     if isinstance(value, str):
         return "" if value == "none" else value

@@ -19,11 +19,11 @@ from bench.experiment.study import study_of
 from bench.measure.gradcheck import EPS
 from bench.model import registry
 from bench.report import reproduce, web
-from bench.report.plotted import plotted
 from bench.report.problems import problem_names, problem_numbers, split_by_problem
 from bench.report.views import arrange, rows_along
 from bench.report.web.content import Content, looks
 from bench.report.web.document import data
+from bench.report.writer import readable
 from bench.run.files import make_directory
 from bench.studies.gradient_check import matrix
 from bench.studies.gradient_check import report as gradient_check
@@ -32,7 +32,7 @@ from bench.studies.stability import page as stability_page
 from bench.studies.stability import report as stability
 from bench.studies.three_errors import page as three_errors_page
 from bench.studies.three_errors import report as three_errors
-from bench.studies.twins import report as twins
+from bench.studies.twins import views as twins
 
 SPRUNG = '''
 from dataclasses import dataclass
@@ -297,13 +297,16 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
     own = [list(np.zeros(int(h) + 1)) for h in rows["horizon"]]
     away = [[0.0] * int(h) + [1e-3] for h in rows["horizon"]]
     rows = rows.assign(state_difference=1e-3, state_difference_rel=1e-3, path=away, own_path=own)
-    figure = twins.figure(arrange(given, rows))
-    titles = [panel.get_title().splitlines()[0] for panel in figure.axes]
-    assert titles == ["pendulum, horizon=2", "pendulum, horizon=3"]
-    drawn = plotted(figure)
-    assert set(drawn["y"]) == {twins.SMALL, 1e-3}, "the difference over time, and 0 at the lower edge"
-    assert "pendulum, horizon=2 (0.0010)" in figure.get_suptitle().replace("\n", " ")
-    assert list(twins.readable(arrange(given, rows))["horizon"]) == ["2", "2", "3", "3"]
+    rows["gradient_difference_rel"], rows["cost_difference_rel"], rows["gradient_s"] = [0.0, 2e-3, 1e-3, 1e-3], 0.0, 1.0
+    shown = twins.views(given, rows)
+    [chart], [lines] = shown.charts, shown.tables
+    drawn = chart.plotted()
+    assert list(dict.fromkeys(drawn["problem"])) == ["pendulum, horizon=2", "pendulum, horizon=3"], "the worst is first"
+    assert list(drawn["gradient_difference_rel"]) == [twins.FLOOR, 2e-3, 1e-3, 1e-3], "0 is at the lower edge"
+    assert list(drawn["gradient_difference_rel_limit"]) == [True, False, False, False]
+    assert "on 0 of 2 problems" in shown.findings[0]
+    assert "on pendulum, horizon=2" in shown.findings[1]
+    assert list(readable(lines)["horizon [steps]"]) == ["2", "2", "3", "3"]
     table_ = table(given, rows)
     assert "own_path" not in table_
     assert list(table_)[-2:] == ["study", "parameters"]

@@ -11,13 +11,11 @@ import pandas as pd
 
 from bench.experiment import axes as sweep
 from bench.experiment.columns import IDENTITY
-from bench.report.problems import (
-    distinguishing_columns,
-)
+from bench.report.problems import distinguishing_columns, titled
 from bench.report.style import MARKERS, VARIANTS, colour, marker
 from bench.report.views import attempted
 
-__all__ = ["distinguishing_columns"]
+__all__ = ["distinguishing_columns", "titled"]
 SYMBOLS = dict(
     zip(MARKERS, ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star"), strict=True)
 )
@@ -129,15 +127,6 @@ STATUS = [TableColumn("status", "status", "text"), TableColumn("reason", "reason
 def numeric_axis(axis: sweep.Axis, column: str = "x", log: bool = True) -> PlotAxis:
     """Return a swept parameter as an axis of a chart, labelled with its unit and the parameters that step with it."""
     return PlotAxis(column, axis.title, log)
-
-
-def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:
-    """Return, per row, the values of some text columns joined by commas, without empty values and ``none``."""
-    return pd.Series(
-        [", ".join(text for text in map(str, row) if text not in ("", "none")) for row in rows[list(names)].to_numpy()],
-        index=rows.index,
-        dtype=object,
-    )
 
 
 def no_result_sentence(rows: pd.DataFrame) -> str:

@@ -8,7 +8,7 @@ import pandas as pd
 
 from bench.experiment.experiment import Experiment
 from bench.report.views import arrange
-from bench.report.web import generic
+from bench.report.web import old_generic as generic
 from bench.report.web.content import Content, no_result_sentence
 from bench.studies.identify.report import failures, findings, flatten, readable
 

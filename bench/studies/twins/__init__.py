@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.experiment.cell import Cell
@@ -11,6 +10,7 @@ from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, t
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
+from bench.experiment.views import Views
 from bench.model import param
 
 if TYPE_CHECKING:
@@ -23,21 +23,23 @@ class Twins(Study):
 
     name = "twins"
     columns: ClassVar[Columns] = Columns.of(
-        Column("state_difference", "largest difference of states over time and coordinates"),
+        Column("state_difference", "largest difference of states over time and coordinates", label="states"),
         Column("state_difference_rel", "largest difference of states, each coordinate in units of its largest value",
+               label="states, relative",
                comparison=ComparisonRule("exact", "difference of states")),
         Column("cost", "cost of the twin"),
         Column("own_cost", "cost of the scene's own program"),
-        Column("cost_difference_rel", "relative difference of the costs"),
+        Column("cost_difference_rel", "relative difference of the costs", label="cost, relative"),
         Column("gradient_norm", "norm of the twin's gradient"),
         Column("own_gradient_norm", "norm of the own program's gradient"),
-        Column("gradient_difference_rel", "relative difference of the gradients", comparison=ComparisonRule("exact", "difference of gradients")),
-        Column("gradient_cosine", "cosine between the gradients"),
-        Column("value_s", "time of the costs of `samples` rollouts", "s"),
-        Column("gradient_s", "time of the gradients of `samples` rollouts", "s"),
+        Column("gradient_difference_rel", "relative difference of the gradients", label="gradient, relative",
+               comparison=ComparisonRule("exact", "difference of gradients")),
+        Column("gradient_cosine", "cosine between the gradients", label="cosine"),
+        Column("value_s", "time of the costs of `samples` rollouts", "s", label="costs", format="seconds"),
+        Column("gradient_s", "time of the gradients of `samples` rollouts", "s", label="gradients", format="seconds"),
         Column("trace_s", "part of compile_s: tracing the Python code", "s"),
         Column("lower_s", "part of compile_s: lowering the trace to the compiler's input", "s"),
-        Column("compile_s", "total time of compiling the gradient", "s"),
+        Column("compile_s", "total time of compiling the gradient", "s", label="compilation", format="seconds"),
         text("own_backend", "backend of the scene's own program"),
         numbers("gradient", "the twin's gradient, by coordinate of theta"),
         numbers("own_gradient", "the own program's gradient, by coordinate of theta"),
@@ -53,20 +55,8 @@ class Twins(Study):
 
         return measure(cell, session, self.timed_calls)
 
-    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the tables and charts."""
-        from bench.studies.twins import report
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return the finding, the table of differences and times, and the chart of differences."""
+        from bench.studies.twins.views import views
 
-        return report.write(experiment, rows)
-
-    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the table, and the reason of each cell without numbers."""
-        from bench.studies.twins import report
-
-        report.show(experiment, rows)
-
-    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the page: the finding, a chart of any two numbers, and the table."""
-        from bench.studies.twins.page import content
-
-        return content(experiment, rows)
+        return views(experiment, rows)

@@ -1,0 +1,167 @@
+"""What a study shows of its rows, as data: findings, tables and charts. :mod:`bench.report` writes and draws them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from bench.experiment.columns import Column
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ChartKind = Literal["lines", "points", "dots", "grid"]
+
+
+@dataclass(frozen=True)
+class Style:
+    """The look of one series or level."""
+
+    colour: str
+    marker: str = "o"
+    """A Matplotlib marker; empty for a line without markers."""
+    line: Any = "-"
+    """A Matplotlib line style."""
+    letter: str = ""
+    """The letter in the cells of a grid."""
+    meaning: str = ""
+    """What the name stands for, in legends."""
+    width: float = 1.3
+    """Line width in points."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A named value of an axis, drawn as a line, or a named range, drawn as a shaded band."""
+
+    name: str
+    at: float
+    to: float | None = None
+    """The end of the range; infinity for the rest of the axis."""
+    axis: Literal["x", "y"] = "x"
+    panel: str | None = None
+    """The only panel that has the mark; None for all panels."""
+
+
+@dataclass(frozen=True)
+class Note:
+    """A text at a point of a panel."""
+
+    text: str
+    x: float
+    y: float
+    panel: str | None = None
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A chart as data: which columns of a table are drawn against each other, for print and page.
+
+    - ``lines``: y against x, a line per ``series``, 95% intervals where the columns have them.
+    - ``points``: the same without lines.
+    - ``dots``: a row per value of the text column y, and x with its interval; ``join`` connects the dots of a row.
+    - ``grid``: a cell per pair of x and y, coloured by the text column ``level`` or by the number ``value``, with the
+      text of the column ``cell``.
+    """
+
+    name: str
+    """The stem of the files' names."""
+    title: str
+    """The finding that the chart shows."""
+    frame: pd.DataFrame
+    """A line per point. Its column ``row``, if any, is the position of the cell in ``Views.rows``."""
+    x: Sequence[Column]
+    """The horizontal quantities: print draws the first, a reader of the page chooses."""
+    y: Sequence[Column]
+    kind: ChartKind = "lines"
+    series: str = ""
+    """The column whose values have a colour and a marker each."""
+    line: str = ""
+    """The column that separates lines of the same series, such as backends; by default ``series``."""
+    panel: str = ""
+    """The column with a panel per value."""
+    level: str = ""
+    value: str = ""
+    cell: str = ""
+    text: str = ""
+    """How to read the chart, for the page."""
+    subtitle: str = ""
+    """Conditions that all panels share, for print."""
+    panel_notes: Mapping[str, str] = field(default_factory=dict)
+    """A sentence below the title of a panel, by panel."""
+    styles: Mapping[str, Style] = field(default_factory=dict)
+    """The looks of series or levels; others get a colour each."""
+    marks: Sequence[Mark] = ()
+    notes: Sequence[Note] = ()
+    join: bool = False
+    front: str = ""
+    """On the page: the column within whose values points are marked that no other point beats in both x and y."""
+    failed: str = ""
+    """The column that is true where a point has no value: a cross at the upper edge."""
+    labels: Literal["ends", "legend"] = "legend"
+    """Where series are named: at the ends of their lines, or in a legend."""
+    across: int = 4
+    """Most panels side by side."""
+    height: float = 2.3
+    """Height of a panel in inches; of a row of dots or cells, in ``dots`` and ``grid``, if below 1."""
+    band: bool = False
+    """Whether intervals are drawn as bands and not as bars."""
+    own_scales: bool = False
+    """Whether each panel has its own scale of y (of x, for dots)."""
+    printed: bool = True
+    """Whether the chart is drawn as a file; the page has all charts."""
+
+    def __post_init__(self) -> None:
+        wanted = (self.series, self.line, self.panel, self.level, self.value, self.cell, self.failed)
+        axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
+        missing = sorted({name for name in (*wanted, *axes) if name and name not in self.frame})
+        if missing:
+            raise ValueError(f"chart {self.name}: its table has no column {', '.join(missing)}")
+
+    def plotted(self) -> pd.DataFrame:
+        """Return the drawn columns of the table: panel, series, levels, and all quantities with their intervals."""
+        axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
+        names = [self.panel, self.series, self.line, self.level, self.value, self.cell, self.failed, *axes]
+        return self.frame[[name for name in dict.fromkeys(names) if name]]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table for readers and for programs."""
+
+    name: str
+    """The stem of the files' names."""
+    frame: pd.DataFrame
+    """A line per entry, numbers with all digits. Columns that ``columns`` does not name are only in the CSV."""
+    columns: Sequence[Column]
+    """The columns for readers, in order."""
+    data: pd.DataFrame | None = None
+    """The table for programs, the CSV, if it is not ``frame``; see :func:`bench.experiment.axes.table`."""
+    title: str = ""
+    notes: Sequence[str] = ()
+    """Paragraphs below the table."""
+    files: Sequence[Literal["csv", "md", "tex"]] = ("csv", "md")
+    terminal: bool = False
+    """Whether the terminal shows the table."""
+    page: bool = False
+    """Whether the page shows the table, above the charts."""
+    split: str = ""
+    """The column that divides the table for readers into parts with a heading each."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """All that a study shows of its rows."""
+
+    findings: Sequence[str]
+    """At most three sentences: the recommendation first, then what fails."""
+    tables: Sequence[Table] = ()
+    charts: Sequence[Chart] = ()
+    """The main chart first."""
+    rows: pd.DataFrame | None = None
+    """The rows with further columns, such as the names of series: the cells on the page; None: the rows as stored."""
+    columns: Sequence[Column] = ()
+    """The result columns of the page's table of cells; empty: all of the study's numbers and verdicts."""
+    remarks: Sequence[str] = ()
+    """Lines that the terminal adds, such as the reasons of cells without results."""

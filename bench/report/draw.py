@@ -1,0 +1,544 @@
+"""Draws charts, given as data, with Matplotlib.
+
+A chart is drawn at any width: the panels are laid out anew, and the text keeps its size.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm, Normalize, to_hex, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import FixedLocator, FuncFormatter
+
+from bench.experiment.columns import Column
+from bench.experiment.views import Chart, Mark, Style
+from bench.report.scales import log_axis
+from bench.report.style import GREY, MARKERS, MARKS, SHADE, SIZE, colour, plain, width_in_inches
+from bench.report.text import axis_value, duration
+from bench.report.views import is_logarithmic
+
+WIDTH, NARROW = 7.16, 3.5
+"""Figure widths in inches: two columns of a paper, or one."""
+LINE = 0.155
+"""Height of a line of text in inches."""
+BOLD = 1.18
+"""Width of a bold title relative to the same text elsewhere."""
+MANY = 12
+"""Most points of a line that are drawn with markers; longer lines are drawn without."""
+
+
+def draw(chart: Chart, width: float | None = None) -> Figure:
+    """Return the chart as a figure of a width in inches: by default two columns of a paper, or one for a single panel."""
+    panels = _panels(chart)
+    if width is None:
+        width = NARROW if len(panels) == 1 and chart.kind in ("lines", "points") and chart.labels == "legend" else WIDTH
+    styles = series_styles(chart)
+    draw_kind = {"dots": _draw_dots, "grid": _draw_grid}.get(chart.kind, _draw_lines)
+    across = _across(chart, len(panels), width)
+    down = math.ceil(len(panels) / across)
+    heights = [_height(chart, part) for _, part in panels]
+    titles = [_panel_title(chart, name, 0.9 * width / across) for name, _ in panels]
+    title_height = LINE * max(title.count("\n") + 1 for title in titles) if any(titles) else 0.0
+    head = _Head(chart, width)
+    legend = [] if chart.labels == "ends" else _legend(chart, styles)
+    columns = _legend_columns([str(handle.get_label()) for handle in legend], width)
+    below = 0.05 + LINE * 1.12 * math.ceil(len(legend) / columns) if legend else 0.0
+    body = sum(max(heights[i * across : (i + 1) * across]) + title_height for i in range(down)) + 0.45
+    height = head.height + body + below
+    layout = ConstrainedLayoutEngine(
+        w_pad=0.04, h_pad=0.03, rect=(0.005, below / height, 0.99, 1 - (below + head.height) / height)
+    )
+    figure = Figure(figsize=(width, height), layout=layout)
+    FigureCanvasAgg(figure)
+    head.write(figure)
+    ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
+    shared = not chart.own_scales
+    grid = figure.subplots(
+        down, across, squeeze=False, sharey=shared and chart.kind in ("lines", "points"),
+        sharex=shared and chart.kind == "dots", height_ratios=ratios,
+    ).ravel()  # fmt: skip
+    for spare in grid[len(panels) :]:
+        spare.remove()
+    axes = list(grid[: len(panels)])
+    for place, (panel, (name, part), title) in enumerate(zip(axes, panels, titles, strict=True)):
+        if title:
+            panel.set_title(title, loc="left", fontsize=SIZE)
+        draw_kind(chart, panel, name, part, styles)
+        if chart.kind in ("lines", "points"):
+            _label_axes(chart, panel, first=place % across == 0 or chart.own_scales)
+    if chart.kind in ("lines", "points"):
+        _scale(chart, axes, panels)
+        for panel, (name, part) in zip(axes, panels, strict=True):
+            _draw_marks(chart, panel, name, part)
+            if chart.labels == "ends":
+                _label_ends(chart, panel, part, styles, width / across)
+    if legend:
+        figure.legend(
+            handles=legend, loc="lower center", bbox_to_anchor=(0.5, 0), ncols=columns, frameon=False,
+            fontsize=SIZE, columnspacing=1.2, handletextpad=0.5, labelspacing=0.25, borderaxespad=0.1,
+        )  # fmt: skip
+    return figure
+
+
+def series_styles(chart: Chart) -> dict[str, Style]:
+    """Return a style for each series or level of a chart; those without a given style get a colour each."""
+    column = chart.level if chart.kind == "grid" else chart.series
+    names = list(dict.fromkeys(chart.frame[column].astype(str))) if column else [""]
+    ordered = [name for name in chart.styles if name in names] + [name for name in names if name not in chart.styles]
+    free = (i for i in range(1000) if colour(i) not in {style.colour for style in chart.styles.values()})
+    return {
+        name: chart.styles[name] if name in chart.styles else Style(colour(i := next(free)), MARKERS[i % len(MARKERS)])
+        for name in ordered
+    }
+
+
+# ------------------------------------------------------------------------------------------------------- layout
+
+
+class _Head:
+    """The title and the subtitle above the panels."""
+
+    def __init__(self, chart: Chart, width: float) -> None:
+        self._width = width
+        self._title = _fill(chart.title, 0.97 * width / BOLD)
+        self._subtitle = _fill(chart.subtitle, 0.97 * width) if chart.subtitle else ""
+        self._lines = self._title.count("\n") + 1
+        self.height = (
+            0.08 + LINE * 1.1 * self._lines + (LINE * (self._subtitle.count("\n") + 1) if self._subtitle else 0)
+        )
+
+    def write(self, figure: Figure) -> None:
+        height = figure.get_size_inches()[1]
+        top, left = 1 - 0.06 / height, 0.06 / self._width
+        figure.text(left, top, plain_lines(self._title), ha="left", va="top", fontsize=SIZE + 1, fontweight="bold")
+        if self._subtitle:
+            below = top - LINE * 1.1 * self._lines / height
+            figure.text(left, below, plain_lines(self._subtitle), ha="left", va="top", color=GREY)
+
+
+def plain_lines(text: str) -> str:
+    """Return text of several lines, escaped for Matplotlib."""
+    return "\n".join(map(plain, text.split("\n")))
+
+
+def _fill(text: str, width: float) -> str:
+    """Break text into lines of at most ``width`` inches, measured in the charts' font."""
+    lines: list[str] = []
+    for paragraph in text.split("\n"):
+        line = ""
+        for word in paragraph.split():
+            longer = f"{line} {word}".strip()
+            if line and width_in_inches(plain(longer)) > width:
+                lines.append(line)
+                line = word
+            else:
+                line = longer
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def _panels(chart: Chart) -> list[tuple[str, pd.DataFrame]]:
+    if not chart.panel:
+        return [("", chart.frame)]
+    return [(str(name), part) for name, part in chart.frame.groupby(chart.panel, sort=False)]
+
+
+def _panel_title(chart: Chart, name: str, width: float) -> str:
+    parts = [_fill(text, width) for text in (name, chart.panel_notes.get(name, "")) if text]
+    return "\n".join(map(plain_lines, parts))
+
+
+def _across(chart: Chart, count: int, width: float) -> int:
+    most = max(1, min(chart.across, count, round(chart.across * width / WIDTH)))
+    return math.ceil(count / math.ceil(count / most))
+
+
+def _height(chart: Chart, part: pd.DataFrame) -> float:
+    """Return the height of a panel in inches."""
+    if chart.height >= 1 or chart.kind in ("lines", "points"):
+        return chart.height
+    return float(chart.height * part[chart.y[0].name].nunique() + 0.1)
+
+
+def _legend(chart: Chart, styles: dict[str, Style]) -> list[Any]:
+    if chart.kind == "grid":
+        if not chart.level:
+            return []
+        return [
+            Patch(facecolor=style.colour, edgecolor="#808080", linewidth=0.4, label=plain(style.meaning or name))
+            for name, style in styles.items()
+        ]
+    if not chart.series:
+        return []
+    line = chart.kind == "lines"
+    return [
+        Line2D(
+            [], [], color=style.colour, marker=style.marker, linestyle=style.line if line else "none",
+            linewidth=style.width, label=plain(style.meaning or name),
+        )
+        for name, style in styles.items()
+    ]  # fmt: skip
+
+
+def _legend_columns(labels: Sequence[str], width: float) -> int:
+    lengths = np.array([0.5 + width_in_inches(label) for label in labels])
+    for count in range(min(len(lengths), 8), 1, -1):
+        if sum(part.max() for part in np.array_split(lengths, count)) <= width:
+            return count
+    return 1
+
+
+def axis_text(column: Column) -> str:
+    """Return the label of an axis."""
+    return plain(column.heading)
+
+
+def _values_text(column: Column) -> Any:
+    if column.format == "seconds":
+        return lambda value: duration(value).replace("us", "µs").replace(".0 ", " ")
+    if column.format == "percent":
+        return lambda value: f"{100 * value:g}%"
+    return None
+
+
+def _is_log(column: Column, values: Any) -> bool:
+    values = np.asarray(values, dtype=float)
+    positive = values[np.isfinite(values)]
+    if column.log is None:
+        return is_logarithmic(values)
+    return column.log and bool(positive.size) and bool((positive > 0).any())
+
+
+# -------------------------------------------------------------------------------------------- lines and points
+
+
+def _draw_lines(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles: dict[str, Style]) -> None:
+    x, y = chart.x[0], chart.y[0]
+    log = _is_log(y, chart.frame[y.name])
+    keys = [key for key in dict.fromkeys((chart.series, chart.line)) if key]
+    groups = part.groupby(keys, sort=False) if keys else [(("",), part)]
+    for order, (key, points) in enumerate(groups):
+        series = str(key[0]) if chart.series else ""
+        style = styles[series]
+        points = points.sort_values(x.name, kind="stable") if chart.kind == "lines" else points
+        values = points[y.name].to_numpy(float)
+        values = np.where(values > 0, values, np.nan) if log else values
+        places = points[x.name].to_numpy(float)
+        limit = points[y.limit].to_numpy(bool) if y.limit else np.zeros(len(points), dtype=bool)
+        line = style.line if chart.kind == "lines" else "none"
+        mark = style.marker if chart.kind == "points" or len(points) <= MANY else ""
+        common: dict[str, Any] = {"color": style.colour, "zorder": 3 + 0.01 * order}
+        panel.plot(places, values, linestyle=line, linewidth=style.width, **common)
+        if mark:
+            panel.plot(places[~limit], values[~limit], linestyle="none", marker=mark, markersize=4, **common)
+            panel.plot(
+                places[limit],
+                values[limit],
+                linestyle="none",
+                marker=mark,
+                markersize=4,
+                markerfacecolor="white",
+                **common,
+            )
+        if y.low and y.high:
+            low, high = (points[end].to_numpy(float) for end in (y.low, y.high))
+            low = np.where(low > 0, low, np.nan) if log and chart.band else low
+            known = np.isfinite(values) & np.isfinite(low) & np.isfinite(high) & ~limit
+            if chart.band:
+                panel.fill_between(
+                    places, low, high, where=known, color=style.colour, alpha=0.18, linewidth=0, zorder=2
+                )
+            else:
+                bottom = np.maximum(low, 1e-300) if log else low
+                panel.vlines(places[known], bottom[known], high[known], linewidth=0.9, **common)
+        if chart.failed:
+            lost = points[chart.failed].to_numpy(bool)
+            panel.plot(
+                places[lost], np.full(lost.sum(), 0.97), "x", transform=panel.get_xaxis_transform(), markersize=5,
+                markeredgewidth=1.4, clip_on=False, **common,
+            )  # fmt: skip
+
+
+def _label_axes(chart: Chart, panel: Axes, first: bool) -> None:
+    panel.set_xlabel(axis_text(chart.x[0]))
+    if first:
+        panel.set_ylabel(axis_text(chart.y[0]))
+
+
+def _scale(chart: Chart, axes: Sequence[Axes], panels: Sequence[tuple[str, pd.DataFrame]]) -> None:
+    """Set the scales of all panels: x per panel, y for all together unless the chart has scales per panel."""
+    x, y = chart.x[0], chart.y[0]
+    for panel, (_, part) in zip(axes, panels, strict=True):
+        rows = part if chart.own_scales else chart.frame
+        _scale_x(panel, x, part[x.name].to_numpy(float))
+        if _is_log(y, chart.frame[y.name]):
+            low, high = _log_range(y, rows, [mark for mark in chart.marks if mark.axis == "y"])
+            log_axis(panel, "y", low, high, text=_values_text(y))
+            if y.above_one and high > 1:
+                panel.axhspan(1.0, high, zorder=0, **SHADE)
+        elif text := _values_text(y):
+            panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _, text=text: text(value)))
+
+
+def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -> tuple[float, float]:
+    """Return the range of a logarithmic axis: all positive values, and their intervals within a factor of 100."""
+    values = rows[column.name].to_numpy(float)
+    values = values[np.isfinite(values) & (values > 0)]
+    low, high = float(values.min()), float(values.max())
+    for name in (column.low, column.high):
+        if name:
+            ends = rows[name].to_numpy(float)
+            ends = ends[np.isfinite(ends) & (ends > 0) & (ends >= low / 100) & (ends <= high * 100)]
+            low, high = min([low, *ends]), max([high, *ends])
+    low, high = min([low, *(m.at for m in marks)]), max([high, *(m.at for m in marks)])
+    margin = max((high / low) ** 0.06, 1.15)
+    return low / margin, high * margin
+
+
+def _scale_x(panel: Axes, column: Column, values: np.ndarray) -> None:
+    values = np.unique(values[np.isfinite(values)])
+    if not values.size:
+        return
+    text = _values_text(column)
+    if _is_log(column, values) and values[0] > 0:
+        margin = max((values[-1] / values[0]) ** 0.05, 1.08)
+        log_axis(panel, "x", values[0] / margin, values[-1] * margin, values if len(values) <= 6 else (), text)
+        return
+    spread = float(np.ptp(values)) or abs(float(values[0])) or 1.0
+    panel.set_xlim(values[0] - 0.05 * spread, values[-1] + 0.05 * spread)
+    if len(values) <= 6:
+        panel.xaxis.set_major_locator(FixedLocator(list(values)))
+    if text:
+        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
+
+
+def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> None:
+    """Draw the named values and ranges of the axes, and the notes."""
+    dashes = iter(MARKS * 10)
+    for mark in chart.marks:
+        if mark.panel not in (None, name):
+            continue
+        low, high = panel.get_xlim() if mark.axis == "x" else panel.get_ylim()
+        if mark.to is not None:
+            start, end = max(mark.at, low), min(mark.to, high)
+            if start >= end:
+                continue
+            span = panel.axvspan if mark.axis == "x" else panel.axhspan
+            span(start, end, zorder=0, color="#D55E00", alpha=0.12, linewidth=0)
+            if mark.name:
+                middle = math.sqrt(start * end) if start > 0 and panel.get_xscale() == "log" else (start + end) / 2
+                panel.text(
+                    middle, 0.985, "\n".join(textwrap.wrap(plain(mark.name), 14)), transform=panel.get_xaxis_transform(),
+                    ha="center", va="top", color="#9c4400", fontsize=SIZE - 0.5,
+                )  # fmt: skip
+        elif low < mark.at < high:
+            dash = next(dashes)
+            if mark.axis == "x":
+                panel.axvline(mark.at, zorder=1, color="#595959", linewidth=0.9, linestyle=dash)
+                if mark.name:
+                    panel.text(
+                        mark.at, 0.985, plain(f" {mark.name}"), transform=panel.get_xaxis_transform(), va="top",
+                        fontsize=SIZE - 0.5, color="#404040",
+                    )  # fmt: skip
+            else:
+                panel.axhline(mark.at, zorder=1, color="#595959", linewidth=0.9, linestyle=dash)
+                if mark.name:
+                    panel.text(
+                        0.005, mark.at, plain(mark.name), transform=panel.get_yaxis_transform(), va="bottom",
+                        fontsize=SIZE - 1, color="#404040",
+                    )  # fmt: skip
+    for note in chart.notes:
+        if note.panel in (None, name):
+            panel.text(note.x, note.y, plain_lines(note.text), fontsize=SIZE - 0.5, va="center", ha="center")
+
+
+def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], width: float) -> None:
+    """Name each series beside the last point of its line, in its colour, moved apart where names would overlap."""
+    x, y = chart.x[0].name, chart.y[0].name
+    wanted = []
+    for series, points in part.groupby(chart.series, sort=False):
+        points = points[np.isfinite(points[y]) & ((points[y] > 0) | (panel.get_yscale() != "log"))]
+        if len(points):
+            last = points.sort_values(x, kind="stable").iloc[-1]
+            at = panel.transAxes.inverted().transform(panel.transData.transform((last[x], last[y])))[1]
+            wanted.append((float(np.clip(at, 0.02, 0.98)), str(series)))
+    wanted.sort()
+    gap = 1.15 * LINE / chart.height
+    places = [at for at, _ in wanted]
+    for _ in range(200):  # move neighbours apart until no two overlap
+        moved = False
+        for i in range(len(places) - 1):
+            lack = gap - (places[i + 1] - places[i])
+            if lack > 1e-6:
+                places[i], places[i + 1], moved = places[i] - lack / 2, places[i + 1] + lack / 2, True
+        if not moved:
+            break
+    for place, (_, series) in zip(places, wanted, strict=True):
+        style = styles[series]
+        panel.annotate(
+            plain_lines(_fill(style.meaning or series, 0.36 * width)), (1.015, place), xycoords="axes fraction",
+            va="center", ha="left", color=style.colour, fontsize=SIZE, annotation_clip=False,
+        )  # fmt: skip
+
+
+# ---------------------------------------------------------------------------------------------------- dots
+
+
+def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles: dict[str, Style]) -> None:
+    """Draw a row per category, the first at the top, with a dot and an interval per series."""
+    x, y = chart.x[0], chart.y[0]
+    categories = list(dict.fromkeys(part[y.name].astype(str)))
+    place = {category: len(categories) - 1 - i for i, category in enumerate(categories)}
+    values = chart.frame if not chart.own_scales else part
+    log = _is_log(x, values[x.name])
+    names = list(styles)
+    several = len(names) > 1 and not chart.join
+    if chart.join:
+        for category, points in part.groupby(part[y.name].astype(str), sort=False):
+            ends = points[x.name].to_numpy(float)
+            ends = ends[np.isfinite(ends) & ((ends > 0) | (not log))]
+            if len(ends) > 1:
+                panel.hlines(place[str(category)], ends.min(), ends.max(), color="#a0a0a0", linewidth=1.6, zorder=1)
+    for number, (series, style) in enumerate(styles.items()):
+        points = part[part[chart.series].astype(str) == series] if chart.series else part
+        if points.empty:
+            continue
+        shift = 0.0
+        if several and points[y.name].nunique() < len(part):
+            shift = -0.5 * (number - (len(names) - 1) / 2) / max(len(names), 2)
+        rows = np.array([place[str(v)] for v in points[y.name]]) + shift
+        at = points[x.name].to_numpy(float)
+        limit = points[x.limit].to_numpy(bool) if x.limit else np.zeros(len(at), dtype=bool)
+        known = np.isfinite(at) & ((at > 0) | (not log))
+        common: dict[str, Any] = {"color": style.colour, "zorder": 3}
+        if x.low and x.high:
+            low, high = (points[end].to_numpy(float) for end in (x.low, x.high))
+            shown = known & np.isfinite(low) & np.isfinite(high) & ~limit
+            low = np.maximum(low, 1e-300) if log else low
+            panel.hlines(rows[shown], low[shown], high[shown], linewidth=1.1, **common)
+        panel.plot(at[known & ~limit], rows[known & ~limit], linestyle="none", marker=style.marker or "o", **common)
+        panel.plot(
+            at[known & limit], rows[known & limit], linestyle="none", marker=style.marker or "o", markerfacecolor="white",
+            **common,
+        )  # fmt: skip
+        for row, lost in zip(rows, ~known, strict=True):
+            if lost and chart.failed:
+                panel.plot([0.985], [row], "x", transform=panel.get_yaxis_transform(), color=style.colour, markersize=5)
+    panel.set_yticks(list(place.values()), [plain(category) for category in place])
+    panel.set_ylim(-0.6, len(categories) - 0.4)
+    panel.tick_params(axis="y", length=0)
+    panel.grid(axis="y", color="#e4e4e4", linewidth=0.6)
+    panel.set_axisbelow(True)
+    panel.set_xlabel(axis_text(x))
+    text = _values_text(x)
+    if log:
+        low, high = _log_range(x, values, [mark for mark in chart.marks if mark.axis == "x"])
+        log_axis(panel, "x", low, high, text=text)
+    elif text:
+        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
+    if x.above_one and log and panel.get_xlim()[1] > 1:
+        panel.axvspan(1.0, panel.get_xlim()[1], zorder=0, **SHADE)
+    _draw_marks(chart, panel, name, part)
+
+
+# ---------------------------------------------------------------------------------------------------- grid
+
+
+def _draw_grid(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles: dict[str, Style]) -> None:
+    """Draw a cell per pair of x and y, coloured by level or value, with its text."""
+    x, y = chart.x[0], chart.y[0]
+    rows = part if chart.own_scales else chart.frame
+    across, down = _categories(x, rows), _categories(y, rows, downwards=True)
+    norm = _norm(chart)
+    for line in part.to_dict("records"):
+        place = across.index(_category(line[x.name])), len(down) - 1 - down.index(_category(line[y.name]))
+        if chart.level:
+            style = styles[str(line[chart.level])]
+            face, text = style.colour, line[chart.cell] if chart.cell else style.letter
+        else:
+            value = float(line[chart.value])
+            face = _shade(norm, value)
+            text = line[chart.cell] if chart.cell else ""
+        panel.add_patch(
+            Rectangle((place[0] - 0.5, place[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8)
+        )
+        if text:
+            panel.text(*place, plain(str(text)), ha="center", va="center", color=ink_on(face), fontsize=SIZE - 1)
+    panel.set_xlim(-0.5, len(across) - 0.5)
+    panel.set_ylim(-0.5, len(down) - 0.5)
+    for which, column, names in (("x", x, across), ("y", y, down[::-1])):
+        labels = [plain(text) for text in names]
+        few = _thinned(labels, which, panel)
+        getattr(panel, f"set_{which}ticks")(few, [labels[i] for i in few])
+        if column.label or column.kind == "number":
+            getattr(panel, f"set_{which}label")(axis_text(column))
+    panel.tick_params(length=0)
+    for spine in panel.spines.values():
+        spine.set_visible(False)
+    if x.kind == "text" and max(map(width_in_inches, across), default=0) * len(across) > WIDTH * 0.75:
+        panel.tick_params(axis="x", rotation=30)
+        for label in panel.get_xticklabels():
+            label.set_horizontalalignment("right")
+
+
+def _thinned(labels: Sequence[str], which: str, panel: Axes) -> list[int]:
+    """Return the positions of the labels that are shown: all, or every second or more of many numbers."""
+    count = len(labels)
+    step = 1
+    if which == "x" and count > 8 and all(_is_number(label) for label in labels):
+        step = math.ceil(count / 8)
+    return list(range(0, count, step))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _category(value: Any) -> str:
+    return axis_value(float(value)) if isinstance(value, int | float | np.number) else str(value)
+
+
+def _categories(column: Column, rows: pd.DataFrame, downwards: bool = False) -> list[str]:
+    """Return the categories of an axis in order: strings as they appear, numbers increasing, or downwards decreasing."""
+    values = rows[column.name].drop_duplicates()
+    if pd.api.types.is_numeric_dtype(values):
+        return list(dict.fromkeys(map(_category, sorted(values.dropna(), reverse=downwards))))
+    return list(map(str, values))
+
+
+def _norm(chart: Chart) -> Normalize:
+    values = chart.frame[chart.value].to_numpy(float) if chart.value else np.array([1.0])
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return Normalize(0, 1)
+    low, high = float(values.min()), float(values.max())
+    return LogNorm(low, high) if low > 0 and high > 8 * low else Normalize(low, high if high > low else low + 1)
+
+
+def _shade(norm: Normalize, value: float) -> str:
+    from matplotlib import colormaps
+
+    if not math.isfinite(value):
+        return "#f0f0f0"
+    return to_hex(colormaps["YlOrBr"](0.08 + 0.84 * float(norm(value))))
+
+
+def ink_on(ground: str) -> str:
+    """Return black or white, whichever contrasts more with a colour."""
+    r, g, b = to_rgb(ground)
+    return "#000000" if 0.3 * r + 0.59 * g + 0.11 * b > 0.5 else "#ffffff"
