@@ -17,7 +17,7 @@ from bench.compare.sources import Results, open_results
 from bench.errors import UserError
 from bench.experiment.columns import Column, Columns
 from bench.experiment.words import parse_words
-from bench.model import registry
+from bench.report.colours import estimator_order
 from bench.report.tables import plain_markdown
 from bench.report.text import number
 from bench.run.files import make_directory, write_all
@@ -124,7 +124,7 @@ def figure(history: History) -> Figure:
     from bench.report.scales import log_axis
     from bench.report.style import MARKERS, colour
 
-    known = sorted(registry.entries()["estimators"])
+    known = estimator_order()
     drawn = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     left, right = drawn.subplots(1, 2)
     places = np.arange(len(history.names))

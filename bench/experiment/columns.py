@@ -72,6 +72,10 @@ class Column:
     """The column that is true where the value is an upper limit."""
     log: bool | None = field(default=None, kw_only=True)
     """Whether its axis is logarithmic; None: if all values are positive and span a factor of 8."""
+    emphasis: str = field(default="", kw_only=True)
+    """The column that is true where tables print the value in bold."""
+    note: str = field(default="", kw_only=True)
+    """The column of words that tables append to the value, or show in place of a missing one."""
     above_one: str = field(default="", kw_only=True)
     """The meaning of values above 1; charts shade that area."""
 

@@ -46,7 +46,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Note:
-    """A text at a point of a panel."""
+    """A text to the left of a point of a panel."""
 
     text: str
     x: float
@@ -107,23 +107,36 @@ class Chart:
     """Height of a panel in inches; of a row of dots or cells, in ``dots`` and ``grid``, if below 1."""
     band: bool = False
     """Whether intervals are drawn as bands and not as bars."""
+    shape: str = ""
+    """The column whose values have a marker each, where ``series`` has the colours."""
+    chosen: Sequence[tuple[str, Sequence[Any]]] = ()
+    """What print draws of the table: columns with the values to keep, in this order. The page draws all."""
     own_scales: bool = False
     """Whether each panel has its own scale of y (of x, for dots)."""
     printed: bool = True
-    """Whether the chart is drawn as a file; the page has all charts."""
+    """Whether the chart is drawn as a file."""
+    on_page: bool = True
 
     def __post_init__(self) -> None:
-        wanted = (self.series, self.line, self.panel, self.level, self.value, self.cell, self.failed)
+        wanted = (self.series, self.line, self.panel, self.shape, self.level, self.value, self.cell, self.failed)
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
         missing = sorted({name for name in (*wanted, *axes) if name and name not in self.frame})
         if missing:
             raise ValueError(f"chart {self.name}: its table has no column {', '.join(missing)}")
 
+    def drawn(self) -> pd.DataFrame:
+        """Return the lines of the table that print draws."""
+        frame = self.frame
+        for name, values in self.chosen:
+            kept = frame[frame[name].isin(values)]
+            frame = kept.iloc[kept[name].map(list(values).index).argsort(kind="stable")]
+        return frame
+
     def plotted(self) -> pd.DataFrame:
-        """Return the drawn columns of the table: panel, series, levels, and all quantities with their intervals."""
+        """Return the drawn lines and columns: panel, series, levels, and all quantities with their intervals."""
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        names = [self.panel, self.series, self.line, self.level, self.value, self.cell, self.failed, *axes]
-        return self.frame[[name for name in dict.fromkeys(names) if name]]
+        names = [self.panel, self.series, self.line, self.shape, self.level, self.value, self.cell, self.failed, *axes]
+        return self.drawn()[[name for name in dict.fromkeys(names) if name]]
 
 
 @dataclass(frozen=True)
@@ -136,18 +149,20 @@ class Table:
     """A line per entry, numbers with all digits. Columns that ``columns`` does not name are only in the CSV."""
     columns: Sequence[Column]
     """The columns for readers, in order."""
-    data: pd.DataFrame | None = None
-    """The table for programs, the CSV, if it is not ``frame``; see :func:`bench.experiment.axes.table`."""
     title: str = ""
     notes: Sequence[str] = ()
     """Paragraphs below the table."""
     files: Sequence[Literal["csv", "md", "tex"]] = ("csv", "md")
     terminal: bool = False
     """Whether the terminal shows the table."""
+    details: Sequence[str] = ()
+    """Columns for readers that the terminal omits."""
     page: bool = False
     """Whether the page shows the table, above the charts."""
     split: str = ""
     """The column that divides the table for readers into parts with a heading each."""
+    data: pd.DataFrame | None = None
+    """The table for programs, the CSV, if it is not ``frame``; see :func:`bench.experiment.axes.table`."""
 
 
 @dataclass(frozen=True)

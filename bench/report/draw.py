@@ -6,8 +6,11 @@ A chart is drawn at any width: the panels are laid out anew, and the text keeps 
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,7 +35,7 @@ WIDTH, NARROW = 7.16, 3.5
 """Figure widths in inches: two columns of a paper, or one."""
 LINE = 0.155
 """Height of a line of text in inches."""
-BOLD = 1.18
+BOLD = 1.3
 """Width of a bold title relative to the same text elsewhere."""
 MANY = 12
 """Most points of a line that are drawn with markers; longer lines are drawn without."""
@@ -40,13 +43,16 @@ MANY = 12
 
 def draw(chart: Chart, width: float | None = None) -> Figure:
     """Return the chart as a figure of a width in inches: by default two columns of a paper, or one for a single panel."""
+    chart = replace(chart, frame=chart.drawn(), chosen=())
     panels = _panels(chart)
     if width is None:
         width = NARROW if len(panels) == 1 and chart.kind in ("lines", "points") and chart.labels == "legend" else WIDTH
     styles = series_styles(chart)
-    draw_kind = {"dots": _draw_dots, "grid": _draw_grid}.get(chart.kind, _draw_lines)
     across = _across(chart, len(panels), width)
     down = math.ceil(len(panels) / across)
+    draw_kind: Any = {"dots": _draw_dots, "grid": partial(_draw_grid, width=width / across)}.get(
+        chart.kind, _draw_lines
+    )
     heights = [_height(chart, part) for _, part in panels]
     titles = [_panel_title(chart, name, 0.9 * width / across) for name, _ in panels]
     title_height = LINE * max(title.count("\n") + 1 for title in titles) if any(titles) else 0.0
@@ -55,6 +61,10 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     columns = _legend_columns([str(handle.get_label()) for handle in legend], width)
     below = 0.05 + LINE * 1.12 * math.ceil(len(legend) / columns) if legend else 0.0
     body = sum(max(heights[i * across : (i + 1) * across]) + title_height for i in range(down)) + 0.45
+    if chart.kind == "grid":
+        names = _categories(chart.x[0], chart.frame)
+        labels = _grid_labels(chart, chart.x[0], names, width / across)
+        body += LINE * max((label.count("\n") for label in labels), default=0)
     height = head.height + body + below
     layout = ConstrainedLayoutEngine(
         w_pad=0.04, h_pad=0.03, rect=(0.005, below / height, 0.99, 1 - (below + head.height) / height)
@@ -75,6 +85,9 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
         if title:
             panel.set_title(title, loc="left", fontsize=SIZE)
         draw_kind(chart, panel, name, part, styles)
+        if chart.kind == "grid" and place + across < len(panels) and not chart.own_scales:
+            panel.set_xlabel("")
+            panel.tick_params(labelbottom=False)
         if chart.kind in ("lines", "points"):
             _label_axes(chart, panel, first=place % across == 0 or chart.own_scales)
     if chart.kind in ("lines", "points"):
@@ -155,7 +168,7 @@ def _panels(chart: Chart) -> list[tuple[str, pd.DataFrame]]:
 
 
 def _panel_title(chart: Chart, name: str, width: float) -> str:
-    parts = [_fill(text, width) for text in (name, chart.panel_notes.get(name, "")) if text]
+    parts = [_fill(_clipped(text, 3 * width), width) for text in (name, chart.panel_notes.get(name, "")) if text]
     return "\n".join(map(plain_lines, parts))
 
 
@@ -182,13 +195,23 @@ def _legend(chart: Chart, styles: dict[str, Style]) -> list[Any]:
     if not chart.series:
         return []
     line = chart.kind == "lines"
-    return [
+    colours = [
         Line2D(
-            [], [], color=style.colour, marker=style.marker, linestyle=style.line if line else "none",
-            linewidth=style.width, label=plain(style.meaning or name),
+            [], [], color=style.colour, marker="s" if chart.shape else style.marker, linestyle=style.line if line else "none",
+            linewidth=style.width, label=plain(_clipped(style.meaning or name, 3.0)),
         )
         for name, style in styles.items()
     ]  # fmt: skip
+    return colours + [
+        Line2D([], [], color=GREY, marker=mark, markerfacecolor="none", linestyle="none", label=plain(name))
+        for name, mark in _shapes(chart).items()
+    ]
+
+
+def _shapes(chart: Chart) -> dict[str, str]:
+    """Return a marker for each value of the column of shapes."""
+    names = dict.fromkeys(chart.frame[chart.shape].astype(str)) if chart.shape else {}
+    return {name: MARKERS[i % len(MARKERS)] for i, name in enumerate(names)}
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
@@ -226,7 +249,8 @@ def _is_log(column: Column, values: Any) -> bool:
 def _draw_lines(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles: dict[str, Style]) -> None:
     x, y = chart.x[0], chart.y[0]
     log = _is_log(y, chart.frame[y.name])
-    keys = [key for key in dict.fromkeys((chart.series, chart.line)) if key]
+    keys = [key for key in dict.fromkeys((chart.series, chart.line, chart.shape)) if key]
+    shapes = _shapes(chart)
     groups = part.groupby(keys, sort=False) if keys else [(("",), part)]
     for order, (key, points) in enumerate(groups):
         series = str(key[0]) if chart.series else ""
@@ -238,6 +262,7 @@ def _draw_lines(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles
         limit = points[y.limit].to_numpy(bool) if y.limit else np.zeros(len(points), dtype=bool)
         line = style.line if chart.kind == "lines" else "none"
         mark = style.marker if chart.kind == "points" or len(points) <= MANY else ""
+        mark = shapes[str(points[chart.shape].iloc[0])] if chart.shape else mark
         common: dict[str, Any] = {"color": style.colour, "zorder": 3 + 0.01 * order}
         panel.plot(places, values, linestyle=line, linewidth=style.width, **common)
         if mark:
@@ -262,8 +287,8 @@ def _draw_lines(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles
             else:
                 bottom = np.maximum(low, 1e-300) if log else low
                 panel.vlines(places[known], bottom[known], high[known], linewidth=0.9, **common)
-        if chart.failed:
-            lost = points[chart.failed].to_numpy(bool)
+        lost = points[chart.failed].to_numpy(bool) if chart.failed else np.zeros(len(points), dtype=bool)
+        if lost.any():
             panel.plot(
                 places[lost], np.full(lost.sum(), 0.97), "x", transform=panel.get_xaxis_transform(), markersize=5,
                 markeredgewidth=1.4, clip_on=False, **common,
@@ -339,8 +364,8 @@ def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> Non
             if mark.name:
                 middle = math.sqrt(start * end) if start > 0 and panel.get_xscale() == "log" else (start + end) / 2
                 panel.text(
-                    middle, 0.985, "\n".join(textwrap.wrap(plain(mark.name), 14)), transform=panel.get_xaxis_transform(),
-                    ha="center", va="top", color="#9c4400", fontsize=SIZE - 0.5,
+                    middle, 0.015, "\n".join(textwrap.wrap(plain(mark.name), 14)), transform=panel.get_xaxis_transform(),
+                    ha="center", va="bottom", color="#9c4400", fontsize=SIZE - 0.5,
                 )  # fmt: skip
         elif low < mark.at < high:
             dash = next(dashes)
@@ -360,7 +385,10 @@ def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> Non
                     )  # fmt: skip
     for note in chart.notes:
         if note.panel in (None, name):
-            panel.text(note.x, note.y, plain_lines(note.text), fontsize=SIZE - 0.5, va="center", ha="center")
+            panel.annotate(
+                plain_lines(note.text), (note.x, note.y), (-6, 0), textcoords="offset points", fontsize=SIZE - 0.5,
+                va="center", ha="right",
+            )  # fmt: skip
 
 
 def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], width: float) -> None:
@@ -387,7 +415,7 @@ def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
     for place, (_, series) in zip(places, wanted, strict=True):
         style = styles[series]
         panel.annotate(
-            plain_lines(_fill(style.meaning or series, 0.36 * width)), (1.015, place), xycoords="axes fraction",
+            plain(_clipped(style.meaning or series, 0.42 * width)), (1.015, place), xycoords="axes fraction",
             va="center", ha="left", color=style.colour, fontsize=SIZE, annotation_clip=False,
         )  # fmt: skip
 
@@ -435,7 +463,7 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
         for row, lost in zip(rows, ~known, strict=True):
             if lost and chart.failed:
                 panel.plot([0.985], [row], "x", transform=panel.get_yaxis_transform(), color=style.colour, markersize=5)
-    panel.set_yticks(list(place.values()), [plain(category) for category in place])
+    panel.set_yticks(list(place.values()), [plain(_clipped(category, 3.0)) for category in place])
     panel.set_ylim(-0.6, len(categories) - 0.4)
     panel.tick_params(axis="y", length=0)
     panel.grid(axis="y", color="#e4e4e4", linewidth=0.6)
@@ -455,11 +483,12 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
 # ---------------------------------------------------------------------------------------------------- grid
 
 
-def _draw_grid(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles: dict[str, Style]) -> None:
+def _draw_grid(
+    chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles: dict[str, Style], width: float = WIDTH
+) -> None:
     """Draw a cell per pair of x and y, coloured by level or value, with its text."""
     x, y = chart.x[0], chart.y[0]
-    rows = part if chart.own_scales else chart.frame
-    across, down = _categories(x, rows), _categories(y, rows, downwards=True)
+    across, down = _categories(x, part if chart.own_scales else chart.frame), _categories(y, part, downwards=True)
     norm = _norm(chart)
     for line in part.to_dict("records"):
         place = across.index(_category(line[x.name])), len(down) - 1 - down.index(_category(line[y.name]))
@@ -478,27 +507,48 @@ def _draw_grid(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
     panel.set_xlim(-0.5, len(across) - 0.5)
     panel.set_ylim(-0.5, len(down) - 0.5)
     for which, column, names in (("x", x, across), ("y", y, down[::-1])):
-        labels = [plain(text) for text in names]
-        few = _thinned(labels, which, panel)
+        labels = _grid_labels(chart, column, names, width)
+        few = _thinned(labels) if which == "x" else list(range(len(labels)))
         getattr(panel, f"set_{which}ticks")(few, [labels[i] for i in few])
         if column.label or column.kind == "number":
             getattr(panel, f"set_{which}label")(axis_text(column))
     panel.tick_params(length=0)
     for spine in panel.spines.values():
         spine.set_visible(False)
-    if x.kind == "text" and max(map(width_in_inches, across), default=0) * len(across) > WIDTH * 0.75:
-        panel.tick_params(axis="x", rotation=30)
-        for label in panel.get_xticklabels():
-            label.set_horizontalalignment("right")
 
 
-def _thinned(labels: Sequence[str], which: str, panel: Axes) -> list[int]:
+def _grid_labels(chart: Chart, column: Column, names: Sequence[str], width: float) -> list[str]:
+    """Return the labels of an axis of a grid: those of x in at most three lines of the width of a cell."""
+    if column is chart.y[0] or column.kind != "text":
+        return [plain(_clipped(name, 3.0)) for name in names]
+    beside = min(3.0, max(map(width_in_inches, map(plain, _categories(chart.y[0], chart.frame))), default=0.0))
+    room = max(0.3, 0.95 * (width - beside - 0.3) / len(names))
+    return ["\n".join(plain(_clipped(line, room)) for line in _broken(name, room).split("\n", 2)[:3]) for name in names]
+
+
+def _broken(text: str, width: float) -> str:
+    """Break a name after its punctuation into lines of at most ``width`` inches, where it can be broken."""
+    lines = [""]
+    for piece in re.findall(r"[^_,\[ ]*[_,\[ ]*", text):
+        if lines[-1] and width_in_inches(plain(lines[-1] + piece)) > width:
+            lines.append("")
+        lines[-1] += piece
+    return "\n".join(lines)
+
+
+def _clipped(text: str, width: float) -> str:
+    """Shorten text that is wider than ``width`` inches, with an ellipsis in its middle."""
+    full = width_in_inches(plain(text))
+    if full <= width:
+        return text
+    kept = max(4, int(len(text) * width / full) - 2)
+    return f"{text[: (kept + 1) // 2]}…{text[len(text) - kept // 2 :]}"
+
+
+def _thinned(labels: Sequence[str]) -> list[int]:
     """Return the positions of the labels that are shown: all, or every second or more of many numbers."""
-    count = len(labels)
-    step = 1
-    if which == "x" and count > 8 and all(_is_number(label) for label in labels):
-        step = math.ceil(count / 8)
-    return list(range(0, count, step))
+    step = math.ceil(len(labels) / 8) if len(labels) > 8 and all(map(_is_number, labels)) else 1
+    return list(range(0, len(labels), step))
 
 
 def _is_number(text: str) -> bool:

@@ -39,7 +39,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         findings=[f"{good} of {counted(len(rows), 'cell')} gave a result."],
         tables=[
             Table(experiment.study.name, table, [*labels, *swept, *(replace(c, digits=3) for c in own), COMMON["status"]],
-                  axes.table(experiment, rows), terminal=True)
+                  data=axes.table(experiment, rows), terminal=True)
         ],
         charts=charts,
     )  # fmt: skip

@@ -138,6 +138,15 @@ def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:
     )
 
 
+def named_values(rows: pd.DataFrame, names: Sequence[str]) -> dict[str, list[str]]:
+    """Return some columns of numbers as strings, ``sigma=0.1``; empty if a column has one value or a row has none."""
+    several = {name: rows[name].nunique() > 1 for name in names}
+    return {
+        name: [f"{name}={axis_value(x)}" if several[name] and math.isfinite(x) else "" for x in rows[name]]
+        for name in names
+    }
+
+
 def _with_name(column: Any, value: Any) -> str:
     if isinstance(value, str):
         return "" if value == "none" else value

@@ -10,7 +10,7 @@ import pandas as pd
 
 from bench.experiment.axes import Axis
 from bench.experiment.columns import COMMON
-from bench.report.text import axis_value
+from bench.report.text import axis_value, one_line
 from bench.report.views import Curve
 
 PALETTE = ("#0072B2", "#000000", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000")
@@ -135,7 +135,7 @@ def quantity(name: str, value: float) -> str:
 
 def plain(text: str) -> str:
     """Return text escaped for Matplotlib: not parsed as a formula, not hidden in legends for a leading underscore."""
-    text = " ".join(text.split()).replace("$", r"\$")
+    text = one_line(text).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
 

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
-from bench.experiment.columns import Column
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
+from bench.report.cells import TableCell, cell, parts, readable
 from bench.report.cores import run_tasks
 from bench.report.draw import draw
 from bench.report.figures import save, styled
-from bench.report.tables import csv, escape_latex, escape_markdown
-from bench.report.text import axis_value, duration, number
+from bench.report.latex import latex
+from bench.report.tables import csv, escape_markdown
 from bench.run.files import write_all
 
 FINDINGS = "findings.json"
@@ -28,9 +27,9 @@ FINDINGS = "findings.json"
 def write(experiment: Experiment, views: Views) -> list[Path]:
     """Write all tables, charts and findings of an experiment; return the files' paths."""
     contents = {FINDINGS: _findings(experiment, views)}
-    for table in views.tables:
-        contents |= table_files(table, experiment.name)
-    tasks = [partial(_draw, experiment, chart) for chart in views.charts if chart.printed and len(chart.frame)]
+    for name in dict.fromkeys(table.name for table in views.tables):
+        contents |= table_files([table for table in views.tables if table.name == name], experiment.name)
+    tasks = [partial(_draw, experiment, chart) for chart in views.charts if chart.printed and len(chart.drawn())]
     paths = [path for saved in run_tasks(tasks) for path in saved]
     return [*write_all(experiment.directory, contents), *paths]
 
@@ -41,106 +40,51 @@ def _draw(experiment: Experiment, chart: Chart) -> list[Path]:
 
 
 def _findings(experiment: Experiment, views: Views) -> str:
-    main = next((chart.name for chart in views.charts if chart.printed and len(chart.frame)), "")
+    main = next((chart.name for chart in views.charts if chart.printed and len(chart.drawn())), "")
     content = {
         "experiment": experiment.name, "question": experiment.question, "findings": list(views.findings), "chart": main
     }  # fmt: skip
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
-def table_files(table: Table, experiment: str) -> dict[str, str]:
-    """Return the content of a table's files by name."""
+def table_files(tables: Sequence[Table], experiment: str) -> dict[str, str]:
+    """Return the content of the files of tables with one name; the CSV has the first."""
+    first = tables[0]
     makers = {
-        "csv": lambda: csv(table.frame if table.data is None else table.data),
-        "md": lambda: markdown(table, experiment),
-        "tex": lambda: latex(table),
+        "csv": lambda: csv(first.frame if first.data is None else first.data),
+        "md": lambda: markdown(tables, experiment),
+        "tex": lambda: latex([table for table in tables if "tex" in table.files], experiment),
     }
-    return {f"{table.name}.{kind}": makers[kind]() for kind in table.files}
-
-
-# -------------------------------------------------------------------------------------------------------- cells
-
-
-def cell_text(column: Column, row: Mapping[Any, Any]) -> str:
-    """Return the value of a column in a row as a string for readers, with its interval: ``0.50 [0.40, 0.60]``.
-
-    An upper limit is ``< 0.12``, a missing number ``-``.
-    """
-    value = row[column.name]
-    if column.kind != "number" or isinstance(value, str):
-        return "" if value is None or value is pd.NA else str(value)
-    if value is None or math.isnan(value):
-        return "-"
-    if column.limit and row[column.limit]:
-        return f"< {value_text(column, row[column.high] if column.high else value)}"
-    text = value_text(column, value)
-    if column.low and column.high:
-        ends = [float(row[name]) for name in (column.low, column.high)]
-        if not all(map(math.isnan, ends)):
-            text += " [{}, {}]".format(*(value_text(column, end) for end in ends))
-    return text
-
-
-def value_text(column: Column, value: float) -> str:
-    """Return a number in the format of a column."""
-    if column.format == "seconds":
-        return duration(value)
-    if column.format == "percent":
-        return "-" if math.isnan(value) else f"{number(100 * value, column.digits)}%"
-    if column.format == "setting":
-        return axis_value(value)
-    return number(value, column.digits)
-
-
-def readable(table: Table) -> pd.DataFrame:
-    """Return the table as strings for readers; the headings are the names of the columns."""
-    lines = [[cell_text(column, row) for column in table.columns] for row in table.frame.to_dict("records")]
-    return pd.DataFrame(lines, columns=[column.heading for column in table.columns])
-
-
-def parts(table: Table) -> list[tuple[str, pd.DataFrame]]:
-    """Return the readable parts of a table with their headings; one part without a heading where it is not split."""
-    texts = readable(table)
-    if not table.split:
-        return [("", texts)]
-    groups = table.frame[table.split].reset_index(drop=True)
-    return [(str(name), texts.loc[index]) for name, index in groups.groupby(groups, sort=False).groups.items()]
-
-
-def is_numeric(column: Column) -> bool:
-    """Return whether a column is right-aligned."""
-    return column.kind == "number"
+    return {f"{first.name}.{kind}": makers[kind]() for kind in first.files}
 
 
 # --------------------------------------------------------------------------------------------------------- files
 
 
-def markdown(table: Table, experiment: str) -> str:
-    """Return a table as Markdown with its title and notes."""
-    blocks = [f"# {experiment}: {table.title}" if table.title else f"# {experiment}"]
-    rule = "|" + "".join("--:|" if is_numeric(column) else "---|" for column in table.columns)
-    for heading, texts in parts(table):
-        if heading:
-            blocks.append(f"**{escape_markdown(heading)}**")
-        head = "| " + " | ".join(map(escape_markdown, texts)) + " |"
-        lines = ["| " + " | ".join(map(escape_markdown, line)) + " |" for line in texts.to_numpy()]
-        blocks.append("\n".join([head, rule, *lines]))
-    return "\n\n".join([*blocks, *table.notes]) + "\n"
-
-
-def latex(table: Table) -> str:
-    """Return a table as a LaTeX ``tabular`` with rules of the booktabs package, to be put into a table environment."""
-    spec = "".join("r" if is_numeric(column) else "l" for column in table.columns)
-    lines = [r"\begin{tabular}{@{}" + spec + "@{}}", r"\toprule"]
-    for number_, (heading, texts) in enumerate(parts(table)):
-        if number_ == 0:
-            lines += [" & ".join(map(escape_latex, texts)) + r" \\", r"\midrule"]
-        if heading:
-            lines += [r"\midrule"] * (number_ > 0) + [
-                rf"\multicolumn{{{len(table.columns)}}}{{@{{}}l}}{{\textit{{{escape_latex(heading)}}}}} \\"
+def markdown(tables: Sequence[Table], experiment: str) -> str:
+    """Return tables as Markdown, the first with a title above, each with its notes below."""
+    e = escape_markdown
+    blocks = []
+    for number_, table in enumerate(tables):
+        title = e(f"{experiment}: {table.title}" if table.title and number_ == 0 else table.title or experiment)
+        blocks += [f"# {title}" if number_ == 0 else f"**{title}**"]
+        for heading, part in parts(table):
+            if heading:
+                blocks.append(f"**{e(heading)}**")
+            head = "| " + " | ".join(e(column.heading) for column in table.columns) + " |"
+            rule = "|" + "".join("--:|" if column.kind == "number" else "---|" for column in table.columns)
+            lines = [
+                "| " + " | ".join(_in_markdown(cell(column, row)) for column in table.columns) + " |"
+                for row in part.to_dict("records")
             ]
-        lines += [" & ".join(map(escape_latex, line)) + r" \\" for line in texts.to_numpy()]
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+            blocks.append("\n".join([head, rule, *lines]))
+        blocks += map(e, table.notes)
+    return "\n\n".join(blocks) + "\n"
+
+
+def _in_markdown(one: TableCell) -> str:
+    value = f"**{escape_markdown(one.value)}**" if one.bold and one.value else escape_markdown(one.value)
+    return " ".join(filter(None, (value, *map(escape_markdown, (one.interval, one.note)))))
 
 
 # ------------------------------------------------------------------------------------------------------ terminal
@@ -153,11 +97,13 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
     console = open_console(experiment, rows)
     for table in views.tables:
         if table.terminal:
-            right = {column.heading for column in table.columns if is_numeric(column)}
-            for place, (heading, texts) in enumerate(parts(table)):
-                title = heading or (table.title if place == 0 else "")
-                print_table(console, texts, right=right, title=title)
-            console.print(*table.notes, sep="\n")
+            right = {column.heading for column in table.columns if column.kind == "number"}
+            for place, (heading, part) in enumerate(parts(table)):
+                columns = [column for column in table.columns if column.name not in table.details]
+                texts = readable(replace(table, frame=part, columns=columns))
+                print_table(console, texts, right=right, title=heading or (table.title if place == 0 else ""))
+            for note in table.notes:
+                console.print(note)
     for text in (*views.remarks, *views.findings):
         console.print(text)
 

@@ -19,11 +19,11 @@ from bench.experiment.study import study_of
 from bench.measure.gradcheck import EPS
 from bench.model import registry
 from bench.report import reproduce, web
+from bench.report.cells import readable
 from bench.report.problems import problem_names, problem_numbers, split_by_problem
 from bench.report.views import arrange, rows_along
 from bench.report.web.content import Content, looks
 from bench.report.web.document import data
-from bench.report.writer import readable
 from bench.run.files import make_directory
 from bench.studies.gradient_check import matrix
 from bench.studies.gradient_check import report as gradient_check

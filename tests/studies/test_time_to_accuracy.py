@@ -9,20 +9,10 @@ from helpers import described_by
 
 from bench.experiment import config
 from bench.measure.statistics import UNEXPLAINED
-from bench.report.views import Curve
-from bench.studies.bias_variance.charts import figures
-from bench.studies.bias_variance.costs import (
-    EQUAL_ROLLOUTS,
-    EQUAL_TIME,
-    ROLLOUTS,
-    TIME,
-    TIME_COMPILED,
-    with_errors_at_equal_cost,
-    with_gradient_cost,
-)
-from bench.studies.bias_variance.findings import winners
-from bench.studies.bias_variance.panels import apart
-from bench.studies.bias_variance.time_to_accuracy import required_cost, sentence, summarise_leaders, table
+from bench.report.views import Curve, arrange
+from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, with_gradient_cost
+from bench.studies.bias_variance.time_to_accuracy import finding, required_cost, sentence
+from bench.studies.bias_variance.time_to_accuracy import table as table_of
 
 SAMPLES = (16, 64, 256)
 VARIANCE = 4.0
@@ -47,6 +37,10 @@ def rows(bias=0.0, resolved=None, **values):
     return pd.DataFrame(
         [one | {"study": "bias_variance", "parameters": json.dumps(described_by(one))} for one in found]
     )
+
+
+def table(given, found):
+    return table_of(arrange(given, with_gradient_cost(found)))
 
 
 def line(**values):
@@ -87,32 +81,6 @@ def test_a_gradient_costs_what_it_takes():
         pd.concat([first, zeroth, rows(estimator="both"), rows(backend="other")], ignore_index=True)
     )
     assert ROLLOUTS.of(found).tolist()[::3] == pytest.approx([48, 16, 64, 32])
-
-
-def test_findings_rank_at_equal_rollouts_and_at_equal_time_not_at_equal_samples():
-    """Pairs leave 5/8 of the variance for twice the rollouts: better by samples, worse by rollouts; and slow, by time."""
-    single = {"gradients": 0.0, "estimator": "single"}
-    pairs = {"estimator": "pairs", "gradients": 0.0, "variance": 4 * 0.625 * VARIANCE / 16}
-    table = pd.concat([rows(**single), rows(**pairs)], ignore_index=True)
-    table = table[table["samples"] == 16].reset_index(drop=True)
-    table.loc[1, ["rollouts", "rmse_rel", "time_s"]] = [32.0, math.sqrt(0.625 * VARIANCE / 16), 4 * 0.016]
-    found = with_errors_at_equal_cost(table)
-    assert found[EQUAL_ROLLOUTS].tolist() == pytest.approx([0.5, 0.5 * math.sqrt(1.25)])
-    assert found[EQUAL_TIME].tolist() == pytest.approx([0.5, 0.5 * math.sqrt(2.5)])
-    lines = [
-        Curve(n, "", {"b": True}, one.set_index("samples"), {}, frozenset(), 0) for n, one in found.groupby("estimator")
-    ]
-    assert winners(lines) == {16: ["pairs"]}
-    assert winners(lines, EQUAL_ROLLOUTS) == winners(lines, EQUAL_TIME) == {16: ["single"]}
-    assert with_errors_at_equal_cost(table.assign(time_s=math.nan))[EQUAL_TIME].isna().all()
-
-
-def test_an_estimator_is_timed_on_its_fastest_backend_and_its_bias_stays():
-    slow, fast = rows(bias=0.3).assign(time_s=8e-3), rows(bias=0.3, backend="fast").assign(time_s=4e-3)
-    other = rows(estimator="other").assign(time_s=1e-3)
-    found = with_errors_at_equal_cost(pd.concat([slow, fast, other], ignore_index=True))[EQUAL_TIME]
-    worse = [math.sqrt(0.3**2 + 4 * VARIANCE / n) for n in SAMPLES]
-    assert found.tolist() == pytest.approx([*worse, *worse, *(math.sqrt(VARIANCE / n) for n in SAMPLES)])
 
 
 def test_without_times_only_rollouts_are_ranked_and_numbers_are_numbers(tmp_path):
@@ -181,7 +149,7 @@ def with_intervals(table, width):
 
 
 @pytest.mark.parametrize(
-    ("width", "said"), [(1.2, "e on b, 3.0 times (2.3 to 3.9) before slow on b"), (3.0, "not distinguishable")]
+    ("width", "said"), [(1.2, "10%: e, 3.0 times ahead [2.3, 3.9]"), (3.0, "10%: open, e or slow")]
 )
 def test_a_factor_is_claimed_only_where_its_interval_excludes_1(tmp_path, width, said):
     given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
@@ -196,10 +164,10 @@ def test_an_error_far_above_all_variances_leaves_no_doubt_about_the_times(tmp_pa
     quick = rows(variance=1e-9, rmse=1e-4, rmse_rel=5e-5, time_s=1e-3)
     slow = rows(variance=1e-9, rmse=1e-4, rmse_rel=5e-5, time_s=3e-3, estimator="slow")
     found = table(given, with_intervals(pd.concat([quick, slow], ignore_index=True), 50.0))
-    assert "e on b, 3.0 times (3.0 to 3.0) before slow on b" in sentence(found[found["by"] == "time"].iloc[0])
+    assert "e, 3.0 times ahead [3.0, 3.0]" in sentence(found[found["by"] == "time"].iloc[0])
     # by rollouts both costs are upper limits: one sample of either may do
     told = sentence(found[found["by"] == "rollouts"].iloc[0])
-    assert "not distinguishable" in told
+    assert "open, e or slow" in told
 
 
 def test_the_next_is_another_estimator_or_the_same_on_another_backend_by_time_alone(tmp_path):
@@ -207,71 +175,24 @@ def test_the_next_is_another_estimator_or_the_same_on_another_backend_by_time_al
     other = rows(backend="other").assign(time_s=lambda r: 2 * r["time_s"])
     slow = rows(estimator="slow").assign(time_s=lambda r: 3 * r["time_s"])
     both = with_intervals(pd.concat([rows(), other], ignore_index=True), 50.0)
-    assert "e on b, 2.0 times (2.0 to 2.0) before e on other" in sentence(table(given, both).iloc[0])
+    assert "e, 2.0 times ahead [2.0, 2.0]" in sentence(table(given, both).iloc[0])
     every = with_intervals(pd.concat([rows(), other, slow], ignore_index=True), 1.1)
     assert table(given, every).iloc[0]["next"] == "slow on b"
 
 
-def test_charts_name_curves_floors_and_the_first_at_a_glance(tmp_path):
-    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
-    slow = rows(estimator="slow", backend="other").assign(time_s=lambda r: 3 * r["time_s"])
-    biased = rows(bias=0.3, estimator="biased", estimator_params="")
-    every = with_intervals(pd.concat([rows(), slow, biased], ignore_index=True), 1.2)
-    drawn = figures(given, every.assign(reason="", dim=1.0))
-    (panel,) = drawn["speed_accuracy"].axes
-    assert {"e", "slow", "biased"} <= {text.get_text() for text in panel.texts}
-    floors = [line.get_ydata()[0] for line in panel.lines if line.get_linestyle() == ":"]
-    assert floors == pytest.approx([0.3])
-    guide = next(line for line in panel.lines if line.get_label() == "_guide")
-    slope = math.log(guide.get_ydata()[1] / guide.get_ydata()[0]) / math.log(
-        guide.get_xdata()[1] / guide.get_xdata()[0]
-    )
-    assert slope == pytest.approx(-0.5)
-    cells = [text.get_text() for text in drawn["summary_matrix"].axes[0].texts]
-    assert cells == ["400 ms\nb", "1.2 s\nother", "bias", "3.0 times\n(2.3 to 3.9)"]
-
-
-def test_names_stay_within_their_panel_and_the_leader_is_named(tmp_path):
-    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
-    long = rows(estimator="an_estimator_with_a_long_name").assign(time_s=lambda r: 9 * r["time_s"])
-    every = with_intervals(pd.concat([rows(), long], ignore_index=True), 1.2)
-    figure = figures(given, every.assign(reason="", dim=1.0))["speed_accuracy"]
-    figure.draw_without_rendering()
-    (panel,) = figure.axes
-    name = next(text for text in panel.texts if text.get_text() == "an_estimator_with_a_long_name")
-    assert name.get_window_extent().x1 <= panel.get_window_extent().x1 + 2  # pixels of padding
-    told = [text.get_text() for part in figure.subfigs for text in part.texts]
-    assert any("e on b is first to 10% error on 1 of 1 problem, to 1% on 1" in " ".join(text.split()) for text in told)
-
-
-def test_names_beside_curves_are_apart_and_within_the_panel():
-    assert apart([0.1, 0.12, 0.5], 0.1, 0.04, 0.96) == pytest.approx([0.1, 0.2, 0.5])
-    assert apart([0.0, 0.9, 0.95, 0.99], 0.1, 0.04, 0.96) == pytest.approx([0.04, 0.76, 0.86, 0.96])
-
-
 def test_a_leader_is_an_estimator_and_its_backend_where_that_is_one():
-    def entry(fastest, following, low, target=0.1):
-        return {"relative error": target, "fastest": fastest, "next": following, "factor_low": low}
+    def entries(*given):
+        names = ("fastest", "next", "factor_low")
+        return pd.DataFrame([
+            {"by": "time", "relative error": target, "factor": 2.0, "how": "measured"} | dict(zip(names, one, strict=True))
+            for one in given
+            for target in (0.1, 0.01)
+        ])  # fmt: skip
 
-    both = [entry("a on x", "b on x", 2.0), entry("a on x", "b on y", 1.5), entry("b on x", "a on x", 0.9)]
-    assert summarise_leaders(both) == "a on x is first to 10% error on 2 of 3 problems"
-    assert (
-        summarise_leaders([entry("a on x", "b on x", 2.0), entry("a on y", "a on x", 0.5)])
-        == "a is first to 10% error on 2 of 2 problems"
-    )
-    assert (
-        summarise_leaders([entry("a on x", "b on x", 0.5), entry("-", "-", 0.0)])
-        == "nobody is certainly first to 10% error on 2 of 2 problems"
-    )
-
-
-def test_without_a_sweep_of_samples_the_title_tells_who_is_accurate_and_who_is_fast(tmp_path):
-    given = config.load([f"results_dir={tmp_path}"])
-    first = rows()[:1].assign(samples=64.0)
-    slow = rows(estimator="slow", backend="other").assign(time_s=1.0, rmse_rel=0.1, rmse=0.2)[:1].assign(samples=64.0)
-    useless = rows(estimator="quick").assign(time_s=1e-5, rmse_rel=3.0, rmse=6.0)[:1].assign(samples=64.0)
-    every = with_intervals(pd.concat([first, slow, useless], ignore_index=True), 1.2)
-    figure = figures(given, every.assign(reason="", dim=1.0))["speed_accuracy"]
-    told = " ".join(text.get_text() for part in figure.subfigs for text in part.texts)
-    said = "slow is most accurate on 1 of 1 problem; quick is fastest on 1, no better than zero on 1 of these"
-    assert said in " ".join(told.split())
+    both = entries(("a on x", "b on x", 2.0), ("a on x", "b on y", 1.5), ("b on x", "a on x", 0.9))
+    first = "a on x is first to 10% error on 2 of 3 problems, 2.0 times ahead"
+    assert finding(both) == f"{first}, and to 1% error on 2 of 3 problems, 2.0 times ahead."
+    ways = entries(("a on x", "b on x", 2.0), ("a on y", "a on x", 0.5))
+    assert finding(ways).startswith("a is first to 10% error on 2 of 2 problems")
+    nobody = entries(("a on x", "b on x", 0.5), ("-", "-", 0.0))
+    assert finding(nobody) == "Nobody is certainly first to 10%, and nobody is certainly first to 1%."

@@ -8,10 +8,10 @@ from bench.experiment.columns import COMMON, Column
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report import draw
+from bench.report.cells import readable
 from bench.report.style import VARIANTS
 from bench.report.views import arrange, is_logarithmic, unsteady
 from bench.report.web import content as page
-from bench.report.writer import readable
 
 
 def content(experiment: Experiment, rows: pd.DataFrame, views: Views) -> page.Content:
@@ -24,7 +24,7 @@ def content(experiment: Experiment, rows: pd.DataFrame, views: Views) -> page.Co
     charts: list[page.Chart] = []
     looks: dict[str, dict[str, object]] = {}
     for chart in views.charts:
-        if len(chart.frame) == 0:
+        if len(chart.frame) == 0 or not chart.on_page:
             continue
         tables[chart.name] = _table(chart)
         charts.append(_chart(chart))

@@ -1,188 +1,402 @@
-"""Chooses an experiment's charts: bias and variance along each swept axis, error against time, or an overview.
-
-An estimator has the same colour and marker in every chart, by its position among all registered estimators. Backends
-that agree are drawn as one line. Relative errors are in units of the reference gradient's norm.
-"""
+"""The charts of the main study: errors along each axis, error against cost, and estimators by problem."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from bench.experiment.axes import Axis
-from bench.experiment.experiment import Experiment
+from bench.experiment.columns import Column, text
+from bench.experiment.parameters import number_problems
+from bench.experiment.views import Chart, Mark, Note, Style
 from bench.model import SURROGATE, registry
-from bench.report.cores import run_tasks
-from bench.report.figures import save, styled
-from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.style import Styles, plain, symbol
-from bench.report.views import CATEGORIES, arrange, attempted
+from bench.report.colours import estimator_order
+from bench.report.problems import ProblemRows, named_values, split_by_problem, titled
+from bench.report.style import colour, marker
+from bench.report.text import counted, number
+from bench.report.views import (
+    Arranged,
+    attempted,
+    estimator_curves,
+    estimator_label,
+    estimator_labels,
+    is_bias_resolved,
+    pareto,
+    rmse_interval,
+)
 from bench.studies.bias_variance import time_to_accuracy
-from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, Cost, with_gradient_cost
-from bench.studies.bias_variance.error_against_time import FEWEST, draw_error_against_time
-from bench.studies.bias_variance.panels import bias_variance, overview, speed_accuracy
-from bench.studies.bias_variance.summary_matrix import draw_summary_matrix
-from bench.studies.bias_variance.time_to_accuracy import SAMPLES
+from bench.studies.bias_variance.columns import COLUMNS
+from bench.studies.bias_variance.comparisons import FAILS, NO_RESULT
+from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost
+from bench.studies.bias_variance.findings import findings, recommended
+from bench.studies.bias_variance.time_to_accuracy import SAMPLES, TARGETS
 
-ROOM = 4
-"""Most problems in one chart."""
-
-
-def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write every chart that the rows have data for, in the experiment's formats; return the files' paths."""
-
-    def drawn(name: str, figure: Callable[[], Figure]) -> list[Path]:
-        with styled():
-            chart = figure()
-            chart.draw_without_rendering()  # computes the layout, once
-            chart.set_layout_engine(None)
-            return save(chart, experiment.directory / name, experiment.formats)
-
-    tasks = [partial(drawn, name, figure) for name, figure in chart_drawers(experiment, rows).items()]
-    return [path for paths in run_tasks(tasks) for path in paths]
-
-
-def file_name(axis: Axis, kind: str = "bias_variance") -> str:
-    """Return the file name, without extension, of the chart along an axis."""
-    return f"{kind}_" + re.sub(r"\W", "_", axis.column)
-
-
-def along_longest(experiment: Experiment, rows: pd.DataFrame) -> list[str]:
-    """Return the names of the charts along swept axes, the longest axis first."""
-    swept = arrange(experiment, rows).swept()
-    return [file_name(axis) for axis in sorted(swept, key=lambda axis: -swept[axis])]
-
-
-def figures(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Figure]:
-    """Return the charts as figures, by file name without extension."""
-    with styled():
-        return {name: figure() for name, figure in chart_drawers(experiment, rows).items()}
+FLOOR = 1e-4
+"""Relative biases below this are drawn here, as upper limits."""
+SERIES = 3
+"""Most estimators of a printed chart along an axis; the page has all."""
+PANELS = 4
+"""Most problems of a printed chart along an axis."""
+POOLED = ("horizon", "stiffness", "sigma", "smoothing")
+"""Columns that change the cost of an estimate: each value has a panel of its own."""
+DISTINCT = 1.2
+"""Median factor between the errors of two estimators from which their lines can be told apart."""
+RMSE = Column(
+    "rmse_rel", label="relative RMSE of one estimate", low="rmse_low", high="rmse_high", log=True,
+    above_one="worse than the zero estimate",
+)  # fmt: skip
+BIAS = Column(
+    "bias_shown", label="relative bias", low="bias_from", high="bias_to", limit="bias_limit", log=True,
+    above_one="larger than the gradient",
+)  # fmt: skip
+SPREAD = Column(
+    "spread", label="standard deviation of one estimate, relative", low="spread_low", high="spread_high", log=True
+)
+TIMES = (
+    replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True),
+    Column("time_total_s", label="time of the first estimate, with compilation", format="seconds", log=True),
+    Column("rollouts_", label="rollouts of one estimate, a gradient at its measured cost", log=True),
+)
+ESTIMATOR = text("series", label="")
 
 
-def chart_drawers(experiment: Experiment, rows: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
-    """Return the functions that draw the charts, by file name without extension."""
-    shown = arrange(experiment, with_gradient_cost(rows))
-    rows = shown.rows
-    look = Styles(rows, sorted(registry.entries()["estimators"]))
-    seeds = rows["seed"].nunique()
-    merged = [f"medians over {seeds} seeds"] if seeds > 1 else []
-    for law in rows.loc[rows["reason"].str.contains(SURROGATE, regex=False), "contact"].unique():
-        merged.append(f"{plain(law)}: {SURROGATE}")
-    drawers: dict[str, Callable[[], Figure]] = {}
-
-    def problems(axis: Axis | None, drawable: Callable[[pd.DataFrame], bool]) -> list[ProblemRows]:
-        return [p for p in split_by_problem(shown, axis) if drawable(p.rows)]
-
+def charts(
+    shown: Arranged,
+    methods: pd.DataFrame,
+    comparisons: pd.DataFrame,
+    best: pd.DataFrame,
+    texts: Sequence[str],
+) -> list[Chart]:
+    """Return all charts, the main one first."""
+    labelled = replace(shown, rows=with_plotted_columns(shown.rows))
+    styles = estimator_styles(shown.rows)
+    subtitle = _conditions(shown)
+    main: list[Chart] = []
+    page_only: list[Chart] = []
     swept = shown.swept()
-    for axis in swept:
-        chosen, held = choose_problems(problems(axis, lambda part: attempted(part)["x"].nunique() > 1))
-        if chosen:
-            drawers[file_name(axis)] = partial(bias_variance, chosen, held + merged, look, axis, shown.marks(axis))
-    nothing_swept = not drawers
-    good = rows[rows["status"] == "ok"]
-    # sigma is excluded: it changes an estimate but not its time
-    longest = max((axis for axis in swept if axis.short != "sigma"), key=lambda axis: swept[axis], default=None)
-    if longest is not None and good["samples"].nunique() < 2 and good["time_s"].notna().any():
-        chosen, held = choose_problems(problems(longest, lambda part: TIME.known(part)["x"].nunique() >= FEWEST))
-        if chosen:
-            drawers[file_name(longest, "time")] = partial(draw_error_against_time, chosen, held + merged, look, longest)
-    if good["samples"].nunique() > 1 or good["backend"].nunique() > 1:
-        for name, cost in (
-            ("speed_accuracy", TIME_COMPILED if experiment.compile_time else TIME),
-            ("rollouts_accuracy", ROLLOUTS),
-        ):
-            costed = problems(SAMPLES, partial(_has_costs, cost))
-            curves = [problem for problem in costed if attempted(problem.rows)["x"].nunique() > 1]
-            chosen, held = choose_problems(curves or costed)
-            if chosen and (cost is not ROLLOUTS or good["samples"].nunique() > 1):
-                drawers[name] = partial(_costs, chosen, held + merged, look, cost)
-        swept_in_samples = (
-            problems(SAMPLES, lambda part: attempted(part)["x"].nunique() > 1) if good["samples"].nunique() > 1 else []
+    for axis in sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness")):
+        if axis.column == "samples" and not best.empty:
+            continue
+        chart = _along(labelled, axis, methods, comparisons, styles, subtitle, texts)
+        main += [chart] if chart is not None else []
+    if not best.empty:
+        first = [_speed_accuracy(labelled, best, styles, subtitle), _costs_matrix(labelled, best)]
+        main = [chart for chart in first if chart is not None] + main
+    elif shown.rows["backend"].nunique() > 1:
+        main += [_error_and_cost(labelled, styles, subtitle, methods)]
+    if not swept and methods["problem"].nunique() > 1:
+        main = [_estimators(methods, texts), *main]
+    everything = labelled.rows
+    page_only.append(
+        Chart(
+            "error_against_time", "Error against time", everything, TIMES, [RMSE, BIAS], "points", series="series",
+            panel="problem_", front="setting_", styles=styles, printed=False,
+            text="Each point is one cell. Lower left is better; above 1 an estimate is worse than the zero estimate. Points with "
+            "a ring are not beaten in both by any point shown of the same problem.",
         )
-        if swept_in_samples:
-            costs = [TIME, ROLLOUTS] if good["time_s"].notna().any() else [ROLLOUTS]
-            drawers["summary_matrix"] = partial(
-                draw_summary_matrix, choose_problems(swept_in_samples, 2 * ROOM)[0], costs
-            )
-    if nothing_swept:
-        chosen = problems(None, lambda part: len(attempted(part)) > 0)
-        if chosen:
-            drawers["overview"] = partial(overview, chosen, merged, look)
-    return drawers
+    )  # fmt: skip
+    page_only.append(
+        Chart(
+            "bias_against_spread", "Bias against spread", everything, [SPREAD], [BIAS], "points", series="series",
+            panel="problem_", styles=styles, printed=False,
+            text="Towards the left more samples do not help; towards the top the error is bias.",
+        )
+    )  # fmt: skip
+    return [*main, *(chart for chart in page_only if len(chart.frame))]
 
 
-def _costs(problems: Sequence[ProblemRows], notes: Sequence[str], look: Styles, cost: Cost) -> Figure:
-    return speed_accuracy(problems, notes, look, cost, *_panel_sentences(problems, cost))
+# ------------------------------------------------------------------------------------------------------- frames
 
 
-def _panel_sentences(problems: Sequence[ProblemRows], cost: Cost) -> tuple[dict[int, str], str]:
-    """Return a text per problem (by its position) on which method reaches 10% and 1% error first, and the chart's title.
+def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with the columns that charts draw: errors in units of |grad J|, and labels of points and lines."""
+    norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
+    limit = ~is_bias_resolved(rows)
+    low, high = rmse_interval(rows)
+    values = {
+        "rmse_low": pd.Series(low, rows.index),
+        "rmse_high": pd.Series(high, rows.index),
+        "bias_shown": (rows["bias"].where(~limit, rows["bias_high"]) / norm).clip(lower=FLOOR),
+        "bias_from": (rows["bias_low"] / norm).clip(lower=FLOOR),
+        "bias_to": rows["bias_high"] / norm,
+        "spread": np.sqrt(rows["variance"]) / norm,
+        "spread_low": np.sqrt(rows["variance_low"]) / norm,
+        "spread_high": np.sqrt(rows["variance_high"]) / norm,
+        "time_total_s": rows["time_s"] + rows["compile_s"].fillna(0.0),
+        "rollouts_": ROLLOUTS.of(rows),
+    }
+    good = rows["status"] == "ok"
+    return rows.assign(
+        **{name: column.where(good) for name, column in values.items()},
+        bias_limit=limit,
+        series=estimator_labels(rows),
+        problem_=titled(rows.assign(**named_values(rows, POOLED)), ["scene", "contact", *POOLED]),
+        line=rows["backend"] + " " + rows["dtype"],
+        setting_=number_problems(rows).astype(str),
+        failed=~good,
+        row=np.arange(len(rows), dtype=float),
+    )
 
-    If samples were not swept, there are no texts, and the title names the most accurate and the cheapest estimator.
+
+def estimator_styles(rows: pd.DataFrame) -> dict[str, Style]:
+    """Return the look of every estimator in the rows: its own colour in all charts; its variants have free colours."""
+    places = {name: i for i, name in enumerate(estimator_order())}
+    pairs = list(dict.fromkeys(zip(rows["estimator"], rows["estimator_params"], strict=True)))
+    names = list(dict.fromkeys(name for name, _ in pairs))
+    used = {places.get(name, len(places) + i) for i, name in enumerate(names)}
+    free = (i for i in range(1000) if i not in used)
+    styles: dict[str, Style] = {}
+    for name, params in sorted(pairs, key=lambda pair: pair[1] != ""):
+        first = not any(label.partition("[")[0] == name for label in styles)
+        place = places.get(name, len(places) + names.index(name)) if first else next(free)
+        styles[estimator_label(name, params)] = Style(colour(place), marker(place))
+    return {estimator_label(*pair): styles[estimator_label(*pair)] for pair in pairs}
+
+
+def _conditions(shown: Arranged) -> str:
+    """Return what all panels share: samples, medians over seeds, surrogate gradients."""
+    rows = shown.rows
+    parts = [str(rows["scene"].iloc[0])] if rows["scene"].nunique() == 1 else []
+    parts += [f"{n:g} samples" for n in rows["samples"].unique()] if rows["samples"].nunique() == 1 else []
+    seeds = rows["seed"].nunique()
+    parts += [f"medians over {seeds} seeds"] if seeds > 1 else []
+    for law in rows.loc[rows["reason"].str.contains(SURROGATE, regex=False), "contact"].unique():
+        parts.append(f"{law}: {SURROGATE}")
+    return ", ".join(parts)
+
+
+# ---------------------------------------------------------------------------------------------- along an axis
+
+
+def _along(
+    shown: Arranged,
+    axis: Axis,
+    methods: pd.DataFrame,
+    comparisons: pd.DataFrame,
+    styles: Mapping[str, Style],
+    subtitle: str,
+    whole: Sequence[str],
+) -> Chart | None:
+    """Return the chart of errors along an axis: print draws the main estimators on the main problems, the page all."""
+    problems = [p for p in split_by_problem(shown, axis) if attempted(p.rows)["x"].nunique() > 1]
+    if not problems:
+        return None
+    own, compared = (table[table["axis"] == axis.column] for table in (methods, comparisons))
+    title = (findings(own, compared, shown.marks(axis)) if 0 < len(compared) < len(comparisons) else whole)[0]
+    frame = pd.concat([_lines(problem) for problem in problems], ignore_index=True)
+    if shown.rows["seed"].nunique() > 1:
+        frame = frame.drop(columns="row")  # a median over seeds is not a cell
+    drawn, notes = choose_problems(problems, PANELS)
+    names = _main_series(frame, methods, comparisons)
+    total = frame["series"].nunique()
+    panels = [problem.title() for problem in drawn]
+    shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
+    marks, remarks = _unstable(shown, axis, frame[frame["panel"].isin(panels) & frame["first"]], names)
+    x = Column("x", label=axis.title, format="setting")
+    return Chart(
+        "bias_variance_" + re.sub(r"\W", "_", axis.column), title, frame, [x], [RMSE, BIAS, SPREAD], series="series",
+        line="line", panel="panel", styles=styles, marks=marks, notes=remarks, failed="failed", across=len(drawn),
+        labels="ends" if len(drawn) <= 2 else "legend", height=2.7 if len(drawn) <= 2 else 2.1,
+        subtitle=", ".join(filter(None, [subtitle, *notes, *shares])), chosen=(("first", [True]), ("series", names), ("panel", panels)),
+        text="Bars are 95% intervals. A hollow marker is the upper limit of a bias that is not distinguishable from 0.",
+    )  # fmt: skip
+
+
+def _lines(problem: ProblemRows) -> pd.DataFrame:
+    """Return the points of a problem: of each estimator the first of the backends that agree, and the others."""
+    parts: list[pd.DataFrame] = []
+    seen: set[str] = set()
+    for curve in estimator_curves(problem.rows, 0.03):
+        parts.append(curve.rows.reset_index().assign(panel=problem.title(), first=curve.label not in seen))
+        seen.add(curve.label)
+    return pd.concat(parts, ignore_index=True)
+
+
+def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
+    """Return the estimators to print: the recommended one, then those that are first elsewhere, then distinct ones."""
+    main = recommended(methods, comparisons)
+    estimator = dict(zip(methods["method"], methods["estimator"], strict=True))
+    wins = Counter(estimator[name] for name in comparisons["first"] if name)
+    present = list(dict.fromkeys(frame["series"]))
+    ranked = [name for name, _ in wins.most_common() if name in present and name != main]
+    plain = sorted((name for name in present if name not in (main, *ranked)), key=lambda name: "[" in name)
+    chosen: list[str] = [main] if main in present else []
+    for name in (*ranked, *plain):
+        if len(chosen) < SERIES and all(_distance(frame, name, other) >= DISTINCT for other in chosen):
+            chosen.append(name)
+    return chosen or present[:SERIES]
+
+
+def _distance(frame: pd.DataFrame, one: str, other: str) -> float:
+    """Return the median factor between the errors of two estimators at the same places."""
+    tables = [frame[frame["series"] == name].groupby(["panel", "x"])["rmse_rel"].first() for name in (one, other)]
+    with np.errstate(all="ignore"):
+        apart = np.abs(np.log(tables[0] / tables[1])).replace(np.inf, np.nan).dropna()
+    return float(np.exp(apart.median())) if len(apart) else math.inf
+
+
+def _unstable(shown: Arranged, axis: Axis, frame: pd.DataFrame, names: Sequence[str]) -> tuple[list[Mark], list[Note]]:
+    """Return the marks of an axis: a band where an estimator fails beyond a named value, else a line at that value.
+
+    The band is drawn in the panels where the first estimator's whole interval is above 1 at every value beyond the mark
+    and at none before it. Its largest error is written beside its point.
     """
-    kind = "rollouts" if cost is ROLLOUTS else "time"
-    sentences = {}
-    every: list[dict[str, Any]] = []
-    for place, problem in enumerate(problems):
-        if problem.rows["x"].nunique() > 1:
-            entries = [time_to_accuracy.line(problem, target, kind, cost) for target in time_to_accuracy.TARGETS]
-            sentences[place] = "\n".join(map(time_to_accuracy.sentence, entries))
-            every += entries
-    if every:
-        return sentences, time_to_accuracy.summarise_leaders(every)
-    return sentences, time_to_accuracy.summarise_accuracy_and_cost(problems, cost)
+    marks, notes = [], []
+    for name, value in shown.marks(axis).items():
+        for panel, part in frame[frame["series"].isin(names[:1])].groupby("panel", sort=False):
+            bad = (part["rmse_low"] > 1) | part["failed"]
+            beyond = part["x"] > value
+            if beyond.any() and bad[beyond].all() and not bad[~beyond].any():
+                marks.append(Mark(f"beyond the {name}", value, math.inf, panel=str(panel)))
+                worst = part.loc[part["rmse_rel"].where(part["failed"] == 0).idxmax()]
+                text_ = f"at least {number(worst['rmse_low'])}\ntimes the gradient"
+                notes.append(Note(text_, worst["x"], worst["rmse_rel"], str(panel)))
+    if not marks:
+        marks = [Mark(name, value) for name, value in shown.marks(axis).items()]
+    return marks, notes
 
 
-def _has_costs(cost: Cost, rows: pd.DataFrame) -> bool:
-    return len(cost.known(rows)) > 1
+def choose_problems(problems: Sequence[ProblemRows], room: int) -> tuple[list[ProblemRows], list[str]]:
+    """Return the problems to print, at most ``room``, and notes on what is left out.
 
-
-def choose_problems(problems: Sequence[ProblemRows], room: int = ROOM) -> tuple[list[ProblemRows], list[str]]:
-    """Return the problems to draw, about ``room`` of them, and notes on how many values of each parameter are shown.
-
-    Every combination of categories (scene, contact law, integrator, noise) is drawn. The parameter with most values
-    gets the remaining panels, at evenly spaced ranks among its most frequent values, not at the ends of their range.
-    Other parameters are fixed at a middle value among their most frequent ones.
+    Problems that differ only in numbers are represented by the first of them; what is left are the first problems.
     """
-    if len(problems) <= room:
+    if len(problems) <= 2:
         return list(problems), []
-    kinds: dict[tuple[Any, ...], list[ProblemRows]] = {}
+    first: dict[str, ProblemRows] = {}
     for problem in problems:
-        kinds.setdefault(tuple(problem.identity.get(k) for k in CATEGORIES), []).append(problem)
-    kept = {p for members in kinds.values() for p in _choose_values(members, problems, max(1, room // len(kinds)))}
-    notes = []
-    for name in _numbers(problems):
-        every, drawn = ({p.identity[name] for p in some if name in p.identity} for some in (problems, kept))
-        if drawn != every:
-            notes.append(f"{len(drawn)} of {len(every)} values of {symbol(name) or name} shown")
-    return [problem for problem in problems if problem in kept], notes
+        first.setdefault(", ".join(str(v) for v in problem.identity.values() if isinstance(v, str)), problem)
+    chosen = list(first.values())[:room]
+    if len(chosen) == len(problems):
+        return chosen, []
+    numbers = {k: v for p in chosen for k, v in p.identity.items() if not isinstance(v, str)}
+    held = ", ".join(f"{name} = {value:g}" for name, value in numbers.items())
+    shares = f"{len(chosen)} of {counted(len(problems), 'problem')}"
+    return chosen, [f"{shares} ({held})" if held else shares]
 
 
-def _numbers(problems: Iterable[ProblemRows]) -> list[str]:
-    return list(dict.fromkeys(k for p in problems for k in p.identity if k not in CATEGORIES))
+# ----------------------------------------------------------------------------------------------- error and cost
 
 
-def _choose_values(members: Sequence[ProblemRows], problems: Sequence[ProblemRows], room: int) -> list[ProblemRows]:
-    """Return the problems that :func:`choose_problems` draws of one combination of categories, at most ``room``."""
+def _speed_accuracy(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, Style], subtitle: str) -> Chart | None:
+    """Return error against cost where samples were swept: of each estimator the best backends' front, per problem."""
+    timed = bool((best["by"] == "time").any())
+    cost, x = (TIME, TIMES[0]) if timed else (ROLLOUTS, TIMES[2])
+    parts, notes = [], {}
+    for problem in split_by_problem(shown, SAMPLES, ("scene",)):
+        rows = cost.known(problem.rows)
+        if rows["x"].nunique() < 2:
+            continue
+        entries = best[(best["problem"] == problem.title()) & (best["by"] == ("time" if timed else "rollouts"))]
+        notes[problem.title()] = "\n".join(map(time_to_accuracy.sentence, entries.to_dict("records")))
+        for _, part in rows.groupby("series", sort=False):
+            front = part[pareto(cost.of(part), part["rmse_rel"])]
+            parts.append(front.assign(panel=problem.title()))
+    if not parts:
+        return None
+    marks = [Mark(f"{target:.0%}", target, axis="y") for target in TARGETS]
+    frame = pd.concat(parts, ignore_index=True)
+    return Chart(
+        "speed_accuracy" if timed else "rollouts_accuracy", time_to_accuracy.finding(best), frame, [x], [RMSE], series="series",
+        panel="panel", panel_notes=notes, styles=styles, marks=marks, across=3, height=2.0,
+        subtitle=", ".join(filter(None, [subtitle, "each estimator on its fastest backend"])),
+        text="Only estimates that no other of the same estimator beats in both error and cost are drawn.",
+    )  # fmt: skip
 
-    def values(some: Iterable[ProblemRows], name: str) -> list[float]:
-        return [float(problem.identity.get(name, -math.inf)) for problem in some]
 
-    kept = list(members)
-    for name in sorted(_numbers(members), key=lambda n: (-len(set(values(members, n))), n)):
-        everywhere = Counter(values(problems, name))
-        counts = {value: everywhere[value] for value in values(kept, name)}
-        run_most = sorted(v for v, count in counts.items() if count == max(counts.values()))
-        taken = min(room, len(run_most))
-        wanted = {run_most[int((2 * i + 1) * len(run_most) / (2 * taken))] for i in range(taken)}
-        kept = [problem for problem, value in zip(kept, values(kept, name), strict=True) if value in wanted]
-        room //= taken
-    return kept
+def _costs_matrix(shown: Arranged, best: pd.DataFrame) -> Chart | None:
+    """Return the matrix of the cost of each estimator to reach each error, relative to the cheapest of its column."""
+    timed = bool((best["by"] == "time").any())
+    cost: Cost = TIME if timed else ROLLOUTS
+    lines = []
+    for problem in split_by_problem(shown, SAMPLES, ("scene",)):
+        if problem.rows["x"].nunique() < 2:
+            continue
+        for target in TARGETS:
+            needed: dict[str, float] = {}
+            for method, way in time_to_accuracy.methods(problem, target, cost).items():
+                name = time_to_accuracy.estimator_of(method)
+                needed[name] = min(way.cost if math.isfinite(way.cost) else math.inf, needed.get(name, math.inf))
+            lowest = min(needed.values())
+            for name, value in needed.items():
+                factor = value / lowest if math.isfinite(value) else math.nan
+                lines.append({
+                    "panel": f"to {target:.0%} error", "series": name, "problem": problem.title(), "factor": factor,
+                    "cell": number(factor) if math.isfinite(factor) else "not shown",
+                })  # fmt: skip
+    what = "Time" if timed else "Rollouts"
+    return Chart(
+        "summary_matrix", f"{what} to reach an error, relative to the first of each column", pd.DataFrame(lines),
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="factor", cell="cell", across=1, height=0.24,
+        subtitle="not shown: no estimate is known to have a bias below the error",
+    )  # fmt: skip
+
+
+def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str, methods: pd.DataFrame) -> Chart:
+    """Return error against time where samples were not swept: a dot per estimator and backend, by problem."""
+    rows = TIME.known(shown.rows)
+    problems = list(dict.fromkeys(rows["problem_"]))
+    step = max(1, math.ceil(len(problems) / 6))
+    chosen = problems[::step]
+    title = _accurate_and_fast(rows)
+    shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
+    return Chart(
+        "speed_accuracy", title, rows, TIMES[:1], [RMSE], "points", series="series", shape="backend", panel="problem_",
+        styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares])),
+        chosen=(("problem_", chosen),), on_page=False,
+    )  # fmt: skip
+
+
+def _accurate_and_fast(rows: pd.DataFrame) -> str:
+    """Format which estimator is most accurate, and which is fastest, on most problems."""
+    if rows.empty:
+        return "No estimate was timed"
+    accurate, fast = (
+        Counter(rows.loc[rows.groupby("problem_")[by].idxmin(), "series"]).most_common(1)[0]
+        for by in ("rmse_rel", "time_s")
+    )
+    total = counted(rows["problem_"].nunique(), "problem")
+    if accurate[0] == fast[0]:
+        return f"{accurate[0]} has the lowest error on {accurate[1]} of {total}, and is fastest on {fast[1]}"
+    return f"{accurate[0]} has the lowest error on {accurate[1]} of {total}, {fast[0]} is fastest on {fast[1]}"
+
+
+# --------------------------------------------------------------------------------------------------- estimators
+
+
+def _estimators(methods: pd.DataFrame, texts: Sequence[str]) -> Chart:
+    """Return the heat table of errors: estimators by their worst case, in families, against problems."""
+    known = methods.assign(worst=methods["error"].where(methods["status"] == "ok", math.inf))
+    order = known.groupby("estimator", sort=False)["worst"].max().sort_values(kind="stable").index
+    families = {name: _family(name.partition("[")[0]) for name in order}
+    lines: list[dict[str, Any]] = []
+    for name in sorted(order, key=lambda n: list(dict.fromkeys(families.values())).index(families[n])):
+        for row in methods[methods["estimator"] == name].to_dict("records"):
+            mark = {FAILS: " fails", NO_RESULT: row["status"]}.get(row["verdict"], "")
+            lines.append({
+                "panel": families[name], "series": name, "problem": row["problem"],
+                "value": min(max(row["error"], 1e-3), 1e3) if math.isfinite(row["error"]) else math.nan,
+                "error": row["error"], "cell": number(row["error"]) if math.isfinite(row["error"]) else mark,
+            })  # fmt: skip
+    frame = pd.DataFrame(lines)
+    return Chart(
+        "estimators", texts[0], frame, [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="value",
+        cell="cell", across=1, height=0.2,
+        subtitle="relative RMSE of one estimate, sorted by the worst case; above 1 the zero estimate is better",
+    )  # fmt: skip
+
+
+def _family(estimator: str) -> str:
+    """Return an estimator's family by what it needs: costs, gradients or both."""
+    entry = registry.entries()["estimators"].get(estimator)
+    needs = frozenset(getattr(entry and entry.plugin, "needs", frozenset()))
+    if "grad" in needs:
+        return "gradients and costs" if needs & {"value", "score"} else "gradients of the program"
+    return "costs only"

@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.experiment.parameters import number_problems
 from bench.report.text import axis_value, duration
-from bench.report.views import estimator_labels
 
 
 @dataclass(frozen=True)
@@ -93,31 +91,3 @@ ROLLOUTS = Cost(
     lambda rows: 0.0 * rows["rollouts"],
     axis_value,
 )
-
-EQUAL_ROLLOUTS, EQUAL_TIME = "rmse_equal_rollouts", "rmse_equal_time"
-
-
-def with_errors_at_equal_cost(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with each estimator's relative RMSE at equal rollouts and at equal time.
-
-    An estimate from c times fewer samples has the same bias and c times the variance. ``rmse_equal_rollouts`` allows
-    one rollout per sample, where a gradient counts at its measured cost (:func:`with_gradient_cost`).
-    ``rmse_equal_time`` allows the time of the fastest estimator with as many samples on the same problem, each on its
-    fastest backend.
-    """
-    rows = with_gradient_cost(rows)
-    good = rows["status"] == "ok"
-    setting = [number_problems(rows), rows["samples"], rows["seed"]]
-    label = estimator_labels(rows)
-    time = rows["time_s"].where(good & (rows["time_s"] > 0))
-    fastest = time.groupby([*setting, label]).transform("min")
-    factors = {
-        EQUAL_ROLLOUTS: _rollouts(rows) / rows["samples"],
-        EQUAL_TIME: fastest / time.groupby(setting).transform("min"),
-    }
-    variance = rows["variance"] / rows["reference_norm"] ** 2
-    errors = {
-        name: np.sqrt((rows["rmse_rel"] ** 2 + (factor - 1.0) * variance).clip(lower=0.0))
-        for name, factor in factors.items()
-    }
-    return rows.assign(**{name: error.where(good) for name, error in errors.items()})

@@ -1,180 +1,307 @@
-"""Finds the estimators with the lowest error at each setting, and where along an axis estimators fail."""
+"""States what the comparisons show in at most three sentences: what to use, what fails, and what removes the failure."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from bench.experiment.axes import Axis
-from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.text import axis_value, number
-from bench.report.views import Arranged, Curve, attempted
+from bench.report.text import axis_value, counted, number
+from bench.studies.bias_variance.comparisons import (
+    FAILS,
+    NO_RESULT,
+    OPEN,
+    SETTING,
+    WORKS,
+    estimators,
+    known,
+    leaders,
+    setting_of,
+    verdicts_by_estimator,
+)
 
-TIE = 1.1
-"""Estimators within this factor of the lowest relative RMSE share first place: R repeats do not resolve less."""
-FLAT = 1.5
-"""Largest factor between errors along an axis at which the axis counts as having no effect."""
-NAMED = 2
-"""Most problems that a title names individually."""
+NAMED = 3
+"""Most problems or estimators that a sentence names."""
+FEWEST = 3
+"""Fewest problems, without an axis, that are compared by the worst case instead of by the number of wins."""
+Where = Callable[[pd.Series], bool]
 
 
-def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
-    """Return the problems to report, each with the longest axis along which it was swept.
+def findings(
+    methods: pd.DataFrame, comparisons: pd.DataFrame, marks: Mapping[str, float] = MappingProxyType({})
+) -> list[str]:
+    """Return the findings on errors at equal samples; ``marks`` are named values of the swept axis."""
+    compared = comparisons[comparisons["first"] != ""]
+    if compared.empty:
+        return ["No cell has an error that could be compared: the table has the reason of each."]
+    if (methods["axis"] == "").all() and methods["problem"].nunique() >= FEWEST:
+        texts = [
+            _worst_case(methods),
+            _record(estimators(methods)[0], methods, comparisons),
+            _share_that_fails(methods),
+        ]
+    else:
+        main = recommended(methods, comparisons)
+        texts = [_use(main, methods, comparisons), *_failures(main, methods, comparisons, marks)]
+    return list(filter(None, texts))[:3]
 
-    Every cell that ran is in at least one problem. The axis is None for cells that no axis sweeps.
+
+def recommended(methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
+    """Return the estimator that is most often first or tied with the first."""
+    wins = Counter(name for names in leaders(comparisons, methods).values() for name in names)
+    return max(estimators(methods), key=lambda name: wins[name])
+
+
+def best_elsewhere(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame, places: set[Any]) -> str:
+    """Return the estimator, other than ``main``, that is most often first or tied at some settings; empty if none is."""
+    named = leaders(comparisons, methods)
+    wins = Counter(name for place in places for name in named.get(place, []) if name != main)
+    return max(estimators(methods), key=lambda name: wins[name]) if wins else ""
+
+
+# --------------------------------------------------------------------------------------------------- sentences
+
+
+def _use(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
+    """Return the recommendation: where an estimator has the lowest error, alone or tied, and that error."""
+    named = {place: names for place, names in leaders(comparisons, methods).items() if names}
+    works = {
+        setting_of(row) for row in methods.to_dict("records") if (row["estimator"], row["verdict"]) == (main, WORKS)
+    }
+    mine = {place for place, names in named.items() if main in names and place in works}
+    alone = {place for place in mine if named[place] == [main]}
+    errors = _errors(methods, main, mine)
+    if not errors:
+        return f"No estimator is certain to be better than the zero estimate; {main} most often has the lowest error."
+    how = (
+        "has the lowest error"
+        if alone == mine
+        else "has the lowest error or ties"
+        if alone
+        else "ties for the lowest error"
+    )
+    where = _where(methods, lambda row: setting_of(row) in mine, lambda row: setting_of(row) in named)
+    return f"Use {main} {where}: it {how} (relative RMSE {value_range(errors)})."
+
+
+def _worst_case(methods: pd.DataFrame) -> str:
+    """Return the estimators with the lowest worst case among those that have a number on every problem."""
+    worst = {}
+    for name, part in methods.groupby("estimator", sort=False):
+        if part["problem"].nunique() == methods["problem"].nunique() and np.isfinite(part[["error", "high"]]).all(
+            axis=None
+        ):
+            worst[str(name)] = part.loc[part["error"].idxmax()]
+    if not worst:
+        return "No estimator has a number on every problem."
+    best = min(worst, key=lambda name: worst[name]["error"])
+    tied = [n for n, row in worst.items() if n != best and not row["low"] > worst[best]["high"]]
+    errors = methods.loc[methods["estimator"] == best, "error"]
+    others = _join(tied) if len(tied) < NAMED else f"{len(tied)} others"
+    also = f", not distinguishable from {others}" if tied else ""
+    return (
+        f"{best} has the lowest worst case on the {methods['problem'].nunique()} problems: {value_range(errors)}{also}."
+    )
+
+
+def _record(name: str, methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
+    """Return on which problems an estimator is first or tied, fails, and is open."""
+    own = methods[methods["estimator"] == name]
+    mine = {place for place, names in leaders(comparisons, methods).items() if name in names}
+    parts = []
+    if mine:
+        problems = dict.fromkeys(row["problem"] for row in own.to_dict("records") if setting_of(row) in mine)
+        parts.append(f"is best or tied on {_names(problems)} ({value_range(_errors(methods, name, mine))})")
+    for kind, verb in ((FAILS, "fails on"), (NO_RESULT, "has no result on"), (OPEN, "is open on")):
+        part = own[own["verdict"] == kind]
+        if len(part):
+            least = f" (at least {number(min(part['low']))} times the gradient)" if kind == FAILS else ""
+            parts.append(f"{verb} {_names(part['problem'])}{least}")
+    return f"{name} {_join(parts)}." if parts else ""
+
+
+def _names(problems: Iterable[str]) -> str:
+    return _join(list(dict.fromkeys(problems)))
+
+
+def _join(parts: Sequence[str]) -> str:
+    """Join parts as ``a, b and c``; with `` and `` after a comma where a part has commas itself."""
+    if len(parts) < 2:
+        return "".join(parts)
+    between = ", and " if any("," in part for part in parts) else " and "
+    return ", ".join(parts[:-1]) + between + parts[-1]
+
+
+def _failures(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame, marks: Mapping[str, float]) -> list[str]:
+    """Return what fails: the recommended estimator with the best alternative, and how many estimators never fail."""
+    own = methods[methods["estimator"] == main]
+    failing = {setting_of(row) for row in own.to_dict("records") if row["verdict"] in (FAILS, NO_RESULT)}
+    texts = []
+    if failing:
+        where = _where(methods, lambda row: setting_of(row) in failing, lambda row: row["estimator"] == main, marks)
+        lows = _lows(methods, main, failing)
+        how = f"its error is at least {number(min(lows))} times the gradient" if lows else "it has no result"
+        text = f"{main} fails {where}: {how}"
+        other = best_elsewhere(main, methods, comparisons, failing)
+        errors = _errors(methods, other, failing)
+        works = other and all(
+            row["verdict"] == WORKS
+            for row in methods[methods["estimator"] == other].to_dict("records")
+            if setting_of(row) in failing
+        )
+        if works and errors:
+            text += f", where {other} is usable ({value_range(errors)})"
+        texts.append(f"{text}.")
+        texts += _remedy(main, methods, failing)
+    else:
+        named = leaders(comparisons, methods)
+        beaten = {place for place, names in named.items() if names and main not in names}
+        other = best_elsewhere(main, methods, comparisons, beaten)
+        ahead = {place for place in beaten if other in named[place]}
+        if other and ahead:
+            where = _where(methods, lambda row: setting_of(row) in ahead, lambda row: setting_of(row) in named)
+            own_errors = _errors(methods, main, ahead)
+            against = f", where {main} has {value_range(own_errors)}" if own_errors else f", where {main} was not run"
+            texts.append(f"{other} is better {where}: {value_range(_errors(methods, other, ahead))}{against}.")
+    return [*texts, _share_that_fails(methods)]
+
+
+def _share_that_fails(methods: pd.DataFrame) -> str:
+    """Return how many estimators fail somewhere, and how many are below the gradient's norm everywhere."""
+    counts = verdicts_by_estimator(methods)
+    failing = counts[counts[FAILS] + counts[NO_RESULT] > 0]
+    sound = counts[(counts[FAILS] + counts[NO_RESULT] + counts[OPEN]) == 0]
+    total = counted(len(counts), "estimator")
+    if len(sound) == len(counts):
+        return f"Every one of the {total} has an error below the gradient's norm at every setting."
+    names = f" ({', '.join(sound.index)})" if 0 < len(sound) <= NAMED else ""
+    open_ = len(counts) - len(failing) - len(sound)
+    return (
+        f"{len(failing) or 'None'} of {total} {_verb(len(failing), 'fail')} at some setting, {len(sound) or 'none'} "
+        f"{_verb(len(sound) or 1, 'work')} at every setting{names}"
+        + (f", {open_} {_verb(open_, 'is', 'are')} open." if open_ else ".")
+    )
+
+
+def _remedy(main: str, methods: pd.DataFrame, failing: set[Any]) -> list[str]:
+    """Return which contact law or integrator removes a failure at the same values of the axis, and its cost in time."""
+    own = methods[methods["estimator"] == main].assign(
+        place=lambda rows: [setting_of(row) for row in rows.to_dict("records")]
+    )
+    bad = own[own["place"].isin(failing)]
+    for kind in ("contact", "integrator"):
+        wrong = set(bad[kind])
+        others = own[~own[kind].isin(wrong) & own["at"].isin(bad["at"]) & own["scene"].isin(bad["scene"])]
+        if others.empty or "none" in wrong or not (others["verdict"] == WORKS).all():
+            continue
+        before = own[own[kind].isin(wrong)].groupby("at")["time_s"].min()
+        after = others.groupby("at")["time_s"].min()
+        factor = float((after / before.reindex(after.index)).median())
+        cost = f", at {number(factor)} times the time" if math.isfinite(factor) and factor > 1.2 else ""
+        laws = " or ".join(dict.fromkeys(others[kind]))
+        return [f"With {laws} {main} does not fail there ({value_range(others['error'])}){cost}."]
+    return []
+
+
+# ------------------------------------------------------------------------------------------------------- parts
+
+
+def _verb(count: int, one: str, many: str = "") -> str:
+    return (one if many else f"{one}s") if count == 1 else many or one
+
+
+def _chosen(methods: pd.DataFrame, estimator: str, places: set[Any]) -> list[dict[Any, Any]]:
+    return [row for row in methods[methods["estimator"] == estimator].to_dict("records") if setting_of(row) in places]
+
+
+def _errors(methods: pd.DataFrame, estimator: str, places: set[Any]) -> list[float]:
+    return known(row["error"] for row in _chosen(methods, estimator, places))
+
+
+def _lows(methods: pd.DataFrame, estimator: str, places: set[Any]) -> list[float]:
+    return known(row["low"] for row in _chosen(methods, estimator, places))
+
+
+def value_range(values: Sequence[float] | pd.Series) -> str:
+    """Format the range of values: ``0.12``, or ``0.10 to 0.15``."""
+    low, high = number(min(values)), number(max(values))
+    return low if low == high else f"{low} to {high}"
+
+
+def _where(methods: pd.DataFrame, holds: Where, tried: Where, marks: Mapping[str, float] = MappingProxyType({})) -> str:
+    """Format where something holds among the settings where it was tried.
+
+    ``everywhere``, ``beyond the step size limit (6400) with penalty``, ``up to stiffness 3000 with penalty``, ``on pushing
+    and heaviside``, ``at 12 of 20 settings``.
     """
-    swept = shown.swept()
-    parts: list[tuple[Axis | None, ProblemRows]] = []
-    seen: set[str] = set()
-    for axis in (*sorted(swept, key=lambda a: -swept[a]), None):
-        for group in split_by_problem(shown, axis, ("scene", "contact")):
-            cells = attempted(group.rows)
-            if set(cells["key"]) - seen and (axis is None or cells["x"].nunique() > 1):
-                seen |= set(cells["key"])
-                parts.append((axis, group))
-    return parts
+    rows = methods.drop_duplicates(list(SETTING))
+    relevant = {setting_of(row) for row in methods.to_dict("records") if tried(row)}
+    holding = {setting_of(row) for row in methods.to_dict("records") if holds(row)} & relevant
+    rows = rows[[setting_of(row) in relevant for row in rows.to_dict("records")]]
+    mask = np.array([setting_of(row) in holding for row in rows.to_dict("records")])
+    if mask.all():
+        return "everywhere" if len(rows) > 1 else f"on {rows['problem'].iloc[0]}"
+    by_problem = {
+        name: {float(x): bool(h) for x, h in zip(part["at"], mask[rows["problem"] == name], strict=True)}
+        for name, part in rows.groupby("problem", sort=False)
+    }
+    some = {name: at for name, at in by_problem.items() if any(at.values())}
+    n_settings = f"at {int(mask.sum())} of {counted(len(rows), 'setting')}"
+    if (rows["axis"] == "").all():
+        return (
+            f"on {_names(some)}" if len(some) <= NAMED else f"on {len(some)} of {counted(len(by_problem), 'problem')}"
+        )
+    if rows["axis"].nunique() > 1:
+        return n_settings
+    axis = rows["axis"].iloc[0]
+    spans = {name: span(at, axis, marks) for name, at in some.items()}
+    for kind in ("contact", "scene", "integrator"):
+        kinds = dict(zip(rows["problem"], rows[kind], strict=True))
+        by_kind = {
+            k: {spans.get(name, "") for name in kinds if kinds[name] == k} for k in dict.fromkeys(kinds.values())
+        }
+        if len(by_kind) > 1 and "none" not in by_kind and all(len(s) == 1 for s in by_kind.values()):
+            word = "on" if kind == "scene" else "with"
+            held: dict[str, list[str]] = {}
+            for name, (span,) in by_kind.items():
+                if span:
+                    held.setdefault(span, []).append(name)
+            parts = [f"{span} {word} {_join(names)}" for span, names in held.items()]
+            if len(parts) <= NAMED:
+                return ", and ".join(parts) if any(" and " in part for part in parts) else " and ".join(parts)
+    if len(set(spans.values())) == 1 and len(some) == len(by_problem):
+        return next(iter(spans.values()))
+    if len(some) <= 2:
+        return _join([f"{span} on {name}" for name, span in spans.items()])
+    return n_settings
 
 
-def lowest(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, float]:
-    """Return the lowest finite error at each ``x``, in increasing order of ``x``."""
-    rows = pd.concat([line.rows for line in curves])
-    good = rows[(rows["status"] == "ok") & np.isfinite(rows[error])]
-    return {float(x): float(low) for x, low in good.groupby(level=0)[error].min().items()}
-
-
-def winners(curves: Sequence[Curve], error: str = "rmse_rel") -> dict[float, list[str]]:
-    """Return, at each ``x``, the estimators whose error is within a factor :data:`TIE` of the lowest.
-
-    ``error`` is a column: ``rmse_rel`` compares at equal samples, the columns of
-    :func:`~.costs.with_errors_at_equal_cost` at equal cost.
-    """
-    named = {}
-    for x, low in lowest(curves, error).items():
-        good = [line for line in curves if x in line.at and line.at[x]["status"] == "ok"]
-        named[x] = list(dict.fromkeys(line.label for line in good if line.at[x][error] <= TIE * low))
-    return named
-
-
-def span(where: Mapping[float, bool]) -> str:
-    """Format where a finding holds on an axis: ``<=1000``, ``>=1e4``, ``at 10 and 100..3000``; empty if everywhere."""
+def span(where: Mapping[float, bool], axis: str, marks: Mapping[str, float] = MappingProxyType({})) -> str:
+    """Format where something holds along an axis: ``up to stiffness 3000``, ``at every stiffness``, ``at 10 and 100``."""
     if all(where.values()):
-        return ""
+        return f"at every {'number of samples' if axis == 'samples' else axis}"
     values = list(where)
     runs = [[x for x, _ in run] for holds, run in itertools.groupby(where.items(), lambda item: item[1]) if holds]
-    if len(runs) == 1 and len(runs[0]) > 1:
-        if runs[0][0] == values[0]:
-            return f"<={axis_value(runs[0][-1])}"
-        if runs[0][-1] == values[-1]:
-            return f">={axis_value(runs[0][0])}"
-    texts = [axis_value(r[0]) if len(r) == 1 else f"{axis_value(r[0])}..{axis_value(r[-1])}" for r in runs]
-    return f"at {' and '.join(texts)}"
+    if len(runs) == 1:
+        first, last = runs[0][0], runs[0][-1]
+        if last == values[-1]:
+            before = values[values.index(first) - 1]
+            name = next((name for name, value in marks.items() if before <= value < first), "")
+            return f"beyond the {name} ({axis} {axis_value(marks[name])})" if name else _from(axis, "from", first)
+        if first == values[0]:
+            return _from(axis, "up to", last)
+    texts = [axis_value(r[0]) if len(r) == 1 else f"{axis_value(r[0])} to {axis_value(r[-1])}" for r in runs]
+    return f"at {axis} {' and '.join(texts)}"
 
 
-def headline(
-    parts: Sequence[tuple[ProblemRows, Sequence[Curve]]], axis: Axis, marks: Mapping[str, float] = MappingProxyType({})
-) -> str:
-    """Summarise failures along an axis: where the most frequently best estimator fails, and which estimators never fail.
-
-    An estimator fails where it is no better than the zero estimate, or where its cell has no result. ``marks`` are
-    named values of the axis.
-    """
-    names = _by_wins(parts)
-    bad = {name: [_failures(curves, name) for _, curves in parts] for name in names}
-    names = [name for name in names if any(bad[name])]
-    sound = [name for name in names if not any(any(where.values()) for where in bad[name])]
-    useless = [name for name in names if all(all(where.values()) for where in bad[name])]
-    broken = [name for name in names if name not in (*sound, *useless)]
-    problems = [problem for problem, _ in parts]
-    clauses = [f"{broken[0]} fails {_failure_range(bad[broken[0]], problems, axis, marks)}"] if broken else []
-    change = max((_error_ratio(line) for _, curves in parts for line in curves), default=math.inf)
-    flat = not broken and change < FLAT
-    if flat:
-        clauses.append(f"{axis.column} changes no error by more than a factor of {number(change)}")
-    if useless and not broken:
-        clauses.append(f"{' and '.join(useless[:2])} no better than zero")
-    if sound and not flat:
-        clauses.append(f"{' and '.join(sound[:2])} better than zero everywhere")
-    return "; ".join(clauses) or f"No estimator is better than zero anywhere along {axis.column}"
-
-
-def failure_summary(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> str:
-    """Summarise failures: how often the most frequently best estimator fails, and how many estimators never fail.
-
-    The criterion of failure is the same as in :func:`headline`.
-    """
-    names = _by_wins(parts)
-    failed = {
-        name: [any(where.values()) for _, curves in parts if (where := _failures(curves, name))] for name in names
-    }
-    broken = [name for name in names if any(failed[name])]
-    sound = sum(bool(tried) and not any(tried) for tried in failed.values())
-    if not broken:
-        return "Every estimator is better than the zero estimate on every problem that it was run on"
-    first, tried = broken[0], failed[broken[0]]
-    if len(parts) == 1:
-        return f"{first} fails; {sound or 'none'} of {len(names)} estimators {'is' if sound == 1 else 'are'} better than zero"
-    among = f"{sum(tried)} of {len(tried)} problem{'s' * (len(tried) > 1)}"
-    return f"{first} fails on {among}; {sound or 'none'} of {len(names)} estimators fail{'s' * (sound == 1)} on none"
-
-
-def _by_wins(parts: Sequence[tuple[ProblemRows, Sequence[Curve]]]) -> list[str]:
-    """Return the estimators, ordered by how often each is best, most often first."""
-    wins = Counter(label for _, curves in parts for labels in winners(curves).values() for label in labels)
-    return sorted(dict.fromkeys(line.label for _, curves in parts for line in curves), key=lambda name: -wins[name])
-
-
-def _error_ratio(line: Curve) -> float:
-    """Return the ratio of a curve's largest to its smallest error; 1 if it has fewer than two errors."""
-    rows = line.rows[line.rows["status"] == "ok"]
-    errors = rows.loc[np.isfinite(rows["rmse_rel"]), "rmse_rel"]
-    return float(errors.max() / errors.min()) if len(errors) > 1 and errors.min() > 0 else 1.0
-
-
-def _failures(curves: Sequence[Curve], name: str) -> dict[float, bool]:
-    """Return, for each ``x`` at which an estimator ran, whether it failed on any backend; refused cells are omitted."""
-    where: dict[float, bool] = {}
-    for line in curves:
-        for x, row in line.at.items() if line.label == name else ():
-            if row["status"] != "ok" or np.isfinite(row["rmse_rel"]):
-                where[x] = where.get(x, False) or row["status"] != "ok" or row["rmse_rel"] >= 1
-    return dict(sorted(where.items()))
-
-
-def _range_text(where: str, axis: Axis) -> str:
-    """Format a :func:`span` in words: ``from stiffness 1e4``, ``everywhere``."""
-    sign = "from" if where.startswith(">=") else "up to" if where.startswith("<=") else "at"
-    return f"{sign} {axis.column} {where.removeprefix('at ').lstrip('<>=')}" if where else "everywhere"
-
-
-def _failure_range(
-    bad: Sequence[Mapping[float, bool]], problems: Sequence[ProblemRows], axis: Axis, marks: Mapping[str, float]
-) -> str:
-    """Format where along an axis an estimator fails, and in which problems; ``bad`` has its failures by problem."""
-    failing = [i for i, where in enumerate(bad) if any(where.values())]
-    spans = list(dict.fromkeys(span(bad[i]) for i in failing))
-    text = _range_text(spans[0], axis) if len(spans) == 1 and spans[0] else ""
-    ends = [
-        (max((x for x, b in bad[i].items() if not b), default=0.0), min(x for x, b in bad[i].items() if b))
-        for i in failing
-    ]
-    beyond = [name for name, value in marks.items() if all(good <= value < first for good, first in ends)]
-    if beyond:
-        text = f"beyond the {beyond[0]} ({axis.column} {axis_value(marks[beyond[0]])})"
-    for key in ("scene", "contact", "integrator"):
-        mine = {str(problems[i].identity.get(key, "")) for i in failing}
-        others = {str(f.identity.get(key, "")) for i, f in enumerate(problems) if i not in failing and bad[i]}
-        if others and not mine & others and not {"", "none"} & (mine | others):
-            return f"{text} with {' and '.join(sorted(mine))}, not with {' and '.join(sorted(others))}".strip()
-    n_run = sum(map(bool, bad))
-    if not beyond and len(failing) < n_run and len(failing) <= NAMED:
-        return " and ".join(f"{_range_text(span(bad[i]), axis)} on {problems[i].title()}" for i in failing)
-    if not text and len(spans) == 1:
-        text = "everywhere"
-    where = "" if len(failing) == n_run else f" in {len(failing)} of {n_run} problems"
-    return (text + where).strip() or "at some values"
+def _from(axis: str, word: str, value: float) -> str:
+    """Format an end of a range: ``from stiffness 1e4``, ``with at most 256 samples``."""
+    if axis == "samples":
+        return f"with at {'least' if word == 'from' else 'most'} {axis_value(value)} samples"
+    return f"{word} {axis} {axis_value(value)}"

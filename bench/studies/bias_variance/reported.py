@@ -29,9 +29,3 @@ def sentences(rows: pd.DataFrame) -> list[str]:
                 + (f", and 0 in most estimates of {off} of them: it does nothing there" if off else "")
             )
     return texts
-
-
-def show(rows: pd.DataFrame) -> None:
-    """Print the sentences on the estimators' diagnostics."""
-    for sentence in sentences(rows):
-        print(f"  {sentence}")

@@ -1,50 +1,201 @@
-"""Writes the main table: all digits as CSV, rounded as Markdown, and a pivot table for papers in Markdown and LaTeX."""
+"""The tables of the main study: estimators along an axis, every cell, error against cost, ranking, comparisons."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from bench.errors import unknown
 from bench.experiment import axes
-from bench.experiment.columns import IDENTITY
+from bench.experiment.axes import Axis
+from bench.experiment.columns import COMMON, IDENTITY, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
-from bench.measure.statistics import UNEXPLAINED, is_unexplained
-from bench.report.problems import value_text
-from bench.report.tables import csv, escape_markdown
-from bench.report.text import number
-from bench.report.views import NUMBERS, UNSTEADY, VIEWS_OF_LAWS, arrange, bias_text, pareto, unsteady
-from bench.run.files import write_all
-from bench.studies.bias_variance import pivot
+from bench.experiment.views import Table
+from bench.measure.statistics import is_unexplained
+from bench.report.problems import ProblemRows, split_by_problem
+from bench.report.text import axis_value
+from bench.report.views import (
+    UNSTEADY,
+    Arranged,
+    estimator_curves,
+    pareto,
+    rmse_interval,
+    unsteady,
+)
+from bench.studies.bias_variance.columns import COLUMNS
+from bench.studies.bias_variance.comparisons import COLUMNS as COMPARED
+from bench.studies.bias_variance.comparisons import (
+    EQUAL_SAMPLES,
+    FAILS,
+    NO_RESULT,
+    leaders,
+    method_names,
+    problems_by_axis,
+    setting_of,
+    verdicts_by_estimator,
+)
+from bench.studies.bias_variance.findings import span, value_range
 
-DOUBTED = " ?"
-FOOTNOTES = [
-    "0 (< u): the bias is not distinguishable from 0, its 95% interval reaches up to u. "
-    f"{DOUBTED.strip()}: the estimator declares to be unbiased and the interval excludes 0, so {UNEXPLAINED}.",
-    "relative bias and rel. RMSE: divided by the norm of the reference gradient. A relative RMSE above 1 is worse "
-    "than the zero estimate.",
-    "variance: trace of the covariance of one estimate. time: one estimate, steady state, without compilation. "
-    f"{UNSTEADY}: the interquartile range of its calls is over 20% of it; something else ran beside them.",
-]
+FAILURES = {
+    "nonfinite": ("∞", "a result that is not finite"),
+    "diverged": ("↑", "a state that diverged"),
+    "timeout": ("⧗", "the time limit"),
+    "crashed": ("†", "a process that died"),
+    "error": ("‡", "an error"),
+    "unsupported": ("–", "a combination that cannot work"),
+    "unavailable": ("∅", "a library that is not installed"),
+}
+"""Sign and meaning of each status other than ``ok``."""
+REMARKED = "?"
+"""Mark of a cell whose row has a remark."""
+LEAST = 3
+"""Fewest estimators for which the ranking is written; the main table is enough for fewer."""
+MANY = 2.5
+"""The number of evaluations per sample is shown above this value."""
+ESTIMATOR = text("method", label="estimator")
 
 
-def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``bias_variance`` (.csv, .md, .tex) and ``speed_accuracy.csv``; return the files' paths."""
-    paper = pivot.pivot(experiment, arrange(experiment, rows))
-    return write_all(
-        experiment.directory,
-        {
-            "bias_variance.csv": csv(axes.table(experiment, rows)),
-            "bias_variance.md": f"{pivot.markdown(paper)}\n{markdown(readable(experiment, rows))}",
-            "bias_variance.tex": pivot.latex(paper),
-            "speed_accuracy.csv": csv(speed_accuracy(rows)),
-        },
-    )
+def tables(
+    experiment: Experiment, rows: pd.DataFrame, shown: Arranged, methods: pd.DataFrame, comparisons: pd.DataFrame
+) -> list[Table]:
+    """Return all tables but those of the cost to reach an error."""
+    made = [*pivots(experiment, shown), every_cell(experiment, rows)]
+    made[0] = replace(made[0], data=axes.table(experiment, rows))
+    columns = [COLUMNS.by_name[name] for name in ("scene", "contact", "backend", "estimator", "rmse_rel", "time_s")]
+    made.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
+    if methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1:
+        made.append(ranking(methods))
+    made.append(recommendations(methods, comparisons[comparisons["basis"] == EQUAL_SAMPLES]))
+    joined = comparisons.assign(tied=[", ".join(names) for names in comparisons["tied"]])
+    made.append(Table("comparisons", joined, COMPARED, "the first and the next at each setting", COMPARISON_NOTES))
+    return made
+
+
+COMPARISON_NOTES = (
+    "Factor: the second over the first, with its 95% interval. Tied: not distinguishable from the first, since the interval "
+    "of the factor reaches 1 or is not known. All findings, the ranking and the charts' titles are computed from this table.",
+)
+
+
+# ------------------------------------------------------------------------------------------- along an axis
+
+
+def pivots(experiment: Experiment, shown: Arranged) -> list[Table]:
+    """Return a table per problem: estimators down, values of its axis across, each cell a relative RMSE.
+
+    The axis is the one that ``table.columns`` names, by default the longest. Raises an error if ``table.columns`` names
+    no swept axis.
+    """
+    parts: Sequence[tuple[Axis | None, ProblemRows]] = problems_by_axis(shown)
+    if experiment.table.columns:
+        axis = _axis(experiment.table.columns, shown)
+        parts = [(axis, problem) for problem in split_by_problem(shown, axis, ("scene", "contact"))]
+    apart = "backend" in experiment.table.rows
+    made = [_pivot(axis, problem, apart) for axis, problem in parts]
+    notes = _notes(made)
+    return [replace(table, notes=notes if table is made[-1] else ()) for table in made]
+
+
+def _axis(name: str, shown: Arranged) -> Axis:
+    swept = list(shown.swept())
+    named = [axis for axis in swept if name in (axis.column, axis.short, *axis.names)]
+    if not named:
+        raise unknown("column of the table:", name, [axis.column for axis in swept])
+    return named[0]
+
+
+def _pivot(axis: Axis | None, problem: ProblemRows, apart: bool) -> Table:
+    curves = estimator_curves(problem.rows, close=None) if apart else estimator_curves(problem.rows)
+    names = [f"{c.label} ({', '.join(c.backends)})" for c in curves] if apart else method_names(curves)
+    values = sorted({x for curve in curves for x in curve.at})
+    lines: list[dict[str, Any]] = []
+    for curve, name in zip(curves, names, strict=True):
+        line: dict[str, Any] = {"method": name}
+        for i, x in enumerate(values):
+            others = [other.at.get(x) for other in curves if other.label != curve.label]
+            line |= {f"x{i}{end}": value for end, value in _pivot_cell(curve.at.get(x), others).items()}
+        lines.append(line)
+    columns = [
+        Column(
+            f"x{i}", label=axis_value(x) if axis is not None else "relative RMSE", low=f"x{i}_low", high=f"x{i}_high",
+            emphasis=f"x{i}_best", note=f"x{i}_note",
+        )
+        for i, x in enumerate(values)
+    ]  # fmt: skip
+    title = problem.title() + (f", by {axis.title}" if axis is not None else "")
+    return Table(
+        "bias_variance", pd.DataFrame(lines), [ESTIMATOR, *columns], f"relative RMSE: {title}", files=["csv", "md", "tex"],
+        terminal=True,
+    )  # fmt: skip
+
+
+def _pivot_cell(row: Mapping[str, Any] | None, others: Sequence[Mapping[str, Any] | None]) -> dict[str, Any]:
+    blank = {"": math.nan, "_low": math.nan, "_high": math.nan, "_best": False, "_note": ""}
+    if row is None:
+        return blank
+    mark = REMARKED if row["reason"] else ""
+    if row["status"] != "ok":
+        return blank | {"_note": FAILURES[row["status"]][0] + mark}
+    low, high = (float(end) for end in rmse_interval(row))
+    rivals = [rmse_interval(other)[0] for other in others if other is not None and other["status"] == "ok"]
+    best = bool(row["rmse_rel"] < 1 and rivals and all(high < rival for rival in rivals))
+    return {"": float(row["rmse_rel"]), "_low": low, "_high": high, "_best": best, "_note": mark}
+
+
+def _notes(made: Sequence[Table]) -> list[str]:
+    """Return the notes below the tables: numbers, intervals, bold type and the signs that occur."""
+    seen = {str(v) for table in made for name in table.frame if name.endswith("_note") for v in table.frame[name]}
+    notes = [
+        "Relative RMSE of one estimate [95% interval], in units of the reference gradient's norm: above 1 the zero estimate "
+        "is better. Bold: below 1, with an interval apart from that of every other estimator."
+    ]
+    signs = [f"{sign}: {what}." for sign, what in FAILURES.values() if any(sign in text_ for text_ in seen)]
+    if any(REMARKED in text_ for text_ in seen):
+        signs.append(
+            f"{REMARKED}: the row has a remark, so its interval is doubtful: see the column reason of the CSV."
+        )
+    return notes + ([" ".join(signs)] if signs else [])
+
+
+# ------------------------------------------------------------------------------------------------ every cell
+
+
+def every_cell(experiment: Experiment, rows: pd.DataFrame) -> Table:
+    """Return the table with a line per cell: what identifies it, its bias and variance, and its remark by number."""
+    swept = axes.axes(experiment.sweep, rows)
+    table = axes.relabel(axes.with_axes(experiment, rows), swept)
+    names = [name for name in (*IDENTITY, *(a.column for a in swept)) if table[name].nunique(dropna=False) > 1]
+    reasons = {text_: i + 1 for i, text_ in enumerate(dict.fromkeys(r for r in table["reason"] if r))}
+    norm = table["reference_norm"].where(table["reference_norm"] > 0)
+    frame = table.assign(
+        bias_limit=~(table["bias_low"] > 0) & np.isfinite(table["bias_high"]),
+        bias_note=[REMARKED if is_unexplained(text_) else "" for text_ in table["reason"]],
+        bias_relative=table["bias"] / norm, bias_relative_high=table["bias_high"] / norm,
+        time_note=[UNSTEADY if flag else "" for flag in unsteady(table)],
+        remark=[f"{s} ({reasons[r]})" if r else s for s, r in zip(table["status"], table["reason"], strict=True)],
+    ).astype({"bias_limit": bool})  # fmt: skip
+    known = {axis.column: Column(axis.column, label=axis.title, format="setting") for axis in swept}
+    columns = [
+        *(known.get(name) or COMMON[name] for name in dict.fromkeys(names)),
+        replace(COLUMNS.by_name["bias"], digits=3, limit="bias_limit", note="bias_note"),
+        Column("bias_relative", label="relative bias", digits=3, high="bias_relative_high", limit="bias_limit"),
+        *(replace(COLUMNS.by_name[name], digits=3) for name in ("variance", "rmse_rel", "cosine")),
+        replace(COLUMNS.by_name["time_s"], note="time_note"),
+        text("remark", label="status"),
+    ]
+    notes = [
+        "< u: the bias is not distinguishable from 0, and its 95% interval reaches up to u. "
+        f"{REMARKED}: a bias where the estimator declares none. {UNSTEADY}: an unsteady time, whose interquartile range is "
+        "over 20% of it. Times are of one estimate, in steady state, without compilation.",
+        *(f"({i}) {reason}" for reason, i in reasons.items()),
+    ]
+    return Table("bias_variance", frame, columns, "Every cell", notes, files=["md"])
 
 
 def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:
@@ -57,94 +208,81 @@ def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-@dataclass(frozen=True)
-class Readable:
-    """The main table as strings, not yet escaped for any format."""
-
-    title: str
-    shared: list[str]
-    headers: list[str]
-    numeric: list[bool]
-    """Whether each column is numeric."""
-    body: list[list[str]]
-    reasons: list[str]
+# --------------------------------------------------------------------------------------------------- ranking
 
 
-def readable(experiment: Experiment, rows: pd.DataFrame) -> Readable:
-    """Return the main table as strings: identity and swept columns that vary, results, status, and numbered reasons."""
-    swept_axes = axes.axes(experiment.sweep, rows)
-    swept = [axis.column for axis in swept_axes if axis.column not in rows and not _is_shown(rows, axis)]
-    rows = axes.relabel(axes.with_axes(experiment, rows), swept_axes)
-    varying, shared = _varying(rows, swept)
-    reasons = {text: i + 1 for i, text in enumerate(dict.fromkeys(r for r in rows["reason"] if r))}
-    status = ["status"] if reasons or (rows["status"] != "ok").any() else []
-    results = ["bias [95% interval]", "relative bias", "variance", "rel. RMSE", "cosine", "time [ms]"]
-    body = []
-    for row in rows.to_dict("records"):
-        cells = [value_text(row[c]) for c in varying] + _results(row)
-        note = f" ({reasons[row['reason']]})" if row["reason"] else ""
-        body.append(cells + [row["status"] + note for _ in status])
-    return Readable(
-        title="Every cell",
-        shared=shared,
-        headers=[*varying, *results, *status],
-        numeric=[
-            *(c in (*NUMBERS, *swept, "seed") for c in varying),
-            *(True for _ in results),
-            *(False for _ in status),
-        ],
-        body=body,
-        reasons=[f"({i}) {text}" for text, i in reasons.items()],
+def ranking(methods: pd.DataFrame) -> Table:
+    """Return the ranking: a line per estimator with the number of settings by verdict, and its errors by problem.
+
+    Where a problem was swept, its error is the largest along the axis: the worst case.
+    """
+    counts = verdicts_by_estimator(methods)
+    worst = methods.assign(known=methods["error"].fillna(math.inf)).sort_values("known", kind="stable")
+    worst = worst.groupby(["estimator", "problem"], sort=False).tail(1).set_index(["estimator", "problem"])
+    problems = list(dict.fromkeys(methods["problem"]))
+    lines = []
+    for name, verdicts in counts.iterrows():
+        line: dict[str, Any] = {"method": name, **verdicts.to_dict()}
+        for i, problem in enumerate(problems):
+            row = worst.loc[(name, problem)] if (name, problem) in worst.index else None
+            line |= {f"p{i}": math.nan, f"p{i}_low": math.nan, f"p{i}_high": math.nan, f"p{i}_note": ""}
+            if row is not None:
+                work = f"({row['evaluations']:.0f}x)" if row["evaluations"] > MANY else ""
+                share = "biased" if row["bias_share"] > 0.5 else ""
+                note = row["status"] if row["status"] != "ok" else ", ".join(filter(None, (row["verdict"], share)))
+                line |= {f"p{i}": row["error"], f"p{i}_low": row["low"], f"p{i}_high": row["high"]}
+                line[f"p{i}_note"] = " ".join(filter(None, (note, work)))
+        finite = [line[f"p{i}"] for i in range(len(problems))]
+        line["worst"] = max(finite) if all(map(math.isfinite, finite)) else math.nan
+        lines.append(line)
+    frame = pd.DataFrame(lines).sort_values("worst", kind="stable", na_position="last")
+    columns = [
+        ESTIMATOR,
+        *(Column(str(name), format="setting") for name in counts),
+        *(
+            Column(f"p{i}", label=problem, low=f"p{i}_low", high=f"p{i}_high", note=f"p{i}_note")
+            for i, problem in enumerate(problems)
+        ),
+    ]
+    notes = (
+        "Sorted by the worst case. Relative RMSE [95% interval] at equal samples; where a problem was swept, the largest along "
+        "the axis. works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
+        "than half of the squared error is bias. (40x): it evaluates 40 costs and gradients per sample, where others take "
+        "one or two.",
     )
+    return Table("ranking", frame, columns, "estimators by their worst case", notes)
 
 
-def _varying(rows: pd.DataFrame, swept: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the identity and swept columns to show, and sentences with the values of the other columns."""
-    names = (*IDENTITY, *swept)
-    varying = [c for c in names if rows[c].nunique(dropna=False) > 1]
-    problems = rows.groupby(["scene", "contact"], sort=False)
-    main = ("scene", "contact", "backend", "estimator", "estimator_params")
-    implied = [c for c in varying if c not in main and (problems[c].nunique(dropna=False) == 1).all()]
-    shared = [f"The same in every row: {_named(rows.iloc[0], [c for c in names if c not in varying])}."]
-    for (scene, contact), part in problems:
-        if named := _named(part.iloc[0], implied):
-            problem = f"{scene}, {contact}" if contact != "none" else str(scene)
-            shared.append(f"In every row of {problem}: {named}.")
-    return [c for c in varying if c not in implied], shared
-
-
-def _is_shown(rows: pd.DataFrame, axis: axes.Axis) -> bool:
-    """Return whether the column ``stiffness`` or ``smoothing`` already shows a swept axis."""
-    own = np.isfinite(axes.values_of(axis, rows))
-    return any(axes.shown_by(view, axis, rows)[own].all() for view in VIEWS_OF_LAWS)
-
-
-def _named(row: Any, columns: Sequence[str]) -> str:
-    texts = {c: value_text(row[c]) for c in columns}
-    return ", ".join(f"{c} {text}" for c, text in texts.items() if text not in ("", "none", "-"))
-
-
-def _results(row: Any) -> list[str]:
-    if row["status"] != "ok":
-        return ["-"] * 6
-    return [
-        bias_text(row) + DOUBTED * is_unexplained(row["reason"]),
-        bias_text(row, row["reference_norm"], interval=False),
-        number(row["variance"], 3), number(row["rmse_rel"], 3), number(row["cosine"], 3),
-        number(row["time_s"] * 1e3, 3) + UNSTEADY * bool(unsteady(row)),
+def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
+    """Return what to use where: a line per problem and range of its axis with the same first and tied estimators."""
+    named = leaders(comparisons, methods)
+    lines = []
+    for (problem, axis), part in methods.groupby(["problem", "axis"], sort=False):
+        places = {place: names for place, names in named.items() if place[0] == problem and place[1] == axis}
+        for use in dict.fromkeys(tuple(names) for names in places.values() if names):
+            mine = [place for place, names in places.items() if tuple(names) == use]
+            at = {float(place[2]): place in mine for place in places} if axis else {}
+            inside = part[[setting_of(row) in mine for row in part.to_dict("records")]]
+            errors = inside.loc[inside["estimator"].isin(use[:1]), "error"]
+            failing = dict.fromkeys(inside.loc[inside["verdict"].isin((FAILS, NO_RESULT)), "estimator"])
+            lines.append({
+                "problem": problem, "where": span(at, axis) if axis else "", "use": " or ".join(use),
+                "error": value_range(errors), "fails": ", ".join(failing) or "none",
+            })  # fmt: skip
+    columns = [
+        text("problem"), text("where"), text("use"), text("error", label="relative RMSE"), text("fails", label="fails there"),
     ]  # fmt: skip
+    return Table("recommendations", pd.DataFrame(lines), columns, "What to use where", files=(), page=True)
 
 
-def markdown(table: Readable) -> str:
-    """Return the main table in Markdown, with footnotes and the numbered reasons."""
-    e = escape_markdown
-    out = [f"## {e(table.title)}", ""]
-    for text in table.shared:
-        out += [e(text), ""]
-    out.append("| " + " | ".join(map(e, table.headers)) + " |")
-    out.append("|" + "|".join("--:" if right else "---" for right in table.numeric) + "|")
-    out += ["| " + " | ".join(map(e, cells)) + " |" for cells in table.body]
-    out += ["", *(f"- {e(note)}" for note in FOOTNOTES)]
-    if table.reasons:
-        out += ["", "Notes on the status:", "", *(f"- {e(reason)}" for reason in table.reasons)]
-    return "\n".join(out) + "\n"
+def remarks(rows: pd.DataFrame) -> list[str]:
+    """Return why cells failed, were refused or have remarks; reasons that differ only in numbers are counted together."""
+    remarked = rows[rows["reason"] != ""]
+    if remarked.empty:
+        return []
+    kinds = remarked["reason"].str.replace(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", regex=True)
+    groups = sorted(remarked.groupby(["status", kinds]), key=lambda item: -len(item[1]))
+    return [
+        f"{len(part)} {status}: {part['reason'].iloc[0]}" + ("" if part["reason"].nunique() == 1 else " (for example)")
+        for (status, _), part in groups
+    ]

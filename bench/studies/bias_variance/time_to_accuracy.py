@@ -8,23 +8,20 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import Axis
-from bench.experiment.experiment import Experiment
+from bench.experiment.columns import Column, text
+from bench.experiment.views import Table
 from bench.measure.statistics import is_unexplained
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.tables import escape_markdown, plain_markdown
-from bench.report.text import axis_value, counted, number
-from bench.report.views import Curve, arrange, estimator_curves
-from bench.run.files import write_all
-from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost, with_gradient_cost
+from bench.report.text import counted, number
+from bench.report.views import Arranged, Curve, estimator_curves
+from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost
 
 SAMPLES = Axis("samples", ("samples",))
 TARGETS = (0.1, 0.01)
@@ -129,11 +126,10 @@ def _extrapolated_cost(row: Any, samples: float, price: float, target: float) ->
     return RequiredCost("extrapolated", price * factor, samples * factor)
 
 
-def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
+def table(shown: Arranged) -> pd.DataFrame:
     """Return a line per problem, kind of cost and target error; empty if samples were not swept."""
-    if rows["samples"].nunique() < 2:
+    if shown.rows["samples"].nunique() < 2:
         return pd.DataFrame()
-    shown = arrange(experiment, with_gradient_cost(rows))
     costs = (("time", TIME), ("rollouts", ROLLOUTS))
     timed = bool(np.isfinite(shown.rows["time_s"]).any())
     entries = [
@@ -192,46 +188,49 @@ def line(problem: ProblemRows, target: float, kind: str, cost: Cost) -> dict[str
     return {"problem": problem.title(), "relative error": target, "by": kind, **entry, **out}
 
 
-def texts(best: pd.DataFrame) -> pd.DataFrame:
-    """Return the table with its numbers formatted as strings."""
-    shown = best.astype(object)
+def accuracy_table(best: pd.DataFrame) -> Table:
+    """Return the table of :func:`table` for readers."""
     kinds = {"time": TIME, "rollouts": ROLLOUTS}
-    shown["relative error"] = [f"{value:.0%}" for value in best["relative error"]]
-    shown["cost"] = [
+    costs = [
         kinds[kind].text(float(number(cost))) if math.isfinite(cost) else "-"
         for kind, cost in zip(best["by"], best["cost"], strict=True)
     ]
-    shown["samples"] = [axis_value(value) for value in best["samples"]]
-    ends = zip(best["factor"], best["factor_low"], best["factor_high"], strict=True)
-    shown["factor"] = [
-        number(value) + (f" ({number(low)} to {number(high)})" if math.isfinite(low) else "")
-        for value, low, high in ends
-    ]
-    return shown.drop(columns=["factor_low", "factor_high"])
+    columns = [
+        text("problem"), Column("relative error", format="percent"), text("by"), text("fastest"), text("cost_text", label="cost"),
+        Column("samples", format="setting"), text("how"), text("next"),
+        Column("factor", low="factor_low", high="factor_high"), text("never"), text("unknown"),
+    ]  # fmt: skip
+    return Table(
+        "time_to_accuracy", best.assign(cost_text=costs), columns, "the method that reaches an error at the lowest cost", NOTES,
+        terminal=True, details=("never", "unknown"), data=best,
+    )  # fmt: skip
+
+
+def comparisons(best: pd.DataFrame) -> pd.DataFrame:
+    """Return the lines of the table of comparisons: who reaches an error first, and by what factor."""
+    return pd.DataFrame({
+        "problem": best["problem"], "axis": "", "at": math.nan,
+        "basis": [f"{by} to {target:.0%}" for by, target in zip(best["by"], best["relative error"], strict=True)],
+        "first": best["fastest"].where(best["fastest"] != "-", ""), "value": best["cost"],
+        "value_low": math.nan, "value_high": math.nan, "second": best["next"].where(best["next"] != "-", ""),
+        "factor": best["factor"], "factor_low": best["factor_low"], "factor_high": best["factor_high"],
+        "tied": [(e["next"],) if e["next"] != "-" and not e["factor_low"] > 1 else () for e in best.to_dict("records")],
+    })  # fmt: skip
 
 
 def sentence(entry: Any) -> str:
-    """Format a line of the table as a sentence: the cheapest method, and how many times the next one costs."""
-    what = f"to {entry['relative error']:.0%}"
+    """Format a line of the table in a few words: ``10%: fobg on jax, 3.8 times ahead [2.7, 5.2]``, or why it is open."""
+    what = f"{entry['relative error']:.0%}: "
     if entry["fastest"] == "-":
-        never = "nobody, all have a larger bias"
-        return f"{what}: {never if entry['how'] == 'never' else 'not known, no bias is certain to be below'}"
+        return what + (
+            "none, all have a larger bias" if entry["how"] == "never" else "open, no bias is known to be below"
+        )
     if entry["next"] == "-":
-        return f"{what}: only {entry['fastest']}"
+        return f"{what}only {entry['fastest']}"
     if not entry["factor_low"] > 1.0:
-        return f"{what}: {entry['fastest']} or {entry['next']}, not distinguishable"
+        return f"{what}open, {estimator_of(entry['fastest'])} or {estimator_of(entry['next'])}"
     low, high = number(entry["factor_low"]), number(entry["factor_high"])
-    return f"{what}: {entry['fastest']}, {number(entry['factor'])} times ({low} to {high}) before {entry['next']}"
-
-
-def sentences(best: pd.DataFrame) -> list[str]:
-    """Return a sentence per problem: the method that reaches each error first in time (in rollouts if untimed)."""
-    kind = "time" if (best["by"] == "time").any() else "rollouts"
-    chosen = best[best["by"] == kind].to_dict("records")
-    by_problem: dict[str, list[str]] = {}
-    for entry in chosen:
-        by_problem.setdefault(entry["problem"], []).append(sentence(entry))
-    return [f"{problem}: {'; '.join(sentences)}." for problem, sentences in by_problem.items()]
+    return f"{what}{estimator_of(entry['fastest'])}, {number(entry['factor'])} times ahead [{low}, {high}]"
 
 
 def _is_clearly_first(entry: Any) -> bool:
@@ -242,78 +241,34 @@ def _is_clearly_first(entry: Any) -> bool:
     return alone or bool(entry["factor_low"] > 1.0)
 
 
-def summarise_leaders(entries: Sequence[Any]) -> str:
-    """Format which estimator is certainly first most often: ``fobg is first to 10% error on 5 of 6 problems, to 1% on 4``."""
+def finding(best: pd.DataFrame) -> str:
+    """Return which estimator is certainly first to each error most often, and on how many problems that is open."""
+    kind = "time" if (best["by"] == "time").any() else "rollouts"
     clauses: list[str] = []
     before = ""
-    for target in dict.fromkeys(entry["relative error"] for entry in entries):
+    entries = best[best["by"] == kind].to_dict("records")
+    for target in TARGETS:
         asked = [entry for entry in entries if entry["relative error"] == target]
         clear = [e["fastest"] for e in asked if _is_clearly_first(e)]
-        leader, count = Counter(map(estimator_of, clear)).most_common(1)[0] if clear else ("nobody", len(asked))
+        if not clear:
+            clauses.append(f"nobody is certainly first to {target:.0%}")
+            continue
+        leader, count = Counter(map(estimator_of, clear)).most_common(1)[0]
         ways = {method for method in clear if estimator_of(method) == leader}
         name = ways.pop() if len(ways) == 1 else leader
-        who = "" if name == before else f"{name} is {'certainly ' * (not clear)}first "
-        error, among = " error" * (not clauses), f" of {counted(len(asked), 'problem')}" if name != before else ""
-        clauses.append(f"{who}to {target:.0%}{error} on {count}{among}")
+        factors = [e["factor"] for e in asked if e["fastest"] in (name, leader) and _is_clearly_first(e)]
+        ahead = (
+            f", {_range([f for f in factors if math.isfinite(f)])} times ahead"
+            if any(map(math.isfinite, factors))
+            else ""
+        )
+        who = "" if name == before else f"{name} is first "
         before = name
-    return ", ".join(clauses)
+        clauses.append(f"{who}to {target:.0%} error on {count} of {counted(len(asked), 'problem')}{ahead}")
+    text = ", and ".join(clauses)
+    return f"{text[0].upper() if text.startswith('nobody') else text[0]}{text[1:]}."
 
 
-def summarise_accuracy_and_cost(problems: Sequence[ProblemRows], cost: Cost) -> str:
-    """Format which estimators are most accurate and cheapest on most problems, and where the cheapest is useless."""
-    accurate: Counter[str] = Counter()
-    cheap: Counter[str] = Counter()
-    useless: Counter[str] = Counter()
-    for problem in problems:
-        known = [(line.label, cost.known(line.rows)) for line in estimator_curves(problem.rows, close=None)]
-        rows = pd.concat([rows.assign(label=label, at=cost.of(rows)) for label, rows in known])
-        best, first = (rows.sort_values(by, kind="stable").iloc[0] for by in ("rmse_rel", "at"))
-        accurate[best["label"]] += 1
-        cheap[first["label"]] += 1
-        useless[first["label"]] += bool(first["rmse_rel"] >= 1.0)
-    (best_, wins), (first_, times) = accurate.most_common(1)[0], cheap.most_common(1)[0]
-    costs = "needs fewest rollouts" if cost is ROLLOUTS else "is fastest"
-    second = f" and {costs.removeprefix('is ')} on {times}" if best_ == first_ else f"; {first_} {costs} on {times}"
-    text = f"{best_} is most accurate on {wins} of {counted(len(problems), 'problem')}{second}"
-    return text + (f", no better than zero on {useless[first_]} of these" if useless[first_] else "")
-
-
-def write(experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-    """Write ``time_to_accuracy`` (.csv, .md) if samples were swept; return the files' paths."""
-    best = table(experiment, rows)
-    if best.empty:
-        return []
-    title = f"# {experiment.name}: which estimator on which backend is fastest for an error"
-    return write_all(
-        experiment.directory,
-        {
-            "time_to_accuracy.csv": best.to_csv(index=False, lineterminator="\n"),
-            "time_to_accuracy.md": "\n\n".join(
-                [title, *map(escape_markdown, sentences(best)), plain_markdown(texts(best)), *NOTES]
-            )
-            + "\n",
-        },
-    )
-
-
-def show(experiment: Experiment, rows: pd.DataFrame) -> None:
-    """Print the table if samples were swept."""
-    best = table(experiment, rows)
-    if not best.empty:
-        _print(texts(best))
-
-
-def _print(best: pd.DataFrame) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal:
-        console.width = max(console.width, 160)
-    shown = Table(title="\nfastest for an error", title_justify="left", box=None, padding=(0, 2, 0, 0))
-    kept: Sequence[str] = [name for name in best if name not in ("never", "unknown")]
-    for name in kept:
-        shown.add_column(name)
-    for line in best[kept].to_numpy():
-        shown.add_row(*line)
-    console.print(shown)
+def _range(values: list[float]) -> str:
+    low, high = number(min(values)), number(max(values))
+    return low if low == high else f"{low} to {high}"

@@ -43,7 +43,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     own = [replace(experiment.columns.by_name[name], digits=3) for name in SHOWN]
     lines = Table(
         "twins", tried, [*(COMMON.get(name, Column(name)) for name in labels), *own, COMMON["status"]],
-        table(experiment, rows), "engines compared with the scenes' own programs", NOTES, terminal=True,
+        "engines compared with the scenes' own programs", NOTES, terminal=True, data=table(experiment, rows),
     )  # fmt: skip
     good = shown.rows[shown.rows["status"] == "ok"]
     if good.empty:

@@ -1,0 +1,182 @@
+"""Compares estimators at each setting, with intervals: the one table behind findings, ranking, charts and page.
+
+A setting is a problem at one value of its swept axis. A method is an estimator, on the backends that agree.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.experiment.axes import Axis
+from bench.experiment.columns import Column, text
+from bench.report.problems import ProblemRows, split_by_problem
+from bench.report.views import CATEGORIES, Arranged, Curve, attempted, estimator_curves, rmse_interval
+
+WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
+"""Verdicts of a method at a setting: its interval is below 1, above 1, contains 1 or is not known; it has no number."""
+VERDICTS = {
+    WORKS: "its error is below the gradient's norm, with the whole 95% interval",
+    FAILS: "its error is above the gradient's norm, with the whole 95% interval: the zero estimate is better",
+    OPEN: "its interval contains the gradient's norm, or is not known",
+    NO_RESULT: "the cell failed: see its status and reason",
+}
+EQUAL_SAMPLES = "relative RMSE at equal samples"
+SETTING = ("problem", "axis", "at")
+"""The columns that identify a setting."""
+COLUMNS = (
+    text("problem", "what distinguishes the problem from the others"),
+    text("axis", "the swept quantity along which the problem is reported"),
+    Column("at", "its value", format="setting"),
+    text("basis", "what is compared: the error at equal samples, or the cost of reaching an error"),
+    text("first", "the method with the lowest value"),
+    Column("value", "its value", low="value_low", high="value_high"),
+    text("second", "the next method, of another estimator where there is one"),
+    Column("factor", "the second value over the first", low="factor_low", high="factor_high"),
+    text("tied", "methods that are not distinguishable from the first"),
+)
+"""The columns of the table of comparisons."""
+
+
+def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
+    """Return the problems to report, each with the longest axis along which it was swept.
+
+    Every cell that ran is in at least one problem. The axis is None for cells that no axis sweeps.
+    """
+    swept = shown.swept()
+    parts: list[tuple[Axis | None, ProblemRows]] = []
+    seen: set[str] = set()
+    for axis in (*sorted(swept, key=lambda a: -swept[a]), None):
+        for group in split_by_problem(shown, axis, ("scene", "contact")):
+            cells = attempted(group.rows)
+            if set(cells["key"]) - seen and (axis is None or cells["x"].nunique() > 1):
+                seen |= set(cells["key"])
+                parts.append((axis, group))
+    return parts
+
+
+def method_names(curves: Sequence[Curve]) -> list[str]:
+    """Return a name per curve: the estimator, and its backends where an estimator has several curves."""
+    labels = [curve.label for curve in curves]
+    return [
+        curve.label if labels.count(curve.label) == 1 else f"{curve.label} ({', '.join(curve.backends)})"
+        for curve in curves
+    ]
+
+
+def method_table(shown: Arranged) -> pd.DataFrame:
+    """Return a line per setting and method: its relative RMSE with a 95% interval, its verdict, and its cost."""
+    lines = []
+    for axis, problem in problems_by_axis(shown):
+        curves = estimator_curves(problem.rows)
+        kinds = {name: str(problem.rows[name].iloc[0]) for name in CATEGORIES}
+        for curve, name in zip(curves, method_names(curves), strict=True):
+            for x, row in curve.at.items():
+                low, high = (float(end) for end in rmse_interval(row))
+                error = float(row["rmse_rel"]) if row["status"] == "ok" else math.nan
+                lines.append({
+                    "problem": problem.title(), **kinds, "axis": axis.column if axis else "", "at": x if axis else math.nan,
+                    "method": name, "estimator": curve.label, "error": error, "low": low, "high": high,
+                    "verdict": verdict(row["status"], error, low, high), "status": row["status"],
+                    "remark": row["reason"], "bias_share": (row["bias_low"] / row["rmse"]) ** 2 if error > 0 else math.nan,
+                    "evaluations": (row["rollouts"] + row["gradients"]) / row["samples"],
+                    "time_s": min((t for t in curve.seconds.values() if t > 0), default=math.nan),
+                })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
+def verdict(status: str, error: float, low: float, high: float) -> str:
+    """Return the verdict on an error with its 95% interval. A missing number or interval is never a pass."""
+    if status != "ok":
+        return NO_RESULT
+    if not all(map(math.isfinite, (error, low))) or math.isnan(high):
+        return OPEN
+    return FAILS if low > 1 else WORKS if high < 1 else OPEN
+
+
+def ratio(first: Any, second: Any) -> tuple[float, float, float]:
+    """Return second over first with a 95% interval; each is a value with the ends of its own interval.
+
+    The interval combines the distances to the ends as independent errors of the logarithms: the method of variance
+    estimates recovery, Zou and Donner, Statistics in Medicine 27 (2008), equation 7 for log ratios.
+    """
+    (a, a_low, a_high), (b, b_low, b_high) = first, second
+    if not (a > 0 and b > 0):
+        return math.nan, math.nan, math.nan
+    with np.errstate(all="ignore"):
+        down = np.hypot(np.log(np.divide(b, b_low)), np.log(np.divide(a_high, a)))
+        up = np.hypot(np.log(np.divide(b_high, b)), np.log(np.divide(a, a_low)))
+    factor = b / a
+    return factor, float(factor * np.exp(-down)), float(factor * np.exp(up))
+
+
+def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per setting: the method of lowest error, the next estimator, their factor, and ties.
+
+    Methods whose error is not known, or whose interval is not, cannot be first. A method is tied with the first unless
+    the interval of their factor lies above 1.
+    """
+    lines = []
+    for key, part in methods.groupby(list(SETTING), sort=False, dropna=False):
+        good = part[np.isfinite(part["error"]) & np.isfinite(part["low"])].sort_values("error", kind="stable")
+        line: dict[str, Any] = dict(zip(SETTING, key, strict=True)) | {
+            "basis": EQUAL_SAMPLES, "first": "", "value": math.nan, "value_low": math.nan,
+            "value_high": math.nan, "second": "", "factor": math.nan, "factor_low": math.nan, "factor_high": math.nan,
+            "tied": (),
+        }  # fmt: skip
+        if len(good):
+            first, *others = (dict(row) for row in good.to_dict("records"))
+            factors = [(other, ratio(_interval(first), _interval(other))) for other in others]
+            line |= {"first": first["method"]} | dict(
+                zip(("value", "value_low", "value_high"), _interval(first), strict=True)
+            )
+            rivals = [item for item in factors if item[0]["estimator"] != first["estimator"]] or factors
+            if rivals:
+                line |= {"second": rivals[0][0]["method"]}
+                line |= dict(zip(("factor", "factor_low", "factor_high"), rivals[0][1], strict=True))
+            line["tied"] = tuple(other["method"] for other, (_, low, _) in factors if not low > 1)
+        lines.append(line)
+    return pd.DataFrame(lines, columns=[name for c in COLUMNS for name in (c.name, c.low, c.high) if name])
+
+
+def _interval(row: Any) -> tuple[float, float, float]:
+    return float(row["error"]), float(row["low"]), float(row["high"])
+
+
+def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> dict[tuple[Any, ...], list[str]]:
+    """Return, per setting, the estimators that are first or tied with the first; empty if no error is known."""
+    estimator = dict(zip(methods["method"], methods["estimator"], strict=True))
+    result = {}
+    for row in comparisons.to_dict("records"):
+        names = [name for name in (row["first"], *row["tied"]) if name]
+        result[setting_of(row)] = list(dict.fromkeys(estimator[name] for name in names))
+    return result
+
+
+def setting_of(row: Any) -> tuple[Any, ...]:
+    """Return the setting of a line; a missing value of the axis is None, so that settings can be compared."""
+    return tuple(None if isinstance(row[name], float) and math.isnan(row[name]) else row[name] for name in SETTING)
+
+
+def verdicts_by_estimator(methods: pd.DataFrame) -> pd.DataFrame:
+    """Return the number of settings per estimator and verdict; an estimator with several methods has the worst of them."""
+    order = [WORKS, OPEN, FAILS, NO_RESULT]
+    worst = methods.assign(rank=methods["verdict"].map(order.index)).groupby(
+        ["estimator", *SETTING], sort=False, dropna=False
+    )["rank"].max()  # fmt: skip
+    counts = worst.groupby(level="estimator", sort=False).value_counts().unstack(fill_value=0)
+    return counts.rename(columns=dict(enumerate(order))).reindex(columns=order, fill_value=0)
+
+
+def estimators(methods: pd.DataFrame) -> list[str]:
+    """Return the estimators in order of appearance."""
+    return list(dict.fromkeys(methods["estimator"]))
+
+
+def known(values: Iterable[float]) -> list[float]:
+    """Return the finite values."""
+    return [value for value in values if math.isfinite(value)]

@@ -1,0 +1,50 @@
+"""What the main study shows of its rows: comparisons with intervals, and the findings, tables and charts from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pandas as pd
+
+from bench.experiment.experiment import Experiment
+from bench.experiment.views import Views
+from bench.report.views import arrange
+from bench.studies.bias_variance import charts, reported, tables, time_to_accuracy
+from bench.studies.bias_variance.columns import COLUMNS
+from bench.studies.bias_variance.comparisons import compare_errors, method_table
+from bench.studies.bias_variance.costs import with_gradient_cost
+from bench.studies.bias_variance.findings import findings
+
+RESULTS = ("variance", "cosine", "rollouts", "gradients", "reference_method")
+
+
+def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
+    """Return findings, tables and charts of the rows."""
+    shown = arrange(experiment, with_gradient_cost(rows))
+    methods = method_table(shown)
+    if methods.empty:
+        text = "No cell was run: the table has the reason of each."
+        return Views(
+            [text], [replace(tables.every_cell(experiment, rows), files=["csv", "md"])], remarks=tables.remarks(rows)
+        )
+    swept = shown.swept()
+    longest = max(swept, key=lambda axis: swept[axis], default=None)
+    errors = compare_errors(methods)
+    best = time_to_accuracy.table(shown)
+    comparisons = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
+    texts = findings(methods, errors, shown.marks(longest) if longest else {})
+    texts = texts if best.empty else [time_to_accuracy.finding(best), *texts][:3]
+    made = tables.tables(experiment, rows, shown, methods, comparisons)
+    made += [] if best.empty else [time_to_accuracy.accuracy_table(best)]
+    return Views(
+        texts,
+        made,
+        charts.charts(shown, methods, errors, best, texts),
+        rows=charts.with_plotted_columns(shown.rows),
+        columns=[
+            replace(COLUMNS.by_name["time_s"], label="time"),
+            *(replace(c, label=label) for c, label in ((charts.BIAS, "rel. bias"), (charts.RMSE, "rel. RMSE"))),
+            *(COLUMNS.by_name[name] for name in RESULTS),
+        ],
+        remarks=[*tables.remarks(rows), *reported.sentences(rows)],
+    )

@@ -1,0 +1,232 @@
+"""Findings of the main study: computed a second way from the committed tables, and on planted rows."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from helpers import experiment, failed, row, table
+
+from bench.experiment import config
+from bench.report.views import arrange, newest_rows
+from bench.run.execute import store_of
+from bench.studies.bias_variance.comparisons import (
+    FAILS,
+    NO_RESULT,
+    OPEN,
+    WORKS,
+    compare_errors,
+    method_table,
+    ratio,
+    verdict,
+    verdicts_by_estimator,
+)
+from bench.studies.bias_variance.findings import findings, recommended
+
+STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
+MAIN = [
+    path.parent.name for path in sorted(STANDARD.glob("*/bias_variance.csv")) if (path.parent / "rows.parquet").exists()
+]
+
+
+def shown(name):
+    """The arranged rows of a standard experiment."""
+    given = config.load([f"experiment={name}", f"results_dir={STANDARD}"])
+    return arrange(given, newest_rows(store_of(given).load()))
+
+
+def cell(error, low, high, **values):
+    """A row whose relative RMSE has exactly this interval, with bias 0."""
+    norm = 4.0
+    made = row(**values)
+    return made | {
+        "bias": 0.0, "bias_low": 0.0, "bias_high": 0.0, "rmse_rel": error, "rmse": norm * error, "variance": (norm * error) ** 2,
+        "variance_low": (norm * low) ** 2, "variance_high": (norm * high) ** 2,
+    }  # fmt: skip
+
+
+def made(*cells, **given):
+    """Methods, comparisons and findings of cells along the stiffness."""
+    rows = table(list(cells))
+    found = arrange(
+        experiment(**({"sweep": {"stiffness": sorted(map(float, rows["stiffness"].unique()))}} | given)), rows
+    )
+    methods = method_table(found)
+    compared = compare_errors(methods)
+    return methods, compared, findings(methods, compared, {"limit": 6400.0})
+
+
+# ------------------------------------------------------------------------------------ verdicts and comparisons
+
+
+@pytest.mark.parametrize(
+    ("status", "error", "low", "high", "expected"),
+    [
+        ("ok", 0.5, 0.4, 0.6, WORKS), ("ok", 1.3, 0.65, 2.4, OPEN), ("ok", 0.71, 0.42, 4.0, OPEN), ("ok", 2.0, 1.5, 3.0, FAILS),
+        ("ok", math.nan, math.nan, math.nan, OPEN), ("ok", 0.5, math.nan, math.nan, OPEN), ("ok", 2.0, 1.5, math.inf, FAILS),
+        ("ok", 0.5, 0.1, math.inf, OPEN), ("nonfinite", math.nan, math.nan, math.nan, NO_RESULT),
+    ],
+)  # fmt: skip
+def test_a_verdict_needs_the_whole_interval(status, error, low, high, expected):
+    assert verdict(status, error, low, high) == expected
+
+
+def test_the_interval_of_a_factor_covers():
+    """Two errors with lognormal noise: the interval of their ratio contains the truth in at least 95% of draws."""
+    generator = np.random.default_rng(0)
+    widths, hits = (0.2, 0.05), 0
+    for _ in range(2000):
+        a, b = (m * math.exp(w * z) for m, w, z in zip((1.0, 3.0), widths, generator.standard_normal(2), strict=True))
+        ends = [(v, v * math.exp(-1.96 * w), v * math.exp(1.96 * w)) for v, w in zip((a, b), widths, strict=True)]
+        _, low, high = ratio(*ends)
+        hits += low <= 3.0 <= high
+    assert 0.94 <= hits / 2000 <= 0.96
+
+
+def test_methods_are_tied_unless_the_interval_of_their_factor_is_above_1():
+    _, compared, texts = made(
+        *(cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator=n) for k in (1e2, 1e4)
+          for n, e in (("fobg", 0.10), ("reinforce", 0.105), ("finite_difference", 0.4)))
+    )  # fmt: skip
+    assert list(compared["first"]) == ["fobg", "fobg"]
+    assert list(compared["tied"]) == [("reinforce",)] * 2
+    assert (compared["factor_low"] < 1).all()
+    assert "ties for the lowest error" in texts[0]
+
+
+def test_a_missing_interval_cannot_be_first_and_an_unresolved_reference_is_open():
+    methods, compared, texts = made(
+        *(cell(0.05, math.nan, math.nan, stiffness=k, estimator="fobg") for k in (1e2, 1e4)),
+        *(cell(0.3, 0.2, 0.4, stiffness=k, estimator="reinforce") for k in (1e2, 1e4)),
+    )
+    assert set(methods.loc[methods["estimator"] == "fobg", "verdict"]) == {OPEN}
+    assert list(compared["first"]) == ["reinforce", "reinforce"]
+    assert texts[0].startswith("Use reinforce everywhere")
+    assert "1 is open" in texts[-1]
+
+
+def test_nan_errors_are_never_a_pass():
+    """An unresolved reference leaves no error: nothing may be said to be better than zero."""
+    methods, compared, texts = made(
+        *(row(stiffness=k) | {"rmse_rel": math.nan, "reference_norm": 0.0} for k in (1e2, 1e4)),
+    )
+    assert set(methods["verdict"]) == {OPEN}
+    assert (compared["first"] == "").all()
+    assert texts == ["No cell has an error that could be compared: the table has the reason of each."]
+
+
+def test_a_failed_cell_fails_its_estimator_and_a_refused_one_does_not():
+    methods, _, texts = made(
+        *(cell(0.1, 0.09, 0.11, stiffness=k) for k in (1e2, 1e4)),
+        cell(0.3, 0.2, 0.4, stiffness=1e2, estimator="reinforce"),
+        failed("nonfinite", "1 of 32 estimates are not finite", stiffness=1e4, estimator="reinforce"),
+        failed("unsupported", "it cannot", stiffness=1e2, estimator="finite_difference"),
+    )
+    counts = verdicts_by_estimator(methods)
+    assert counts.loc["reinforce", NO_RESULT] == 1
+    assert counts.loc["fobg", WORKS] == 2
+    assert "finite_difference" not in counts.index
+    assert "1 of 2 estimators fails at some setting, 1 works at every setting (fobg)" in texts[-1]
+
+
+# ---------------------------------------------------------------------------------------------------- sentences
+
+
+def stiff(contact, stiffness):
+    return 90.0 if contact == "penalty" and stiffness > 6400 else 0.1
+
+
+def test_the_recommendation_comes_first_then_the_failure_then_what_removes_it():
+    cells = [
+        cell(e := error(contact, k), 0.9 * e, 1.1 * e, stiffness=k, contact=contact, estimator=name)
+        for name, error in (("fobg", stiff), ("randomized_smoothing", lambda *_: 0.5))
+        for contact in ("penalty", "complementarity")
+        for k in (10.0, 1e3, 1e4, 1e5)
+    ]
+    texts = made(*cells)[2]
+    assert texts == [
+        "Use fobg up to stiffness 1000 with penalty and at every stiffness with complementarity: it has the lowest error "
+        "(relative RMSE 0.10).",
+        "fobg fails beyond the limit (stiffness 6400) with penalty: its error is at least 81 times the gradient, where "
+        "randomized_smoothing is usable (0.50).",
+        "With complementarity fobg does not fail there (0.10).",
+    ]
+
+
+def test_an_interval_around_1_is_no_failure():
+    texts = made(*(cell(1.3, 0.65, 2.4, stiffness=k) for k in (1e2, 1e4)))[2]
+    assert not any("fobg fails" in text or "better than zero" in text for text in texts)
+    assert texts[0].startswith("No estimator is certain to be better than the zero estimate")
+
+
+def test_without_an_axis_the_worst_case_is_ranked():
+    cells = [
+        cell(e, 0.9 * e, 1.1 * e, estimator=name, scene=scene)
+        for name, errors in (("fobg", (0.01, 0.01, 50.0)), ("reinforce", (0.3, 0.4, 0.5)))
+        for scene, e in zip(("pendulum", "cartpole", "pushing"), errors, strict=True)
+    ]
+    texts = made(*cells, sweep={})[2]
+    assert texts[0] == "reinforce has the lowest worst case on the 3 problems: 0.30 to 0.50."
+    assert "fobg is best or tied on pendulum, penalty, and cartpole, penalty (0.010)" in texts[1]
+    assert "fails on pushing, penalty (at least 45 times the gradient)" in texts[1]
+    assert texts[2] == "1 of 2 estimators fails at some setting, 1 works at every setting (reinforce)."
+
+
+# ------------------------------------------------------------------------- a second way, from the committed rows
+
+
+@pytest.mark.parametrize("name", MAIN)
+def test_findings_of_standard_results_follow_from_the_csv(name):
+    """Verdicts, winners and the numbers of the first two sentences, from bias and variance by plain loops."""
+    arranged = shown(name)
+    methods = method_table(arranged)
+    compared = compare_errors(methods)
+    rows = arranged.rows
+    for line in methods[methods["status"] == "ok"].to_dict("records"):
+        match = rows[(rows["rmse_rel"] == line["error"]) & (rows["status"] == "ok")]
+        if rows["seed"].nunique() > 1 or match.empty:
+            continue
+        one = match.iloc[0]
+        low = math.hypot(one["bias_low"], math.sqrt(one["variance_low"])) / one["reference_norm"]
+        high = math.hypot(one["bias_high"], math.sqrt(one["variance_high"])) / one["reference_norm"]
+        expected = FAILS if low > 1 else WORKS if high < 1 else OPEN
+        assert line["verdict"] == expected, line
+    for place in compared.to_dict("records"):
+        part = methods[(methods["problem"] == place["problem"]) & (methods["axis"] == place["axis"])]
+        part = part[part["at"].isna() if math.isnan(place["at"]) else part["at"] == place["at"]]
+        known = part[np.isfinite(part["error"]) & np.isfinite(part["low"])]
+        assert (place["value"] == known["error"].min()) if len(known) else place["first"] == ""
+    swept = arranged.swept()
+    longest = max(swept, key=lambda axis: swept[axis], default=None)
+    texts = findings(methods, compared, arranged.marks(longest) if longest else {})
+    assert 1 <= len(texts) <= 3
+    main = recommended(methods, compared)
+    errors = methods.loc[methods["error"].notna(), "error"]
+    numbers = re.findall(r"(?:RMSE|:|\() ?(\d[\d.e-]*) to (\d[\d.e-]*)", texts[0])
+    for pair in numbers:
+        for text in pair:
+            assert np.isclose(errors, float(text.rstrip(".")), rtol=0.06).any(), (text, texts[0])
+    if f"{main} fails" in texts[1 % len(texts)]:
+        least = float(re.search(r"at least ([\d.e+]+) times", texts[1])[1])
+        failing = methods[(methods["estimator"] == main) & (methods["verdict"] == FAILS)]
+        assert failing["low"].min() == pytest.approx(least, rel=0.06)
+        assert least > 1
+
+
+@pytest.mark.parametrize("path", sorted(STANDARD.glob("*/findings.json")), ids=lambda path: path.parent.name)
+def test_stored_findings_are_short_and_their_chart_exists(path):
+    found = json.loads(path.read_text())
+    assert set(found) == {"experiment", "question", "findings", "chart"}
+    assert 1 <= len(found["findings"]) <= 3
+    assert all(text.endswith(".") and ";" not in text for text in found["findings"])
+    assert not found["chart"] or (path.parent / f"{found['chart']}.png").exists()
+
+
+def test_there_are_standard_results():
+    assert len(MAIN) >= 6
+    assert pd.Series(MAIN).is_unique
