@@ -14,18 +14,9 @@ import pandas as pd
 
 from bench.errors import UserError
 from bench.report.text import counted
+from bench.report.web import shell
 from bench.run.files import write_whole
 
-STYLE = """
-:root { color-scheme: light dark; }
-body { font: 16px/1.45 system-ui, sans-serif; max-width: 72rem; margin: 0 auto; padding: 0 1rem 3rem; }
-article { border-top: 1px solid #8888; padding: .8rem 0; }
-h2 { margin: 0; font-size: 1.1rem; }
-p { margin: .2rem 0; max-width: 60rem; }
-.state { font-variant-numeric: tabular-nums; }
-.bad { color: #d55e00; font-weight: 600; }
-.soft { opacity: .75; font-size: .9rem; }
-"""
 GOOD = ("ok", "unsupported", "unavailable")
 """Statuses that do not count as failures: the cell has a result, or was refused with a reason."""
 
@@ -44,14 +35,11 @@ def write(folder: Path) -> Path:
         raise UserError(f"'{folder}' has no experiments: no rows.parquet and no run.json below it")
     articles = "\n".join(_article(folder, place) for place in places)
     title = f"Results in {folder.name or folder.resolve().name}"
-    policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-    text = (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
-        f"<title>{html.escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<h1>{html.escape(title)}</h1>\n"
-        f"<p>{counted(len(places), 'experiment')}.</p>\n{articles}\n</body>\n</html>\n"
+    body = (
+        f"<header><h1>{html.escape(title)}</h1><p>{counted(len(places), 'experiment')}.</p></header>\n"
+        f"<main>\n{articles}\n</main>"
     )
+    text = shell.document(title, body)
     path = folder / "index.html"
     write_whole(path, text.encode())
     return path

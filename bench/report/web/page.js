@@ -706,14 +706,6 @@ function fitCharts() {
 
 // --------------------------------------------------------------------------------------------------------- start
 
-/* Plotly's script out of the page: base64 of gzip. */
-async function inflated(id) {
-  const letters = atob(document.getElementById(id).textContent);
-  const bytes = new Uint8Array(letters.length);
-  for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
-  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
-}
-
 /* When the charts in sight are drawn. */
 async function settled() {
   do await new Promise(requestAnimationFrame); while (charts.some((chart) => chart.near && chart.dirty));
@@ -726,11 +718,6 @@ async function start() {
   if (location.hash) fromAddress();
   else refresh();
   buildCharts();
-  if (!window.DecompressionStream) {
-    document.getElementById("charts").prepend(element("p", { textContent: "Charts need a browser of 2023 or later." }));
-    return;
-  }
-  document.head.append(element("script", { textContent: await inflated("plotly") }));
   markDirty();
   await settled();
   document.documentElement.dataset.loaded = performance.now().toFixed(0);
