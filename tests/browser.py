@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +24,9 @@ class Page:
         self.requests: list[str] = []
         """Addresses the page requested from outside its own folder."""
         page.on("pageerror", lambda error: self.said.append(str(error)))
-        page.on("console", lambda message: message.type in ("error", "warning", "assert") and self.said.append(message.text))
+        page.on(
+            "console", lambda message: message.type in ("error", "warning", "assert") and self.said.append(message.text)
+        )
         page.on("request", lambda request: self._note(request.url))
 
     def _note(self, address: str) -> None:
@@ -35,15 +38,18 @@ class Page:
         return self.page.evaluate(script)
 
     def wait(self, condition: str, seconds: float = 60.0) -> None:
-        """Wait until a JavaScript condition is true; raises a timeout error after ``seconds``."""
-        self.page.wait_for_function(condition, timeout=1000 * seconds)
+        """Wait until a JavaScript condition is true; raises AssertionError after ``seconds``."""
+        # not Playwright's wait_for_function, which the pages' security policy forbids
+        end = time.monotonic() + seconds
+        while not self.do(condition):
+            assert time.monotonic() < end, f"not within {seconds} s: {condition}; messages of the page: {self.said}"
+            self.page.wait_for_timeout(50)
 
     def open(self, path: Path) -> None:
         """Open a file and wait until it is loaded and, on the page of an experiment, its visible charts are drawn."""
         self.said.clear()
         self.page.goto(path.resolve().as_uri())
-        if self.do("typeof settled === 'function'"):
-            self.wait("document.documentElement.dataset.loaded")
+        self.do("typeof settled === 'function' && settled()")
 
     def size(self, width: int, height: int, dark: bool = False) -> None:
         """Set the size of the window in pixels, and whether the system prefers a dark theme."""

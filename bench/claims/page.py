@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from html import escape
 from pathlib import Path
@@ -16,6 +17,7 @@ from bench.report.web import shell
 from bench.run.files import write_all
 
 TITLE = "Published claims, run again"
+QUESTION = "Which published results on gradients through simulators are reproduced?"
 NUMBERS = ("published", "measured (95%)", "would fail at")
 """Columns of the figures that are aligned to the right."""
 LOOKS = {REPRODUCED: "good", RESERVED: "reserved"}
@@ -32,6 +34,16 @@ def write(directory: Path, results: Results) -> list[Path]:
             "claims.csv": csv(tables.figures_table(results)),
             "claims.tex": tables.latex(results),
             "claims.html": page(results, charts),
+            "findings.json": json.dumps(
+                {
+                    "experiment": "claims",
+                    "question": QUESTION,
+                    "findings": [f"{counted(len(results), 'published claim')}: {tables.count_verdicts(results)}."],
+                    "chart": next(iter(charts), ""),
+                },
+                indent=1,
+            )
+            + "\n",
         },
     )
     return [*charts.values(), *paths]

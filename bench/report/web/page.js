@@ -7,6 +7,7 @@
 
 const page = JSON.parse(document.getElementById("data").textContent);
 const rowCount = size("rows");
+const SMALL = 12; // size of the smallest text in a chart [px]
 const PANELS = 4; // most panels of a chart that are drawn at once
 const FIRST = 60, MORE = 240; // rows of the table at first, and with every "Show more"
 const GLYPHS = {
@@ -275,7 +276,36 @@ function dark() {
 
 const LOST = { colour: ["#757575", "#9a9a9a"], symbol: "circle", dash: "solid" };
 const looks = (name) => page.looks[name] || LOST;
-const colour = (name) => looks(name).colour[dark() ? 1 : 0];
+const filling = (name) => looks(name).colour[dark() ? 1 : 0];
+const GROUND = ["#ffffff", "#14171a"], INK = ["#16191d", "#e9ecef"];
+const MARK = 3, TEXT = 4.5; // contrasts that WCAG level AA asks for
+const ground = () => GROUND[dark() ? 1 : 0];
+const ink = () => INK[dark() ? 1 : 0];
+const colour = (name) => readable(filling(name), MARK);
+
+const channels = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
+
+function mixed(from, to, share) {
+  const end = channels(to);
+  return "#" + channels(from).map((part, k) => Math.round(part + share * (end[k] - part)).toString(16).padStart(2, "0")).join("");
+}
+
+/* The contrast of two colours, from 1 to 21, by WCAG 2. */
+function contrast(one, other) {
+  const [a, b] = [one, other].map((hex) => channels(hex).map((part) => part / 255)
+    .map((part) => (part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4))
+    .reduce((sum, part, k) => sum + [0.2126, 0.7152, 0.0722][k] * part, 0.05));
+  return Math.max(a / b, b / a);
+}
+
+/* The colour, mixed with the colour of text as far as needed for a contrast with the page. */
+function readable(hex, least) {
+  for (let share = 0; share < 1; share += 0.05) {
+    const found = mixed(hex, ink(), share);
+    if (contrast(found, ground()) >= least) return found;
+  }
+  return ink();
+}
 
 function drawChart(chart) {
   if (!window.Plotly) return;
@@ -305,6 +335,7 @@ function drawChart(chart) {
     }
     const [title, plot] = chart.panels.children[k].children;
     title.textContent = name;
+    title.hidden = !name;
     const [traces, layout] = chart.level ? mapFigure(chart, facets.get(name)) : pointFigure(chart, facets.get(name), range);
     Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true });
     plot.removeAllListeners("plotly_click");
@@ -323,16 +354,13 @@ function drawLegend(chart, panels) {
   chart.legend.replaceChildren(...(chart.share ? [] : ordered).map((name) => {
     const look = looks(name);
     const mark = element("b", { textContent: chart.level ? look.letter || " " : GLYPHS[look.symbol] });
-    if (chart.level) { mark.className = "level"; mark.style.background = colour(name); mark.style.color = inkOn(colour(name)); }
+    if (chart.level) { mark.className = "level"; mark.style.background = filling(name); mark.style.color = inkOn(filling(name)); }
     else mark.style.color = colour(name);
     return element("li", {}, mark, " " + (look.meaning || name));
   }));
 }
 
-const inkOn = (ground) => {
-  const [r, g, b] = [1, 3, 5].map((k) => parseInt(ground.slice(k, k + 2), 16));
-  return 0.3 * r + 0.59 * g + 0.11 * b > 130 ? "#000000" : "#ffffff";
-};
+const inkOn = (hex) => (contrast(hex, "#000000") > contrast(hex, "#ffffff") ? "#000000" : "#ffffff");
 
 /* The points to draw: panels by name, each with the points of a line or series, and all its points by front. */
 function pointPanels(chart) {
@@ -368,7 +396,7 @@ function ranges(chart, panels) {
     if (!values.length) return undefined;
     const scaled = axis.log ? values.map(Math.log10) : values;
     const [first, last] = [scaled.reduce((a, b) => Math.min(a, b)), scaled.reduce((a, b) => Math.max(a, b))];
-    const margin = Math.max(0.05 * (last - first), axis.log ? 0.08 : 1e-9);
+    const margin = Math.max(0.08 * (last - first), axis.log ? 0.08 : 1e-9);
     return [first - margin, last + margin];
   };
   const points = panels.flatMap((panel) => [...panel.lines.values()].flat());
@@ -383,18 +411,17 @@ function pointFigure(chart, panel, range) {
   if (chart.front) traces.push(...frontTraces(panel));
   const chosen = [...panel.lines.values()].flat().filter((point) => point.row === state.selected);
   if (chosen.length) traces.push(rings(chosen, 17, 3, colour("")));
-  const ink = dark() ? "#e9ecef" : "#16191d";
   const shapes = [], annotations = [];
   if (range.y && chart.yAxis.log && chart.yAxis.above_one && range.y[1] > 0) {
     shapes.push({ type: "rect", xref: "paper", x0: 0, x1: 1, y0: 1, y1: 10 ** range.y[1], layer: "below",
       fillcolor: dark() ? "#ffffff14" : "#00000010", line: { width: 0 } });
-    annotations.push({ xref: "paper", x: 0.01, yref: "paper", y: 1, yanchor: "top", xanchor: "left", showarrow: false,
-      text: chart.yAxis.above_one, font: { size: 10 } });
+    annotations.push({ xref: "paper", x: 0.01, y: Math.max(0, range.y[0]), yanchor: "bottom", xanchor: "left", showarrow: false,
+      text: chart.yAxis.above_one, font: { size: SMALL } });
   }
   for (const [name, value] of Object.entries(chart.marks)) {
-    shapes.push({ type: "line", x0: value, x1: value, yref: "paper", y0: 0, y1: 1, line: { dash: "dash", width: 1, color: ink } });
+    shapes.push({ type: "line", x0: value, x1: value, yref: "paper", y0: 0, y1: 1, line: { dash: "dash", width: 1, color: ink() } });
     annotations.push({ x: chart.xAxis.log ? Math.log10(value) : value, yref: "paper", y: 1, yanchor: "bottom",
-      text: plotted(name), showarrow: false, font: { size: 10 } });
+      text: plotted(name), showarrow: false, font: { size: SMALL } });
   }
   annotations.push(...backendNames(chart, panel, joined, range));
   return [traces, { ...frame(chart.xAxis, chart.yAxis, range), shapes, annotations }];
@@ -417,26 +444,27 @@ function backendNames(chart, panel, joined, range) {
     const [x, y, name] = [scaled(p.x, chart.xAxis), scaled(p.y, chart.yAxis), read(p.row)];
     const place = names.find((one) => near(one.x, x, range.x, 0.12) && near(one.y, y, range.y, 0.07));
     if (place) place.told.add(name);
-    else names.push({ x, y, told: new Set([name]), color: colour(p.series) });
+    else names.push({ x, y, told: new Set([name]), color: readable(filling(p.series), TEXT) });
   }
   return names.map(({ x, y, told: here, color }) => ({ x, y, xanchor: "left", xshift: 4, yanchor: "bottom",
-    showarrow: false, text: plotted([...here].join(", ")), font: { size: 9, color } }));
+    showarrow: false, text: plotted([...here].join(", ")), font: { size: SMALL, color } }));
 }
 
 function trace(chart, points, joined) {
   const look = looks(points[0].series);
-  const ink = colour(points[0].series);
+  const own = colour(points[0].series);
   const symbol = points.some((p) => p.limit) ? points.map((p) => look.symbol + (p.limit ? "-open" : "")) : look.symbol;
   const made = {
     type: "scatter", mode: joined ? "lines+markers" : "markers", x: points.map((p) => p.x), y: points.map((p) => p.y),
     customdata: points.map((p) => p.row), text: points.map((p) => hover(chart, p)), hovertemplate: "%{text}<extra></extra>",
-    marker: { color: ink, symbol, size: points.length > 500 ? 6 : 8 }, line: { color: ink, dash: look.dash, width: 1.5 },
-    opacity: joined ? 1 : 0.85,
+    marker: { color: own, symbol, size: points.length > 500 ? 6 : 8,
+      ...(joined ? {} : { line: { color: ground(), width: 1 } }) }, // an outline separates points that overlap
+    line: { color: own, dash: look.dash, width: 1.5 },
   };
   if (joined && chart.yAxis.high) {
     const bar = (p, end) => (p.limit || p[end] === null ? 0 : Math.abs(p[end] - p.y));
     made.error_y = { type: "data", array: points.map((p) => bar(p, "high")), arrayminus: points.map((p) => bar(p, "low")),
-      color: ink, thickness: 1, width: 0 };
+      color: own, thickness: 1, width: 0 };
   }
   return made;
 }
@@ -454,9 +482,9 @@ function hover(chart, point) {
     `${plotted(yAxis.label)}: ${point.limit ? "&lt; " : ""}${number(point.y)}${interval}`].join("<br>");
 }
 
-function rings(points, size, width, ink) {
+function rings(points, size, width, color) {
   return { type: "scatter", mode: "markers", x: points.map((p) => p.x), y: points.map((p) => p.y), hoverinfo: "skip",
-    marker: { symbol: "circle-open", size, color: ink, line: { width } } };
+    marker: { symbol: "circle-open", size, color, line: { width } } };
 }
 
 /* Per problem, the points that no other beats in both coordinates; joined where there are few problems. */
@@ -480,7 +508,7 @@ function frame(x, y, range) {
     title: { text: plotted(axis.label), standoff: 6 }, type: axis.log ? "log" : "linear", range: limits, automargin: true,
     gridcolor: dark() ? "#363c43" : "#e3e6e9", zeroline: false, ...ticks(axis, limits),
   });
-  return { ...ground(), xaxis: style(x, range.x), yaxis: style(y, range.y) };
+  return { ...layout(), xaxis: style(x, range.x), yaxis: style(y, range.y) };
 }
 
 /* Ticks of a log axis: whole decades, or 1, 2 and 5 of each if there are few. */
@@ -497,10 +525,10 @@ function ticks(axis, limits) {
   return { tickvals, ticktext };
 }
 
-function ground() {
+function layout() {
   return {
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", showlegend: false, margin: { l: 10, r: 14, t: 18, b: 10 },
-    font: { family: "system-ui, sans-serif", size: 12, color: dark() ? "#e9ecef" : "#16191d" }, hovermode: "closest",
+    font: { family: "system-ui, sans-serif", size: SMALL, color: ink() }, hovermode: "closest",
     dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom", hoverlabel: { align: "left" },
   };
 }
@@ -525,6 +553,8 @@ function mapPanels(chart) {
   return panels;
 }
 
+const SHARE = "#0072B2";
+
 function mapFigure(chart, panel) {
   const names = Object.keys(page.looks);
   const order = (values) => [...values].sort((a, b) => a - b || (a < b ? -1 : 1));
@@ -536,20 +566,27 @@ function mapFigure(chart, panel) {
   const worst = (found) => found.reduce((a, b) => (names.indexOf(b.level) > names.indexOf(a.level) ? b : a));
   const share = (found) => found.filter((one) => one.level === chart.share).length / found.length;
   const k = names.length;
-  const scale = chart.share ? [[0, dark() ? "#14171a" : "#ffffff"], [1, "#0072B2"]]
-    : names.flatMap((name, n) => [[n / k, colour(name)], [(n + 1) / k, colour(name)]]);
+  const scale = chart.share ? [[0, ground()], [1, SHARE]]
+    : names.flatMap((name, n) => [[n / k, filling(name)], [(n + 1) / k, filling(name)]]);
+  const fill = (found) => (chart.share ? mixed(ground(), SHARE, share(found)) : filling(worst(found).level));
   const text = (found) => (chart.share ? Math.round(100 * share(found)) + "%" : looks(worst(found).level).letter || "");
   const label = (found, x, y) => [`<b>${plotted(chart.share ? text(found) : worst(found).level)}</b>`,
     `${plotted(chart.xAxis.label)} ${plotted(x)}`, `${plotted(chart.yAxis.label)} ${plotted(y)}`,
     chart.share ? `${found.length} cells` : plotted(reader("rows", "reason")(worst(found).row) || "")].join("<br>");
   const made = {
     type: "heatmap", x: xs.map(plotted), y: ys.map(plotted), z: grid((found) => (chart.share ? share(found) : names.indexOf(worst(found).level))),
-    text: grid(text), texttemplate: "%{text}", customdata: grid((found) => (chart.share ? null : worst(found).row)),
+    customdata: grid((found) => (chart.share ? null : worst(found).row)),
     hovertext: grid(label), hovertemplate: "%{hovertext}<extra></extra>", colorscale: scale, showscale: false, xgap: 1, ygap: 1,
     zmin: chart.share ? 0 : -0.5, zmax: chart.share ? 1 : k - 0.5,
   };
+  // not the heat map's own text, whose colour has too little contrast on some cells
+  const filled = ys.flatMap((y) => xs.map((x) => [x, y, panel.places.get(JSON.stringify([x, y]))])).filter(([, , found]) => found);
+  const letters = {
+    type: "scatter", mode: "text", x: filled.map(([x]) => plotted(x)), y: filled.map(([, y]) => plotted(y)), hoverinfo: "skip",
+    text: filled.map(([, , found]) => text(found)), textfont: { color: filled.map(([, , found]) => inkOn(fill(found))) },
+  };
   const axis = (from) => ({ title: { text: plotted(from.label), standoff: 6 }, type: "category", automargin: true, showgrid: false });
-  return [[made], { ...ground(), xaxis: axis(chart.xAxis), yaxis: axis(chart.yAxis) }];
+  return [[made, letters], { ...layout(), xaxis: axis(chart.xAxis), yaxis: axis(chart.yAxis) }];
 }
 
 // -------------------------------------------------------------------------------------------------------- table
@@ -706,9 +743,10 @@ function fitCharts() {
 
 // --------------------------------------------------------------------------------------------------------- start
 
-/* When the charts in sight are drawn. */
+/* When the charts in sight are drawn; until the browser has said which these are, near is undefined. */
 async function settled() {
-  do await new Promise(requestAnimationFrame); while (charts.some((chart) => chart.near && chart.dirty));
+  do await new Promise(requestAnimationFrame);
+  while (charts.some((chart) => chart.near === undefined || (chart.near && chart.dirty)));
 }
 
 async function start() {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from html import escape
@@ -60,7 +61,7 @@ def table(frame: pd.DataFrame, numbers: Collection[str] = (), marked: Mapping[st
     lines = []
     for row in frame.astype(str).to_numpy():
         cells = (
-            f"<td{_class(classes.get(text) or ('number' if name in numbers else ''))}>{escape(text)}</td>"
+            f"<td{_class(classes.get(text) or ('number' if name in numbers else ''))}>{_breakable(text)}</td>"
             for name, text in zip(frame, row, strict=True)
         )
         lines.append(f"<tr>{''.join(cells)}</tr>")
@@ -68,6 +69,11 @@ def table(frame: pd.DataFrame, numbers: Collection[str] = (), marked: Mapping[st
         f'<div class="scroll" tabindex="0"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{''.join(lines)}</tbody></table></div>"
     )
+
+
+def _breakable(text: str) -> str:
+    """Return a text as HTML that may also break after a comma without a space, as in the settings of a plugin."""
+    return re.sub(r",(?=\S)", ",<wbr>", escape(text))
 
 
 def picture(path: Path, description: str) -> str:
