@@ -22,6 +22,7 @@ from bench.experiment.study import Study
 from bench.model import registry
 from bench.report import reproduce, web
 from bench.report.web import document
+from bench.report.web.content import Chart, Content, PlotAxis, TableColumn
 from bench.run.store import Store
 from bench.studies.bias_variance import page as bias_variance_page
 from bench.studies.bias_variance.columns import COLUMNS
@@ -492,6 +493,62 @@ def test_hostile_names_are_shown_as_they_are_and_do_nothing(browser, tmp_path):
     assert all(name in texts for name in HOSTILE)
     assert browser.do("document.querySelectorAll('img, .panels b, td b').length") == 0
     assert browser.said == browser.requests == []
+
+
+def test_a_chart_may_have_names_on_its_axis_and_lines_of_no_cell(browser, tmp_path):
+    """Dots in the order of the table, joined, hollow only where limits; a shaded range; no cell to select or filter."""
+    frame = pd.DataFrame({
+        "name": ["zebra", "zebra", "<b>ant</b>", "<b>ant</b>"], "size": [1.0, 10.0, 2.0, 100.0], "low": [0.5, 5.0, 1.0, 50.0],
+        "high": [2.0, 20.0, 4.0, 200.0], "is_limit": [False, False, True, False], "kind": list("abab"), "row": -1,
+    })  # fmt: skip
+    chart = Chart(
+        "Sizes", "text", [PlotAxis("size", "size", low="low", high="high", limit="is_limit")], [PlotAxis("name", "", False)],
+        table="sizes", series="kind", join=True, marks={"large": [50.0, None], "one": 1.0},
+    )  # fmt: skip
+    rows = small_rows()
+    content = Content("It works", rows, [TableColumn("scene", "scene", "text")], [chart], tables={"sizes": frame})
+    path = tmp_path / "report.html"
+    path.write_text(document.assemble(experiment(), content, [["a=1"]] * len(rows), {}))
+    browser.open(path)
+    plot = "document.querySelector('.plot')"
+    assert browser.do(f"{plot}.data.filter((one) => one.text).map((one) => [one.x, one.error_x.array])") == [
+        [[1, 2], [1, 0]], [[10, 100], [10, 100]],
+    ]  # fmt: skip
+    assert browser.do(f"{plot}.data.filter((one) => one.text).flatMap((one) => one.marker.symbol)") == [
+        "circle", "circle-open", "circle",
+    ]  # fmt: skip
+    assert browser.do(f"{plot}.data.filter((one) => one.mode === 'lines').map((one) => one.x)") == [[1, 10], [2, 100]]
+    texts = browser.do(
+        f"[...{plot}.querySelectorAll('.ytick text')].map((one) => [one.textContent, one.getBoundingClientRect().top])"
+    )
+    assert [text for text, top in sorted(texts, key=lambda one: one[1])] == ["zebra", "<b>ant</b>"]
+    assert browser.do(f"{plot}.layout.shapes.map((one) => one.type).sort()") == ["line", "rect"]
+    assert browser.do(f"{plot}.layout.annotations.map((one) => one.text)") == ["large", "one"]
+    browser.do("state.find = 'nothing has this'; refresh(); settled()")
+    assert browser.do(f"{plot}.data.filter((one) => one.text).length") == 2
+    assert browser.said == []
+
+
+def test_cells_of_a_map_may_have_colours_and_texts_of_their_own(browser, tmp_path):
+    frame = pd.DataFrame({
+        "x": ["b", "a"] * 15, "y": [f"line {i // 2}" for i in range(30)], "fill": ["#ffffe5", "#662506"] * 15, "text": ["1.5", ">9"] * 15,
+        "row": -1,
+    })  # fmt: skip
+    chart = Chart(
+        "Map", "", [PlotAxis("x", "x", False)], [PlotAxis("y", "y", False)], table="map", fill="fill", cell="text"
+    )
+    rows = small_rows()
+    content = Content("It works", rows, [TableColumn("scene", "scene", "text")], [chart], tables={"map": frame})
+    path = tmp_path / "report.html"
+    path.write_text(document.assemble(experiment(), content, [["a=1"]] * len(rows), {}))
+    browser.open(path)
+    shown = browser.do(
+        "[...document.querySelectorAll('.plot .textpoint text')].map((one) => [one.textContent, getComputedStyle(one).fill])"
+    )
+    assert sorted(map(tuple, shown)) == [("1.5", "rgb(0, 0, 0)")] * 15 + [(">9", "rgb(255, 255, 255)")] * 15
+    assert browser.do("document.querySelector('.plot').data[0].x") == ["b", "a"]
+    assert browser.do("document.querySelector('.plot').getBoundingClientRect().height") == 60 + 24 * 15
+    assert browser.said == []
 
 
 @dataclass(frozen=True)

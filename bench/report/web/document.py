@@ -75,7 +75,17 @@ def data(content: Content, commands: Sequence[Sequence[str]]) -> dict[str, Any]:
         wanted.setdefault(chart.table, {"row"}).update(_columns_of(chart))
         wanted["rows"] |= _columns_of(chart)
     sources = {"rows": rows, **content.tables}
-    tables = {name: {c: column(sources[name][c]) for c in sources[name] if c in wanted[name]} for name in wanted}
+    flags = {c.flag for c in content.columns} | {
+        axis.limit for chart in content.charts for axis in (*chart.x, *chart.y)
+    }
+    tables = {
+        name: {
+            c: column(sources[name][c].astype(float) if c in flags else sources[name][c])
+            for c in sources[name]
+            if c in wanted[name]
+        }
+        for name in wanted
+    }
     longest = max(map(len, commands), default=0)
     words = [[line[i] if i < len(line) else "" for line in commands] for i in range(longest)]
     return {
@@ -103,7 +113,7 @@ def filtered(content: Content) -> list[str]:
 def _columns_of(chart: Chart) -> set[str]:
     axes: list[PlotAxis] = [*chart.x, *chart.y]
     names = {name for axis in axes for name in (axis.column, axis.low, axis.high, axis.limit)}
-    return names | {chart.series, chart.facet, chart.line, chart.front, chart.level}
+    return names | {chart.series, chart.facet, chart.line, chart.front, chart.level, chart.fill, chart.cell}
 
 
 def column(values: pd.Series) -> Any:
