@@ -102,6 +102,7 @@ def _article(claim: type[Claim], result: ClaimResult, chart: Path | None) -> str
     name = escape(claim.name)
     parts = [
         f"<h3>{name}: {_verdict(result)}</h3>",
+        shell.picture(chart, claim.statement) if chart else "",
         f"<p>{escape(claim.statement)} <cite>{escape(claim.source)}</cite></p>",
         f"<p><b>Learned:</b> {escape(claim.learned)}</p>",
     ]
@@ -111,7 +112,5 @@ def _article(claim: type[Claim], result: ClaimResult, chart: Path | None) -> str
         parts.append(shell.table(tables.readable_figures(result.figures), NUMBERS, {"NO": "bad"}))
     if sentence := tables.insensitive_text(result.figures):
         parts.append(f"<p>{escape(sentence)}.</p>")
-    if chart:
-        parts.append(shell.picture(chart, claim.statement))
     parts.append(f"<p><code>python -m bench claims {name}</code> ({duration(result.seconds)})</p>")
     return f'<article id="{name}" data-group="{escape(result.verdict)}">{"".join(parts)}</article>'

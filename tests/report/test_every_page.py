@@ -150,14 +150,16 @@ def test_letters_of_a_map_have_the_contrast_of_level_aa(browser, pages):
 
 def test_claims_are_filtered_by_verdict_and_a_link_to_a_hidden_one_shows_it(pages, browser):
     browser.open(pages["claims"])
-    shown = "[...document.querySelectorAll('article, main section, nav li li')].filter((one) => one.checkVisibility()).length"
-    assert browser.do(shown) == 3 + 2 + 3
+    shown = (
+        "[...document.querySelectorAll('article, main section, nav li')].filter((one) => one.checkVisibility()).length"
+    )
+    assert browser.do(shown) == 3 + 2 + 5
     browser.page.get_by_label("not reproduced").check()
-    assert browser.do(shown) == 1 + 1 + 1
+    assert browser.do(shown) == 1 + 1 + 2
     assert browser.do("document.getElementById('T2').checkVisibility()")
     browser.do("location.hash = '#T3'; new Promise((done) => setTimeout(done, 100))")
     assert browser.do("document.getElementById('T3').checkVisibility()")
-    assert browser.do(shown) == 8
+    assert browser.do(shown) == 10
     assert browser.do("document.querySelectorAll('p b + b, article p b').length") == 1 + 3, "only our own bold words"
 
 

@@ -248,7 +248,8 @@ def test_what_to_use_where_is_in_sight_as_a_whole_on_a_laptop(browser, tmp_path)
     """Long settings of estimators break; they pushed the last column out of sight."""
     path, long = tmp_path / "report.html", "delta=0.95,gamma=4,sharing=shared,samples=quasi_random,pilot=0.25"
     rows = [
-        row(stiffness=k, estimator=e, estimator_params=p, rmse_rel=error)
+        row(scene=scene, stiffness=k, estimator=e, estimator_params=p, rmse_rel=error)
+        for scene in "abcdefgh"
         for k in (1.0, 10.0)
         for e, p, error in (("randomized_smoothing", "", 0.1), ("alpha_order", long, 2.0), ("alpha_order", f"{long},ratio=3", 0.5), ("control_variate", "", 3.0))
     ]  # fmt: skip
@@ -257,7 +258,9 @@ def test_what_to_use_where_is_in_sight_as_a_whole_on_a_laptop(browser, tmp_path)
     browser.open(path)
     wider = "(b => b.scrollWidth - b.clientWidth)(document.querySelector('#answers .scroll'))"
     assert browser.do(wider) <= 0
-    assert browser.do("document.querySelectorAll('#answers tr').length") > 1
+    assert browser.do("document.querySelectorAll('#answers tr').length") > 8
+    higher = "(b => b.scrollHeight - b.clientHeight)(document.querySelector('#answers .scroll'))"
+    assert browser.do(higher) <= 0, "every row is visible without scrolling in a box"
     browser.size(*WIDE)
 
 

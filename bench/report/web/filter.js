@@ -1,5 +1,5 @@
 /* Radio buttons in [data-filter] choose which elements with [data-group] are shown: those of the chosen group, or all.
-   A section without any element left is hidden too. */
+   A section or an entry of the contents without any element left is hidden too. */
 "use strict";
 
 const filter = document.querySelector("[data-filter]");
@@ -8,7 +8,7 @@ const grouped = [...document.querySelectorAll("[data-group]")];
 function applyFilter() {
   const chosen = filter.querySelector("input:checked").value;
   for (const one of grouped) one.hidden = chosen !== "" && one.dataset.group !== chosen;
-  for (const section of document.querySelectorAll("main section")) {
+  for (const section of document.querySelectorAll("main section, .contents > li")) {
     const own = [...section.querySelectorAll("[data-group]")];
     section.hidden = own.length > 0 && own.every((one) => one.hidden);
   }
