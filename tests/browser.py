@@ -1,12 +1,8 @@
-"""Drives headless Chromium over its debugging protocol, to test the pages."""
+"""Drives the installed Chromium with Playwright, to test the pages. Nothing is downloaded."""
 
 from __future__ import annotations
 
-import base64
-import json
-import os
 import shutil
-import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,136 +10,82 @@ from pathlib import Path
 from typing import Any
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+MISSING = "no Chromium to open pages in: apt-get install chromium"
 
 
 class Page:
     """A page opened from disk without a network."""
 
-    def __init__(self, socket: Any) -> None:
-        self._socket = socket
-        self._count = 0
+    def __init__(self, page: Any) -> None:
+        self.page = page
+        """The page of Playwright."""
         self.said: list[str] = []
         """Errors and warnings: from the console, exceptions and the browser's own log."""
         self.requests: list[str] = []
-        """Addresses the page requested from outside its own file."""
-        for domain in ("Page", "Runtime", "Log", "Network"):
-            self.send(f"{domain}.enable")
-        offline = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
-        self.send("Network.emulateNetworkConditions", **offline)
+        """Addresses the page requested from outside its own folder."""
+        page.on("pageerror", lambda error: self.said.append(str(error)))
+        page.on(
+            "console", lambda message: message.type in ("error", "warning", "assert") and self.said.append(message.text)
+        )
+        page.on("request", lambda request: self._note(request.url))
 
-    def send(self, method: str, **params: Any) -> Any:
-        """Send a command of the protocol and return its result."""
-        self._count += 1
-        self._socket.send(json.dumps({"id": self._count, "method": method, "params": params}))
-        while True:
-            message = json.loads(self._socket.recv(timeout=60))
-            if message.get("id") == self._count:
-                assert "error" not in message, message
-                return message["result"]
-            self._hear(message)
-
-    def _hear(self, message: dict[str, Any]) -> None:
-        params = message.get("params", {})
-        if message.get("method") == "Runtime.exceptionThrown":
-            self.said.append(json.dumps(params["exceptionDetails"]))
-        if message.get("method") == "Runtime.consoleAPICalled" and params["type"] in ("error", "warning", "assert"):
-            self.said.append(json.dumps(params["args"]))
-        if message.get("method") == "Log.entryAdded" and params["entry"]["level"] in ("error", "warning"):
-            self.said.append(params["entry"]["text"])
-        if message.get("method") == "Network.requestWillBeSent":
-            address = params["request"]["url"]
-            if not address.startswith(("file:", "data:", "blob:")):
-                self.requests.append(address)
+    def _note(self, address: str) -> None:
+        if not address.startswith(("file:", "data:", "blob:", "about:")):
+            self.requests.append(address)
 
     def do(self, script: str) -> Any:
         """Evaluate a JavaScript expression in the page, await it, and return its value."""
-        answer = self.send("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
-        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
-        return answer["result"].get("value")
+        return self.page.evaluate(script)
 
-    def wait(self, condition: str, seconds: float = 60.0) -> Any:
-        """Wait until a JavaScript condition is true, and return its value; raises AssertionError after ``seconds``."""
+    def wait(self, condition: str, seconds: float = 60.0) -> None:
+        """Wait until a JavaScript condition is true; raises AssertionError after ``seconds``."""
+        # not Playwright's wait_for_function, which the pages' security policy forbids
         end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            value = self.do(condition)
-            if value:
-                return value
-            time.sleep(0.05)
-        raise AssertionError(f"not within {seconds} s: {condition}; messages of the page: {self.said}")
+        while not self.do(condition):
+            assert time.monotonic() < end, f"not within {seconds} s: {condition}; messages of the page: {self.said}"
+            self.page.wait_for_timeout(50)
 
     def open(self, path: Path) -> None:
-        """Open a file and wait until its visible charts are drawn."""
+        """Open a file and wait until it is loaded and, on the page of an experiment, its visible charts are drawn."""
         self.said.clear()
-        self.send("Page.navigate", url=path.resolve().as_uri())
-        self.wait("document.readyState === 'complete' && document.documentElement.dataset.loaded")
+        self.page.goto(path.resolve().as_uri())
+        self.do("typeof settled === 'function' && settled()")
 
     def size(self, width: int, height: int, dark: bool = False) -> None:
         """Set the size of the window in pixels, and whether the system prefers a dark theme."""
-        self.send(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
-        )
-        features = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-        self.send("Emulation.setEmulatedMedia", features=features)
+        self.page.set_viewport_size({"width": width, "height": height})
+        self.page.emulate_media(color_scheme="dark" if dark else "light", media="null")
 
     def press(self, key: str) -> None:
         """Press and release a key."""
-        codes = {"Tab": 9, "Enter": 13, "Escape": 27, "ArrowDown": 40, "ArrowUp": 38}
-        text = {"text": "\r"} if key == "Enter" else {}
-        for kind in ("keyDown", "keyUp"):
-            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=codes[key], **text)
+        self.page.keyboard.press(key)
 
     def click(self, x: float, y: float) -> None:
         """Click the left button at a position in the window, in pixels."""
-        self.send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-        for kind in ("mousePressed", "mouseReleased"):
-            self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+        self.page.mouse.click(x, y)
 
-    def picture(self, path: Path) -> None:
-        """Write a screenshot of the window as PNG."""
-        path.write_bytes(base64.b64decode(self.send("Page.captureScreenshot", format="png")["data"]))
+    def violations(self) -> list[str]:
+        """Return what axe-core finds against WCAG 2.2 AA and its best practices: rule, help and elements."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        found = Axe().run(self.page).response["violations"]
+        return [f"{one['id']}: {one['help']}: {[node['html'][:200] for node in one['nodes'][:5]]}" for one in found]
+
+    def overflow(self) -> float:
+        """Return by how many pixels the page is wider than its window."""
+        return float(self.do("document.documentElement.scrollWidth - document.documentElement.clientWidth"))
 
 
 @contextmanager
-def chromium(profile: Path) -> Iterator[Page]:
-    """Start a browser with an empty profile and yield its page."""
-    from websockets.sync.client import connect
+def chromium() -> Iterator[Page]:
+    """Start the installed browser with an empty profile and yield its page."""
+    from playwright.sync_api import sync_playwright
 
     assert CHROMIUM is not None
-    flags = [
-        "--headless=new",
-        "--remote-debugging-port=0",
-        f"--user-data-dir={profile}",
-        "--no-first-run",
-        "--disable-gpu",
-    ]
-    flags += ["--disable-background-networking", "--disable-dev-shm-usage", "--disable-component-update"]
-    flags += ["--no-sandbox"] if os.geteuid() == 0 else []
-    process = subprocess.Popen(
-        [CHROMIUM, *flags, "about:blank"],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        with connect(_address(profile), max_size=None) as socket:
-            yield Page(socket)
-    finally:
-        process.terminate()
-        process.wait(timeout=20)
-
-
-def _address(profile: Path) -> str:
-    """Return the WebSocket address of the browser's first page."""
-    from urllib.request import ProxyHandler, build_opener
-
-    end = time.monotonic() + 60
-    port_file = profile / "DevToolsActivePort"
-    while time.monotonic() < end:
-        if port_file.exists() and len(port_file.read_text().splitlines()) == 2:
-            port = port_file.read_text().splitlines()[0]
-            with build_opener(ProxyHandler({})).open(f"http://127.0.0.1:{port}/json/list", timeout=20) as answer:
-                pages = [page for page in json.load(answer) if page["type"] == "page"]
-            if pages:
-                return str(pages[0]["webSocketDebuggerUrl"])
-        time.sleep(0.05)
-    raise AssertionError("the browser does not answer")
+    with sync_playwright() as playwright:
+        flags = ["--disable-dev-shm-usage", "--disable-gpu", "--disable-component-update"]
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+        try:
+            yield Page(browser.new_context(offline=True).new_page())
+        finally:
+            browser.close()

@@ -3,6 +3,7 @@
 import os
 
 import pytest
+from browser import CHROMIUM, MISSING, chromium
 
 from bench.model import registry, trial
 
@@ -63,3 +64,12 @@ def remove_plugin_folders():
     if registry.folders() != before:
         registry._folders[:] = before
         registry.entries.cache_clear()
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Return a page of the installed Chromium, without a network."""
+    if CHROMIUM is None:
+        pytest.skip(MISSING)
+    with chromium() as page:
+        yield page

@@ -16,7 +16,7 @@ OPTIONS = ("--list", "--quick", "--again")
 
 def main(words: Sequence[str]) -> int:
     """Run the named claims, or all, and print verdicts. Returns 1 if a claim is not reproduced or its code fails."""
-    from bench.claims import discovery, results, tables
+    from bench.claims import discovery, page, results, tables
     from bench.experiment.words import parse_words
     from bench.report.text import counted
     from bench.run.files import make_directory
@@ -44,8 +44,9 @@ def main(words: Sequence[str]) -> int:
     # the page also shows stored results of claims that this command did not name
     shown = [(claim, result) for name, claim in claims.items() if (result := by_name[name]) is not None]
     if shown:
-        for path in tables.write(directory, shown)[-4:]:
-            print(f"  {path}")
+        for path in page.write(directory, shown):
+            if path.suffix != ".png":
+                print(f"  {path}")
         print(f"{counted(len(shown), 'claim')}: {tables.count_verdicts(shown)}")
     bad = (NOT_REPRODUCED, results.FAILED)
     return int(any(result.verdict in bad for claim, result in shown if claim in selected))

@@ -1,9 +1,8 @@
-"""Writes the results of claims: a chart per claim, one page, and tables in Markdown, CSV and LaTeX."""
+"""Writes the results of claims: a chart per claim, and tables in Markdown, CSV and LaTeX."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from html import escape
 from pathlib import Path
 from textwrap import fill
 
@@ -12,36 +11,14 @@ import pandas as pd
 from bench.claims.claim import VERDICTS, Claim, Figure
 from bench.claims.discovery import LESSONS
 from bench.claims.results import FAILED, ClaimResult
-from bench.report.tables import csv, escape_latex, escape_markdown, plain_markdown
+from bench.report.tables import escape_latex, escape_markdown, plain_markdown
 from bench.report.text import counted, duration, number
-from bench.run.files import write_all
 
 Results = Sequence[tuple[type[Claim], ClaimResult]]
 WIDE = 26
 """Length of the longest label [characters] for which a legend below a chart has two columns."""
 BOLD_WIDTH, SMALL_WIDTH = 48, 54
 """Characters of a bold and of a small line above a chart 3.5 inches wide."""
-CSS = """body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem;color:#222}
-table{border-collapse:collapse;font-size:14px;margin:.6rem 0}td,th{padding:.15rem .8rem .15rem 0;text-align:left}
-td:is(:nth-child(2),:nth-child(3),:nth-child(5)){text-align:right;font-variant-numeric:tabular-nums}
-th{border-bottom:1px solid #888}img{max-width:100%}
-.reproduced{color:#00664a}.reserved{color:#8a5a00}.bad{color:#b00020}code{background:#f2f2f2;padding:0 .2rem}
-section{margin-top:2.2rem}h3{margin:1.8rem 0 .2rem}p{margin:.3rem 0}.bad b{color:#b00020}"""
-
-
-def write(directory: Path, results: Results) -> list[Path]:
-    """Write charts, tables and the page of all results. Returns their paths, the charts first."""
-    charts = {claim.name: path for claim, result in results for path in chart(directory, claim, result)}
-    paths = write_all(
-        directory,
-        {
-            "claims.md": markdown(results),
-            "claims.csv": csv(figures_table(results)),
-            "claims.tex": latex(results),
-            "claims.html": page(results, charts),
-        },
-    )
-    return [*charts.values(), *paths]
 
 
 def chart(directory: Path, claim: type[Claim], result: ClaimResult) -> list[Path]:
@@ -190,43 +167,6 @@ def latex(results: Results) -> str:
         cells += [figure.what, figure.published, number(figure.measured, 4)] if figure else ["", "", ""]
         lines.append(" & ".join(map(escape_latex, [*cells, result.verdict])) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table*}", ""])
-
-
-def page(results: Results, charts: dict[str, Path]) -> str:
-    """Return the HTML page with lessons, claims, figures and embedded charts."""
-    import base64
-
-    body = [
-        f"<h1>Published claims, run again</h1><p>{counted(len(results), 'claim')}: {escape(count_verdicts(results))}.</p>"
-    ]
-    for lesson, summary, own in by_lesson(results):
-        body.append(f"<section><h2>{escape(lesson)}</h2><p>{escape(summary)}</p>")
-        for claim, result in own:
-            look = {VERDICTS[0]: "reproduced", VERDICTS[1]: "reserved"}.get(result.verdict, "bad")
-            body.append(
-                f'<h3 id="{escape(claim.name)}">{escape(claim.name)}: <span class="{look}">{escape(result.verdict)}</span></h3>'
-                f"<p>{escape(claim.statement)} <i>{escape(claim.source)}</i></p>"
-            )
-            if result.figures:
-                with pd.option_context("display.max_colwidth", None):  # else long texts would be cut
-                    table = readable_figures(result.figures).to_html(index=False, border=0, justify="left")
-                body.append(table.replace("<td>NO</td>", '<td class="bad">no</td>'))
-            if result.remark:
-                body.append(f"<p><b>Reservation:</b> {escape(result.remark)}</p>")
-            if sentence := insensitive_text(result.figures):
-                body.append(f"<p>{escape(sentence)}.</p>")
-            if claim.name in charts:
-                picture = base64.b64encode(charts[claim.name].read_bytes()).decode()
-                body.append(f'<img alt="{escape(claim.statement)}" src="data:image/png;base64,{picture}" width="525">')
-            body.append(
-                f"<p>{escape(claim.learned)}</p><p><code>python -m bench claims {escape(claim.name)}</code> "
-                f"({duration(result.seconds)})</p>"
-            )
-        body.append("</section>")
-    return (
-        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Published claims, run again</title>'
-        f"<style>{CSS}</style><body>{''.join(body)}</body></html>\n"
-    )
 
 
 def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> Iterator[str]:

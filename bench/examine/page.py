@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ from bench.examine.findings import Findings
 from bench.report.figures import save, styled
 from bench.report.style import GREY, MARKERS, PALETTE
 from bench.report.text import number
+from bench.report.web import shell
 from bench.run.files import make_directory, write_all, write_whole
 
 if TYPE_CHECKING:
@@ -23,29 +23,17 @@ WIDTH = 7.16
 """Width of two columns of a paper in inches."""
 SHOWN = 8
 """Most components drawn: those with the largest errors."""
-PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{title}</title>
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<style>
-body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }}
-h1 {{ font-size: 1.4rem; margin-bottom: .3rem; }} h2 {{ font-size: 1.1rem; margin-top: 2rem; }}
-.verdict {{ padding: .6rem .9rem; border-left: 5px solid {colour}; background: #f6f6f6; }}
-pre {{ overflow-x: auto; background: #f6f6f6; padding: .8rem; font-size: 12.5px; }}
-.sentence {{ white-space: pre-wrap; overflow-wrap: anywhere; }}
-img {{ max-width: 100%; }}
-table {{ border-collapse: collapse; font-size: 13px; }} .wide {{ overflow-x: auto; }}
-th, td {{ padding: .2rem .6rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap; }}
-th:first-child, td:first-child {{ text-align: left; }}
-</style></head><body>
+BODY = """<header>
 <h1>{title}</h1>
-<p class="verdict">{verdict}</p>
+<p class="finding {state}">{verdict}</p>
+</header>
+<main>
 {charts}
 <h2>All numbers</h2>
-<pre>{text}</pre>
+<pre class="lines" tabindex="0">{text}</pre>
 <h2>Every derivative checked</h2>
-<div class="wide">{table}</div>
-</body></html>
-"""
+<div class="scroll" tabindex="0">{table}</div>
+</main>"""
 
 
 def write(report: Findings, directory: Path) -> list[Path]:
@@ -62,17 +50,17 @@ def write(report: Findings, directory: Path) -> list[Path]:
         for name, (title, figure) in charts(report).items():
             saved = save(figure, directory / name)
             paths += saved
-            data = base64.b64encode(saved[0].read_bytes()).decode()
-            pictures.append(f'<h2>{escape(title)}</h2><img alt="{escape(title)}" src="data:image/png;base64,{data}">')
-    page = PAGE.format(
-        title=escape(f"Examination of {report.name}"),
-        colour="#D55E00" if report.status else "#009E73",
+            pictures.append(f"<h2>{escape(title)}</h2>{shell.picture(saved[0], title)}")
+    title = f"Examination of {report.name}"
+    body = BODY.format(
+        title=escape(title),
+        state="bad" if report.status else "good",
         verdict=escape(" ".join(report.problems) or report.conclusion),
         charts="\n".join(pictures),
         text=_wrapping(str(report)),
         table=report.frame.to_html(index=False, float_format=lambda x: number(x, 5), border=0),
     )
-    write_whole(directory / "report.html", page.encode())
+    write_whole(directory / "report.html", shell.document(title, body).encode())
     return [*paths, directory / "report.html"]
 
 

@@ -588,6 +588,12 @@ def _shade(norm: Normalize, value: float) -> str:
     return to_hex(colormaps["YlOrBr"](0.08 + 0.84 * float(norm(value))))
 
 
+def cell_colours(chart: Chart) -> list[str]:
+    """Return the colour of each line of a grid whose cells are coloured by a number."""
+    norm = _norm(chart)
+    return [_shade(norm, value) for value in chart.frame[chart.value].astype(float)]
+
+
 def ink_on(ground: str) -> str:
     """Return black or white, whichever contrasts more with a colour."""
     r, g, b = to_rgb(ground)

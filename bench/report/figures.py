@@ -10,13 +10,17 @@ from typing import Any
 
 import matplotlib
 import pandas as pd
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.transforms import Bbox
 from PIL import Image
 
 from bench.report.plotted import plotted
 from bench.report.style import STYLE
 from bench.run.files import write_whole
 
+DPI = 150
+PLACES = 6
+"""Decimal places of positions, in units of the figure."""
 METADATA: dict[str, dict[str, Any]] = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
 """Metadata to omit from each file format, because it would differ between equal figures."""
 
@@ -33,18 +37,38 @@ def styled() -> Iterator[None]:
 def save(figure: Figure, stem: Path, formats: Sequence[str] = ("png",), data: pd.DataFrame | None = None) -> list[Path]:
     """Write a figure as ``stem`` in some formats, and its data as ``stem.plotted.csv``; return the files' paths.
 
-    Equal figures give equal files, because the files contain no dates. Fonts are embedded, as outlines in SVG and as
+    Equal figures give equal files: the files contain no dates, and places are rounded. Fonts are embedded, as outlines in SVG and as
     TrueType in PDF.
     """
+    _settle(figure)
     data = plotted(figure) if data is None else data
     contents = {"plotted.csv": data.to_csv(index=False, lineterminator="\n", float_format="%.9g").encode()}
     for suffix in formats:
         buffer = io.BytesIO()
-        figure.savefig(buffer, format=suffix, dpi=150, metadata=METADATA[suffix])
+        figure.savefig(buffer, format=suffix, dpi=DPI, metadata=METADATA[suffix])
         contents[suffix] = _with_palette(buffer) if suffix == "png" else buffer.getvalue()
     for suffix, content in contents.items():
         write_whole(stem.with_name(f"{stem.name}.{suffix}"), content)
     return [stem.with_name(f"{stem.name}.{suffix}") for suffix in (*formats, "plotted.csv")]
+
+
+def _settle(figure: Figure) -> None:
+    """Compute the layout once, and round the places of subfigures and axes to a hundredth of a pixel or less.
+
+    The solver of constrained layouts orders its variables by their addresses in memory, so its results differ between runs
+    in the last bits. Where a text is half a pixel from its neighbours, that would move it by a pixel.
+    """
+    if figure.get_layout_engine() is not None:
+        figure.set_dpi(DPI)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+    parts: list[Figure | SubFigure] = [figure]
+    for part in parts:
+        parts += part.subfigs
+    for part in parts[1:]:
+        part.bbox_relative.set_points(part.bbox_relative.get_points().round(PLACES))  # type: ignore[union-attr]
+    for axes in figure.axes:
+        axes.set_position(Bbox(axes.get_position(original=True).get_points().round(PLACES)))
 
 
 def _with_palette(png: io.BytesIO) -> bytes:

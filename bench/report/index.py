@@ -1,33 +1,31 @@
-"""Writes ``index.html``, a page with the state and the finding of every experiment in a results folder."""
+"""Writes ``index.html``: a grid with a chart, the finding and the state of every experiment in a results folder.
+
+All texts come from stored files, which may be foreign: they are shown literally, and nothing is read from other pages.
+"""
 
 from __future__ import annotations
 
-import html
 import json
-import re
 import time
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import pandas as pd
 
 from bench.errors import UserError
 from bench.report.text import counted
+from bench.report.web import shell
 from bench.run.files import write_whole
 
-STYLE = """
-:root { color-scheme: light dark; }
-body { font: 16px/1.45 system-ui, sans-serif; max-width: 72rem; margin: 0 auto; padding: 0 1rem 3rem; }
-article { border-top: 1px solid #8888; padding: .8rem 0; }
-h2 { margin: 0; font-size: 1.1rem; }
-p { margin: .2rem 0; max-width: 60rem; }
-.state { font-variant-numeric: tabular-nums; }
-.bad { color: #d55e00; font-weight: 600; }
-.soft { opacity: .75; font-size: .9rem; }
-"""
 GOOD = ("ok", "unsupported", "unavailable")
 """Statuses that do not count as failures: the cell has a result, or was refused with a reason."""
+MARKERS = ("rows.parquet", "run.json", "findings.json")
+"""Files whose folder is listed."""
+LISTED = (".html", ".md", ".csv", ".tex", ".png", ".svg", ".pdf")
+"""Suffixes of the files that a card lists."""
 
 
 def write(folder: Path) -> Path:
@@ -37,89 +35,116 @@ def write(folder: Path) -> Path:
     """
     if not folder.is_dir():
         raise UserError(f"'{folder}' is not a folder")
-    places = sorted(
-        {path.parent for path in folder.rglob("rows.parquet")} | {p.parent for p in folder.rglob("run.json")}
-    )
+    places = sorted({path.parent for name in MARKERS for path in folder.rglob(name)})
     if not places:
-        raise UserError(f"'{folder}' has no experiments: no rows.parquet and no run.json below it")
-    articles = "\n".join(_article(folder, place) for place in places)
+        raise UserError(f"'{folder}' has no experiments: no {', no '.join(MARKERS)} below it")
     title = f"Results in {folder.name or folder.resolve().name}"
-    policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-    text = (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
-        f"<title>{html.escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<h1>{html.escape(title)}</h1>\n"
-        f"<p>{counted(len(places), 'experiment')}.</p>\n{articles}\n</body>\n</html>\n"
-    )
+    notes = [f"<p>{counted(len(places), 'experiment')}.</p>"]
+    if any(_page(place) is None for place in places):
+        command = f"python -m bench report +experiment=NAME results_dir={folder}"
+        notes.append(f'<p class="hint">Some have no page yet: <code>{escape(command)}</code> writes one.</p>')
+    cards = "\n".join(_card(folder, place) for place in places)
+    header = f"<header><h1>{escape(title)}</h1>{''.join(notes)}</header>"
     path = folder / "index.html"
-    write_whole(path, text.encode())
+    body = f'{header}\n<main class="cards">\n{cards}\n</main>'
+    write_whole(path, shell.document(title, body, has_local_images=True).encode())
     return path
 
 
-def _article(folder: Path, place: Path) -> str:
-    """Return the HTML of one experiment: its question, finding, state, and links to its files."""
-    e = html.escape
-    record = _record(place / "run.json")
-    name = str(record.get("experiment") or place.name)
-    relative = place.relative_to(folder)
-    page = place / "report.html"
-    heading = f'<a href="{e((relative / page.name).as_posix())}">{e(name)}</a>' if page.exists() else e(name)
-    parts = [f"<h2>{heading}</h2>"]
-    if record.get("question"):
-        parts.append(f"<p><em>{e(str(record['question']))}</em></p>")
-    if finding := _finding(page):
-        parts.append(f"<p>{finding}</p>")
-    parts.append(f'<p class="state">{_state(place / "rows.parquet", record)}</p>')
-    notes = [str(record[key]) for key in ("finished", "git_commit") if record.get(key)]
-    notes[1:] = [f"commit {commit[:12]}" for commit in notes[1:]]
-    files = sorted(path.name for path in place.iterdir() if path.suffix in (".md", ".csv", ".png", ".tex"))
-    links = [f'<a href="{e((relative / file).as_posix())}">{e(file)}</a>' for file in files if "plotted" not in file]
-    if not page.exists():
-        notes.append("no page yet: python -m bench report writes it")
-    parts.append(f'<p class="soft">{e("; ".join(notes))}<br>{", ".join(links)}</p>')
-    return "<article>\n" + "\n".join(parts) + "\n</article>"
+def _card(folder: Path, place: Path) -> str:
+    """Return the HTML of one experiment: chart, question, finding, state, one button, and its files folded away."""
+    record, stored = _mapping(place / "run.json"), _mapping(place / "findings.json")
+    name = _text(stored, "experiment") or _text(record, "experiment") or place.name
+    question = _text(stored, "question") or _text(record, "question")
+    findings = stored.get("findings")
+    finding = next(iter(findings), "") if isinstance(findings, list) else ""
+    chart = _chart(place, _text(stored, "chart"))
+    state, when = _state(place / "rows.parquet", record)
+    notes = [when, _text(record, "git_commit") and f"commit {_text(record, 'git_commit')[:12]}"]
+    parts = [_thumbnail(folder, chart, name), f"<h2>{escape(name)}</h2>"]
+    if question:
+        parts.append(f'<p class="hint">{escape(question)}</p>')
+    if isinstance(finding, str) and finding:
+        parts.append(f'<p class="finding-line">{escape(finding)}</p>')
+    parts += [f'<p class="state">{state}</p>' if state else "", _button(folder, place, chart, name)]
+    files = sorted(p for p in place.iterdir() if p.suffix in LISTED and ".plotted" not in p.name)
+    links = "".join(f'<li><a href="{_link(folder, path)}">{escape(path.name)}</a></li>' for path in files)
+    parts.append(
+        f"<details><summary>{counted(len(files), 'file')}</summary>"
+        f"<p>{escape('; '.join(filter(None, notes)))}</p><ul>{links}</ul></details>"
+    )
+    return "<article>\n" + "\n".join(filter(None, parts)) + "\n</article>"
 
 
-def _state(path: Path, record: dict[str, Any]) -> str:
-    """Return the HTML of the number of cells by status, failures marked, or a note that the rows cannot be read."""
-    counts: dict[str, int] = {}
+def _thumbnail(folder: Path, chart: Path | None, name: str) -> str:
+    if chart is None:
+        return '<div class="none">no chart</div>'
+    description = f"The chart {chart.stem} of {name}"
+    return f'<img src="{_link(folder, chart)}" alt="{escape(description)}" loading="lazy">'
+
+
+def _button(folder: Path, place: Path, chart: Path | None, name: str) -> str:
+    """Return a link to the page of an experiment, or without a page to its chart; empty without both."""
+    page = _page(place)
+    target, label = (page, "Open the page") if page else (chart, "Open the chart")
+    if target is None:
+        return ""
+    return f'<a class="button" href="{_link(folder, target)}" aria-label="{escape(f"{label} of {name}")}">{label}</a>'
+
+
+def _page(place: Path) -> Path | None:
+    """Return the page of an experiment, or of the claims; None if it has not been written."""
+    return next((path for name in ("report.html", "claims.html") if (path := place / name).is_file()), None)
+
+
+def _chart(place: Path, stem: str) -> Path | None:
+    """Return the chart with this stem, else the first chart of the folder; None without charts."""
+    charts = sorted(place.glob("*.png"))
+    return next((path for path in charts if path.stem == stem), charts[0] if charts else None)
+
+
+def _link(folder: Path, path: Path) -> str:
+    """Return the relative address of a file; quoted, so that no name of a folder is taken for a scheme or a query."""
+    return escape(quote(path.relative_to(folder).as_posix()))
+
+
+def _state(path: Path, record: dict[str, Any]) -> tuple[str, str]:
+    """Return the number of cells by status as HTML, failures marked, and the date of the newest row as text.
+
+    Both are empty if neither the rows nor the record of the run know them.
+    """
+    counts, when = record.get("counts"), _text(record, "finished")
     if path.exists():
         try:
             table = pd.read_parquet(path, columns=["status", "stored_at"])
+            counts = table["status"].value_counts().to_dict()
+            newest = table["stored_at"].max()
+            if newest == newest:
+                when = time.strftime("newest row of %Y-%m-%d %H:%M UTC", time.gmtime(newest))
         except Exception as error:  # any error in the file is reported on the page
-            return f'<span class="bad">rows.parquet cannot be read: {html.escape(str(error)[:200])}</span>'
-        counts = {str(status): int(count) for status, count in table["status"].value_counts().items()}
-        newest = table["stored_at"].max()
-    else:
-        newest = float("nan")
-        counts = {str(k): int(v) for k, v in record.get("counts", {}).items()}
-    texts = [
-        f"<span{'' if status in GOOD else ' class=bad'}>{count} {html.escape(status)}</span>"
-        for status, count in counts.items()
-    ]
-    when = time.strftime(", newest of %Y-%m-%d %H:%M UTC", time.gmtime(newest)) if newest == newest else ""
-    return f"{counted(sum(counts.values()), 'cell')}: {', '.join(texts) or 'none'}{when}"
+            return f'<span class="bad">rows.parquet cannot be read: {escape(str(error)[:200])}</span>', ""
+    if not isinstance(counts, dict) or not counts:
+        return "", when
+    texts = []
+    for status, count in counts.items():
+        look = "" if status in GOOD else ' class="bad"'
+        texts.append(f"<span{look}>{escape(str(count))} {escape(str(status))}</span>")
+    return ", ".join(texts), when
 
 
-def _finding(page: Path) -> str:
-    """Return the finding of an experiment's page as escaped HTML; empty without a page."""
+def _mapping(path: Path) -> dict[str, Any]:
+    """Return the content of a JSON file if it is an object, else an empty mapping."""
     try:
-        text = page.read_text(errors="replace")
-    except OSError:
-        return ""
-    match = re.search(r'id="finding">(.*?)</p>', text, re.DOTALL)
-    # each part of the finding is one element on the page
-    text = re.sub(r"<(?!/?(br|b|em)\b)[^>]*>", "; ", match[1]) if match else ""
-    return re.sub(r"(\s*;\s*)+", "; ", re.sub(r"(&\w+);", r"\1\0", text)).strip("; ").replace("\0", ";")
-
-
-def _record(path: Path) -> dict[str, Any]:
-    try:
-        record = json.loads(path.read_text())
-    except (OSError, ValueError):
+        content = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError):
         return {}
-    return record if isinstance(record, dict) else {}
+    return content if isinstance(content, dict) else {}
+
+
+def _text(content: dict[str, Any], key: str) -> str:
+    """Return a string of a mapping; empty if there is none or the value has another type."""
+    value = content.get(key)
+    return value if isinstance(value, str) else ""
 
 
 def main(words: Sequence[str]) -> int:

@@ -5,43 +5,115 @@ from __future__ import annotations
 import json
 
 import pytest
-from browser import CHROMIUM
 from helpers import failed, row, table
+from PIL import Image
 
 from bench import cli
 from bench.report import index
 
 HOSTILE = "<script>window.hacked = 1</script>"
+BANNER = '<b style="position:fixed;inset:0">banner</b><meta http-equiv="refresh" content="0;url=about:blank#gone"><style>h1{display:none}</style>'
+"""Markup that would act without a script: it leaves the page, covers it, and hides its heading."""
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """Three experiments: one with a page and a failure, one without rows, one whose rows are broken."""
+    """Four experiments: with page, findings, a chart and a failure; without rows; with broken rows; only findings."""
     rows = table([row(), failed("error", "it broke", seed=1), failed("unsupported", "cannot work", seed=2)])
-    for name in ("good", "nested/bare", "broken"):
+    for name in ("good", "nested/bare", "broken", "published#1"):
         (tmp_path / name).mkdir(parents=True)
         record = {"experiment": name, "question": HOSTILE, "counts": {"ok": 7}, "git_commit": "0123456789abcdef"}
         (tmp_path / name / "run.json").write_text(json.dumps(record))
+    (tmp_path / "published#1" / "run.json").unlink()
     rows.to_parquet(tmp_path / "good" / "rows.parquet")
-    (tmp_path / "good" / "report.html").write_text(
-        '<p class="finding" id="finding"><span>bad</span><span>use <b>fobg</b> &lt; 3</span></p>'
-    )
+    for name in ("good", "published#1"):
+        findings = {
+            "experiment": name,
+            "question": "why?",
+            "findings": ["use fobg < 3 & more", "second"],
+            "chart": "second",
+        }
+        (tmp_path / name / "findings.json").write_text(json.dumps(findings))
+        for stem in ("first", "second"):
+            Image.new("RGB", (40, 30), "red").save(tmp_path / name / f"{stem}.png")
+    (tmp_path / "good" / "report.html").write_text(f'<p class="finding" id="finding">{BANNER}</p>')
     (tmp_path / "broken" / "rows.parquet").write_text("not Parquet")
     return tmp_path
 
 
-def test_every_experiment_is_there_with_its_state(folder):
+def card(text, name):
+    """The article of an experiment."""
+    return next(part for part in text.split("<article>") if f"<h2>{name}</h2>" in part)
+
+
+def test_every_experiment_is_there_with_its_state_and_finding(folder):
     assert cli.main(["index", str(folder)]) == 0
     text = (folder / "index.html").read_text()
-    assert text.count("<article>") == 3
-    assert 'href="good/report.html"' in text
-    assert "<p>bad; use <b>fobg</b> &lt; 3</p>" in text
-    assert "3 cells" in text
-    assert "<span class=bad>1 error</span>" in text
-    assert "<span>1 unsupported</span>" in text
-    assert "7 cells: <span>7 ok</span>" in text
-    assert "rows.parquet cannot be read" in text
+    assert text.count("<article>") == 4
+    good = card(text, "good")
+    assert 'href="good/report.html"' in good
+    assert "use fobg &lt; 3 &amp; more</p>" in good
+    assert "second</p>" not in good, "one finding on a card"
+    assert 'src="good/second.png"' in good
+    assert '<span class="bad">1 error</span>' in good
+    assert "<span>1 unsupported</span>" in good
+    assert "<span>7 ok</span>" in card(text, "nested/bare")
+    assert "rows.parquet cannot be read" in card(text, "broken")
     assert HOSTILE not in text
+
+
+def test_findings_are_shown_without_a_page_and_its_chart_is_one_click_away(folder):
+    """As in a fresh clone, where no page has been written."""
+    (folder / "good" / "report.html").unlink()
+    text = index.write(folder).read_text()
+    good = card(text, "good")
+    assert "use fobg &lt; 3 &amp; more</p>" in good
+    assert good.count('class="button"') == 1
+    assert 'href="good/second.png" aria-label="Open the chart of good"' in good
+    assert f"results_dir={folder}" in text
+    published = card(text, "published#1")
+    assert 'src="published%231/second.png"' in published
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "[]", "nonsense", "null", "[" * 100_000, '{"findings": "text"}', '{"findings": [{"a": 1}]}', '{"findings": []}',
+        '{"experiment": 3, "question": [], "findings": [3], "chart": {}}', '{"chart": "../../secret"}',
+    ],
+)  # fmt: skip
+def test_findings_of_other_types_are_left_out(content, folder):
+    (folder / "good" / "findings.json").write_text(content)
+    text = index.write(folder).read_text()
+    good = card(text, "good")
+    assert 'src="good/first.png"' in good, "the first chart"
+    assert "finding-line" not in good
+    assert "secret" not in text
+    assert HOSTILE not in text
+
+
+def test_every_text_of_findings_and_record_is_literal(folder, browser):
+    for name in ("run", "findings"):
+        texts = {"experiment": BANNER, "question": BANNER, "findings": [BANNER], "chart": BANNER, "finished": BANNER}
+        record = texts | {"git_commit": BANNER, "counts": {BANNER: BANNER}}
+        (folder / "nested" / "bare" / f"{name}.json").write_text(json.dumps(record))
+    (folder / "nested" / "bare" / f"{BANNER.replace('/', '')}.csv").write_text("a")
+    browser.open(index.write(folder))
+    browser.do("new Promise((done) => setTimeout(done, 300))")
+    assert browser.page.url.endswith("index.html")
+    assert browser.do("document.body.innerText").count(BANNER[:30]) >= 4
+    assert browser.do("document.querySelectorAll('main meta, main style, main b').length") == 0
+    assert browser.said == browser.requests == []
+
+
+def test_a_foreign_page_puts_nothing_into_the_index(folder, browser):
+    """Its finding used to be copied as it was."""
+    browser.open(index.write(folder))
+    browser.do("new Promise((done) => setTimeout(done, 300))")
+    assert browser.page.url.endswith("index.html"), "a refresh left the page"
+    assert browser.do("document.querySelectorAll('main meta, main style, main b, [style]').length") == 0
+    assert browser.do("document.querySelector('h1').checkVisibility()")
+    assert "banner" not in browser.do("document.documentElement.textContent")
 
 
 @pytest.mark.parametrize(("words", "said"), [(["nowhere"], "is not a folder"), (["."], "no experiments"), (["a", "b"], "name one folder")])  # fmt: skip
@@ -51,13 +123,13 @@ def test_bad_input_is_refused(words, said, tmp_path, monkeypatch, capsys):
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open pages in: apt-get install chromium")
-def test_the_index_opens_without_a_complaint(folder, tmp_path):
-    from browser import chromium
-
-    index.write(folder)
-    with chromium(tmp_path / "profile") as browser:
-        browser.send("Page.navigate", url=(folder / "index.html").resolve().as_uri())
-        browser.wait("document.querySelectorAll('article').length === 3", 20)
-        assert browser.do("window.hacked === undefined")
-        assert browser.said == browser.requests == []
+def test_the_index_opens_without_a_complaint(folder, browser):
+    browser.open(index.write(folder))
+    assert browser.do("document.querySelectorAll('article').length === 4")
+    assert (
+        browser.do("Promise.all([...document.images].map((one) => one.decode())).then(() => document.images.length)")
+        == 2
+    )
+    assert browser.page.locator(".button").count() == 2
+    assert browser.do("window.hacked === undefined")
+    assert browser.said == browser.requests == []

@@ -63,8 +63,15 @@ class Chart:
     front: str = ""
     level: str = ""
     share: str = ""
-    marks: dict[str, float] = field(default_factory=dict)
-    """Named values of x."""
+    fill: str = ""
+    """The column with the colour of each cell of a map, ``#rrggbb``, instead of ``level``."""
+    cell: str = ""
+    """The column with the text in each cell of a map; by default the level's letter."""
+    join: bool = False
+    """Whether the points with the same value of a text axis y are joined."""
+    marks: dict[str, float | list[float | None]] = field(default_factory=dict)
+    """Named values of x, and named ranges ``[from, to]``, where None is the end of the axis."""
+    y_marks: dict[str, float | list[float | None]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

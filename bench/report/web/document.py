@@ -1,9 +1,7 @@
-"""Assembles the HTML file of a page: escaped texts, data by column, and the embedded script, style and Plotly."""
+"""Assembles the HTML file of an experiment's page: escaped texts, data by column, and the scripts that draw it."""
 
 from __future__ import annotations
 
-import base64
-import gzip
 import json
 import math
 import re
@@ -20,6 +18,7 @@ import pandas as pd
 from bench.experiment.columns import IDENTITY
 from bench.experiment.experiment import Experiment
 from bench.report import reproduce
+from bench.report.web import shell
 from bench.report.web.content import Chart, Content, PlotAxis
 
 HERE = Path(__file__).parent
@@ -42,13 +41,11 @@ def assemble(
         "counts": f"<li><b>{len(content.rows)}</b> cells</li>{statuses}",
         "answers": _answers(content),
         "made": _made(record),
-        "style": (HERE / "page.css").read_text(),
-        "script": (HERE / "page.js").read_text(),
         "data": in_script(json.dumps(data(content, commands), separators=(",", ":"), allow_nan=False)),
-        "plotly": plotly(),
     }
     template = (HERE / "page.html").read_text()
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
+    body = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
+    return shell.document(experiment.name, body, [plotly(), shell.script("page.js")])
 
 
 def in_script(text: str) -> str:
@@ -58,13 +55,11 @@ def in_script(text: str) -> str:
 
 @cache
 def plotly() -> str:
-    """Return Plotly's script as base64 of gzip, a third of its size."""
+    """Return Plotly's script. It is embedded as it is, so that charts exist when a page is printed immediately."""
     spec = find_spec("plotly")
     assert spec is not None
     assert spec.origin is not None
-    script = (Path(spec.origin).parent / "package_data" / "plotly.min.js").read_bytes()
-    # no time stamp, so that equal pages are equal files
-    return base64.b64encode(gzip.compress(script, mtime=0)).decode()
+    return (Path(spec.origin).parent / "package_data" / "plotly.min.js").read_text()
 
 
 # --------------------------------------------------------------------------------------------------------- data
@@ -80,7 +75,17 @@ def data(content: Content, commands: Sequence[Sequence[str]]) -> dict[str, Any]:
         wanted.setdefault(chart.table, {"row"}).update(_columns_of(chart))
         wanted["rows"] |= _columns_of(chart)
     sources = {"rows": rows, **content.tables}
-    tables = {name: {c: column(sources[name][c]) for c in sources[name] if c in wanted[name]} for name in wanted}
+    flags = {c.flag for c in content.columns} | {
+        axis.limit for chart in content.charts for axis in (*chart.x, *chart.y)
+    }
+    tables = {
+        name: {
+            c: column(sources[name][c].astype(float) if c in flags else sources[name][c])
+            for c in sources[name]
+            if c in wanted[name]
+        }
+        for name in wanted
+    }
     longest = max(map(len, commands), default=0)
     words = [[line[i] if i < len(line) else "" for line in commands] for i in range(longest)]
     return {
@@ -108,7 +113,7 @@ def filtered(content: Content) -> list[str]:
 def _columns_of(chart: Chart) -> set[str]:
     axes: list[PlotAxis] = [*chart.x, *chart.y]
     names = {name for axis in axes for name in (axis.column, axis.low, axis.high, axis.limit)}
-    return names | {chart.series, chart.facet, chart.line, chart.front, chart.level}
+    return names | {chart.series, chart.facet, chart.line, chart.front, chart.level, chart.fill, chart.cell}
 
 
 def column(values: pd.Series) -> Any:
@@ -140,12 +145,7 @@ def _answers(content: Content) -> str:
     table = content.answers
     if table.empty:
         return ""
-    head = "".join(f'<th scope="col">{escape(str(name))}</th>' for name in table)
-    lines = (f"<tr>{''.join(f'<td>{escape(str(v))}</td>' for v in row)}</tr>" for row in table.to_numpy())
-    return (
-        f'<section id="answers"><h2>{escape(content.answers_title)}</h2><div class="scroll" tabindex="0">'
-        f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table></div></section>"
-    )
+    return f'<section id="answers"><h2>{escape(content.answers_title)}</h2>{shell.table(table)}</section>'
 
 
 def _made(record: Mapping[str, Any]) -> str:

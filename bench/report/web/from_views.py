@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pandas as pd
 
 from bench.experiment.columns import COMMON, Column
@@ -59,11 +61,11 @@ def _table(chart: Chart) -> pd.DataFrame:
     frame = chart.frame.reset_index(drop=True)
     frame = frame if "row" in frame else frame.assign(row=-1)
     key = [name for name in (chart.series, chart.line) if name]
-    return frame.assign(line_=frame[key].astype(str).agg(" ".join, axis=1) if key else "", one_="")
+    frame = frame.assign(line_=frame[key].astype(str).agg(" ".join, axis=1) if key else "", one_="")
+    return frame.assign(fill_=draw.cell_colours(chart)) if chart.kind == "grid" and chart.value else frame
 
 
 def _chart(chart: Chart) -> page.Chart:
-    marks = {mark.name: mark.at for mark in chart.marks if mark.axis == "x" and mark.panel is None}
     return page.Chart(
         title=chart.title,
         text=" ".join(filter(None, (chart.text, chart.subtitle))),
@@ -75,8 +77,21 @@ def _chart(chart: Chart) -> page.Chart:
         line="line_" if chart.kind == "lines" else "",
         front=chart.front,
         level=chart.level,
-        marks=marks,
+        fill="fill_" if chart.kind == "grid" and chart.value else "",
+        cell=chart.cell,
+        join=chart.join,
+        marks=_marks(chart, "x"),
+        y_marks=_marks(chart, "y"),
     )
+
+
+def _marks(chart: Chart, axis: str) -> dict[str, float | list[float | None]]:
+    """Return the marks of an axis that all panels have: values, and ranges whose infinite end is None."""
+    return {
+        mark.name: mark.at if mark.to is None else [mark.at, mark.to if math.isfinite(mark.to) else None]
+        for mark in chart.marks
+        if mark.axis == axis and mark.panel is None
+    }
 
 
 def _axis(column: Column, chart: Chart) -> page.PlotAxis:

@@ -1,12 +1,13 @@
 /* Filters, charts, the table and the selected cell of a page, drawn from the columns in #data.
 
    A table is columns by name: a list of numbers (null where there is none), or texts as {values, index}. The table
-   "rows" has a line per cell; in the others the column "row" has the index in "rows" that a line comes from.
+   "rows" has a line per cell; in the others the column "row" has the index in "rows" that a line comes from, or -1.
    Texts reach the page only through textContent or plotted(), so that none is taken for HTML. */
 "use strict";
 
 const page = JSON.parse(document.getElementById("data").textContent);
 const rowCount = size("rows");
+const SMALL = 12; // size of the smallest text in a chart [px]
 const PANELS = 4; // most panels of a chart that are drawn at once
 const FIRST = 60, MORE = 240; // rows of the table at first, and with every "Show more"
 const GLYPHS = {
@@ -42,6 +43,10 @@ function readerOf(table, name) {
   return (i) => read(row[i]);
 }
 
+/* Lines of no cell are not filtered. */
+const isShown = (row) => row < 0 || visible[row];
+const isText = (table, name) => Boolean((page.tables[table][name] || page.tables.rows[name] || {}).index);
+
 const rowOf = (table) => (table === "rows" ? (i) => i : (i) => page.tables[table].row[i]);
 
 function element(tag, properties = {}, ...children) {
@@ -54,6 +59,7 @@ function element(tag, properties = {}, ...children) {
 
 function number(value) {
   if (value === null || value === undefined) return "-";
+  if (typeof value === "string") return value;
   if (value === 0) return "0";
   const size = Math.abs(value);
   if (size >= 1e-3 && size < 1e5) return String(Number(value.toPrecision(3)));
@@ -84,6 +90,8 @@ function shownAs(column, row) {
 
 /* A text as Plotly shows it literally: it takes a few tags for markup. */
 const plotted = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+
+const coordinate = (value) => (typeof value === "string" ? plotted(value) : value);
 
 // ------------------------------------------------------------------------------------------------------ filters
 
@@ -275,12 +283,50 @@ function dark() {
 
 const LOST = { colour: ["#757575", "#9a9a9a"], symbol: "circle", dash: "solid" };
 const looks = (name) => page.looks[name] || LOST;
-const colour = (name) => looks(name).colour[dark() ? 1 : 0];
+const filling = (name) => looks(name).colour[dark() ? 1 : 0];
+const GROUND = ["#ffffff", "#14171a"], INK = ["#16191d", "#e9ecef"];
+const MARK = 3, TEXT = 4.5; // contrasts that WCAG level AA asks for
+const ground = () => GROUND[dark() ? 1 : 0];
+const ink = () => INK[dark() ? 1 : 0];
+const colour = (name) => readable(filling(name), MARK);
+
+const channels = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
+
+function mixed(from, to, share) {
+  const end = channels(to);
+  return "#" + channels(from).map((part, k) => Math.round(part + share * (end[k] - part)).toString(16).padStart(2, "0")).join("");
+}
+
+/* The contrast of two colours, from 1 to 21, by WCAG 2. */
+function contrast(one, other) {
+  const [a, b] = [one, other].map((hex) => channels(hex).map((part) => part / 255)
+    .map((part) => (part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4))
+    .reduce((sum, part, k) => sum + [0.2126, 0.7152, 0.0722][k] * part, 0.05));
+  return Math.max(a / b, b / a);
+}
+
+/* The colour, mixed with the colour of text as far as needed for a contrast with the page. */
+function readable(hex, least) {
+  for (let share = 0; share < 1; share += 0.05) {
+    const found = mixed(hex, ink(), share);
+    if (contrast(found, ground()) >= least) return found;
+  }
+  return ink();
+}
+
+const isMap = (chart) => Boolean(chart.level || chart.fill);
+
+/* The number of names on the vertical axis, each of which takes a line. */
+function lineCount(chart, panel) {
+  if (isMap(chart)) return panel.y.size;
+  if (!isText(chart.table, chart.yAxis.column)) return 0;
+  return new Set([...panel.lines.values()].flat().map((point) => point.y)).size;
+}
 
 function drawChart(chart) {
   if (!window.Plotly) return;
   chart.dirty = false;
-  const facets = chart.level ? mapPanels(chart) : pointPanels(chart);
+  const facets = isMap(chart) ? mapPanels(chart) : pointPanels(chart);
   const names = [...facets.keys()];
   chart.pick.hidden = names.length <= PANELS;
   if (!chart.pick.hidden) {
@@ -293,7 +339,7 @@ function drawChart(chart) {
   const drawn = chart.only ? [chart.only] : names.slice(0, PANELS);
   chart.note.textContent = names.length ? "" : "nothing to draw among the cells shown";
   chart.panels.dataset.count = drawn.length;
-  const range = chart.level ? null : ranges(chart, drawn.map((name) => facets.get(name)));
+  const range = isMap(chart) ? null : ranges(chart, drawn.map((name) => facets.get(name)));
   while (chart.panels.children.length > drawn.length) {
     Plotly.purge(chart.panels.lastChild.lastChild);
     chart.panels.lastChild.remove();
@@ -305,7 +351,10 @@ function drawChart(chart) {
     }
     const [title, plot] = chart.panels.children[k].children;
     title.textContent = name;
-    const [traces, layout] = chart.level ? mapFigure(chart, facets.get(name)) : pointFigure(chart, facets.get(name), range);
+    title.hidden = !name;
+    const lines = lineCount(chart, facets.get(name));
+    plot.style.height = lines > 12 ? `${60 + 24 * lines}px` : "";
+    const [traces, layout] = isMap(chart) ? mapFigure(chart, facets.get(name)) : pointFigure(chart, facets.get(name), range);
     Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true });
     plot.removeAllListeners("plotly_click");
     plot.on("plotly_click", (event) => {
@@ -323,30 +372,29 @@ function drawLegend(chart, panels) {
   chart.legend.replaceChildren(...(chart.share ? [] : ordered).map((name) => {
     const look = looks(name);
     const mark = element("b", { textContent: chart.level ? look.letter || " " : GLYPHS[look.symbol] });
-    if (chart.level) { mark.className = "level"; mark.style.background = colour(name); mark.style.color = inkOn(colour(name)); }
+    if (chart.level) { mark.className = "level"; mark.style.background = filling(name); mark.style.color = inkOn(filling(name)); }
     else mark.style.color = colour(name);
     return element("li", {}, mark, " " + (look.meaning || name));
   }));
 }
 
-const inkOn = (ground) => {
-  const [r, g, b] = [1, 3, 5].map((k) => parseInt(ground.slice(k, k + 2), 16));
-  return 0.3 * r + 0.59 * g + 0.11 * b > 130 ? "#000000" : "#ffffff";
-};
+const inkOn = (hex) => (contrast(hex, "#000000") > contrast(hex, "#ffffff") ? "#000000" : "#ffffff");
 
 /* The points to draw: panels by name, each with the points of a line or series, and all its points by front. */
 function pointPanels(chart) {
   const [x, y] = [chart.xAxis, chart.yAxis];
   const read = (name) => (name ? reader(chart.table, name) : () => null);
-  const [X, Y, low, high, limit] = [x.column, y.column, y.low, y.high, y.limit].map(read);
+  const [X, Y, low, high, limit, left, right, leftLimit] =
+    [x.column, y.column, y.low, y.high, y.limit, x.low, x.high, x.limit].map(read);
   const [series, facet, line, front] = [chart.series, chart.facet, chart.line, chart.front].map(read);
   const row = rowOf(chart.table);
   const panels = new Map();
   for (let i = 0, count = size(chart.table); i < count; i++) {
     const point = { row: row(i), x: X(i), y: Y(i) };
-    if (!visible[point.row] || point.x === null || point.y === null) continue;
+    if (!isShown(point.row) || point.x === null || point.y === null) continue;
     if ((x.log && point.x <= 0) || (y.log && point.y <= 0)) continue;
-    Object.assign(point, { low: low(i), high: high(i), limit: limit(i), series: series(i) });
+    Object.assign(point, { low: low(i), high: high(i), limit: limit(i), series: series(i) || "" });
+    Object.assign(point, { left: left(i), right: right(i), leftLimit: leftLimit(i) });
     const name = facet(i) || "";
     if (!panels.has(name)) panels.set(name, { lines: new Map(), fronts: new Map(), names: new Set() });
     const panel = panels.get(name);
@@ -365,15 +413,16 @@ function append(map, key, value) {
 /* One range of each axis for all panels that are drawn. */
 function ranges(chart, panels) {
   const find = (axis, values) => {
-    if (!values.length) return undefined;
+    if (!values.length || values.some((value) => typeof value === "string")) return undefined;
     const scaled = axis.log ? values.map(Math.log10) : values;
     const [first, last] = [scaled.reduce((a, b) => Math.min(a, b)), scaled.reduce((a, b) => Math.max(a, b))];
-    const margin = Math.max(0.05 * (last - first), axis.log ? 0.08 : 1e-9);
+    const margin = Math.max(0.08 * (last - first), axis.log ? 0.08 : 1e-9);
     return [first - margin, last + margin];
   };
   const points = panels.flatMap((panel) => [...panel.lines.values()].flat());
-  const marks = points.length ? Object.values(chart.marks) : [];
-  return { x: find(chart.xAxis, [...points.map((p) => p.x), ...marks]), y: find(chart.yAxis, points.map((p) => p.y)) };
+  const ends = (marks) => (points.length ? Object.values(marks || {}).flat().filter((end) => end !== null) : []);
+  return { x: find(chart.xAxis, [...points.map((p) => p.x), ...ends(chart.marks)]),
+    y: find(chart.yAxis, [...points.map((p) => p.y), ...ends(chart.y_marks)]) };
 }
 
 function pointFigure(chart, panel, range) {
@@ -381,30 +430,52 @@ function pointFigure(chart, panel, range) {
   const joined = Boolean(chart.line);
   for (const points of panel.lines.values()) traces.push(trace(chart, points, joined));
   if (chart.front) traces.push(...frontTraces(panel));
-  const chosen = [...panel.lines.values()].flat().filter((point) => point.row === state.selected);
+  if (chart.join) traces.unshift(...joins(panel));
+  const chosen = [...panel.lines.values()].flat().filter((point) => point.row >= 0 && point.row === state.selected);
   if (chosen.length) traces.push(rings(chosen, 17, 3, colour("")));
-  const ink = dark() ? "#e9ecef" : "#16191d";
   const shapes = [], annotations = [];
   if (range.y && chart.yAxis.log && chart.yAxis.above_one && range.y[1] > 0) {
     shapes.push({ type: "rect", xref: "paper", x0: 0, x1: 1, y0: 1, y1: 10 ** range.y[1], layer: "below",
       fillcolor: dark() ? "#ffffff14" : "#00000010", line: { width: 0 } });
-    annotations.push({ xref: "paper", x: 0.01, yref: "paper", y: 1, yanchor: "top", xanchor: "left", showarrow: false,
-      text: chart.yAxis.above_one, font: { size: 10 } });
+    annotations.push({ xref: "paper", x: 0.01, y: Math.max(0, range.y[0]), yanchor: "bottom", xanchor: "left", showarrow: false,
+      text: chart.yAxis.above_one, font: { size: SMALL } });
   }
-  for (const [name, value] of Object.entries(chart.marks)) {
-    shapes.push({ type: "line", x0: value, x1: value, yref: "paper", y0: 0, y1: 1, line: { dash: "dash", width: 1, color: ink } });
-    annotations.push({ x: chart.xAxis.log ? Math.log10(value) : value, yref: "paper", y: 1, yanchor: "bottom",
-      text: plotted(name), showarrow: false, font: { size: 10 } });
+  for (const [axis, marks] of [["x", chart.marks], ["y", chart.y_marks || {}]]) {
+    for (const [name, value] of Object.entries(marks)) mark(chart, axis, name, value, range, shapes, annotations);
   }
   annotations.push(...backendNames(chart, panel, joined, range));
-  return [traces, { ...frame(chart.xAxis, chart.yAxis, range), shapes, annotations }];
+  return [traces, { ...frame(chart, panel, range), shapes, annotations }];
+}
+
+/* A value of an axis as a dashed line, or a range [from, to] as a shaded band, to null for the rest of the axis. */
+function mark(chart, axis, name, value, range, shapes, annotations) {
+  const other = axis === "x" ? "y" : "x";
+  const log = axis === "x" ? chart.xAxis.log : chart.yAxis.log;
+  const [from, to] = Array.isArray(value) ? value : [value, value];
+  const limit = range[axis] ? (log ? 10 ** range[axis][1] : range[axis][1]) : from;
+  const end = to === null ? limit : to;
+  const at = { [axis + "0"]: from, [axis + "1"]: end, [other + "ref"]: "paper", [other + "0"]: 0, [other + "1"]: 1 };
+  const band = { type: "rect", layer: "below", fillcolor: dark() ? "#ffffff14" : "#00000010", line: { width: 0 } };
+  shapes.push({ ...(from === end ? { type: "line", line: { dash: "dash", width: 1, color: ink() } } : band), ...at });
+  const place = axis === "x" ? { yref: "paper", y: 1, yanchor: "bottom" } : { xref: "paper", x: 1, xanchor: "right", yanchor: "bottom" };
+  annotations.push({ ...place, [axis]: log ? Math.log10(from) : from, xanchor: from === end && axis === "x" ? "center" : axis === "x" ? "left" : "right",
+    text: plotted(name), showarrow: false, font: { size: SMALL } });
+}
+
+/* A line through the dots of each row of a dot plot. */
+function joins(panel) {
+  const rows = new Map();
+  for (const point of [...panel.lines.values()].flat()) append(rows, point.y, point);
+  return [...rows.values()].map((points) => ({ type: "scatter", mode: "lines", hoverinfo: "skip",
+    x: points.map((p) => coordinate(p.x)), y: points.map((p) => coordinate(p.y)), line: { color: readable("#8a8a8a", MARK), width: 2 } }));
 }
 
 /* Colour and symbol are the estimator, so a backend is told by its name: beside points, or where those lines of one
    estimator are farthest apart that differ by more than can be seen. Names that would overlap share a place. */
 function backendNames(chart, panel, joined, range) {
   const read = reader("rows", "backend");
-  const every = [...panel.lines.values()].flat();
+  const every = [...panel.lines.values()].flat().filter((p) => p.row >= 0);
+  if (!range.x || !range.y) return []; // an axis of names
   if (new Set(every.map((p) => read(p.row))).size < 2) return [];
   const apart = (p) => Math.max(1, ...every.filter((q) => q.series === p.series && q.x === p.x)
     .map((q) => Math.max(q.y / p.y, p.y / q.y)));
@@ -417,27 +488,31 @@ function backendNames(chart, panel, joined, range) {
     const [x, y, name] = [scaled(p.x, chart.xAxis), scaled(p.y, chart.yAxis), read(p.row)];
     const place = names.find((one) => near(one.x, x, range.x, 0.12) && near(one.y, y, range.y, 0.07));
     if (place) place.told.add(name);
-    else names.push({ x, y, told: new Set([name]), color: colour(p.series) });
+    else names.push({ x, y, told: new Set([name]), color: readable(filling(p.series), TEXT) });
   }
   return names.map(({ x, y, told: here, color }) => ({ x, y, xanchor: "left", xshift: 4, yanchor: "bottom",
-    showarrow: false, text: plotted([...here].join(", ")), font: { size: 9, color } }));
+    showarrow: false, text: plotted([...here].join(", ")), font: { size: SMALL, color } }));
 }
 
 function trace(chart, points, joined) {
   const look = looks(points[0].series);
-  const ink = colour(points[0].series);
-  const symbol = points.some((p) => p.limit) ? points.map((p) => look.symbol + (p.limit ? "-open" : "")) : look.symbol;
+  const own = colour(points[0].series);
+  const symbol = points.some((p) => p.limit || p.leftLimit)
+    ? points.map((p) => look.symbol + (p.limit || p.leftLimit ? "-open" : "")) : look.symbol;
   const made = {
-    type: "scatter", mode: joined ? "lines+markers" : "markers", x: points.map((p) => p.x), y: points.map((p) => p.y),
-    customdata: points.map((p) => p.row), text: points.map((p) => hover(chart, p)), hovertemplate: "%{text}<extra></extra>",
-    marker: { color: ink, symbol, size: points.length > 500 ? 6 : 8 }, line: { color: ink, dash: look.dash, width: 1.5 },
-    opacity: joined ? 1 : 0.85,
+    type: "scatter", mode: joined ? "lines+markers" : "markers", x: points.map((p) => coordinate(p.x)), y: points.map((p) => coordinate(p.y)),
+    customdata: points.map((p) => (p.row < 0 ? null : p.row)), text: points.map((p) => hover(chart, p)), hovertemplate: "%{text}<extra></extra>",
+    marker: { color: own, symbol, size: points.length > 500 ? 6 : 8,
+      ...(joined ? {} : { line: { color: ground(), width: 1 } }) }, // an outline separates points that overlap
+    line: { color: own, dash: look.dash, width: 1.5 },
   };
-  if (joined && chart.yAxis.high) {
-    const bar = (p, end) => (p.limit || p[end] === null ? 0 : Math.abs(p[end] - p.y));
-    made.error_y = { type: "data", array: points.map((p) => bar(p, "high")), arrayminus: points.map((p) => bar(p, "low")),
-      color: ink, thickness: 1, width: 0 };
-  }
+  const bars = (low, high, at, limit) => {
+    const length = (p, end) => (p[limit] || p[end] === null ? 0 : Math.abs(p[end] - p[at]));
+    return { type: "data", array: points.map((p) => length(p, high)), arrayminus: points.map((p) => length(p, low)),
+      color: own, thickness: 1, width: 0 };
+  };
+  if (joined && chart.yAxis.high) made.error_y = bars("low", "high", "y", "limit");
+  if (isText(chart.table, chart.yAxis.column) && chart.xAxis.high) made.error_x = bars("left", "right", "x", "leftLimit");
   return made;
 }
 
@@ -446,17 +521,19 @@ const cellTexts = []; // per row that was drawn, a text that identifies its cell
 
 function hover(chart, point) {
   const { xAxis, yAxis } = chart;
-  const interval = point.low !== null && point.high !== null && !point.limit
-    ? ` [${number(point.low)}, ${number(point.high)}]` : "";
-  if (!cellTexts[point.row]) cellTexts[point.row] = tellingColumns.map((c) => plotted(`${c.label} ${shownAs(c, point.row)}`)).join("<br>");
-  return [`<b>${plotted(point.series)}</b>`, cellTexts[point.row],
-    `${plotted(xAxis.label)}: ${number(point.x)}`,
-    `${plotted(yAxis.label)}: ${point.limit ? "&lt; " : ""}${number(point.y)}${interval}`].join("<br>");
+  const value = (axis, at, low, high, limit) => {
+    const interval = low !== null && high !== null && !limit ? ` [${number(low)}, ${number(high)}]` : "";
+    return `${axis.label ? plotted(axis.label) + ": " : ""}${limit ? "&lt; " : ""}${plotted(number(at))}${interval}`;
+  };
+  if (point.row >= 0 && !cellTexts[point.row]) cellTexts[point.row] = tellingColumns.map((c) => plotted(`${c.label} ${shownAs(c, point.row)}`)).join("<br>");
+  return [`<b>${plotted(point.series)}</b>`, cellTexts[point.row] || "",
+    value(xAxis, point.x, point.left, point.right, point.leftLimit),
+    value(yAxis, point.y, point.low, point.high, point.limit)].filter(Boolean).join("<br>");
 }
 
-function rings(points, size, width, ink) {
-  return { type: "scatter", mode: "markers", x: points.map((p) => p.x), y: points.map((p) => p.y), hoverinfo: "skip",
-    marker: { symbol: "circle-open", size, color: ink, line: { width } } };
+function rings(points, size, width, color) {
+  return { type: "scatter", mode: "markers", x: points.map((p) => coordinate(p.x)), y: points.map((p) => coordinate(p.y)), hoverinfo: "skip",
+    marker: { symbol: "circle-open", size, color, line: { width } } };
 }
 
 /* Per problem, the points that no other beats in both coordinates; joined where there are few problems. */
@@ -475,12 +552,21 @@ function frontTraces(panel) {
   return [...found, rings(all, 13, 1, grey)];
 }
 
-function frame(x, y, range) {
+function frame(chart, panel, range) {
+  const [x, y] = [chart.xAxis, chart.yAxis];
+  const names = {}; // axes of names, in the order of the table, the first at the top
+  for (const [axis, key] of [[x, "x"], [y, "y"]]) {
+    if (!isText(chart.table, axis.column)) continue;
+    const values = page.tables[chart.table][axis.column] || page.tables.rows[axis.column];
+    const here = new Set([...panel.lines.values()].flat().map((p) => p[key]));
+    names[axis.column] = { type: "category", categoryarray: values.values.filter((name) => here.has(name)).map(plotted), tickfont: { size: SMALL },
+      ...(key === "y" ? { autorange: "reversed" } : {}) };
+  }
   const style = (axis, limits) => ({
     title: { text: plotted(axis.label), standoff: 6 }, type: axis.log ? "log" : "linear", range: limits, automargin: true,
-    gridcolor: dark() ? "#363c43" : "#e3e6e9", zeroline: false, ...ticks(axis, limits),
+    gridcolor: dark() ? "#363c43" : "#e3e6e9", zeroline: false, ...ticks(axis, limits), ...names[axis.column],
   });
-  return { ...ground(), xaxis: style(x, range.x), yaxis: style(y, range.y) };
+  return { ...layout(), xaxis: style(x, range.x), yaxis: style(y, range.y) };
 }
 
 /* Ticks of a log axis: whole decades, or 1, 2 and 5 of each if there are few. */
@@ -497,59 +583,75 @@ function ticks(axis, limits) {
   return { tickvals, ticktext };
 }
 
-function ground() {
+function layout() {
   return {
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", showlegend: false, margin: { l: 10, r: 14, t: 18, b: 10 },
-    font: { family: "system-ui, sans-serif", size: 12, color: dark() ? "#e9ecef" : "#16191d" }, hovermode: "closest",
+    font: { family: "system-ui, sans-serif", size: SMALL, color: ink() }, hovermode: "closest",
     dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom", hoverlabel: { align: "left" },
   };
 }
 
 /* Maps: panels by name with their lines' places, sorted. */
 function mapPanels(chart) {
-  const [X, Y, level, facet] = [chart.xAxis.column, chart.yAxis.column, chart.level, chart.facet].map((name) =>
-    name ? reader(chart.table, name) : () => "");
+  const [X, Y, level, facet, fill, cell] =
+    [chart.xAxis.column, chart.yAxis.column, chart.level, chart.facet, chart.fill, chart.cell].map((name) =>
+      name ? reader(chart.table, name) : () => "");
   const row = rowOf(chart.table);
   const panels = new Map();
   for (let i = 0, count = size(chart.table); i < count; i++) {
-    if (!visible[row(i)] || !level(i)) continue;
+    if (!isShown(row(i)) || (chart.fill ? !fill(i) : !level(i))) continue;
     const name = facet(i) || "";
     if (!panels.has(name)) panels.set(name, { places: new Map(), names: new Set(), x: new Set(), y: new Set() });
     const panel = panels.get(name);
     const [x, y] = [exact(X(i)), exact(Y(i))];
     panel.x.add(x);
     panel.y.add(y);
-    panel.names.add(level(i));
-    append(panel.places, JSON.stringify([x, y]), { row: row(i), level: level(i) });
+    if (level(i)) panel.names.add(level(i));
+    append(panel.places, JSON.stringify([x, y]), { row: row(i), level: level(i), fill: fill(i), cell: cell(i) });
   }
   return panels;
 }
 
+const SHARE = "#0072B2";
+
 function mapFigure(chart, panel) {
   const names = Object.keys(page.looks);
-  const order = (values) => [...values].sort((a, b) => a - b || (a < b ? -1 : 1));
-  const [xs, ys] = [order(panel.x), order(panel.y)];
-  const grid = (make) => ys.map((y) => xs.map((x) => {
-    const found = panel.places.get(JSON.stringify([x, y]));
-    return found ? make(found, x, y) : "";
-  }));
+  const order = (axis, values) => {
+    const column = page.tables[chart.table][axis.column] || page.tables.rows[axis.column];
+    if (!column.index) return [...values].sort((a, b) => a - b);
+    const known = column.values.filter((name) => values.has(name));
+    return known.every((name) => isFinite(name)) ? known.sort((a, b) => a - b) : known;
+  };
+  const [xs, ys] = [order(chart.xAxis, panel.x), order(chart.yAxis, panel.y)];
+  const at = (x, y) => panel.places.get(JSON.stringify([x, y]));
+  const grid = (make) => ys.map((y) => xs.map((x) => (at(x, y) ? make(at(x, y), x, y) : null)));
   const worst = (found) => found.reduce((a, b) => (names.indexOf(b.level) > names.indexOf(a.level) ? b : a));
   const share = (found) => found.filter((one) => one.level === chart.share).length / found.length;
-  const k = names.length;
-  const scale = chart.share ? [[0, dark() ? "#14171a" : "#ffffff"], [1, "#0072B2"]]
-    : names.flatMap((name, n) => [[n / k, colour(name)], [(n + 1) / k, colour(name)]]);
-  const text = (found) => (chart.share ? Math.round(100 * share(found)) + "%" : looks(worst(found).level).letter || "");
-  const label = (found, x, y) => [`<b>${plotted(chart.share ? text(found) : worst(found).level)}</b>`,
+  const fill = (found) => (chart.share ? mixed(ground(), SHARE, share(found))
+    : worst(found).fill || filling(worst(found).level));
+  const text = (found) => (chart.share ? Math.round(100 * share(found)) + "%"
+    : chart.cell ? worst(found).cell : looks(worst(found).level).letter || "");
+  const label = (found, x, y) => [`<b>${plotted(chart.share || !worst(found).level ? text(found) : worst(found).level)}</b>`,
     `${plotted(chart.xAxis.label)} ${plotted(x)}`, `${plotted(chart.yAxis.label)} ${plotted(y)}`,
-    chart.share ? `${found.length} cells` : plotted(reader("rows", "reason")(worst(found).row) || "")].join("<br>");
+    chart.share ? `${found.length} cells` : worst(found).row < 0 ? "" : plotted(reader("rows", "reason")(worst(found).row) || ""),
+  ].filter(Boolean).join("<br>");
+  const fills = [...new Set([...panel.places.values()].map(fill))];
   const made = {
-    type: "heatmap", x: xs.map(plotted), y: ys.map(plotted), z: grid((found) => (chart.share ? share(found) : names.indexOf(worst(found).level))),
-    text: grid(text), texttemplate: "%{text}", customdata: grid((found) => (chart.share ? null : worst(found).row)),
-    hovertext: grid(label), hovertemplate: "%{hovertext}<extra></extra>", colorscale: scale, showscale: false, xgap: 1, ygap: 1,
-    zmin: chart.share ? 0 : -0.5, zmax: chart.share ? 1 : k - 0.5,
+    type: "heatmap", x: xs.map(plotted), y: ys.map(plotted), z: grid((found) => fills.indexOf(fill(found))), xgap: 1, ygap: 1,
+    customdata: grid((found) => (chart.share || worst(found).row < 0 ? null : worst(found).row)),
+    hovertext: grid(label), hovertemplate: "%{hovertext}<extra></extra>", hoverongaps: false, showscale: false,
+    colorscale: fills.flatMap((one, n) => [[n / fills.length, one], [(n + 1) / fills.length, one]]),
+    zmin: -0.5, zmax: fills.length - 0.5,
+  };
+  // not the heat map's own text, whose colour has too little contrast on some cells
+  const filled = ys.flatMap((y) => xs.map((x) => [x, y, at(x, y)])).filter(([, , found]) => found);
+  const letters = {
+    type: "scatter", mode: "text", x: filled.map(([x]) => plotted(x)), y: filled.map(([, y]) => plotted(y)), hoverinfo: "skip",
+    text: filled.map(([, , found]) => text(found)), textfont: { color: filled.map(([, , found]) => inkOn(fill(found))) },
   };
   const axis = (from) => ({ title: { text: plotted(from.label), standoff: 6 }, type: "category", automargin: true, showgrid: false });
-  return [[made], { ...ground(), xaxis: axis(chart.xAxis), yaxis: axis(chart.yAxis) }];
+  const downwards = isText(chart.table, chart.yAxis.column) ? { autorange: "reversed" } : {};
+  return [[made, letters], { ...layout(), xaxis: axis(chart.xAxis), yaxis: { ...axis(chart.yAxis), ...downwards } }];
 }
 
 // -------------------------------------------------------------------------------------------------------- table
@@ -706,17 +808,10 @@ function fitCharts() {
 
 // --------------------------------------------------------------------------------------------------------- start
 
-/* Plotly's script out of the page: base64 of gzip. */
-async function inflated(id) {
-  const letters = atob(document.getElementById(id).textContent);
-  const bytes = new Uint8Array(letters.length);
-  for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
-  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
-}
-
-/* When the charts in sight are drawn. */
+/* When the charts in sight are drawn; until the browser has said which these are, near is undefined. */
 async function settled() {
-  do await new Promise(requestAnimationFrame); while (charts.some((chart) => chart.near && chart.dirty));
+  do await new Promise(requestAnimationFrame);
+  while (charts.some((chart) => chart.near === undefined || (chart.near && chart.dirty)));
 }
 
 async function start() {
@@ -726,11 +821,6 @@ async function start() {
   if (location.hash) fromAddress();
   else refresh();
   buildCharts();
-  if (!window.DecompressionStream) {
-    document.getElementById("charts").prepend(element("p", { textContent: "Charts need a browser of 2023 or later." }));
-    return;
-  }
-  document.head.append(element("script", { textContent: await inflated("plotly") }));
   markDirty();
   await settled();
   document.documentElement.dataset.loaded = performance.now().toFixed(0);

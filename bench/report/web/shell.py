@@ -1,0 +1,91 @@
+"""Wraps the body of a page in one HTML document: one stylesheet for light, dark and paper, and one security policy."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from collections.abc import Collection, Mapping, Sequence
+from functools import cache
+from html import escape
+from pathlib import Path
+
+import pandas as pd
+
+HERE = Path(__file__).parent
+
+
+def document(title: str, body: str, scripts: Sequence[str] = (), has_local_images: bool = False) -> str:
+    """Return a complete HTML document that loads nothing from a network.
+
+    ``title`` is text, ``body`` is HTML whose texts are escaped already. Only ``scripts`` run, after the body and in their
+    order: the policy names them by their hashes, so that markup which reaches a page by mistake cannot run code.
+    Images are embedded, or with ``has_local_images`` also files beside the page.
+    """
+    hashes = " ".join(f"'sha256-{_digest(script)}'" for script in scripts) or "'none'"
+    images = "data: 'self' file:" if has_local_images else "data:"
+    policy = (
+        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src {images}; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        '<meta name="color-scheme" content="light dark">\n'
+        f"<title>{escape(title)}</title>\n<style>\n{_file('page.css')}</style>\n</head>\n<body>\n{body}\n"
+        f"{''.join(f'<script>{script}</script>{chr(10)}' for script in scripts)}</body>\n</html>\n"
+    )
+
+
+@cache
+def _file(name: str) -> str:
+    return (HERE / name).read_text()
+
+
+@cache
+def _digest(script: str) -> str:
+    """Return the hash of a script as base64, as a security policy names it."""
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def table(frame: pd.DataFrame, numbers: Collection[str] = (), marked: Mapping[str, str] | None = None) -> str:
+    """Return a frame of texts as an HTML table, in a box that scrolls sideways where the window is narrow.
+
+    The columns ``numbers`` are aligned to the right. A cell whose text is a key of ``marked`` has that class.
+    """
+    classes = dict(marked or {})
+    head = "".join(
+        f'<th scope="col"{_class("number" if name in numbers else "")}>{escape(str(name))}</th>' for name in frame
+    )
+    lines = []
+    for row in frame.astype(str).to_numpy():
+        cells = (
+            f"<td{_class(classes.get(text) or ('number' if name in numbers else ''))}>{_breakable(text)}</td>"
+            for name, text in zip(frame, row, strict=True)
+        )
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    return (
+        f'<div class="scroll" tabindex="0"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{''.join(lines)}</tbody></table></div>"
+    )
+
+
+def _breakable(text: str) -> str:
+    """Return a text as HTML that may also break after a comma without a space, as in the settings of a plugin."""
+    return re.sub(r",(?=\S)", ",<wbr>", escape(text))
+
+
+def picture(path: Path, description: str) -> str:
+    """Return a PNG file as an embedded image, with a description for readers who do not see it."""
+    data = base64.b64encode(path.read_bytes()).decode()
+    return f'<img alt="{escape(description)}" src="data:image/png;base64,{data}">'
+
+
+def script(name: str) -> str:
+    """Return a script of this folder."""
+    return _file(name)
+
+
+def _class(name: str) -> str:
+    return f' class="{escape(name)}"' if name else ""

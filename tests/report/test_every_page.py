@@ -1,0 +1,186 @@
+"""Every kind of page in a browser: accessible in light and dark, no wider than a phone, and silent."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from helpers import experiment, row, small_rows, table
+
+import bench
+from bench.claims import page as claims_page
+from bench.claims.claim import NOT_REPRODUCED, REPRODUCED, RESERVED, Claim, Figure
+from bench.claims.results import ClaimResult
+from bench.model import registry
+from bench.report import index, web
+from bench.report.web import document, shell
+
+TEXT, MARK = 4.5, 3.0
+"""Contrasts that WCAG 2.2 asks for at level AA: of text, and of marks such as points and lines."""
+KINDS = ("study", "index", "claims", "examine")
+
+
+class Lesson(Claim):
+    """A claim for a page."""
+
+    name, lesson, statement, source, learned = "T1", "A lesson", "one is <b>one</b>", "here & now", "it is one"
+
+    def measure(self):
+        """Nothing: results are given."""
+        raise NotImplementedError
+
+    def draw(self, axes, series):
+        """Draw a line."""
+        axes.plot(series["x"], series["y"], label="line")
+
+
+class Other(Lesson):
+    """Another claim, of another lesson."""
+
+    name, lesson, learned = "T2", "Another lesson", "two is wrong"
+
+
+class Third(Lesson):
+    """A third claim, beside the first."""
+
+    name, learned = "T3", "three is nearly right"
+
+
+LONG = "a quantity with_a_name_that_is_longer_than_the_window_of_a_phone_and_has_no_place_to_break"
+RESULTS = [
+    (Lesson, ClaimResult("T1", REPRODUCED, 1.0, (Figure(LONG, "1.00", 1.0),), series={"x": [0, 1], "y": [0, 1]})),
+    (Third, ClaimResult("T3", RESERVED, 1.0, (Figure("three", "3", 3.0),), "too coarse")),
+    (Other, ClaimResult("T2", NOT_REPRODUCED, 1.0, (Figure("two", "2.00", 2.5),))),
+]
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """The path of a page of each kind."""
+    folder = tmp_path_factory.mktemp("pages")
+    made = experiment()
+    study = folder / "mine" / "report.html"
+    study.parent.mkdir()
+    rows = small_rows()
+    rows.to_parquet(study.parent / "rows.parquet")
+    study.write_text(document.assemble(made, web.content(made, rows), [["a=1"]] * len(rows), {}))
+    (folder / "claims").mkdir()
+    claims_page.write(folder / "claims", RESULTS)
+    report = bench.examine(
+        lambda x: float(x @ x), [1.0, 0.5], grad=lambda x: 2 * x, sigma=[0.1], progress=False, budget=2
+    )
+    report.save(folder / "examine")
+    paths = (study, index.write(folder), folder / "claims" / "claims.html", folder / "examine" / "report.html")
+    return dict(zip(KINDS, paths, strict=True))
+
+
+@pytest.fixture(autouse=True)
+def silent(browser):
+    """Start each test with a wide light window; no page may complain or ask for anything."""
+    browser.size(1280, 900)
+    yield
+    assert browser.said == browser.requests == []
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_axe_finds_nothing(kind, dark, pages, browser):
+    browser.size(1280, 900, dark)
+    browser.open(pages[kind])
+    assert browser.violations() == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_phone_needs_no_sideways_scrolling(kind, pages, browser):
+    browser.size(390, 844)
+    browser.open(pages[kind])
+    assert browser.overflow() == 0
+
+
+def luminance(colour):
+    """The relative luminance of ``rgb(r, g, b)`` by WCAG 2."""
+    parts = [float(part) / 255 for part in re.findall(r"[\d.]+", colour)[:3]]
+    linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def contrast(one, other):
+    """The contrast of two colours by WCAG 2."""
+    light, dark = sorted((luminance(one), luminance(other)), reverse=True)
+    return (light + 0.05) / (dark + 0.05)
+
+
+COLOURS = """[...document.querySelectorAll('.plot text, .plot .point, .plot .js-line, .legend b')].map((one) => {
+  const style = getComputedStyle(one), isText = one.tagName === 'text';
+  const shown = one.tagName === 'B' ? style.color : style.fill === 'none' || !isText && one.matches('.js-line') ? style.stroke : style.fill;
+  return [isText, shown, parseFloat(style.fontSize), one.textContent];
+})"""
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_charts_have_the_contrast_of_level_aa(dark, browser, tmp_path):
+    """Of every colour of the palette and of those beyond it, and with names of backends beside points."""
+    estimators = [*registry.entries()["estimators"], "unknown"]
+    rows = [
+        row(stiffness=k, backend=backend, estimator=e, time_s=1e-3 * (3 * place + i + 1), rmse_rel=0.1 + 0.02 * place + i)
+        for place, e in enumerate(estimators) for i, backend in enumerate(("one", "two")) for k in (1.0, 10.0)
+    ]  # fmt: skip
+    made = experiment(sweep={"stiffness": [1.0, 10.0]}, marks={"stiffness": {"limit": 5.0}})
+    path = tmp_path / "report.html"
+    path.write_text(document.assemble(made, web.content(made, table(rows)), [["a=1"]] * len(rows), {}))
+    browser.size(1280, 4000, dark)
+    browser.open(path)
+    ground = browser.do("getComputedStyle(document.body).backgroundColor")
+    found = browser.do(COLOURS)
+    assert len(found) > 4 * len(estimators)
+    for is_text, colour, size, text in found:
+        assert contrast(colour, ground) >= (TEXT if is_text else MARK), (colour, text)
+        if is_text and text and not re.fullmatch(r"[−\d]+", text):  # exponents are smaller
+            assert size >= 12, text
+
+
+def test_letters_of_a_map_have_the_contrast_of_level_aa(browser, pages):
+    """On every colour, letters are black or white, whichever is clearer."""
+    browser.open(pages["study"])
+    for colour in ("#0072b2", "#d55e00", "#e69f00", "#cc79a7", "#009e73", "#56b4e9", "#7f7f7f"):
+        letter = browser.do(f"inkOn('{colour}')")
+        numbers = [f"rgb({', '.join(str(int(c[i : i + 2], 16)) for i in (1, 3, 5))})" for c in (letter, colour)]
+        assert contrast(*numbers) >= TEXT
+
+
+def test_claims_are_filtered_by_verdict_and_a_link_to_a_hidden_one_shows_it(pages, browser):
+    browser.open(pages["claims"])
+    shown = (
+        "[...document.querySelectorAll('article, main section, nav li')].filter((one) => one.checkVisibility()).length"
+    )
+    assert browser.do(shown) == 3 + 2 + 5
+    browser.page.get_by_label("not reproduced").check()
+    assert browser.do(shown) == 1 + 1 + 2
+    assert browser.do("document.getElementById('T2').checkVisibility()")
+    browser.do("location.hash = '#T3'; new Promise((done) => setTimeout(done, 100))")
+    assert browser.do("document.getElementById('T3').checkVisibility()")
+    assert browser.do(shown) == 10
+    assert browser.do("document.querySelectorAll('p b + b, article p b').length") == 1 + 3, "only our own bold words"
+
+
+def test_printing_immediately_after_loading_keeps_every_chart(pages, browser):
+    browser.page.goto(pages["study"].as_uri())
+    browser.do(
+        "addEventListener('afterprint', () => {"
+        "  window.printed = charts.map((chart) => chart.panels.querySelectorAll('.main-svg .point').length > 0); })"
+    )
+    assert len(browser.page.pdf(format="A4")) > 50_000
+    printed = browser.do("printed")
+    assert len(printed) > 1
+    assert all(printed)
+
+
+def test_a_script_that_reaches_a_page_does_not_run(browser, tmp_path):
+    body = "<main><script>window.hacked = 1</script><img src=x onerror='window.hacked = 1'><p onclick='window.hacked = 1'>x</p></main>"
+    path = tmp_path / "page.html"
+    path.write_text(shell.document("A <title>", body, ["window.ours = 1"]))
+    browser.open(path)
+    browser.do("document.querySelector('p').click()")
+    assert browser.do("[window.hacked === undefined, window.ours, document.title]") == [True, 1, "A <title>"]
+    assert any("Content Security Policy" in text for text in browser.said)
+    browser.said.clear()
