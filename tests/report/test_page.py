@@ -24,8 +24,9 @@ from bench.report import reproduce, web
 from bench.report.web import document
 from bench.report.web.content import Chart, Content, PlotAxis, TableColumn
 from bench.run.store import Store
-from bench.studies.bias_variance import page as bias_variance_page
+from bench.studies.bias_variance.charts import with_plotted_columns
 from bench.studies.bias_variance.columns import COLUMNS
+from bench.studies.bias_variance.costs import with_gradient_cost
 
 HOSTILE = (
     "<script>window.hacked=1</script>",
@@ -36,12 +37,23 @@ HOSTILE = (
 """Names that would do something if they were taken for HTML, or for a part of the page's template."""
 
 
+CLOUD, ALONG = (
+    "charts.find((c) => c.table.startsWith('%s'))" % name for name in ("error_against_time", "bias_variance_")
+)
+"""The charts of errors against time and along an axis, in the page's script."""
+
+
 def page(rows, study=None, **given):
     """The page of made-up rows."""
     made = experiment(**given)
     if study is not None:
         made = replace(made, study=study, columns=study.columns)
-    return document.assemble(made, web.content(made, rows), [["a=1"]] * len(rows), {})
+    return document.assemble(
+        made,
+        web.content(made, rows, made.study.views(made, rows) if study is None else None),
+        [["a=1"]] * len(rows),
+        {},
+    )
 
 
 def data_of(text):
@@ -61,42 +73,24 @@ def finding(text):
 # ------------------------------------------------------------------------------------------------------- contents
 
 
-def test_finding_names_the_estimators_and_their_errors_where_each_is_to_be_used():
+def test_the_page_shows_the_findings_and_what_to_use_where():
     given = {"scene": "one", "estimator": "good", "rmse_rel": 0.1}
     rows = [row(**given | {"stiffness": k}) for k in (10.0, 100.0, 1000.0)]
     rows += [row(**given | {"stiffness": k, "estimator": "other", "rmse_rel": 0.5}) for k in (10.0, 100.0)]
     rows += [row(**given | {"stiffness": 1000.0, "estimator": "other", "rmse_rel": 0.04})]
-    text = page(table(rows), sweep={"stiffness": [10.0, 100.0, 1000.0]}, marks={})
-    assert "Use good: lowest relative RMSE at equal rollouts in 2 of 3 settings (0.10)" in finding(text)
-    assert "one, penalty, stiffness at 1000: use other (0.040, where good has 0.10)" in finding(text)
+    rows = table(rows)
+    made = experiment(sweep={"stiffness": [10.0, 100.0, 1000.0]}, marks={})
+    text = page(rows, sweep={"stiffness": [10.0, 100.0, 1000.0]}, marks={})
+    for sentence in made.study.views(made, rows).findings:
+        assert sentence in finding(text)
+    assert "Use good" in finding(text)
+    assert "up to stiffness 100" in text
 
 
-def test_finding_says_when_nothing_beats_zero_and_when_nothing_ran():
-    rows = table([row(stiffness=k, rmse_rel=3.0) for k in (10.0, 100.0)])
-    assert "nothing beats the zero estimate" in finding(page(rows))
-    rows["status"], rows["reason"] = "error", "it broke"
-    assert "No cell gave a result" in finding(page(rows))
-
-
-def test_finding_leads_with_what_fails_and_tells_worse_than_zero_from_no_better():
-    rows = table([row(stiffness=k, estimator="wild") for k in (1.0, 10.0, 100.0, 1e3)] + [row(estimator="fine")])
-    rows["rmse_rel"] = [0.2, 1.1, 50.0, 0.3, 0.1]
-    rows[["bias_low", "variance_low"]] = 0.0
-    rows.loc[2, "variance_low"] = (40.0 * rows["reference_norm"][2]) ** 2
-    rows.loc[3, ["status", "reason"]] = ["diverged", "too far"]
-    assert finding(page(rows)).startswith(
-        "wild is worse than the zero estimate in 1 (up to 50 times the gradient), no better than zero in 1, "
-        "without a number in 1 of 4 cells; "
-    )
-    assert not bias_variance_page.failure_sentence(rows[rows["estimator"] == "fine"])
-
-
-def test_finding_tells_of_backends_that_refused_every_cell():
+def test_finding_says_when_nothing_ran():
     rows = table([row(stiffness=k) for k in (10.0, 100.0)])
-    refused = rows.assign(backend="stubborn", status="unsupported", reason="cannot", key=rows["key"] + "s")
-    assert "stubborn refuses: cannot" in finding(page(pd.concat([rows, refused], ignore_index=True)))
-    refused.loc[0, "status"] = "ok"
-    assert "stubborn" not in finding(page(pd.concat([rows, refused], ignore_index=True)))
+    rows["status"], rows["reason"] = "error", "it broke"
+    assert "No cell has an error that could be compared" in finding(page(rows))
 
 
 def test_every_row_is_in_the_page_with_its_status_and_reason():
@@ -323,9 +317,9 @@ def test_backends_are_told_apart_by_name(browser, tmp_path):
     path = tmp_path / "report.html"
     path.write_text(page(rows, sweep={"stiffness": [1.0, 10.0]}, marks={}))
     browser.open(path)
-    names = "[...charts[%d].panels.querySelectorAll('.plot')].map((p) => p.layout.annotations.map((a) => a.text).filter((t) => /one|two/.test(t)).sort())"
-    assert browser.do(names % 0) == [["one", "one", "two", "two"]] * 2
-    assert browser.do(names % 1) == [["one", "two"]]
+    names = "[...%s.panels.querySelectorAll('.plot')].map((p) => p.layout.annotations.map((a) => a.text).filter((t) => /one|two/.test(t)).sort())"
+    assert browser.do(names % CLOUD) == [["one", "one", "two", "two"]] * 2
+    assert browser.do(names % ALONG) == [["one", "two"]]
     assert browser.said == []
 
 
@@ -340,28 +334,13 @@ def test_a_browser_draws_a_panel_for_each_stiffness_and_noise(browser, tmp_path)
     browser.open(path)
     browser.do(SETTLED)
     drawn = browser.do(
-        "charts.map((c) => [...c.panels.querySelectorAll('.plot')].map((p) => p.data.filter((d) => d.text)"
+        "charts.filter((c) => !c.fill).map((c) => [...c.panels.querySelectorAll('.plot')].map((p) => p.data.filter((d) => d.text)"
         ".reduce((n, d) => n + d.x.length, 0)))"
     )
-    assert drawn[0] == [2] * 4, "two sample counts for each stiffness and noise"
-    assert all(max(panels, default=0) <= 2 for panels in drawn), drawn
-    assert browser.said == []
-
-
-def test_a_browser_shows_what_fails_first_and_tells_worse_from_no_better(browser, tmp_path):
-    rows = table([row(stiffness=k, estimator="wild") for k in (1.0, 10.0, 100.0)] + [row(estimator="fine")])
-    rows["rmse_rel"] = [0.2, 1.1, 50.0, 0.1]
-    rows[["bias_low", "variance_low"]] = 0.0
-    rows.loc[2, "variance_low"] = (40.0 * rows["reference_norm"][2]) ** 2
-    path = tmp_path / "report.html"
-    path.write_text(page(rows))
-    browser.size(1280, 900)
-    browser.open(path)
-    assert browser.do("document.getElementById('finding').innerText").startswith(
-        "wild is worse than the zero estimate in 1 (up to 50 times the gradient), no better than zero in 1 of 3 cells"
+    assert drawn[browser.do(f"charts.filter((c) => !c.fill).indexOf({CLOUD})")] == [2] * 4, (
+        "two sample counts for each stiffness and noise"
     )
-    assert browser.do("document.getElementById('finding').getBoundingClientRect().bottom") < 900
-    browser.size(*WIDE)
+    assert all(max(panels, default=0) <= 2 for panels in drawn), drawn
     assert browser.said == []
 
 
@@ -414,23 +393,23 @@ def test_filters_stay_in_the_address_and_the_csv_has_what_is_shown(shown, tmp_pa
 
 
 def test_no_panel_pools_stiffness_or_sigma():
-    derived = bias_variance_page.with_plotted_columns(stiffness_rows())
-    pooled = derived.groupby("problem")[["stiffness", "sigma"]].nunique()
+    derived = with_plotted_columns(with_gradient_cost(stiffness_rows()))
+    pooled = derived.groupby("problem_")[["stiffness", "sigma"]].nunique()
     assert (pooled == 1).all().all()
 
 
 def test_number_of_points_in_the_first_chart_is_that_of_the_good_cells(shown):
     drawn = shown.do(
-        "[...charts[0].panels.querySelectorAll('.plot')].flatMap((plot) => plot.data).filter((one) => one.text)"
+        f"[...{CLOUD}.panels.querySelectorAll('.plot')].flatMap((plot) => plot.data).filter((one) => one.text)"
         ".reduce((count, one) => count + one.x.length, 0)"
     )
     assert drawn == int((small_rows()["status"] == "ok").sum())
 
 
 def test_time_axis_takes_compilation_and_rollouts(shown):
-    values = "charts[0].panels.querySelector('.plot').data.filter((one) => one.text).flatMap((one) => one.x)"
+    values = f"{CLOUD}.panels.querySelector('.plot').data.filter((one) => one.text).flatMap((one) => one.x)"
     times = shown.do(values)
-    select = "charts[0].options.querySelector('select')"
+    select = f"{CLOUD}.options.querySelector('select')"
     for place in (1, 2):
         shown.do(f"{select}.value = {place}; {select}.dispatchEvent(new Event('change'))")
         assert min(shown.do(values)) > max(times)

@@ -15,6 +15,9 @@ from bench.report.style import VARIANTS
 from bench.report.views import arrange, is_logarithmic, unsteady
 from bench.report.web import content as page
 
+IN_SIGHT = 5
+"""Most identity columns before the status and its reason, which a laptop then shows without scrolling."""
+
 
 def content(experiment: Experiment, rows: pd.DataFrame, views: Views) -> page.Content:
     """Return the content of the page: findings, tables, charts, and the cells with their results."""
@@ -35,15 +38,13 @@ def content(experiment: Experiment, rows: pd.DataFrame, views: Views) -> page.Co
         c for c in experiment.columns.all if c.table and c.name not in COMMON and c.kind != "list" and c.name in cells
         and (cells[c.name].nunique() > 1 if c.kind == "text" else cells[c.name].notna().any())
     ]  # fmt: skip
+    identity = page.identity_columns(cells, [axis.column for axis in shown.axes])
+    results = [_column(column, cells) for column in own]
     answers = next((table for table in views.tables if table.page), None)
     return page.Content(
         finding="; ".join(views.findings),
         rows=cells,
-        columns=[
-            *page.identity_columns(cells, [axis.column for axis in shown.axes]),
-            *(_column(column, cells) for column in own),
-            *page.STATUS,
-        ],
+        columns=[*identity[:IN_SIGHT], *results[:1], *page.STATUS, *results[1:], *identity[IN_SIGHT:]],
         charts=charts,
         answers=pd.DataFrame() if answers is None else _readable(answers),
         answers_title=answers.title if answers else "",

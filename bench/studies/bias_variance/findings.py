@@ -269,16 +269,16 @@ def _where(methods: pd.DataFrame, holds: Where, tried: Where, marks: Mapping[str
         if len(by_kind) > 1 and "none" not in by_kind and all(len(s) == 1 for s in by_kind.values()):
             word = "on" if kind == "scene" else "with"
             held: dict[str, list[str]] = {}
-            for name, (span,) in by_kind.items():
-                if span:
-                    held.setdefault(span, []).append(name)
-            parts = [f"{span} {word} {_join(names)}" for span, names in held.items()]
+            for name, (where,) in by_kind.items():
+                if where:
+                    held.setdefault(where, []).append(name)
+            parts = [f"{where} {word} {_join(names)}" for where, names in held.items()]
             if len(parts) <= NAMED:
                 return ", and ".join(parts) if any(" and " in part for part in parts) else " and ".join(parts)
     if len(set(spans.values())) == 1 and len(some) == len(by_problem):
         return next(iter(spans.values()))
     if len(some) <= 2:
-        return _join([f"{span} on {name}" for name, span in spans.items()])
+        return _join([f"{where} on {name}" for name, where in spans.items()])
     return n_settings
 
 

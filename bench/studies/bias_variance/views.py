@@ -40,7 +40,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         texts,
         made,
         charts.charts(shown, methods, errors, best, texts),
-        rows=charts.with_plotted_columns(shown.rows),
+        rows=charts.with_plotted_columns(with_gradient_cost(rows)),
         columns=[
             replace(COLUMNS.by_name["time_s"], label="time"),
             *(replace(c, label=label) for c, label in ((charts.BIAS, "rel. bias"), (charts.RMSE, "rel. RMSE"))),
