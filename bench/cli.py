@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from bench.experiment.experiment import Experiment
-    from bench.model import registry
     from bench.run.execute import Finished
 
 SETTINGS = """\
@@ -264,58 +263,23 @@ def _plan(words: list[str]) -> int:
 
 def _list(words: list[str]) -> int:
     """List the plugins of the given kinds or names, or all."""
+    from bench.api import described, matching_plugins
     from bench.experiment.words import parse_words
-    from bench.model import registry
     from bench.model.identity import text_of
-    from bench.model.parameters import parameters, singular
+    from bench.model.parameters import parameters
 
     names, _, _ = parse_words(words, "list", {})
-    table = registry.entries()
-    kinds = {name: kind for kind in table for name in (kind, singular(kind))}
-    plugins = {name for entries in table.values() for name in entries}
-    for name in names:
-        if name not in plugins and name not in kinds:
-            raise unknown("plugin or kind", name, {*plugins, *table})
-    selected_kinds = {kinds[name] for name in names if name in kinds}
-    for kind, entries in table.items():
-        listed = {name: e for name, e in entries.items() if not names or kind in selected_kinds or name in names}
+    for kind, listed in matching_plugins(names).items():
         if listed:
             print(f"\n{printable(kind)}")
         for name, entry in sorted(listed.items()):
-            print(f"  {printable(name):<22}{printable(_describe(entry))}")
+            print(f"  {printable(name):<22}{printable(described(entry))}")
             for parameter in parameters(entry.plugin).values() if entry.plugin else ():
                 unit = f" [{parameter.unit}]" if parameter.unit else ""
                 choices = f" ({' | '.join(parameter.choices)})" if parameter.choices else ""
                 line = f"{parameter.name}={text_of(parameter.default)}{unit}  {parameter.doc}{choices}"
                 print(f"      {printable(line)}")
     return 0
-
-
-def _describe(entry: registry.Entry) -> str:
-    """Return the first line of a plugin's docstring, its capabilities, and why it is unavailable."""
-    from bench.model import Backend, Estimator, Integrator, Scene
-
-    plugin = entry.plugin
-    if plugin is None:
-        return f"UNAVAILABLE, {entry.reason}"
-    facts = [(plugin.__doc__ or "").strip().split("\n")[0]]
-    if issubclass(plugin, Backend):
-        facts.append(f"provides {', '.join(sorted(plugin.provides))}")
-    elif issubclass(plugin, Estimator):
-        facts.append(f"needs {', '.join(sorted(plugin.needs))}")
-        if not plugin.unbiased:
-            facts.append("biased at finite N")
-        elif plugin.unbiased_at_discontinuities:
-            facts.append("unbiased, across jumps too")
-        else:
-            facts.append("unbiased where the cost is continuous")
-    elif issubclass(plugin, Integrator):
-        facts.append(f"order {plugin.order}")
-    elif issubclass(plugin, Scene) and plugin.neglected_effects:
-        facts.append(f"leaves out {plugin.neglected_effects}")
-    if not entry.available:
-        facts.append(f"UNAVAILABLE, {entry.reason}")
-    return "; ".join(facts)
 
 
 # ---------------------------------------------------------------------------------------- checks and traces
@@ -446,7 +410,7 @@ VERBS = {
         "--quick: only claims that take less than 5 s. Exit status 1 when a claim is not reproduced.\n",
     ),
     "compare": Verb(
-        _main_of("bench.compare"), "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
+        _main_of("bench.compare.command"), "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
         "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
         "times only with --timings, compared with the spread between runs: again=DIR,DIR names further runs of BEFORE.\n"
         "Written to out=DIR (runs/compare): compare.csv, .md, .json, .xml (JUnit) and .html.\n",

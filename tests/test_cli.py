@@ -253,7 +253,7 @@ def test_files_are_written_before_anything_is_printed(tmp_path):
 
 ESCAPING = '''
 from dataclasses import dataclass
-from bench import SampleMean
+from bench.plugin import SampleMean
 
 @dataclass(frozen=True)
 class Escaping(SampleMean):

@@ -231,7 +231,7 @@ def _study(text: Any) -> Study:
     name, values = parse_identity(text)
     study = build(registry.usable("studies", name), values)
     if not isinstance(study, Study):
-        raise UserError(f"study '{name}' does not derive from bench.Study")
+        raise UserError(f"study '{name}' does not derive from bench.plugin.Study")
     return study
 
 

@@ -172,7 +172,7 @@ def test_what_a_users_file_imports_from_bench_counts(tmp_path):
 STUDY = """
 from dataclasses import dataclass
 
-from bench import Column, Columns, Study
+from bench.plugin import Column, Columns, Study
 
 GAIN = {gain}
 
