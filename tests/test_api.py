@@ -178,7 +178,7 @@ def test_a_notebook_shows_problems_estimates_and_reports():
     assert "<td>penalty[stiffness=500]</td>" in problem._repr_html_()
     assert "a&lt;b" in report._repr_html_()
     assert "<b" not in report._repr_html_().replace("<b>", "")
-    assert "<th>relative RMSE</th>" in found._repr_html_()
+    assert "<th>RMSE</th>" in found._repr_html_()
     assert list(found.to_frame().index) == ["mass"]
     parameters = problem.to_frame().set_index(["part", "parameter"])
     assert parameters.loc[("contact", "stiffness"), "value"] == 500
