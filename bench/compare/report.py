@@ -12,9 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from bench.compare import timings
 from bench.compare.cells import FIRST, LAST, OUTCOMES, WORSE_IN, both_sides, differing_parameters, flat_parameters
@@ -23,6 +20,7 @@ from bench.compare.judging import NOTES
 from bench.experiment.columns import Column
 from bench.experiment.experiment import Experiment
 from bench.model import registry
+from bench.report import terminal
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted, one_line
 from bench.report.web.content import STATUS, Chart, Content, PlotAxis, identity_columns, look
@@ -140,21 +138,14 @@ def markdown(comparison: Comparison) -> str:
 
 def show(comparison: Comparison, paths: Sequence[Path]) -> None:
     """Print the summary, the remarks and the first changes."""
-    console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal:
-        console.width = max(console.width, 160)
+    console = terminal.open_console()
     console.print(f"\n{comparison.title}", style="bold")
     console.print(summary(comparison.table))
     for remark in comparison.remarks:
         console.print(f"  {remark}")
     listed = comparison.changes
     if not listed.empty:
-        shown = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="underline")
-        for name in ("outcome", "experiment", "cell", "change"):
-            shown.add_column(name, overflow="fold")
-        for outcome, *texts in listed.head(PRINTED).to_numpy():
-            shown.add_row(Text(outcome, "red" if outcome == "worse" else ""), *texts)
-        console.print(shown)
+        terminal.print_table(console, listed.head(PRINTED), least_important=("experiment",))
     if len(listed) > PRINTED:
         console.print(f"and {len(listed) - PRINTED} more in the files")
     print("\nWritten:")
