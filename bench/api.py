@@ -89,7 +89,7 @@ SPECIAL, ESCAPED = re.compile(r"([\\()\[\]{}:=,])"), r"\\\1"
 def run(experiment: str | Sequence[str] = (), **settings: Unpack[Settings]) -> pd.DataFrame:
     """Run the missing cells of an experiment, write its tables and charts, and return its rows, one per cell.
 
-    ``experiment`` is the name of an experiment, or a list of command-line words. ``settings`` are those of
+    ``experiment`` is the name of an experiment, or a list of command-line words. ``settings`` are the keys of
     :class:`bench.api.Settings`: ``run("stiffness_sweep", samples=32, sweep={"stiffness": [1e2, 1e4]},
     results_dir="out")``. Parameters of plugins are nested dictionaries: ``scene={"pushing": {"mass": 0.2}}``. Raises
     :class:`bench.UserError` for invalid input.

@@ -157,9 +157,9 @@ def _notebook_class(backend_class: type[Problem]) -> type[Problem]:
 def for_notebook(problem: Problem, backend: str) -> NotebookProblem:
     """Give a compiled problem the methods of :class:`NotebookProblem`, in place; return it."""
     problem.__class__ = _notebook_class(type(problem))
-    shown = cast(NotebookProblem, problem)
-    shown.backend = backend
-    return shown
+    converted = cast(NotebookProblem, problem)
+    converted.backend = backend
+    return converted
 
 
 def component_names(problem: Problem) -> list[str]:

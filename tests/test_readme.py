@@ -164,7 +164,9 @@ def test_readme_example_runs(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     exec(example, {})
     printed = capsys.readouterr().out
-    assert printed.startswith("fobg on pushing[sigma=0.1], penalty, semi_implicit_euler, numpy: 16 estimates of 32 samples")
+    assert printed.startswith(
+        "fobg on pushing[sigma=0.1], penalty, semi_implicit_euler, numpy: 16 estimates of 32 samples"
+    )
     assert "\nrandomized_smoothing on pushing" in printed
     assert printed.count("\nrelative bias ") == 2
 

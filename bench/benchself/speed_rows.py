@@ -59,7 +59,9 @@ def show(rows: Sequence[SpeedRow]) -> None:
     from bench.report import terminal
 
     formatted = pd.DataFrame(format_rows(rows))
-    terminal.print_table(terminal.open_console(), formatted, title="bench-self", right=("result", "target", "ratio"))
+    terminal.print_table(
+        terminal.open_console(), formatted, title="bench-self", right=("measured", "target", "ratio", "spread")
+    )
 
 
 def write(rows: Sequence[SpeedRow], directory: Path, load_before: list[float] | None) -> list[Path]:

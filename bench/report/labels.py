@@ -14,7 +14,7 @@ IDENTITY = re.compile(r"[\w.+-]+\[([^\[\]]*=[^\[\]]*)\]")
 
 
 class Labels:
-    """Replaces the parameters of long identity strings by letters; :attr:`key` has the parameters of each letter.
+    """Replaces the parameters of each long identity string by one letter; :attr:`key` has the parameters of each letter.
 
     >>> labels = Labels()
     >>> labels.short("alpha_order[delta=0.95,gamma=4,sharing=shared]"), labels.short("fobg"), labels.key
@@ -24,10 +24,10 @@ class Labels:
     def __init__(self, longest: int = LONGEST) -> None:
         self._longest = longest
         self._letters: dict[str, str] = {}
-        self._unused = ("".join(letters) for n in count(1) for letters in product(ascii_lowercase, repeat=n))
+        self._unused = ("".join(parts) for n in count(1) for parts in product(ascii_lowercase, repeat=n))
 
     def short(self, text: str) -> str:
-        """Return text in which equal parameters of long identity strings have equal letters."""
+        """Return text in which equal parameters of long identity strings have the same letter."""
         return IDENTITY.sub(self._replace, text)
 
     def _replace(self, match: re.Match[str]) -> str:
@@ -39,11 +39,11 @@ class Labels:
 
     @property
     def key(self) -> list[str]:
-        """The letters that :meth:`short` has used, each with its parameters."""
+        """Each letter that :meth:`short` has used, with its parameters."""
         return [f"[{letter}] {', '.join(values.split(','))}" for values, letter in self._letters.items()]
 
 
 def shortened(texts: Iterable[str], longest: int = LONGEST) -> tuple[dict[str, str], list[str]]:
-    """Return a short label for each text, and the key of the letters in the labels."""
+    """Return a short label for each text, and the key of the labels."""
     labels = Labels(longest)
     return {text: labels.short(text) for text in texts}, labels.key

@@ -7,11 +7,12 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
+import numpy as np
 import pandas as pd
 from rich.cells import cell_len, chop_cells
 from rich.console import Console
 
-from bench.report.labels import Labels
+from bench.report.labels import LONGEST, Labels
 from bench.report.text import number, one_line
 
 GAP = 2
@@ -58,7 +59,16 @@ def print_table(
     lines = layout(table, console.width, title, notes, heads, right, least_important)
     for part, style in ((lines.title, "bold"), (lines.header, "underline"), (lines.body, ""), (lines.notes, "dim")):
         for line in part:
-            console.print(line, style=style, no_wrap=True, overflow="ignore", crop=False)
+            console.print(
+                line,
+                style=style,
+                no_wrap=True,
+                overflow="ignore",
+                crop=False,
+                markup=False,
+                highlight=False,
+                emoji=False,
+            )
 
 
 def layout(
@@ -74,7 +84,7 @@ def layout(
 
     ``heads`` replaces names of columns. Columns of numbers and the columns ``right`` are right-aligned and never
     wrapped. Long identity strings have short labels, explained below the table. Where the table is too wide, columns
-    with one value are stated once above it, then text wraps, then columns are left out and named below it: those of
+    with one value are stated once above it, then text wraps, then columns are left out and named below it: first
     ``least_important`` in their order, then from the right. The first column and the status stay longest.
     """
     width = max(width, LEAST_WIDTH)
@@ -87,46 +97,52 @@ def layout(
     def least(name: str) -> int:
         natural = _widest(columns[name])
         if name not in aligned:
-            natural = min(natural, LEAST_TEXT)
+            longest = _widest(piece for text in columns[name] for piece in _pieces(text))
+            natural = min(natural, max(LEAST_TEXT, min(longest, LONGEST)))
         return max(natural, _widest(_pieces(names[name])))
 
-    def total(shown: Sequence[str]) -> int:
-        return sum(map(least, shown)) + GAP * (len(shown) - 1)
+    def total(visible: Sequence[str]) -> int:
+        return sum(map(least, visible)) + GAP * (len(visible) - 1)
 
-    shown = list(columns)
+    visible = list(columns)
     constant: list[str] = []
-    if total(shown) > width and len(table) > 1:
-        constant = [name for name in shown[1:] if len(set(columns[name])) == 1]
-        shown = [name for name in shown if name not in constant]
-    first_out = [name for name in least_important if name in shown[1:]]
-    others = [name for name in reversed(shown[1:]) if name not in first_out]
+    if total(visible) > width and len(table) > 1:
+        constant = [name for name in visible[1:] if len(set(columns[name])) == 1]
+        visible = [name for name in visible if name not in constant]
+    first_out = [name for name in least_important if name in visible[1:]]
+    others = [name for name in reversed(visible[1:]) if name not in first_out]
     queue = [*first_out, *sorted(others, key=lambda name: name in KEPT)]
     omitted: list[str] = []
-    while total(shown) > width and queue:
+    while total(visible) > width and queue:
         omitted.append(queue.pop(0))
-        shown.remove(omitted[-1])
-    widths = _widths([(least(name), max(_widest(columns[name]), least(name))) for name in shown], width)
+        visible.remove(omitted[-1])
+    for name in reversed(omitted):  # a narrow column may fit where a wide one did not
+        again = [other for other in columns if other in (*visible, name)]
+        visible = again if total(again) <= width else visible
+    widths = _widths([(least(name), _widest([names[name], *columns[name]])) for name in visible], width)
 
     def lines(cells: Sequence[str]) -> list[str]:
         wrapped = [wrap(cell, size) for cell, size in zip(cells, widths, strict=True)]
         height = max(map(len, wrapped), default=0)
         return [
-            (" " * GAP).join(
+            (" " * GAP)
+            .join(
                 _padded(part[row] if row < len(part) else "", size, name in aligned)
-                for part, size, name in zip(wrapped, widths, shown, strict=True)
-            ).rstrip()
+                for part, size, name in zip(wrapped, widths, visible, strict=True)
+            )
+            .rstrip()
             for row in range(height)
         ]
 
     facts = [f"{names[name]}: {columns[name][0]}" for name in constant if columns[name][0]]
-    dropped = [names[name] for name in columns if name in omitted]
+    dropped = [names[name] for name in columns if name not in (*visible, *constant)]
     remarks = [*labels.key, *notes]
     if dropped:
         remarks.append(f"Left out to fit {width} characters: {', '.join(dropped)}. The CSV file has all columns.")
     return Layout(
         title=_wrapped([*title.splitlines(), *(["; ".join(facts)] if facts else [])], width),
-        header=lines([names[name] for name in shown]),
-        body=[line for row in zip(*(columns[name] for name in shown), strict=True) for line in lines(row)],
+        header=lines([names[name] for name in visible]),
+        body=[line for row in zip(*(columns[name] for name in visible), strict=True) for line in lines(row)],
         notes=_wrapped(remarks, width),
     )
 
@@ -149,9 +165,8 @@ def wrap(text: str, width: int) -> list[str]:
 
 
 def _text(value: object, is_number: bool, labels: Labels) -> str:
-    if is_number:
-        value = float(value)  # type: ignore[arg-type]
-        return f"{value:.0f}" if value.is_integer() and abs(value) < 1e6 else number(value, 3)
+    if is_number and not isinstance(value, int | np.integer):
+        return number(float(value), 3)  # type: ignore[arg-type]
     if pd.api.types.is_scalar(value) and pd.isna(value):
         return ""
     return "\n".join(labels.short(one_line(line)) for line in str(value).split("\n"))
