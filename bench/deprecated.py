@@ -32,6 +32,8 @@ MEMBERS = {
     "wants": "required_fields",
 }
 """New names of plugin members, by old name."""
+EXPERIMENTS = {"quick_optimise": "optimise/small", "ladder": "optimise/large"}
+"""New names of experiments, by old name."""
 MODULES = {
     "bench.face": ("bench.api",),
     "bench.model.known": ("bench.model.known_solutions",),
@@ -50,9 +52,12 @@ MODULES = {
 
 def warn(old: str, new: str, level: int = 3) -> None:
     """Issue a DeprecationWarning that an old name will be removed in the next version."""
-    warnings.warn(
-        f"{old} is now called {new}; the old name will be removed in the next version", DeprecationWarning, level
-    )
+    warnings.warn(sentence(old, new), DeprecationWarning, level)
+
+
+def sentence(old: str, new: str) -> str:
+    """Return the sentence that an old name will be removed in the next version."""
+    return f"{old} is now called {new}; the old name will be removed in the next version"
 
 
 def lookup(module: str, namespace: Mapping[str, Any], homes: Mapping[str, str] | None = None) -> Callable[[str], Any]:

@@ -57,7 +57,7 @@ def gallery_page(page: Path, results: Path) -> str:
     entries = []
     for name in config.experiments():
         experiment = config.load([f"experiment={name}", f"results_dir={results}"])
-        entries.append((gallery_entry(experiment, page.parent) or present.get(name, "")).strip())
+        entries.append((gallery_entry(experiment, page.parent) or present.get(experiment.name, "")).strip())
     if not any(entries):
         raise UserError(f"'{results}' has no rows of any experiment: run some with results_dir={results} first")
     body = "".join(f"\n### {entry}\n" for entry in entries if entry)
