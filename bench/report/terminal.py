@@ -89,10 +89,13 @@ def layout(
     """
     width = max(width, LEAST_WIDTH)
     labels = Labels()
-    numeric = {str(name) for name in table if pd.api.types.is_numeric_dtype(table[name]) and table[name].dtype != bool}
-    aligned = {*numeric, *map(str, right)}
-    columns = {str(name): [_text(value, str(name) in numeric, labels) for value in table[name]] for name in table}
-    names = {name: heads.get(name, name) for name in columns}
+    given = [str(name) for name in table]
+    keys = [name if given.count(name) == 1 else f"{name} {place}" for place, name in enumerate(given)]
+    table = table.set_axis(keys, axis=1)
+    numeric = {name for name in table if pd.api.types.is_numeric_dtype(table[name]) and table[name].dtype != bool}
+    aligned = {key for key, name in zip(keys, given, strict=True) if key in numeric or name in right}
+    columns = {name: [_text(value, name in numeric, labels) for value in table[name]] for name in keys}
+    names = {key: heads.get(name, name) for key, name in zip(keys, given, strict=True)}
 
     def least(name: str) -> int:
         natural = _widest(columns[name])

@@ -75,6 +75,12 @@ def test_missing_values_and_booleans():
     assert layout(pd.DataFrame(columns=["a", "b"]), 80).body == []
 
 
+def test_two_columns_of_one_name_are_both_shown():
+    table = pd.DataFrame([["a", 1, 2.5]], columns=["name", "value", "value"])
+    assert layout(table, 80).header == ["name  value  value"]
+    assert layout(table, 80).body == ["a         1   2.50"]
+
+
 def test_equal_parameters_have_equal_letters_and_short_names_stay():
     labels, key = shortened([LONG, "fobg", "reinforce[baseline=none]", LONG.replace("alpha_order", "other")])
     assert list(labels.values()) == ["alpha_order[a]", "fobg", "reinforce[baseline=none]", "other[a]"]
