@@ -18,7 +18,6 @@ from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Table
 from bench.measure.statistics import is_unexplained
-from bench.report import terminal
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.text import counted, number
 from bench.report.views import Arranged, Curve, estimator_curves
