@@ -26,7 +26,8 @@ docs: $(VENV)/.installed
 
 # Run the missing cells of all experiments into results/standard, then build the gallery from them.
 gallery: $(VENV)/.installed
-	for file in conf/experiment/*.yaml; do $(RUN) +experiment=$$(basename $$file .yaml) results_dir=results/standard || exit 1; done
+	for name in $$(cd conf/experiment && find * -name '*.yaml' | sed 's/\.yaml$$//' | sort); do \
+	  $(RUN) +experiment=$$name results_dir=results/standard || exit 1; done
 	$(BIN)/python docs/build.py gallery
 
 # The examples on other people's engines, in environments of their own: their pins and ours do not live together.

@@ -1,7 +1,9 @@
 """Compare gradient estimators through physics simulation: bias, variance and cost against a certified gradient.
 
-The Python interface (:func:`run`, :func:`load`, :func:`problem`, :func:`estimate`, :func:`examine`) and the contracts of
-plugins.
+- One gradient: :func:`problem` compiles a problem, :func:`estimate` estimates its gradient.
+- Experiments: :func:`run` runs one, :func:`load` reads stored rows, :func:`compare` compares two results.
+- Your own simulator: :func:`examine` reports whether its gradient is right; :class:`Mjcf` makes a cost of an MJCF model.
+- Plugins: :func:`list` lists them, and :mod:`bench.plugin` has the contracts that their authors import.
 """
 
 # ruff: noqa: E402
@@ -10,40 +12,32 @@ from bench.interrupts import exit_on_interrupt
 exit_on_interrupt()  # before the slow imports
 
 import bench.run  # noqa: F401, before the function of the same name replaces the package here
-from bench import deprecated
-from bench.api import Estimates, estimate, load, problem, run
-from bench.errors import StorageError, UserError
-from bench.examine import Report, examine
-from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule
-from bench.experiment.experiment import Experiment
-from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.model import *  # noqa: F403
-from bench.model import __all__ as _contracts
+from bench import deprecated, plugin
+from bench.api import estimate, list_plugins, load, problem, run
+from bench.compare import compare
+from bench.errors import Unsupported, UserError
+from bench.examine import examine
 from bench.model.simulator.mjcf import Mjcf
+
+list = list_plugins  # not in __all__: a star import must not replace the built-in type
 
 __version__ = "0.4.0"
 __all__ = [
-    *_contracts,
-    "Cell",
-    "Column",
-    "Columns",
-    "Estimates",
-    "Experiment",
-    "ComparisonRule",
     "Mjcf",
-    "Report",
-    "Session",
-    "StorageError",
-    "Study",
+    "Unsupported",
     "UserError",
+    "compare",
     "estimate",
     "examine",
     "load",
+    "plugin",
     "problem",
     "run",
 ]
 
 deprecated.install()
-__getattr__ = deprecated.lookup(__name__, globals())
+__getattr__ = deprecated.lookup(__name__, globals(), dict.fromkeys(plugin.__all__, "bench.plugin") | deprecated.HOMES)
+
+
+def __dir__() -> tuple[str, ...]:
+    return (*__all__, "__version__", "list")

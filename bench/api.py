@@ -1,4 +1,4 @@
-"""The Python interface: run an experiment, load stored rows, compile a problem, estimate a gradient.
+"""The Python interface: run an experiment, load stored rows, list plugins, compile a problem, estimate a gradient.
 
 Names and settings are the same as on the command line.
 """
@@ -8,21 +8,77 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 
-from bench.errors import Unsupported, UserError
+from bench.errors import Unsupported, UserError, unknown
 from bench.experiment.by_name import compile_problem, make
-from bench.model import Decision, Estimator, Problem, registry
-from bench.model.parameters import singular
+from bench.model import Backend, Decision, Estimator, Integrator, Problem, Scene, registry
+from bench.model.identity import label, text_of
+from bench.model.parameters import parameters, singular
+from bench.notebook import Estimates, NotebookProblem, for_notebook
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from bench.measure.statistics import Summary
+Names = Sequence[str] | str
+"""Identity strings of plugins, ``name`` or ``name[parameter=value]``: several, or one."""
+Values = Mapping[str, Mapping[str, Any]]
+"""Parameters of plugins: ``{"pushing": {"mass": 0.2}}``."""
+
+
+class Settings(TypedDict, total=False):
+    """The settings of an experiment, by their names on the command line; docs/commands.md has their meanings.
+
+    A setting that is omitted has the value of the experiment's file, else the default of ``conf/config.yaml``.
+    """
+
+    name: str
+    question: str
+    study: str
+    scenes: Names
+    contacts: Names
+    integrators: Names
+    backends: Names
+    estimators: Names
+    optimizers: Names
+    sweep: Mapping[str, Any]
+    scene: Values
+    contact: Values
+    integrator: Values
+    backend: Values
+    estimator: Values
+    optimizer: Values
+    theta: Names
+    theta0: Sequence[float] | np.ndarray | None
+    samples: int
+    repeats: int
+    seed: int
+    reference: Mapping[str, float]
+    workers: int | None
+    timeout: float | str | None
+    memory: float | str | None
+    on_error: str
+    retry: Names
+    versions: str
+    timing: bool | None
+    compile_cache: str | Path | None
+    plugins: str | Path | Sequence[str | Path]
+    launcher: str
+    ray: Mapping[str, Any]
+    slurm: Mapping[str, Any]
+    results_dir: str | Path
+    formats: Names
+    table: Mapping[str, Any]
+    columns: str | None
+    rows: Names
+    compile_time: bool
+    average: Names
+    marks: Mapping[str, Mapping[str, float]]
+
 
 SIMPLE = re.compile(r"[A-Za-z0-9_./+-]*")
 """Strings that Hydra reads without quotes."""
@@ -30,12 +86,13 @@ SPECIAL, ESCAPED = re.compile(r"([\\()\[\]{}:=,])"), r"\\\1"
 """Characters that need a backslash in the keys of a Hydra table."""
 
 
-def run(experiment: str | Sequence[str] = (), **overrides: Any) -> pd.DataFrame:
+def run(experiment: str | Sequence[str] = (), **settings: Unpack[Settings]) -> pd.DataFrame:
     """Run the missing cells of an experiment, write its tables and charts, and return its rows, one per cell.
 
-    ``experiment`` is the name of an experiment, or a list of command-line words. ``overrides`` are settings:
-    ``run("stiffness_sweep", samples=32, sweep={"stiffness": [1e2, 1e4]}, results_dir="out")``. Parameters of plugins are
-    nested dictionaries: ``scene={"pushing": {"mass": 0.2}}``. Raises :class:`bench.UserError` for invalid input.
+    ``experiment`` is the name of an experiment, or a list of command-line words. ``settings`` are the keys of
+    :class:`bench.api.Settings`: ``run("stiffness_sweep", samples=32, sweep={"stiffness": [1e2, 1e4]},
+    results_dir="out")``. Parameters of plugins are nested dictionaries: ``scene={"pushing": {"mass": 0.2}}``. Raises
+    :class:`bench.UserError` for invalid input.
     """
     from bench.experiment import config
     from bench.experiment.axes import with_axes
@@ -43,7 +100,7 @@ def run(experiment: str | Sequence[str] = (), **overrides: Any) -> pd.DataFrame:
     from bench.run.execute import execute
 
     words = [f"experiment={experiment}"] if isinstance(experiment, str) and experiment else list(experiment)
-    words += [word for key, value in overrides.items() for word in _override_words(key, value)]
+    words += [word for key, value in settings.items() for word in _override_words(key, value)]
     resolved = config.load(words)
     rows, _ = finish(execute(resolved), words)
     return with_axes(resolved, rows).reset_index(drop=True)
@@ -108,6 +165,68 @@ def load(directory: str | Path) -> pd.DataFrame:
     return rows.assign(**{axis.column: axes.values_of(axis, rows) for axis in swept_axes if axis.column not in rows})
 
 
+def list_plugins(*names: str, plugins: str | Path | Sequence[str | Path] = ()) -> pd.DataFrame:
+    """List plugins, one per row: kind, name, what it is, its parameters with their defaults, and why it is unavailable.
+
+    ``names`` are kinds (``"scenes"``) and names of plugins; without them, all plugins are listed. ``plugins`` are folders
+    with your own plugins. Raises :class:`bench.UserError` for an unknown name.
+    """
+    import pandas as pd
+
+    for folder in [plugins] if isinstance(plugins, str | Path) else plugins:
+        registry.add_folder(Path(folder))
+    rows = []
+    for kind, listed in matching_plugins(names).items():
+        for name, entry in sorted(listed.items()):
+            declared = parameters(entry.plugin).values() if entry.plugin else ()
+            texts = {parameter.name: text_of(parameter.default) for parameter in declared}
+            rows.append((kind, name, described(entry, availability=False), texts, entry.available, entry.reason))
+    return pd.DataFrame(rows, columns=["kind", "name", "description", "parameters", "available", "reason"])
+
+
+def matching_plugins(names: Sequence[str]) -> registry.Table:
+    """Return the plugins of the given kinds or names, or all plugins, by kind and name.
+
+    Raises :class:`bench.UserError` for an unknown name.
+    """
+    table = registry.entries()
+    kinds = {name: kind for kind in table for name in (kind, singular(kind))}
+    known = {name for entries in table.values() for name in entries}
+    for name in names:
+        if name not in known and name not in kinds:
+            raise unknown("plugin or kind", name, {*known, *table})
+    selected = {kinds[name] for name in names if name in kinds}
+    return {
+        kind: {name: e for name, e in entries.items() if not names or kind in selected or name in names}
+        for kind, entries in table.items()
+    }
+
+
+def described(entry: registry.Entry, availability: bool = True) -> str:
+    """Return the first line of a plugin's docstring and its capabilities; with ``availability``, why it is unavailable."""
+    plugin = entry.plugin
+    facts: list[str] = []
+    if plugin is not None:
+        facts.append((plugin.__doc__ or "").strip().split("\n")[0])
+        if issubclass(plugin, Backend):
+            facts.append(f"provides {', '.join(sorted(plugin.provides))}")
+        elif issubclass(plugin, Estimator):
+            facts.append(f"needs {', '.join(sorted(plugin.needs))}")
+            if not plugin.unbiased:
+                facts.append("biased at finite N")
+            elif plugin.unbiased_at_discontinuities:
+                facts.append("unbiased, across jumps too")
+            else:
+                facts.append("unbiased where the cost is continuous")
+        elif issubclass(plugin, Integrator):
+            facts.append(f"order {plugin.order}")
+        elif issubclass(plugin, Scene) and plugin.neglected_effects:
+            facts.append(f"leaves out {plugin.neglected_effects}")
+    if availability and not entry.available:
+        facts.append(f"UNAVAILABLE, {entry.reason}")
+    return "; ".join(facts)
+
+
 def problem(
     scene: str,
     contact: str = "penalty",
@@ -115,47 +234,25 @@ def problem(
     backend: str = "jax",
     theta: Sequence[str] = (),
     theta0: Sequence[float] | None = None,
-) -> Problem:
+) -> NotebookProblem:
     """Compile a problem by command-line names: ``problem("pushing[sigma=0.1]", contact="penalty[stiffness=1e4]")``.
 
-    ``problem.value(theta, w)``, ``.grad`` and ``.score`` take ``theta (d,)`` or ``(d, B)`` and noise ``w (n_w, B)``.
-    ``problem.program.theta0`` is the point at which gradients are taken. ``theta`` names float parameters of the scene
-    and the contact law as the decision variable in place of the scene's own. Raises :class:`bench.UserError` for an
-    invalid name or value, and :class:`bench.Unsupported` if the combination cannot run or a library is not installed.
+    ``problem.value(theta, w)``, ``.grad`` and ``.score`` take ``theta (d,)`` or ``(d, B)`` and noise ``w (n_w,)`` or
+    ``(n_w, B)``, as arrays or lists. By default they use ``problem.program.theta0``, the point at which gradients are
+    taken, and no noise. ``problem.plot()`` draws the cost, and ``problem.to_frame()`` has the parameters. ``theta``
+    names float parameters of the scene and the contact law as the decision variable in place of the scene's own. Raises
+    :class:`bench.UserError` for an invalid name or value, and :class:`bench.Unsupported` if the combination cannot run
+    or a library is not installed.
     """
     at = None if theta0 is None else tuple(map(float, theta0))
-    return compile_problem(scene, contact, integrator, backend, Decision(tuple(theta), at))
+    return for_notebook(compile_problem(scene, contact, integrator, backend, Decision(tuple(theta), at)), backend)
 
 
-@dataclass(frozen=True, eq=False)
-class Estimates:
-    """Independent estimates of a gradient, compared with the reference gradient."""
-
-    values: np.ndarray
-    """The estimates, ``(R, d)``."""
-    reference: np.ndarray
-    """The reference gradient, ``(d,)``."""
-    reference_method: str
-    summary: Summary
-    """Bias and variance with 95% intervals, see :class:`bench.measure.statistics.Summary`."""
-    auxiliaries: Mapping[str, np.ndarray]
-    """Diagnostics of the estimator by name, such as a weight, each ``(R,)`` or ``(R, d)``."""
-
-    def __str__(self) -> str:
-        s = self.summary
-        return (
-            f"{len(self.values)} estimates: bias {s.bias:.3g} [{s.bias_low:.3g}, {s.bias_high:.3g}], variance {s.variance:.3g} "
-            f"[{s.variance_low:.3g}, {s.variance_high:.3g}], rmse {s.rmse:.3g}, |reference| {s.reference_norm:.3g} "
-            f"({self.reference_method})" + (f"; {s.note}" if s.note else "")
-        )
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the statistics by the names of the main table's columns."""
-        return asdict(self.summary)
+_problem = problem  # an argument of estimate has the same name
 
 
 def estimate(
-    problem: Problem,
+    problem: Problem | str,
     estimator: str,
     samples: int = 256,
     repeats: int = 64,
@@ -165,13 +262,16 @@ def estimate(
 ) -> Estimates:
     """Compute R = ``repeats`` independent estimates of grad J_sigma at ``theta0``, with their bias and variance.
 
-    Each estimate uses N = ``samples`` samples. The noise is the same as in the cells of an experiment with this seed. The
-    reference gradient is the closed form, quadrature or long sampling of the same problem, with up to
-    ``reference_samples`` samples, until its relative standard error is at most ``tolerance``. Raises
-    :class:`bench.Unsupported` if the estimator cannot be used on the problem.
+    ``problem`` is compiled by :func:`problem`, or the name of a scene: ``estimate("pushing", "fobg")``. Each estimate
+    uses N = ``samples`` samples. The noise is the same as in the cells of an experiment with this seed. The reference
+    gradient is the closed form, quadrature or long sampling of the same problem, with up to ``reference_samples``
+    samples, until its relative standard error is at most ``tolerance``. Raises :class:`bench.Unsupported` if the
+    estimator cannot be used on the problem.
     """
     from bench.measure import noise, reference, statistics
 
+    if isinstance(problem, str):
+        problem = _problem(problem)
     method: Estimator = make("estimators", estimator)
     program = problem.program
     if reason := method.incompatibility(program, problem.provides, "this backend"):
@@ -183,4 +283,4 @@ def estimate(
     unbiased = method.declares_unbiased(program)
     summary = statistics.summarise(values, truth.known(), samples, unbiased=unbiased)
     summary = replace(summary, note="; ".join(part for part in (summary.note, truth.note) if part))
-    return Estimates(values, truth.gradient, truth.method, summary, diagnostics)
+    return Estimates(problem, label(method), samples, values, truth.gradient, truth.method, summary, diagnostics)

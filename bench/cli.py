@@ -9,6 +9,7 @@ import re
 import shlex
 import signal
 import sys
+import textwrap
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,19 +23,22 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from bench.experiment.experiment import Experiment
-    from bench.model import registry
     from bench.run.execute import Finished
 
 SETTINGS = """\
-Settings: scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..] study=NAME
-  sweep.AXIS=[..]  scene.NAME.PARAMETER=..  (also contact. integrator. backend. estimator.)
-  samples=N repeats=R seed=S theta=[mass,..] theta0=[..] results_dir=DIR name=FOLDER formats=[png,svg,pdf]
+Settings:
+  scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..]
+  study=NAME sweep.AXIS=[..] theta=[mass,..] theta0=[..]
+  scene.NAME.PARAMETER=..  (also contact. integrator. backend. estimator.)
+  samples=N repeats=R seed=S results_dir=DIR name=FOLDER formats=[png,svg,pdf]
   workers=N timeout=10m memory=4g on_error=stop timing=false retry=[timeout]
-  plugins=DIR: plugins of your own.  --config-dir DIR: experiments of your own, as DIR/experiment/NAME.yaml
+  plugins=DIR: plugins of your own
+  --config-dir DIR: experiments of your own, as DIR/experiment/NAME.yaml
   --quiet: no progress
 """
 STATUS = """\
-Exit status: 0 every cell has a row that is not 'error'; 1 some cell failed unexpectedly; 2 bad input.
+Exit status: 0 every cell has a row that is not 'error'; 1 some cell failed
+unexpectedly; 2 bad input.
 """
 EXAMINE = """\
   theta=1,0            the point: numbers, names with numbers (mass:1,gain:2), or a name in the file; by default theta
@@ -49,6 +53,12 @@ EXAMINE = """\
   --quiet              no progress
 Exit status: 0 the gradient can be trusted; 1 it cannot; 2 bad input.
 """
+FAMILY = """\
+Three commands ask whether something is right, each about its own subject:
+  check      a plugin: does it do what it declares?
+  gradcheck  a scene: is each gradient the derivative of its program?
+  examine    your own simulator: is its gradient right, and what to use?
+"""
 QUIET, CONFIG_DIR = "--quiet", "--config-dir"
 
 
@@ -61,6 +71,8 @@ class Verb:
     does: str
     more: str = ""
     """Text that ``--help`` adds."""
+    group: str = "Results"
+    """Heading under which the overview lists the command."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -155,11 +167,16 @@ def _dispatch(words: list[str]) -> int:
 def _print_overview() -> None:
     from bench.experiment import config
 
-    lines = [f"  python -m bench {verb.usage:<45} {verb.does}" for verb in VERBS.values()]
+    groups = dict.fromkeys(verb.group for verb in VERBS.values())
+    listed = {
+        group: "".join(f"\n  {verb.usage}\n      {verb.does}" for verb in VERBS.values() if verb.group == group)
+        for group in groups
+    }
     parts = [
-        "Compare gradient estimators through physics simulation.",
-        "\n".join(lines),
-        f"Each takes --help.  Experiments: {', '.join(config.experiments())}\n{SETTINGS}",
+        "python -m bench COMMAND: compare gradient estimators through physics simulation.",
+        *(f"{group}{lines}" for group, lines in listed.items()),
+        textwrap.fill(f"Each takes --help. Experiments: {', '.join(config.experiments())}", 79),
+        SETTINGS,
         STATUS,
     ]
     print("\n\n".join(part.rstrip("\n") for part in parts))
@@ -184,7 +201,10 @@ def _load(words: Sequence[str], notes: bool = True) -> Experiment:
         else:
             overrides.append(word)
     experiment = config.load(overrides, folders)
-    for note in config.explain_sweep(overrides, folders) if notes else ():
+    for note in [
+        *config.explain_names(overrides, folders),
+        *(config.explain_sweep(overrides, folders) if notes else ()),
+    ]:
         print(f"bench: {printable(note)}", file=sys.stderr)
     return experiment
 
@@ -264,25 +284,17 @@ def _plan(words: list[str]) -> int:
 
 def _list(words: list[str]) -> int:
     """List the plugins of the given kinds or names, or all."""
+    from bench.api import described, matching_plugins
     from bench.experiment.words import parse_words
-    from bench.model import registry
     from bench.model.identity import text_of
-    from bench.model.parameters import parameters, singular
+    from bench.model.parameters import parameters
 
     names, _, _ = parse_words(words, "list", {})
-    table = registry.entries()
-    kinds = {name: kind for kind in table for name in (kind, singular(kind))}
-    plugins = {name for entries in table.values() for name in entries}
-    for name in names:
-        if name not in plugins and name not in kinds:
-            raise unknown("plugin or kind", name, {*plugins, *table})
-    selected_kinds = {kinds[name] for name in names if name in kinds}
-    for kind, entries in table.items():
-        listed = {name: e for name, e in entries.items() if not names or kind in selected_kinds or name in names}
+    for kind, listed in matching_plugins(names).items():
         if listed:
             print(f"\n{printable(kind)}")
         for name, entry in sorted(listed.items()):
-            print(f"  {printable(name):<22}{printable(_describe(entry))}")
+            print(f"  {printable(name):<22}{printable(described(entry))}")
             for parameter in parameters(entry.plugin).values() if entry.plugin else ():
                 unit = f" [{parameter.unit}]" if parameter.unit else ""
                 choices = f" ({' | '.join(parameter.choices)})" if parameter.choices else ""
@@ -291,34 +303,27 @@ def _list(words: list[str]) -> int:
     return 0
 
 
-def _describe(entry: registry.Entry) -> str:
-    """Return the first line of a plugin's docstring, its capabilities, and why it is unavailable."""
-    from bench.model import Backend, Estimator, Integrator, Scene
-
-    plugin = entry.plugin
-    if plugin is None:
-        return f"UNAVAILABLE, {entry.reason}"
-    facts = [(plugin.__doc__ or "").strip().split("\n")[0]]
-    if issubclass(plugin, Backend):
-        facts.append(f"provides {', '.join(sorted(plugin.provides))}")
-    elif issubclass(plugin, Estimator):
-        facts.append(f"needs {', '.join(sorted(plugin.needs))}")
-        if not plugin.unbiased:
-            facts.append("biased at finite N")
-        elif plugin.unbiased_at_discontinuities:
-            facts.append("unbiased, across jumps too")
-        else:
-            facts.append("unbiased where the cost is continuous")
-    elif issubclass(plugin, Integrator):
-        facts.append(f"order {plugin.order}")
-    elif issubclass(plugin, Scene) and plugin.neglected_effects:
-        facts.append(f"leaves out {plugin.neglected_effects}")
-    if not entry.available:
-        facts.append(f"UNAVAILABLE, {entry.reason}")
-    return "; ".join(facts)
-
-
 # ---------------------------------------------------------------------------------------- checks and traces
+
+
+def _refer(verb: str, names: Sequence[str]) -> None:
+    """Raise :class:`UserError` with the right command if a name is the subject of another command of :data:`FAMILY`."""
+    from bench.model import registry
+
+    for name in names:
+        plugin = name.partition("[")[0]
+        if re.search(r"\.py(:|$)", name):
+            subject, right = "a simulator of your own", "examine"
+        elif ":" in name:
+            continue
+        elif plugin in registry.entries()["scenes"]:
+            subject, right = "a scene", "gradcheck"
+        elif any(plugin in entries for entries in registry.entries().values()):
+            subject, right = "a plugin", "check"
+        else:
+            continue
+        if right != verb and (verb, right) != ("check", "gradcheck"):  # a scene is a plugin too
+            raise UserError(f"'{name}' is {subject}, which {verb} does not take: python -m bench {right} {name}")
 
 
 def _check(words: list[str]) -> int:
@@ -328,11 +333,20 @@ def _check(words: list[str]) -> int:
     from bench.model import registry
 
     names, _, _ = parse_words(words, "check", {})
+    _refer("check", names)
     plugins = {name for table in registry.entries().values() for name in table}
     for name in names:
         if name not in plugins:
             raise unknown("plugin", name, plugins)
     return conformance.main(names)
+
+
+def _examine(words: list[str]) -> int:
+    """Examine a user's simulator."""
+    from bench.examine import command
+
+    _refer("examine", [word for word in words if "=" not in word.partition("[")[0] and not word.startswith("-")])
+    return command.main(words)
 
 
 def _split_scenes(words: Sequence[str], verb: str) -> tuple[list[str], list[str]]:
@@ -363,6 +377,7 @@ def _gradcheck(words: list[str]) -> int:
     from bench.model.parameters import parameters
 
     scenes, settings = _split_scenes(words, "gradcheck")
+    _refer("gradcheck", words[: len(words) - len(settings)])
     experiment = _load(["experiment=gradient_check", *scenes, "name=gradcheck", *settings])
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
     horizons = [word for word in words if _sets_horizon(word)]
@@ -407,46 +422,48 @@ def _main_of(module: str) -> Callable[[list[str]], int]:
 VERBS = {
     "run": Verb(
         _run, "+experiment=NAME [key=value ...]", "run what is missing, then write tables and charts",
-        f"Without an experiment, name=FOLDER and the settings say what is run.\n{SETTINGS}{STATUS}",
+        f"Without an experiment, name=FOLDER and the settings say what is run.\n{SETTINGS}{STATUS}", "Experiments",
     ),
     "report": Verb(
         _report, "report +experiment=NAME [key=value ...]", "tables and charts again from stored rows",
-        "Nothing is simulated.\n" + SETTINGS,
+        "Nothing is simulated.\n" + SETTINGS, "Experiments",
     ),
     "plan": Verb(
         _plan, "plan +experiment=NAME [key=value ...]", "cells, how many are stored, expected time",
-        "Cells that cannot run are listed with their reason.\n" + SETTINGS,
+        "Cells that cannot run are listed with their reason.\n" + SETTINGS, "Experiments",
     ),
     "list": Verb(
         _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
-        "KIND is scenes, contacts, integrators, backends, estimators, optimizers or studies.\n",
+        "KIND is scenes, contacts, integrators, backends, estimators, optimizers or studies.\n", "Experiments",
     ),
     "check": Verb(
-        _check, "check [NAME ...] [plugins=DIR]", "the conformance kit on some plugins, or all",
-        "Verifies by running each plugin what the plugin declares. Exit status 1 when a check fails.\n",
+        _check, "check [NAME ...] [plugins=DIR]", "plugins: does each do what it declares?",
+        "Runs the conformance kit on some plugins, or all. Exit status 1 when a check fails.\n\n" + FAMILY, "Is it right?",
     ),
     "gradcheck": Verb(
-        _gradcheck, "gradcheck SCENE ... [key=value ...]", "gradients compared with differences of the cost",
-        f"Exit status 1 when a gradient must not be used.\n{SETTINGS}",
+        _gradcheck, "gradcheck SCENE ... [key=value ...]", "scenes: is each gradient the derivative of its program?",
+        "Compares gradients with differences of the cost, also at a contact switch.\n"
+        f"Exit status 1 when a gradient must not be used.\n\n{FAMILY}\n{SETTINGS}", "Is it right?",
     ),
     "examine": Verb(
-        _main_of("bench.examine.command"), "examine FILE:COST [key=value ...]", "your own simulator: its gradient, jumps, and what to use",
-        EXAMINE,
+        _examine, "examine FILE:COST [key=value ...]", "your own simulator: its gradient, jumps, and what to use",
+        f"{EXAMINE}\n{FAMILY}", "Is it right?",
     ),
     "trace": Verb(
         _trace, "trace SCENE ... [key=value ...]", "one rollout: do gradient spikes coincide with contact switches?",
-        f"Without noise, or with seed=S the first sample of that seed.\n{SETTINGS}",
+        f"Without noise, or with seed=S the first sample of that seed.\n{SETTINGS}", "Is it right?",
     ),
     "bench-self": Verb(
-        _main_of("bench.benchself"), "bench-self [quick=true] [results_dir=DIR]", "speed of the harness, compared with a NumPy loop and native code",
+        _main_of("bench.benchself"), "bench-self [quick=true] [results_dir=DIR]", "speed of the harness, compared with a NumPy loop and native code", group="This package",
     ),
     "claims": Verb(
-        _main_of("bench.claims"), "claims [NAME ...] [--list] [--quick] [--again] [results_dir=DIR] [plugins=DIR]", "published results run again, each with a verdict",
+        _main_of("bench.claims"), "claims [NAME ...] [--list] [--quick] [--again] [results_dir=DIR]", "published results run again, each with a verdict",
         "Results stored under results_dir/claims are measured again only if their code has changed, or with --again.\n"
-        "--quick: only claims that take less than 5 s. Exit status 1 when a claim is not reproduced.\n",
+        "--quick: only claims that take less than 5 s. plugins=DIR: claims of your own.\n"
+        "Exit status 1 when a claim is not reproduced.\n",
     ),
     "compare": Verb(
-        _main_of("bench.compare"), "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
+        _main_of("bench.compare.command"), "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
         "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
         "times only with --timings, compared with the spread between runs: again=DIR,DIR names further runs of BEFORE.\n"
         "Written to out=DIR (runs/compare): compare.csv, .md, .json, .xml (JUnit) and .html.\n",

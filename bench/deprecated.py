@@ -19,6 +19,8 @@ NAMES = {
     "simulator_of": "load_simulator",
 }
 """New names of public classes and functions, by old name."""
+HOMES = {"Estimates": "bench.notebook", "Report": "bench.examine", "StorageError": "bench.errors"}
+"""Modules of the names that ``bench`` no longer has, besides the contracts of plugins."""
 MEMBERS = {
     "leaves_out": "neglected_effects",
     "across_jumps": "unbiased_at_discontinuities",
@@ -30,6 +32,8 @@ MEMBERS = {
     "wants": "required_fields",
 }
 """New names of plugin members, by old name."""
+EXPERIMENTS = {"quick_optimise": "optimise/small", "ladder": "optimise/large"}
+"""New names of experiments, by old name."""
 MODULES = {
     "bench.face": ("bench.api",),
     "bench.model.known": ("bench.model.known_solutions",),
@@ -48,19 +52,27 @@ MODULES = {
 
 def warn(old: str, new: str, level: int = 3) -> None:
     """Issue a DeprecationWarning that an old name will be removed in the next version."""
-    warnings.warn(
-        f"{old} is now called {new}; the old name will be removed in the next version", DeprecationWarning, level
-    )
+    warnings.warn(sentence(old, new), DeprecationWarning, level)
 
 
-def lookup(module: str, namespace: Mapping[str, Any]) -> Callable[[str], Any]:
-    """Return a ``__getattr__`` for a module that resolves the old names of public classes and functions."""
+def sentence(old: str, new: str) -> str:
+    """Return the sentence that an old name will be removed in the next version."""
+    return f"{old} is now called {new}; the old name will be removed in the next version"
+
+
+def lookup(module: str, namespace: Mapping[str, Any], homes: Mapping[str, str] | None = None) -> Callable[[str], Any]:
+    """Return a ``__getattr__`` for a module that resolves the old names of public classes and functions.
+
+    ``homes`` are the modules of names that have moved, by present name.
+    """
 
     def resolve(name: str) -> Any:
-        if name not in NAMES or NAMES[name] not in namespace:
+        new = NAMES.get(name, name)
+        home = (homes or {}).get(new, "")
+        if not home and (new == name or new not in namespace):
             raise AttributeError(f"module '{module}' has no attribute '{name}'")
-        warn(f"{module}.{name}", NAMES[name])
-        return namespace[NAMES[name]]
+        warn(f"{module}.{name}", f"{home}.{new}" if home else new)
+        return getattr(importlib.import_module(home), new) if home else namespace[new]
 
     return resolve
 

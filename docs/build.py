@@ -57,7 +57,7 @@ def gallery_page(page: Path, results: Path) -> str:
     entries = []
     for name in config.experiments():
         experiment = config.load([f"experiment={name}", f"results_dir={results}"])
-        entries.append((gallery_entry(experiment, page.parent) or present.get(name, "")).strip())
+        entries.append((gallery_entry(experiment, page.parent) or present.get(experiment.name, "")).strip())
     if not any(entries):
         raise UserError(f"'{results}' has no rows of any experiment: run some with results_dir={results} first")
     body = "".join(f"\n### {entry}\n" for entry in entries if entry)
@@ -144,20 +144,30 @@ def cell_text(text: str) -> str:
 # ----------------------------------------------------------------------------------------------------------- API
 
 API_INTRODUCTION = """\
-Every public name of `bench`, with its signature and docstring. [Python](python.md) shows the functions in use, and
-[extending](extending.md) the contracts. `from bench import NAME` imports any of them.
+Every public name, with its signature and docstring. [Python](python.md) shows the functions in use, and
+[extending](extending.md) the contracts. `bench` has the functions and their errors, `bench.plugin` what plugins import.
 
 Arrays are component-first and batch-last: B is the batch, d the length of theta, n_w the length of a sample's noise, R the
 number of estimates and N the samples in each.
 """
 GROUPS = {
-    "Functions for results": "run experiments, load rows, build problems, estimate gradients",
-    "Contracts of plugins": "base classes of scenes, contact laws, integrators, backends, estimators, optimizers and studies",
-    "Other classes": "values that plugins and functions take or return",
-    "Functions for plugins": "building blocks of estimators, scenes and backends",
-    "Types and constants": "aliases for annotations",
+    "Functions": "`bench.NAME`: run experiments, load and compare results, build problems, estimate gradients",
+    "Returned objects": "problems, estimates, reports and comparisons, as a notebook shows them",
+    "Contracts of plugins": "`bench.plugin.NAME`: base classes of scenes, contact laws, integrators, backends, estimators, "
+    "optimizers and studies",
+    "Other classes": "`bench.plugin.NAME`: values that plugins take or return",
+    "Functions for plugins": "`bench.plugin.NAME`: building blocks of estimators, scenes and backends",
+    "Types and constants": "`bench.plugin.NAME`: aliases for annotations",
     "Exceptions": "errors that users of the package see",
 }
+RETURNED = {
+    "Comparison": "bench.compare.report",
+    "Estimates": "bench.notebook",
+    "NotebookProblem": "bench.notebook",
+    "Report": "bench.examine",
+    "Settings": "bench.api",
+}
+"""The modules of the classes that the functions of ``bench`` take or return."""
 
 
 @dataclass(frozen=True)
@@ -171,25 +181,29 @@ class Definition:
 def api_page() -> str:
     """Return the text of ``docs/api.md``: every public name by kind, with its signature, docstring and members."""
     groups: dict[str, list[str]] = {title: [] for title in GROUPS}
-    for name in sorted(set(bench.__all__), key=str.lower):
+    for name in sorted({*bench.__all__, "list", *bench.plugin.__all__, *RETURNED} - {"plugin"}, key=str.lower):
         groups[group_of(name)].append(entry_of(name))
     header = GENERATED.format(source="docstrings")
     parts = ["# Python interface\n", header + "\n", API_INTRODUCTION]
     for title, entries in groups.items():
-        parts += [f"## {title}\n", f"{GROUPS[title].capitalize()}.\n", *entries]
+        parts += [f"## {title}\n", f"{GROUPS[title][0].upper()}{GROUPS[title][1:]}.\n", *entries]
     return "\n".join(parts)
 
 
 def group_of(name: str) -> str:
     """Return the title of the group, a key of :data:`GROUPS`, that a public name belongs to."""
-    value = getattr(bench, name)
+    if name in RETURNED:
+        return "Returned objects"
+    value = getattr(bench if name in dir(bench) else bench.plugin, name)
+    if isinstance(value, type) and issubclass(value, Exception):
+        return "Exceptions"
+    if name in dir(bench):
+        return "Functions"
     if not isinstance(definition(name).node, ast.FunctionDef | ast.ClassDef):
         return "Types and constants"
     if not isinstance(value, type):
-        return "Functions for plugins" if name in bench.model.__all__ else "Functions for results"
-    if issubclass(value, Exception):
-        return "Exceptions"
-    return "Contracts of plugins" if issubclass(value, bench.Plugin) else "Other classes"
+        return "Functions for plugins"
+    return "Contracts of plugins" if issubclass(value, bench.plugin.Plugin) else "Other classes"
 
 
 def entry_of(name: str) -> str:
@@ -270,8 +284,11 @@ def markdown(text: str) -> str:
 
 
 def definition(name: str) -> Definition:
-    """Return the definition of a public name of ``bench``, in the module that defines it."""
-    return find_definition("bench", name)
+    """Return the definition of a public name, in the module that defines it."""
+    if name == "list":  # another name in ``bench.api``, where it would hide the built-in type
+        return find_definition("bench.api", "list_plugins")
+    default = "bench" if name in dir(bench) else "bench.plugin"
+    return find_definition(RETURNED.get(name, default), name)
 
 
 @cache

@@ -160,7 +160,7 @@ def test_a_directory_with_packages_of_the_same_names(hidden, tmp_path):
 OWN_ESTIMATOR = """
 from dataclasses import dataclass
 import numpy as np
-from bench import Problem, SampleMean, param
+from bench.plugin import Problem, SampleMean, param
 
 @dataclass(frozen=True)
 class Half(SampleMean):

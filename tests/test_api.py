@@ -1,19 +1,25 @@
 """The Python face, used as in a notebook; and what plugin authors import."""
 
 import ast
+import builtins
 import doctest
 import importlib
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
+import yaml
 from helpers import SPRINGY
 
 import bench
 import bench.model
-from bench.api import _override_words
+from bench.api import Settings, _override_words
 from bench.experiment import config, grid
+from bench.report.text import number
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = {
@@ -108,7 +114,126 @@ def test_problem_and_estimate():
     assert found.reference_method.startswith("closed_form")
     np.testing.assert_allclose(found.values.mean(axis=0), found.reference, rtol=0.5)
     assert found.as_dict()["bias_low"] <= found.as_dict()["bias_high"]
-    assert "8 estimates: bias" in str(found)
+    assert str(found).startswith("fobg on quadratic[dimension=3], numpy: 8 estimates of 16 samples\nrelative bias ")
+
+
+def test_a_problem_takes_lists_and_one_sample():
+    problem = bench.problem("quadratic[dimension=3]", backend="numpy")
+    w = np.arange(6.0).reshape(3, 2) / 10
+    theta = [1.0, -2.0, 0.5]
+    many = problem.grad(theta, w)
+    np.testing.assert_array_equal(problem.grad(theta, w[:, 1].tolist()), many[:, 1])
+    np.testing.assert_array_equal(problem.score(theta, list(w[:, 1])), problem.score(theta, w)[:, 1])
+    assert problem.value(theta, [0.0, 0.1, 0.2]).shape == ()
+    assert problem.value(np.tile(np.array(theta)[:, None], 4)).shape == (4,)
+    np.testing.assert_array_equal(problem.grad(), problem.grad(problem.program.theta0, np.zeros((3, 1)))[:, 0])
+    for function in (problem.value, problem.grad, problem.score):
+        with pytest.raises(bench.UserError, match=r"noise w has the shape \(2,\): give \(3,\) or \(3, B\)"):
+            function(theta, [0.0, 0.1])
+        with pytest.raises(bench.UserError, match=r"theta has the shape \(\): give \(3,\) or \(3, B\)"):
+            function(0.1, [0.0, 0.1, 0.2])
+
+
+def test_estimate_of_a_scene_by_name_is_that_of_its_problem():
+    few = {"samples": 8, "repeats": 4, "reference_samples": 4096}
+    found = bench.estimate("heaviside", "reinforce[baseline=none]", **few)
+    same = bench.estimate(bench.problem("heaviside"), "reinforce[baseline=none]", **few)
+    np.testing.assert_array_equal(found.values, same.values)
+    assert found.estimator == "reinforce[baseline=none]"
+
+
+def test_a_printed_estimate_is_relative_as_in_tables():
+    found = bench.estimate(bench.problem("quadratic", backend="numpy"), "fobg", samples=8, repeats=16)
+    facts = found._facts()
+    row = found.as_dict()
+    assert facts["relative RMSE"].split()[0] == number(row["rmse"] / row["reference_norm"], 3)
+    assert row["bias_low"] == 0
+    assert facts["relative bias"] == f"0 (< {number(row['bias_high'] / row['reference_norm'], 3)})"
+    assert facts["|grad J|"] == f"{number(row['reference_norm'], 3)} (closed_form)"
+
+
+def test_an_estimate_of_a_gradient_of_0_is_printed_without_division():
+    found = bench.estimate(
+        bench.problem("quadratic[dimension=2]", backend="numpy", theta0=[0.0, 0.0]),
+        "fobg",
+        samples=8,
+        repeats=8,
+        reference_samples=4096,
+    )
+    assert np.isnan(found.summary.rmse_rel)
+    facts = found._facts()
+    assert facts["RMSE"].split()[0] == number(found.summary.rmse, 3)
+    assert "bias" in facts
+    assert "nan" not in str(found)
+
+
+def test_a_notebook_shows_problems_estimates_and_reports():
+    problem = bench.problem("pushing[horizon=3]", contact="penalty[stiffness=500]", backend="numpy", theta=["mass"])
+    found = bench.estimate(problem, "fobg", samples=4, repeats=3, reference_samples=512, tolerance=0.5)
+    report = bench.examine(lambda x: x[0] ** 2, [1.0], grad=lambda x: 2 * x, name="a<b", progress=False, budget=5)
+    assert repr(problem) == (
+        "Problem: pushing[horizon=3], penalty[stiffness=500], semi_implicit_euler, numpy; "
+        "theta = [0.1], d = 1; noise: sigma = 0.3 on theta, n_w = 1"
+    )
+    assert "<td>penalty[stiffness=500]</td>" in problem._repr_html_()
+    assert "a&lt;b" in report._repr_html_()
+    assert "<b" not in report._repr_html_().replace("<b>", "")
+    assert "<th>RMSE</th>" in found._repr_html_()
+    assert list(found.to_frame().index) == ["mass"]
+    parameters = problem.to_frame().set_index(["part", "parameter"])
+    assert parameters.loc[("contact", "stiffness"), "value"] == 500
+    assert report.to_frame()["name"].iloc[0] == "theta[0]"
+    for shown in (problem, found, report):
+        figure = shown.plot()
+        assert figure.axes[0].lines
+        assert figure._repr_png_().startswith(b"\x89PNG")
+    with pytest.raises(bench.UserError, match="component=1 is not a component of theta: give 0 to 0"):
+        problem.plot(component=1)
+    with pytest.raises(bench.UserError, match="unknown chart 'sigma'"):
+        report.plot("sigma")
+
+
+def test_the_tangent_of_a_problems_chart_touches_its_cost():
+    figure = bench.problem("quadratic", backend="numpy").plot(component=1)
+    cost, tangent = (line.get_ydata() for line in figure.axes[0].lines[:2])
+    middle = len(cost) // 2
+    assert cost[middle] == tangent[middle]
+    slope = (cost[middle + 1] - cost[middle - 1], tangent[middle + 1] - tangent[middle - 1])
+    assert slope[0] == pytest.approx(slope[1], rel=1e-6)
+
+
+def test_list_has_a_row_per_plugin():
+    table = bench.list("fobg", "integrators")
+    assert set(table["kind"]) == {"estimators", "integrators"}
+    fobg = table[table["name"] == "fobg"].iloc[0]
+    assert fobg["available"]
+    assert "needs grad" in fobg["description"]
+    everything = bench.list().set_index(["kind", "name"])
+    assert everything.loc[("contacts", "penalty"), "parameters"]["stiffness"] == "1000"
+    with pytest.raises(bench.UserError, match="did you mean 'fobg'"):
+        bench.list("fbog")
+
+
+def test_compare_finds_what_got_worse(rows, results, tmp_path):
+    (tmp_path / "notes").mkdir()
+    stored = pd.read_parquet(results / "notes" / "rows.parquet")
+    doubled = stored.assign(mean_estimate=stored["mean_estimate"] * 2)
+    doubled.to_parquet(tmp_path / "notes" / "rows.parquet")
+    comparison = bench.compare(results, tmp_path)
+    assert comparison.worse
+    assert (comparison.to_frame()["outcome"] == "worse").any()
+    assert "got worse" in repr(comparison)
+    assert "got worse" in comparison._repr_html_()
+    assert not bench.compare(results, results).worse
+    with pytest.raises(bench.UserError, match="add --timings"):
+        bench.compare(results, results, again=[results, results])
+
+
+def test_settings_are_all_settings_of_the_command_line():
+    known = {
+        name for name in config._known_keys() if name in yaml.safe_load((ROOT / "conf" / "config.yaml").read_text())
+    }
+    assert set(Settings.__annotations__) == {*known, *config.LAYOUT}
 
 
 def test_estimate_is_that_of_a_cell(rows):
@@ -191,15 +316,29 @@ def test_marks_are_a_table_with_names_of_any_kind():
 # -------------------------------------------------------------------------------------------------- public names
 
 
-def test_every_public_name_exists_and_every_contract_is_public():
-    assert len(bench.__all__) == len(set(bench.__all__))
-    assert set(bench.model.__all__) < set(bench.__all__)
-    for name in bench.__all__:
+def test_bench_has_a_dozen_names_and_every_contract_is_in_bench_plugin():
+    assert len(dir(bench)) <= 13
+    assert set(dir(bench)) == {*bench.__all__, "list", "__version__"}
+    for name in dir(bench):
         assert getattr(bench, name) is not None
+    assert len(bench.plugin.__all__) == len(set(bench.plugin.__all__))
+    assert set(bench.model.__all__) < set(bench.plugin.__all__)
     for name in bench.model.__all__:
-        assert getattr(bench, name) is getattr(bench.model, name)
+        assert getattr(bench.plugin, name) is getattr(bench.model, name)
     public = {name for name, value in vars(bench.model).items() if not name.startswith("_") and getattr(value, "__module__", "") != "bench.model" and not hasattr(value, "__path__") and type(value).__name__ != "module"}  # fmt: skip
     assert public == set(bench.model.__all__)
+
+
+def test_a_star_import_replaces_no_builtin():
+    names: dict[str, object] = {}
+    exec("from bench import *", names)
+    assert names["run"] is bench.run
+    assert not set(names) & set(dir(builtins)) - {"__builtins__"}
+
+
+def test_functions_stay_functions_after_all_commands_are_imported():
+    code = "import bench.cli, bench.compare.command, bench.compare.history, bench.examine.command, bench; assert all(map(callable, (bench.run, bench.compare, bench.examine)))"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_plugins_import_public_names_only():

@@ -131,6 +131,7 @@ def test_identity_columns_tell_cells_apart(tmp_path):
 
 BAD = [
     (["+experiment=stifness_sweep"], ["stifness_sweep", "'stiffness_sweep'"]),
+    (["+experiment=optimise/smal"], ["optimise/smal", "'optimise/small'"]),
     (["scenes=[pushng]"], ["pushng", "'pushing'"]),
     (["contacts=[penality]"], ["penality", "'penalty'"]),
     (["integrators=[eular]"], ["eular", "explicit_euler"]),
@@ -207,9 +208,53 @@ def test_unreadable_rows_are_not_written_over(tmp_path, capsys):
     assert path.read_bytes() == b"not parquet"
 
 
-def test_help_names_the_experiments(capsys):
+def test_help_names_the_experiments_and_fits_80_columns(capsys):
     assert main(["--help"]) == 0
-    assert "stiffness_sweep" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "stiffness_sweep" in text
+    assert "optimise/small" in text
+    assert max(map(len, text.splitlines())) <= 80
+    family = text.partition("Is it right?")[2].partition("\n\n")[0]
+    assert [name for name in ("check ", "gradcheck ", "examine ", "trace ", "compare ") if f"\n  {name}" in family] == [
+        "check ", "gradcheck ", "examine ", "trace "
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("verb", ["check", "gradcheck", "examine"])
+def test_the_commands_that_ask_whether_something_is_right_name_each_other(verb, capsys):
+    assert main([verb, "--help"]) == 0
+    text = capsys.readouterr().out
+    for name, subject in (("check", "a plugin"), ("gradcheck", "a scene"), ("examine", "your own simulator")):
+        assert any(line.split()[:1] == [name] and subject in line for line in text.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("words", "right"),
+    [
+        (["check", "mysim.py:cost"], "examine mysim.py:cost"),
+        (["gradcheck", "mysim.py:cost", "backends=[jax]"], "examine mysim.py:cost"),
+        (["gradcheck", "fobg"], "check fobg"),
+        (["examine", "pushing[horizon=3]", "theta=1"], "gradcheck pushing[horizon=3]"),
+        (["examine", "fobg"], "check fobg"),
+    ],
+)
+def test_the_subject_of_another_command_is_sent_there(words, right, capsys):
+    assert main(words) == 2
+    assert capsys.readouterr().err.strip().endswith(f"python -m bench {right}")
+
+
+@pytest.mark.parametrize(("old", "new"), [("quick_optimise", "optimise/small"), ("ladder", "optimise/large")])
+def test_an_experiment_by_its_old_name_is_a_size_of_another(old, new, capsys):
+    with pytest.warns(DeprecationWarning, match=f"experiment={old} is now called experiment={new};"):
+        assert main(["plan", f"+experiment={old}", "sweep.seed=[0]"]) == 0
+    first = capsys.readouterr()
+    assert f"bench: experiment={old} is now called experiment={new}" in first.err
+    assert main(["plan", f"+experiment={new}", "sweep.seed=[0]"]) == 0
+    again = capsys.readouterr()
+    assert again.out == first.out
+    assert again.out.startswith(f"{old}: "), "the folder of its results has the old name"
+    assert "is now called" not in again.err
+    assert "sweep: seed of the command line replaces that of" in again.err
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -253,7 +298,7 @@ def test_files_are_written_before_anything_is_printed(tmp_path):
 
 ESCAPING = '''
 from dataclasses import dataclass
-from bench import SampleMean
+from bench.plugin import SampleMean
 
 @dataclass(frozen=True)
 class Escaping(SampleMean):

@@ -21,6 +21,7 @@ LAYERS = [
     ["report"],
     ["studies", "trace"],
     ["compare", "benchself", "examine", "claims"],
+    ["notebook", "plugin"],
     ["api"],
     ["__init__"],
     ["cli"],

@@ -164,8 +164,11 @@ def test_readme_example_runs(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     exec(example, {})
     printed = capsys.readouterr().out
-    assert printed.startswith("fobg 16 estimates: bias")
-    assert "\nrandomized_smoothing 16 estimates: bias" in printed
+    assert printed.startswith(
+        "fobg on pushing[sigma=0.1], penalty, semi_implicit_euler, numpy: 16 estimates of 32 samples"
+    )
+    assert "\nrandomized_smoothing on pushing" in printed
+    assert printed.count("\nrelative bias ") == 2
 
 
 @pytest.mark.slow

@@ -54,14 +54,14 @@ def _number(value: float) -> str:
 
 def show(rows: Sequence[SpeedRow]) -> None:
     """Print the table."""
-    from rich.console import Console
-    from rich.table import Table
+    import pandas as pd
 
-    formatted = format_rows(rows)
-    table = Table(*formatted[0], title="bench-self")
-    for row in formatted:
-        table.add_row(*row.values())
-    Console(width=130).print(table)
+    from bench.report import terminal
+
+    formatted = pd.DataFrame(format_rows(rows))
+    terminal.print_table(
+        terminal.open_console(), formatted, title="bench-self", right=("measured", "target", "ratio", "spread")
+    )
 
 
 def write(rows: Sequence[SpeedRow], directory: Path, load_before: list[float] | None) -> list[Path]:

@@ -2,122 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import pandas as pd
+if TYPE_CHECKING:
+    from bench.compare.report import Comparison
 
-from bench.compare.cells import assumed_defaults, compare_cells
-from bench.compare.report import Comparison, show, write
-from bench.compare.sources import Results, open_results
-from bench.compare.timings import RUNS
-from bench.errors import UserError
-from bench.experiment.columns import Column
-from bench.experiment.words import parse_flag, parse_words
-
-
-@dataclass(frozen=True)
-class Request:
-    """The two results to compare and the options, from the command line."""
-
-    before: str
-    after: str
-    out: Path
-    timings: bool = False
-    again: tuple[str, ...] = ()
-    """Further runs of ``before``, which show how much times differ between runs."""
-
-
-def main(words: Sequence[str]) -> int:
-    """Compare the two results named in ``words``. Returns 1 if something got worse. Raises :class:`UserError`."""
-    request = _parse(words)
-    with ExitStack() as stack:
-        names = (request.before, request.after, *request.again)
-        old, new, *again = (stack.enter_context(open_results(name)) for name in names)
-        comparison = compare(request, old, new, again)
-    show(comparison, write(comparison, request.out))
-    return 1 if comparison.worse else 0
+__all__ = ["compare"]
 
 
 def compare(
-    request: Request,
-    old: Mapping[str, Results],
-    new: Mapping[str, Results],
-    again: Sequence[Mapping[str, Results]] = (),
+    before: str | Path, after: str | Path, timings: bool = False, again: Sequence[str | Path] = ()
 ) -> Comparison:
-    """Compare the accuracy of the experiments that two results have in common, and their times if requested."""
-    before, after = request.before, request.after
-    shared = [name for name in old if name in new]
-    if not shared:
-        raise UserError(f"{before} ({', '.join(old)}) and {after} ({', '.join(new)}) have no experiment in common")
-    remarks = [
-        f"{name} is only in {side}: not compared"
-        for side, mine, other in ((before, old, new), (after, new, old))
-        for name in mine
-        if name not in other
-    ]
-    parts = []
-    judged: dict[str, Column] = {}
-    for name in shared:
-        one, two = old[name], new[name]
-        if one.study != two.study:
-            raise UserError(f"{name} is of study {one.study} in {before} and of study {two.study} in {after}")
-        runs = [results[name].rows for results in again if name in results]
-        judged |= {column.name: column for column in one.columns.compared}
-        table, time_remarks = compare_cells(one.rows, two.rows, one.columns, request.timings, runs)
-        own = (*row_remarks(one, two), *machine_remarks(one, two, request.timings), *time_remarks)
-        remarks += [f"{name}: {remark}" for remark in own]
-        parts.append(table.assign(experiment=name))
-    table = pd.concat(parts, ignore_index=True)
-    return Comparison(f"{before} against {after}", table, remarks, list(judged.values()), old[shared[0]].study)
+    """Compare two results, cell by cell; ``print`` shows what got worse or better.
 
+    ``before`` and ``after`` are directories of experiments or of one experiment, or git revisions as ``REV`` or
+    ``REV:PATH``. ``comparison.to_frame()`` has one row per cell, and ``comparison.worse`` is true if some cell got
+    worse. With ``timings``, times are compared too, with the spread between the runs ``again`` of ``before``. Raises
+    :class:`bench.UserError` for results that cannot be read or compared.
+    """
+    from bench.compare.command import compare_results, request
 
-def row_remarks(old: Results, new: Results) -> list[str]:
-    """Return remarks on omitted rows, and on parameters that one side lacks, so that their present default is assumed."""
-    remarks = [
-        f"{results.n_outdated} rows {when} were made by an older version and are left out"
-        for when, results in (("before", old), ("after", new))
-        if results.n_outdated
-    ]
-    missing = {"before": assumed_defaults(old.rows), "after": assumed_defaults(new.rows)}
-    for when, other in (("before", "after"), ("after", "before")):
-        own = [f"{name}={value}" for name, value in missing[when].items() if name not in missing[other]]
-        if own:
-            remarks.append(f"rows {when} do not store {', '.join(own)}: the present default is assumed")
-    return remarks
-
-
-def machine_remarks(old: Results, new: Results, timings: bool) -> list[str]:
-    """Return remarks on different machines and, if times are compared, on reasons to doubt them."""
-    remarks: list[str] = []
-    machines = f"{old.machine or 'unknown'}; {new.machine or 'unknown'}"
-    is_same = bool(old.machine) and old.machine == new.machine
-    if timings and not is_same:
-        remarks.append(f"WARNING: timings of different machines ({machines}) are compared")
-    elif not is_same:
-        remarks.append(f"made on different machines ({machines}): rounding may change the estimates of chaotic cells")
-    if timings:
-        for when, results in (("before", old), ("after", new)):
-            if results.busy:
-                remarks.append(f"WARNING: the machine was busy {when} ({results.busy}), so timings are doubtful")
-    return remarks
-
-
-def _parse(words: Sequence[str]) -> Request:
-    defaults = {"timings": "false", "again": "", "out": "runs/compare"}
-    names, settings, options = parse_words(words, "compare", defaults, ("--timings",))
-    if len(names) != 2:
-        raise UserError(
-            "name two results: python -m bench compare BEFORE AFTER (directories, or revisions as REV or REV:PATH)"
-        )
-    timings = bool(options) or parse_flag(settings, "timings")
-    again = tuple(filter(None, settings["again"].split(",")))
-    if again and not timings:
-        raise UserError("again= names further runs for their times: add --timings")
-    if again and len(again) + 1 < RUNS:
-        raise UserError(
-            f"the spread between runs needs {RUNS} or more runs of before: again= names {len(again)} besides the first"
-        )
-    return Request(names[0], names[1], Path(settings["out"]).expanduser(), timings, again)
+    return compare_results(request(str(before), str(after), timings=timings, again=tuple(map(str, again))))

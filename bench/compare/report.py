@@ -7,13 +7,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from bench.compare import timings
 from bench.compare.cells import FIRST, LAST, OUTCOMES, WORSE_IN, both_sides, differing_parameters, flat_parameters
@@ -22,8 +20,9 @@ from bench.compare.judging import NOTES
 from bench.experiment.columns import Column
 from bench.experiment.experiment import Experiment
 from bench.model import registry
+from bench.report import terminal
 from bench.report.tables import plain_markdown
-from bench.report.text import axis_value, counted
+from bench.report.text import axis_value, counted, one_line
 from bench.report.web.content import STATUS, Chart, Content, PlotAxis, identity_columns, look
 from bench.report.web.content import TableColumn as Shown
 from bench.report.web.document import assemble
@@ -65,6 +64,24 @@ class Comparison:
         """Whether some cell got worse."""
         return bool((self.table["outcome"] == "worse").any())
 
+    def __str__(self) -> str:
+        changes = self.changes.head(PRINTED)
+        lines = [self.title, summary(self.table), *(f"  {remark}" for remark in self.remarks)]
+        lines += [": ".join(map(str, line)) for line in changes.to_numpy()]
+        return "\n".join(map(one_line, lines))
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        paragraphs = (self.title, summary(self.table), *self.remarks)
+        text = "".join(f"<p>{escape(paragraph)}</p>" for paragraph in paragraphs)
+        return text + str(self.changes.head(PRINTED).to_html(index=False, border=0))
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return one row per cell: its name, the outcome, what changed, and both sides of every judged column."""
+        columns = ["experiment", *FIRST, *both_sides(self.judged), *LAST]
+        return self.table[columns].assign(cell=self.cells)
+
     @cached_property
     def cells(self) -> list[str]:
         """The name of each cell, in the order of the table."""
@@ -92,11 +109,10 @@ def write(comparison: Comparison, out: Path) -> list[Path]:
     """Write ``compare`` as .csv, .md, .json, .xml (JUnit) and .html. Raises :class:`StorageError` if that fails."""
     make_directory(out)
     table = comparison.table
-    columns = ["experiment", *FIRST, *both_sides(comparison.judged), *LAST]
     return write_all(
         out,
         {
-            "compare.csv": table[columns].to_csv(index=False, lineterminator="\n"),
+            "compare.csv": comparison.to_frame().drop(columns="cell").to_csv(index=False, lineterminator="\n"),
             "compare.md": markdown(comparison),
             "compare.json": as_json(comparison.title, table, comparison.cells, comparison.remarks),
             "compare.xml": as_junit(comparison.title, table, comparison.cells),
@@ -122,21 +138,14 @@ def markdown(comparison: Comparison) -> str:
 
 def show(comparison: Comparison, paths: Sequence[Path]) -> None:
     """Print the summary, the remarks and the first changes."""
-    console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal:
-        console.width = max(console.width, 160)
+    console = terminal.open_console()
     console.print(f"\n{comparison.title}", style="bold")
     console.print(summary(comparison.table))
     for remark in comparison.remarks:
         console.print(f"  {remark}")
     listed = comparison.changes
     if not listed.empty:
-        shown = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="underline")
-        for name in ("outcome", "experiment", "cell", "change"):
-            shown.add_column(name, overflow="fold")
-        for outcome, *texts in listed.head(PRINTED).to_numpy():
-            shown.add_row(Text(outcome, "red" if outcome == "worse" else ""), *texts)
-        console.print(shown)
+        terminal.print_table(console, listed.head(PRINTED), least_important=("experiment",))
     if len(listed) > PRINTED:
         console.print(f"and {len(listed) - PRINTED} more in the files")
     print("\nWritten:")

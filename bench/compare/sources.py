@@ -51,7 +51,7 @@ def columns_of(study: str) -> Columns:
     """Return the columns of a study's rows. Raises :class:`UserError` if the study is not installed."""
     plugin = registry.usable("studies", study)
     if not issubclass(plugin, Study):
-        raise UserError(f"study '{study}' does not derive from bench.Study")
+        raise UserError(f"study '{study}' does not derive from bench.plugin.Study")
     return plugin.columns
 
 

@@ -3,18 +3,52 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from bench.errors import UserError, unknown
 from bench.examine.findings import Findings
 
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Report(Findings):
     """The findings about a cost and its gradient at one theta; ``print`` shows them as text.
 
     ``frame``, ``sigmas`` and ``breaks`` are tables, ``problems`` and ``warnings`` are sentences, and ``status`` is the
     exit status.
     """
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return f"<p><b>{escape(self.name)}: {escape(self.conclusion)}</b></p><pre>{escape(str(self))}</pre>"
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return one row per checked derivative, as :attr:`frame`."""
+        return self.frame
+
+    def plot(self, chart: str = "") -> Figure:
+        """Return a chart of the page: ``steps``, ``lines`` or ``sigmas``, by default the first for which there is data.
+
+        Raises :class:`bench.UserError` for a chart without data.
+        """
+        from bench.examine import page
+        from bench.report.displays import displayable
+        from bench.report.figures import styled
+
+        with styled():
+            figures = page.charts(self)
+        if not figures:
+            raise UserError("this examination has no data for a chart: give a gradient, sigma or a larger budget")
+        if chart and chart not in figures:
+            raise unknown("chart", chart, figures)
+        return displayable(figures[chart or next(iter(figures))][1])
 
     def assert_right(self) -> None:
         """Raise AssertionError with the full report if there is a problem."""

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from bench import deprecated
 from bench.errors import STATUSES, UserError, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
 from bench.experiment.grid import parameter_name, refuse_too_many, swept
@@ -30,9 +31,13 @@ def config_dir() -> Path:
 
 
 def experiments(config_dirs: Sequence[Path] = ()) -> list[str]:
-    """Return the sorted names of the package's experiments and of the user's experiments in ``config_dirs``."""
+    """Return the sorted names of the package's experiments and of the user's experiments in ``config_dirs``.
+
+    A file ``experiment/NAME/SIZE.yaml`` is another size of an experiment: its name is ``NAME/SIZE``.
+    """
+    folders = [folder / "experiment" for folder in (config_dir(), *config_dirs)]
     return sorted(
-        {path.stem for folder in (config_dir(), *config_dirs) for path in (folder / "experiment").glob("*.yaml")}
+        {path.relative_to(folder).with_suffix("").as_posix() for folder in folders for path in folder.rglob("*.yaml")}
     )
 
 
@@ -113,10 +118,7 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
             raise UserError(
                 f"'{override}': one command runs one experiment with its sweep; run one command for each experiment"
             )
-        names = experiments(config_dirs)
-        if value not in names:
-            raise unknown("experiment", value, names)
-        return f"+experiment={value}"
+        return f"+experiment={_present_name(value, experiments(config_dirs))}"
     if head.partition("/")[0] == "hydra" or key.startswith("~"):
         raise UserError(f"'{override}': Hydra's own settings cannot be changed")
     if head not in _known_keys():
@@ -134,6 +136,23 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
     return f"{bare}={value}"
 
 
+def _present_name(name: str, names: Sequence[str]) -> str:
+    """Return the present name of an experiment; raises :class:`UserError` if there is none."""
+    if name in names:
+        return name
+    if name not in deprecated.EXPERIMENTS:
+        raise unknown("experiment", name, names)
+    deprecated.warn(f"experiment={name}", f"experiment={deprecated.EXPERIMENTS[name]}", 5)
+    return deprecated.EXPERIMENTS[name]
+
+
+def explain_names(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
+    """Return one sentence for each old name of an experiment among the overrides, with the new name."""
+    values = [value for key, _, value in (word.lstrip("+").partition("=") for word in overrides) if key == "experiment"]
+    old = [value for value in values if value in deprecated.EXPERIMENTS and value not in experiments(config_dirs)]
+    return [deprecated.sentence(f"experiment={name}", f"experiment={deprecated.EXPERIMENTS[name]}") for name in old]
+
+
 def explain_sweep(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
     """Return one sentence on how the sweeps of file and command line combine; empty unless both have a sweep."""
     import yaml
@@ -148,7 +167,8 @@ def explain_sweep(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) ->
     if not chosen or not axes:
         return []
     paths = (folder / "experiment" / f"{chosen[-1]}.yaml" for folder in (*config_dirs, config_dir()))
-    own = yaml.safe_load(next(path for path in paths if path.exists()).read_text()).get("sweep") or {}
+    path = next((path for path in paths if path.exists()), None)  # None: an old name
+    own = (path and yaml.safe_load(path.read_text()).get("sweep")) or {}
     replaced = [f"{axis} of the command line replaces that of {chosen[-1]}" for axis in axes if axis in own]
     kept = [f"{axis} of {chosen[-1]} stays" for axis in own if axis not in axes]
     added = [f"{axis} of the command line is multiplied with it" for axis in axes if axis not in own]
@@ -231,7 +251,7 @@ def _study(text: Any) -> Study:
     name, values = parse_identity(text)
     study = build(registry.usable("studies", name), values)
     if not isinstance(study, Study):
-        raise UserError(f"study '{name}' does not derive from bench.Study")
+        raise UserError(f"study '{name}' does not derive from bench.plugin.Study")
     return study
 
 

@@ -59,5 +59,5 @@ def study_of(experiment: Experiment) -> Study:
     """Return the experiment's study; raises :class:`UserError` for a plugin that is not a :class:`Study`."""
     study = experiment.study
     if not isinstance(study, Study):
-        raise UserError(f"study {study.name} does not derive from bench.Study")
+        raise UserError(f"study {study.name} does not derive from bench.plugin.Study")
     return study

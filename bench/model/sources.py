@@ -105,11 +105,12 @@ def _origins(base: str, name: str) -> list[str]:
     """Return the modules that ``from base import name`` depends on."""
     if file_of(f"{base}.{name}") is not None:
         return [f"{base}.{name}"]
-    path = file_of(base)
-    if path is not None and path.name == "__init__.py":
-        origins = _passed_on(base).get(name)
-        return [base] if origins is None else origins
-    return [base]
+    return _passed_on(base).get(name, [base]) if _is_package(base) else [base]
+
+
+def _is_package(module: str) -> bool:
+    path = file_of(module)
+    return path is not None and path.name == "__init__.py"
 
 
 @cache
@@ -122,7 +123,9 @@ def _passed_on(package: str) -> dict[str, list[str]]:
         if isinstance(node, ast.ImportFrom):
             base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
             for alias in node.names:
-                if base != package and alias.name != "*":
+                if alias.name == "*":
+                    names |= _passed_on(base) if _is_package(base) else {}
+                elif base != package:
                     names[alias.asname or alias.name] = _origins(base, alias.name)
     return names
 

@@ -14,10 +14,10 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.table import Table
 
 from bench.experiment.axes import Axis, table
 from bench.experiment.experiment import Experiment
+from bench.report import terminal
 from bench.report.page import WIDTH, columns
 from bench.report.problems import part_columns, problem_numbers
 from bench.report.text import counted, number
@@ -25,8 +25,6 @@ from bench.report.views import Arranged
 from bench.report.web.content import distinguishing_columns
 from bench.run.files import write_all
 
-TERMINAL_WIDTH = 180
-"""Least line width, in characters, if the output is not a terminal."""
 TITLE_WIDTH = 86
 """Characters of a line of a figure's title, in a figure of full width."""
 
@@ -83,11 +81,9 @@ def write_tables(
 # ----------------------------------------------------------------------------------------------------- terminal
 
 
-def open_console(experiment: Experiment, rows: pd.DataFrame, width: int = TERMINAL_WIDTH) -> Console:
+def open_console(experiment: Experiment, rows: pd.DataFrame) -> Console:
     """Print the experiment's question and the number of cells by status; return the console for further output."""
-    console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal:
-        console.width = max(console.width, width)
+    console = terminal.open_console()
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
     console.print(f"{counted(len(rows), 'cell')}: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
@@ -102,12 +98,7 @@ def print_table(
     title: str = "",
 ) -> None:
     """Print a table of strings. ``heads`` replaces column names, and the columns ``right`` are right-aligned."""
-    grid = Table(title=title or None, title_justify="left", box=None, padding=(0, 2, 0, 0))
-    for name in texts:
-        grid.add_column(heads.get(name, str(name)), justify="right" if name in right else "left")
-    for line in texts.fillna("").to_numpy():
-        grid.add_row(*map(str, line))
-    console.print(grid)
+    terminal.print_table(console, texts, title, heads=heads, right=right)
 
 
 def print_reasons(console: Console, rows: pd.DataFrame) -> None:

@@ -1,11 +1,14 @@
 """Every file that can decide a number is in the keys of the cells whose numbers it can decide, and in no other."""
 
+import ast
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from trees import ROOT
 
+import bench
+import bench.model
 from bench.experiment import config, grid, keys
 from bench.experiment.cell import Cell
 from bench.experiment.keys import HARMLESS, PROGRAM, REFERENCE, code, plugin_code
@@ -156,6 +159,20 @@ def test_base_classes_of_another_package_count(tmp_path, monkeypatch):
     )
 
 
+def test_a_name_of_bench_plugin_counts_as_the_module_that_defines_it(tmp_path):
+    """A plugin does not rerun after a change of code that it does not use."""
+    file = tmp_path / "own.py"
+    names = [name for name in bench.plugin.__all__ if name in bench.model.__all__]
+
+    def imported(package: str) -> set[str]:
+        tree = ast.parse(f"from {package} import {', '.join(names)}")
+        return set(sources.imports_of_tree(tree, "own", file))
+
+    assert imported("bench.plugin") == imported("bench.model")
+    assert len(imported("bench.plugin")) > 10
+    assert not {"bench", "bench.plugin", "bench.model"} & imported("bench.plugin")
+
+
 def test_what_a_users_file_imports_from_bench_counts(tmp_path):
     file = tmp_path / "sim.py"
     file.write_text("from bench import Mjcf\n\n\ndef cost(theta):\n    return theta\n")
@@ -172,7 +189,7 @@ def test_what_a_users_file_imports_from_bench_counts(tmp_path):
 STUDY = """
 from dataclasses import dataclass
 
-from bench import Column, Columns, Study
+from bench.plugin import Column, Columns, Study
 
 GAIN = {gain}
 

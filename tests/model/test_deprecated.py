@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import bench
-from bench import deprecated
+from bench import deprecated, errors, notebook
 from bench.model import Descent, Estimator, FunctionScene, SampleMean, sources
 
 ESTIMATOR = '''
@@ -152,7 +152,8 @@ def test_an_old_estimator_runs_on_old_scenes(settings):
     assert tuple(rows.loc[("quadratic", "old"), ["status", "reason"]]) == ("unsupported", "old refuses quadratic")
     said = messages(caught)
     for old, new in (
-        ("bench.GustyScene", "ProcessNoiseScene"), ("bench.HeldScene", "ZeroOrderHoldScene"),
+        ("bench.SampleMean", "bench.plugin.SampleMean"), ("bench.GustyScene", "bench.plugin.ProcessNoiseScene"),
+        ("bench.HeldScene", "bench.plugin.ZeroOrderHoldScene"),
         ("Windy.leaves_out", "neglected_effects"), ("Held.leaves_out", "neglected_effects"),
         ("Old.across_jumps", "unbiased_at_discontinuities"), ("Old.adds_explicit", "includes_explicit_derivative"),
         ("Old.reports", "diagnostics"), ("Old.explained", "estimate_with_diagnostics"),
@@ -171,7 +172,7 @@ def test_an_old_study_runs(settings):
     said = messages(caught)
     for old, new in (
         ("bench.sweep.axes", "bench.experiment.axes"), ("bench.sweep.files", "bench.run.files"),
-        ("bench.Judged", "ComparisonRule"), ("Column(judged=...)", "comparison"),
+        ("bench.Judged", "bench.plugin.ComparisonRule"), ("Column(judged=...)", "comparison"),
         ("Norm.refuses", "unsupported_reason"),
     ):  # fmt: skip
         assert f"{old} is now called {new};" in said
@@ -236,8 +237,19 @@ def test_an_old_optimizer_names_the_fields_of_the_next_step():
 
 
 def test_a_renamed_function_is_found_by_its_old_name():
-    with pytest.warns(DeprecationWarning, match="bench.simulator_of is now called load_simulator"):
-        assert bench.simulator_of is bench.load_simulator
+    with pytest.warns(DeprecationWarning, match="bench.simulator_of is now called bench.plugin.load_simulator"):
+        assert bench.simulator_of is bench.plugin.load_simulator
+
+
+def test_a_name_that_bench_had_is_found_where_it_is_now():
+    for name in [*bench.plugin.__all__, *deprecated.HOMES]:
+        if name not in bench.__all__:
+            with pytest.warns(DeprecationWarning, match=rf"bench\.{name} is now called bench\.\w+\.{name};"):
+                assert getattr(bench, name) is not None
+    with pytest.warns(DeprecationWarning, match="is now called"):
+        from bench import Estimates, Report, StorageError
+    assert (Estimates, StorageError) == (notebook.Estimates, errors.StorageError)
+    assert isinstance(bench.examine(lambda x: x[0] ** 2, [1.0], progress=False, budget=2), Report)
 
 
 def test_an_old_name_that_the_kind_never_had_is_the_authors_own():

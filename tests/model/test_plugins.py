@@ -15,7 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench import Problem, SampleMean, param
+from bench.plugin import Problem, SampleMean, param
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ FAILING_SCENE = '''
 
 from dataclasses import dataclass
 
-from bench import FunctionScene
+from bench.plugin import FunctionScene
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def tree(tmp_path_factory) -> Tree:
     made = Tree(tmp_path_factory.mktemp("plugins"))
     made.add("plugins/estimators/half_step.py", ESTIMATOR.format(name="half_step", requires=""))
     made.add("plugins/estimators/broken.py", "import no_such_module_at_all\n")
-    made.add("plugins/scenes/unfinished.py", "from bench import Scene\n\nclass Unfinished(Scene:\n")
+    made.add("plugins/scenes/unfinished.py", "from bench.plugin import Scene\n\nclass Unfinished(Scene:\n")
     made.add("plugins/scenes/failing.py", FAILING_SCENE)
     absent = ESTIMATOR.format(name="absent", requires='"no_such_module=some-dist",')
     made.add("plugins/estimators/absent.py", absent)

@@ -51,7 +51,7 @@ def marked(owner, name, phase):
         mark(phase)
         return real(*given, **more)
     setattr(owner, name, call)
-from bench import compare
+from bench.compare import command as compare
 from bench.report import finish, web
 from bench.run import execute, runner
 answers = runner._Run._answers

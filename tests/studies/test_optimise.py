@@ -418,7 +418,7 @@ def test_estimator_without_gradients_is_refused(tmp_path):
 COST_ONLY = '''
 from dataclasses import dataclass
 import numpy as np
-from bench import Estimator, param
+from bench.plugin import Estimator, param
 
 @dataclass(frozen=True)
 class CostOnly(Estimator):

@@ -1,0 +1,17 @@
+"""The contracts of plugins: everything that authors of scenes, estimators, backends, optimizers and studies import.
+
+:mod:`bench.model` describes the conventions: frozen dataclasses, declared parameters, component-first arrays.
+"""
+
+from bench import deprecated
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule
+from bench.experiment.experiment import Experiment
+from bench.experiment.session import Session
+from bench.experiment.study import Study
+from bench.model import *  # noqa: F403
+from bench.model import __all__ as _contracts
+
+__all__ = [*_contracts, "Cell", "Column", "Columns", "ComparisonRule", "Experiment", "Session", "Study"]
+
+__getattr__ = deprecated.lookup(__name__, globals())

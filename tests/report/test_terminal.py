@@ -1,0 +1,113 @@
+"""A table on the terminal is never wider than the terminal, and states what it leaves out."""
+
+import io
+
+import numpy as np
+import pandas as pd
+import pytest
+from rich.cells import cell_len
+from rich.console import Console
+
+from bench.experiment import config
+from bench.report import finish, terminal
+from bench.report.labels import Labels, shortened
+from bench.report.terminal import layout, wrap
+from bench.report.views import newest_rows
+from bench.run.execute import store_of
+
+LONG = "alpha_order[delta=0.95,gamma=4,sharing=shared]"
+WORDS = ["fobg", LONG, "a text with blanks", "x" * 50, "名前が長い", "", "line one\nline two", "1.2 [1.0, 1.4]"]
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_no_line_is_wider_than_asked(seed):
+    random = np.random.default_rng(seed)
+    columns = {
+        f"column {index} {'long ' * int(random.integers(4))}": random.choice(WORDS, 5)
+        if random.random() < 0.6
+        else 10.0 ** random.integers(-8, 8, 5)
+        for index in range(random.integers(1, 14))
+    }
+    table = pd.DataFrame(columns)
+    right = [name for name in table if random.random() < 0.3]
+    for width in (20, 33, 60, 80, 140):
+        lines = str(layout(table, width, "a title " * 5, ["a note " * 30], right=right)).splitlines()
+        assert max(map(cell_len, lines)) <= width
+
+
+def test_nothing_is_lost_where_there_is_room():
+    table = pd.DataFrame({"estimator": ["fobg", LONG], "rel. RMSE": [0.0213, 12000.0], "samples": [16, 256]})
+    assert str(layout(table, 80, "Errors", ["A note."])).splitlines() == [
+        "Errors",
+        "estimator       rel. RMSE  samples",
+        "fobg               0.0213       16",
+        "alpha_order[a]     1.20e4      256",
+        "[a] delta=0.95, gamma=4, sharing=shared",
+        "A note.",
+    ]
+
+
+def test_constant_columns_are_stated_once_and_the_least_important_left_out_first():
+    table = pd.DataFrame(
+        {"scene": ["one", "two"], "contact": ["penalty"] * 2, "bias": ["0.1 [0.0, 0.2]", "0.2 [0.1, 0.3]"]}
+        | {"extra": ["a" * 30, "b" * 30], "time": ["1 ms", "2 ms"], "status": ["ok", "error"]}
+    )
+    right = ["bias", "extra", "time"]
+    text = str(layout(table, 40, right=right))
+    assert text.startswith("contact: penalty\nscene ")
+    assert "Left out to fit 40 characters: extra." in " ".join(text.split())
+    assert "error" in text
+    assert "2 ms" in text, "a narrow column fits where a wide one did not"
+    assert "extra" in layout(table, 45, right=right, least_important=["bias", "time"]).header[0]
+
+
+def test_numbers_stay_whole_and_texts_break_after_commas_and_blanks():
+    assert wrap("mass_spring, semi_implicit_euler, horizon=200", 21) == ["mass_spring,", "semi_implicit_euler,", "horizon=200"]  # fmt: skip
+    assert wrap("abcdefgh", 3) == ["abc", "def", "gh"]
+    assert wrap("", 10) == [""]
+    table = pd.DataFrame({"a text": ["word " * 12], "number": ["123.456789"]})
+    assert "123.456789" in str(layout(table, 30, right=["number"]))
+
+
+def test_missing_values_and_booleans():
+    table = pd.DataFrame({"name": ["a", None], "value": [1.5, np.nan], "flag": [True, False]})
+    assert layout(table, 80).body == ["a      1.50  True", "          -  False"]
+    assert layout(pd.DataFrame(columns=["a", "b"]), 80).body == []
+
+
+def test_two_columns_of_one_name_are_both_shown():
+    table = pd.DataFrame([["a", 1, 2.5]], columns=["name", "value", "value"])
+    assert layout(table, 80).header == ["name  value  value"]
+    assert layout(table, 80).body == ["a         1   2.50"]
+
+
+def test_equal_parameters_have_equal_letters_and_short_names_stay():
+    labels, key = shortened([LONG, "fobg", "reinforce[baseline=none]", LONG.replace("alpha_order", "other")])
+    assert list(labels.values()) == ["alpha_order[a]", "fobg", "reinforce[baseline=none]", "other[a]"]
+    assert key == ["[a] delta=0.95, gamma=4, sharing=shared"]
+    many = Labels(longest=5)
+    assert [many.short(f"name[x={index}]") for index in (0, 25, 0, 26)] == ["name[a]", "name[b]", "name[a]", "name[c]"]
+    assert len({many.short(f"name[x={index}]") for index in range(800)}) == 800
+
+
+def test_columns_of_the_environment_count_in_a_pipe(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "57")
+    assert terminal.open_console().width == 57
+    out = io.StringIO()
+    console = Console(file=out, width=40)
+    terminal.print_table(console, pd.DataFrame({"a[b]": ["[red]x[/red]" * 5]}), title="[bold]t")
+    lines = out.getvalue().splitlines()
+    assert max(map(len, lines)) <= 40
+    assert "[red]" in out.getvalue() or "[red" in out.getvalue()
+
+
+@pytest.mark.parametrize("width", [40, 80])
+@pytest.mark.parametrize("name", ["quick", "twins", "three_errors", "horizon_growth", "identify", "stability_map"])
+def test_what_a_command_prints_of_standard_results_fits(name, width, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(width))
+    experiment = config.load([f"experiment={name}", "results_dir=results/standard"])
+    rows = finish.shown(newest_rows(store_of(experiment).load()))
+    finish.show(experiment, rows[rows["seed"] == rows["seed"].min()].head(150).reset_index(drop=True))
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) > 10
+    assert max(map(cell_len, lines)) <= width
