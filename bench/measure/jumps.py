@@ -19,6 +19,8 @@ NO_JUMP = 1e-6
 """Change of a cost, relative to its range on the lines, below which rounding may hide that the change still shrinks."""
 LOUD = 100.0
 """Multiple of the cost's rounding noise below which a change counts as noise."""
+SINGLE = float(np.finfo(np.float32).eps)
+"""Relative rounding of a cost computed in single precision, whose values are all single-precision numbers."""
 
 
 class Jump(NamedTuple):
@@ -44,7 +46,8 @@ def largest_jump(
     count = starts.shape[1]
     line = np.arange(count)
     left, width = np.zeros(count), 1.0
-    span = noise = 0.0
+    span = noise = size = 0.0
+    single = True
     changes = [0.0]
     while True:
         nodes = left[:, None] + width * np.linspace(0.0, 1.0, parts + 1)
@@ -53,6 +56,9 @@ def largest_jump(
         values = np.where(np.isfinite(values), values, np.nan)
         if not np.isfinite(values).any():
             return Jump(0.0, span)
+        known = values[np.isfinite(values)]
+        single = single and bool((known == known.astype(np.float32)).all())
+        size = max(size, float(np.abs(known).max()))
         span = max(span, float(np.nanmax(values) - np.nanmin(values)))
         steps = np.nan_to_num(np.abs(np.diff(values, axis=1)))
         bends = np.nan_to_num(np.abs(np.diff(values, 2, axis=1)))
@@ -63,5 +69,8 @@ def largest_jump(
             break
         row, place = np.unravel_index(np.argsort(bends, axis=None)[-SUSPECTS:], bends.shape)
         line, left, width, parts = line[row], nodes[row, place], 2.0 * width / parts, CUTS
+    if single:
+        # steps of rounding are flat at the last level, so that they have no median bend
+        noise = max(noise, SINGLE * size)
     stays = changes[-1] > 0.1 * changes[-2] and changes[-1] > max(NO_JUMP * span, LOUD * noise)
     return Jump(changes[-1] if stays else 0.0, span)
