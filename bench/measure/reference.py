@@ -28,6 +28,8 @@ QUADRATURE_TOLERANCE = 1e-3
 """Relative error above which quadrature is accepted only where sampling does no better."""
 TAIL_EVENTS = 10.0
 """Expected samples in the tails. Their contribution is estimated separately, as a spread may not show so few samples."""
+DEEPER = 0.2
+"""Spacing of the points along a direction beyond the deepest sample of the tails, in standard deviations."""
 DIRECTIONS = 16
 """Most coordinate directions in noise space searched for tails and jumps, besides the direction of the mean effect."""
 FAR = 4.5
@@ -389,7 +391,8 @@ def _tail_error(
     """Return the norm of the far tails' contribution to the mean, the largest over the directions; NaN if not finite.
 
     The tails contain few of the ``count`` samples or none, so the spread of the samples does not show the contribution.
-    Along each direction, the tails are where :data:`TAIL_EVENTS` samples are expected, and are sampled separately.
+    Along each direction, the tails are where :data:`TAIL_EVENTS` samples are expected, and are sampled separately. What
+    lies beyond these samples, as of an exponential cost, is integrated along the direction.
     """
     from scipy.special import ndtri
 
@@ -404,7 +407,15 @@ def _tail_error(
     tails = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
     if not np.isfinite(tails).all():
         return math.nan
-    return share * float(np.linalg.norm(tails.mean(axis=2) - mean[:, None], axis=0).max())
+    # the same noise across the direction, at depths beyond the deepest sample of the tails
+    depth = float(np.abs(depth).max()) + DEEPER * (np.arange(each) // 2 + 0.5)
+    side = np.where(np.arange(each) % 2, 1.0, -1.0)
+    w = w + along * (np.tile(side * depth, directions.shape[1]) - (along * w).sum(axis=0))
+    with np.errstate(over="ignore", invalid="ignore"):
+        deep = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
+        deep = np.nan_to_num(deep * np.exp(-(depth**2) / 2) * DEEPER / math.sqrt(2.0 * math.pi), posinf=0.0, neginf=0.0)
+    beyond = float(np.linalg.norm(deep.sum(axis=2), axis=0).max())
+    return beyond + share * float(np.linalg.norm(tails.mean(axis=2) - mean[:, None], axis=0).max())
 
 
 def _directions(effect: np.ndarray) -> np.ndarray:
