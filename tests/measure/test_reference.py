@@ -132,7 +132,9 @@ def test_certificate_of_an_assumed_fact_states_what_its_check_resolves():
 @pytest.mark.parametrize("power", [0.5, 0.55])
 def test_mean_that_does_not_exist_is_said(power):
     """exp(a w^2) has a mean below a = 1/2 only."""
-    found = bank.certified(ridge(bank.Piece("none", lambda u: np.exp(power * u**2), lambda u, s: math.nan), dim=1), SAMPLES)
+    found = bank.certified(
+        ridge(bank.Piece("none", lambda u: np.exp(power * u**2), lambda u, s: math.nan), dim=1), SAMPLES
+    )
     assert np.isnan(found.gradient).all()
     assert "may not exist" in found.note
 
