@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import gradcheck, noise
 from bench.measure.contacts import active_contacts
+from bench.measure.jumps import jump_under_noise
 from bench.model import SURROGATE, ContactScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
 from bench.studies.gradient_check.points import is_trusted
 
@@ -56,7 +58,9 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     drawn = noise.draw(cell.seed, cell.scene.name, 1, 1, problem.program.n_noise, "gradient check")[0, 0]
     directions = noise.draw(cell.seed, cell.scene.name, 1, search.drawn, theta.size, "directions")[0]
     whole = start(problem, theta, unit, search, cell.seed)
-    places, samples = examine(problem, theta, drawn, directions, unit, search)
+    jump, at_jump = jump_under_noise(problem, theta, cell.seed, COLUMNS_AT_ONCE)
+    jumps = [Place("noise", theta, directions[0] / np.linalg.norm(directions[0]), at_jump, 0, 1)] if jump.height else []
+    places, samples = examine(problem, theta, drawn, directions, unit, search, jumps)
     points = [*at_start(whole), *(_checked(place, *both) for place, both in zip(places, samples, strict=True))]
     verdicts = [point.verdict for point in points]
     best = [gradcheck.best(point.sample) for point in points]
@@ -66,6 +70,12 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     parts = whole.components
     remarks = [SURROGATE] if problem.program.surrogate else []
     remarks += [] if whole.cause in PLAIN else [whole.sentence()]
+    distance = float(np.linalg.norm(at_jump)) if jump.height else math.nan
+    if jump.height:
+        remarks.append(
+            f"the cost jumps by {jump.height:.3g}, {jump.height / jump.span:.2g} of its range, under noise of "
+            f"{distance:.2g} standard deviations: the mean of gradients misses jumps"
+        )
     return {
         "status": "nonfinite" if lost else "ok",
         "reason": "no cost is finite" if lost else "; ".join([*remarks, *beyond_stability(cell)]),
@@ -75,6 +85,9 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
         "best_eps": float(gradcheck.EPS[best[severest]]),
         "scale": scale_of(theta),
         "taylor_order": whole.order,
+        "jump": jump.height,
+        "jump_share": jump.height / jump.span if jump.height else 0.0,
+        "jump_distance": distance,
         "cost_noise": whole.noise,
         "device": problem.device,
         "component": [part.component for part in parts],
@@ -165,7 +178,8 @@ def _number(part: gradcheck.Part) -> int:
 
 def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, str]]) -> Point:
     minus, plus = zip(*sides, strict=True)
-    return Point(place.point, place.sample, place.number, gradcheck.diagnose(sample), sample, minus, plus)
+    verdict = "jump" if place.point == "noise" else gradcheck.diagnose(sample)
+    return Point(place.point, place.sample, place.number, verdict, sample, minus, plus)
 
 
 def beyond_stability(cell: Cell) -> list[str]:
@@ -203,13 +217,19 @@ Modes = Callable[[np.ndarray, np.ndarray], list[str]]
 
 
 def examine(
-    problem: Problem, theta: np.ndarray, drawn: np.ndarray, directions: np.ndarray, unit: float, search: SwitchSearch
+    problem: Problem,
+    theta: np.ndarray,
+    drawn: np.ndarray,
+    directions: np.ndarray,
+    unit: float,
+    search: SwitchSearch,
+    more: Sequence[Place] = (),
 ) -> tuple[list[Place], list[tuple[gradcheck.Sample, list[tuple[str, str]]]]]:
     """Check directional derivatives at ``theta (d,)``, without noise and with ``drawn (n_w,)``, and at contact switches.
 
     Derivatives at theta are along the first ``search.directions`` of ``directions (D, d)``. Switches are searched along
-    all directions, without noise, and checked along the first ``search.directions`` that meet one. Returns the places
-    and, for each place, its costs and the contact modes on both sides at every eps. ``unit`` is the unit roundoff of
+    all directions, without noise, and checked along the first ``search.directions`` that meet one. ``more`` places are
+    checked too. Returns the places and, for each place, its costs and the contact modes on both sides at every eps. ``unit`` is the unit roundoff of
     the program's arithmetic. All costs are one batch, which is evaluated twice.
     """
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -223,6 +243,7 @@ def examine(
     if modes is not None:
         met = (boundary(modes, theta, direction, still, number, search) for number, direction in enumerate(directions))
         places += itertools.chain(*itertools.islice(filter(None, met), search.directions))
+    places += more
     scale, count = scale_of(theta), gradcheck.EPS.size
     thetas = np.concatenate([gradcheck.points(p.theta, scale * p.direction[:, None], unit) for p in places], axis=1)
     each = thetas.shape[1] // len(places)
