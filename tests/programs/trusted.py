@@ -12,7 +12,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -224,7 +224,7 @@ def scenes() -> Iterator[Scene]:
         yield Scene("plane", f"d {dim}, at {at} by {height}", plane(dim, at, height), (0.5,) * dim, 1.0)
 
 
-@lru_cache(maxsize=None)
+@cache
 def truth(scene: Scene) -> np.ndarray:
     """Return the smoothed gradient ``(d,)``, from costs only, without the harness."""
     theta, dim = np.array(scene.theta), len(scene.theta)
