@@ -14,6 +14,7 @@ import numpy as np
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import gradcheck, noise
+from bench.measure.batches import in_columns
 from bench.measure.contacts import active_contacts
 from bench.measure.jumps import jump_under_noise
 from bench.model import SURROGATE, ContactScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
@@ -21,6 +22,10 @@ from bench.studies.gradient_check.points import is_trusted
 
 COLUMNS_AT_ONCE = 128
 """Rollouts per evaluation. The number is fixed, so that a compiling backend compiles once."""
+COMPLEX_STEP = 1e-100
+"""Largest imaginary part of theta in a complex step; its square underflows beside every cost."""
+SAME_COST = 1e-3
+"""Relative difference between the costs of two array libraries: a chaotic rollout amplifies their rounding."""
 NEUTRAL = 1e-9
 """Relative growth of the state per step up to which rounding may be the cause."""
 
@@ -61,7 +66,8 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     jump, at_jump = jump_under_noise(problem, theta, cell.seed, COLUMNS_AT_ONCE)
     jumps = [Place("noise", theta, directions[0] / np.linalg.norm(directions[0]), at_jump, 0, 1)] if jump.height else []
     places, samples = examine(problem, theta, drawn, directions, unit, search, jumps)
-    points = [*at_start(whole), *(_checked(place, *both) for place, both in zip(places, samples, strict=True))]
+    checked = [_checked(place, *both) for place, both in zip(places, samples, strict=True)]
+    points = [*at_start(whole), *(_settled(problem, unit, point, place) for point, place in zip(checked, places, strict=True))]
     verdicts = [point.verdict for point in points]
     best = [gradcheck.best(point.sample) for point in points]
     errors = [float(point.sample.errors[i]) for point, i in zip(points, best, strict=True)]
@@ -156,7 +162,30 @@ def start(problem: Problem, theta: np.ndarray, unit: float, search: SwitchSearch
     modes = contact_modes(problem)
     named = None if modes is None else lambda thetas: modes(thetas, np.zeros((still.shape[0], thetas.shape[1])))
     options = gradcheck.Options(directions=search.directions, draws=search.around, unit=unit, seed=seed)
-    return gradcheck.check(cost, gradient, theta, options, named)
+    return gradcheck.check(cost, gradient, theta, options, named, lambda at, along: complex_step(problem, at, along))
+
+
+def complex_step(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: np.ndarray | None = None) -> float:
+    """Return the derivative of the program at ``theta (d,)`` along ``direction (d,)`` by a complex step; NaN if invalid.
+
+    The imaginary part of the cost at theta + i h direction is h times the derivative, without cancellation (Squire and
+    Trapp 1998). It needs code that is analytic, so it is NaN for programs with contacts or equations to solve, or where
+    the real part is not the cost.
+    """
+    program = problem.program
+    if program.contact is not None or program.needs or program.surrogate or "physics" in problem.provides:
+        return math.nan
+    noise_ = np.zeros((program.n_noise, 1)) if w is None else w[:, None]
+    size = COMPLEX_STEP / max(float(np.abs(direction).max()), 1e-300)
+    try:
+        with np.errstate(all="ignore"):
+            value = program.cost(LoopOps(), theta[:, None] + 1j * size * direction[:, None], noise_.astype(complex))[0]
+            real = problem.value(theta, noise_)[0]
+    except Exception:  # code of a plugin that does not run on complex numbers
+        return math.nan
+    if not abs(complex(value).real - real) <= SAME_COST * abs(real):
+        return math.nan
+    return float(complex(value).imag / size)
 
 
 def at_start(whole: gradcheck.Check) -> list[Point]:
@@ -180,6 +209,27 @@ def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, 
     minus, plus = zip(*sides, strict=True)
     verdict = "jump" if place.point == "noise" else gradcheck.diagnose(sample)
     return Point(place.point, place.sample, place.number, verdict, sample, minus, plus)
+
+
+def _settled(problem: Problem, unit: float, point: Point, place: Place) -> Point:
+    """Return the point with the verdict from smaller steps or a complex step, if the usual steps leave it unsettled."""
+    if point.verdict != "unsettled":
+        return point
+    scale = scale_of(problem.program.theta0)
+    at = gradcheck.points(place.theta[:, None], scale * place.direction[:, None], unit, gradcheck.FINE)
+    w = np.repeat(place.w[:, None], at.shape[1], axis=1)
+    values = in_columns(
+        lambda both: problem.value(both[: at.shape[0]], both[at.shape[0] :]), np.concatenate([at, w]), COLUMNS_AT_ONCE
+    )
+    (fine,) = gradcheck.samples(
+        values.reshape(1, -1), np.array([scale]), np.array([point.sample.derivative]), unit, gradcheck.FINE
+    )
+    verdict = gradcheck.diagnose(fine)
+    if verdict == "unsettled":
+        slope = complex_step(problem, place.theta, place.direction, place.w)
+        if abs(slope - point.sample.derivative) <= gradcheck.AGREES * abs(slope):
+            verdict = "nonlinear"
+    return replace(point, verdict=verdict)
 
 
 def beyond_stability(cell: Cell) -> list[str]:
