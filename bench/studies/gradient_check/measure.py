@@ -162,7 +162,21 @@ def start(problem: Problem, theta: np.ndarray, unit: float, search: SwitchSearch
     modes = contact_modes(problem)
     named = None if modes is None else lambda thetas: modes(thetas, np.zeros((still.shape[0], thetas.shape[1])))
     options = gradcheck.Options(directions=search.directions, draws=search.around, unit=unit, seed=seed)
-    return gradcheck.check(cost, gradient, theta, options, named, lambda at, along: complex_step(problem, at, along))
+    return gradcheck.check(cost, gradient, theta, options, named, lambda at, along: tangent(problem, at, along))
+
+
+def tangent(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: np.ndarray | None = None) -> float:
+    """Return the derivative at ``theta (d,)`` along ``direction (d,)`` by the backend's second method, else a complex step.
+
+    It is NaN where neither is possible.
+    """
+    if problem.program.surrogate:
+        return math.nan
+    noise_ = np.zeros((problem.program.n_noise, 1)) if w is None else w[:, None]
+    try:
+        return float(problem.second_gradient(theta, noise_)[:, 0] @ direction)
+    except Exception:  # unsupported, or a program that the second method cannot differentiate
+        return complex_step(problem, theta, direction, w)
 
 
 def complex_step(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: np.ndarray | None = None) -> float:
@@ -226,7 +240,7 @@ def _settled(problem: Problem, unit: float, point: Point, place: Place) -> Point
     )
     verdict = gradcheck.diagnose(fine)
     if verdict == "unsettled":
-        slope = complex_step(problem, place.theta, place.direction, place.w)
+        slope = tangent(problem, place.theta, place.direction, place.w)
         if abs(slope - point.sample.derivative) <= gradcheck.AGREES * abs(slope):
             verdict = "nonlinear"
     return replace(point, verdict=verdict)
