@@ -350,7 +350,9 @@ class _Checker:
             findings = self._with_staircases(thetas, vectors, measured, findings)
             for m, finding in enumerate(findings):
                 if finding.verdict == "unsettled" and self._gradient is not None:
-                    findings[m], steps[m] = self._settle(thetas[:, m], vectors[:, m], float(lengths[m]), measured[m], finding)
+                    findings[m], steps[m] = self._settle(
+                        thetas[:, m], vectors[:, m], float(lengths[m]), measured[m], finding
+                    )
         modes = [(tuple(a), tuple(b)) for a, b in zip(minus, plus, strict=True)]
         return [
             replace(_part(names[m], components[m], sample, finding, modes[m]), step=steps[m])

@@ -67,7 +67,10 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     jumps = [Place("noise", theta, directions[0] / np.linalg.norm(directions[0]), at_jump, 0, 1)] if jump.height else []
     places, samples = examine(problem, theta, drawn, directions, unit, search, jumps)
     checked = [_checked(place, *both) for place, both in zip(places, samples, strict=True)]
-    points = [*at_start(whole), *(_settled(problem, unit, point, place) for point, place in zip(checked, places, strict=True))]
+    points = [
+        *at_start(whole),
+        *(_settled(problem, unit, point, place) for point, place in zip(checked, places, strict=True)),
+    ]
     verdicts = [point.verdict for point in points]
     best = [gradcheck.best(point.sample) for point in points]
     errors = [float(point.sample.errors[i]) for point, i in zip(points, best, strict=True)]
