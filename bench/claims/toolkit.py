@@ -116,7 +116,7 @@ def descend(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the last point of gradient descent and the path ``(iterations + 1, ...)``. ``step(theta, i)`` is the gradient.
 
-    The steps are those of the optimizer ``gradient_descent``.
+    The optimizer ``gradient_descent`` takes the steps.
     """
     optimizer: Optimizer = plugin("optimizers", f"gradient_descent[rate={rate!r}]")
     theta = np.array(start, dtype=float)

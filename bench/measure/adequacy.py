@@ -59,7 +59,7 @@ def judge(
     terms: Mapping[str, np.ndarray] | None = None,
     seed: int = 0,
 ) -> Adequacy:
-    """Return whether standardised residuals ``(m,)`` of a fit with the Jacobian ``(m, p)`` are those of a right model.
+    """Return whether standardised residuals ``(m,)`` of a fit with the Jacobian ``(m, p)`` can come from a right model.
 
     The measurements are ``channels`` numbers per step, step by step. ``terms`` are derivatives ``(m,)`` of the
     standardised measurements with respect to effects that the model lacks, by name.

@@ -152,8 +152,8 @@ def _compute(
 def _unit(problem: Problem, theta: np.ndarray) -> float:
     """Return the power of 2 that costs are divided by, so that their squares are in range; 1 for usual costs."""
     # one column at a time, as for the cost at w = 0, so that a compiling backend compiles no other shape
-    drawn = draw_columns(problem, "unit", SIZED, 0)
-    values = np.abs(np.concatenate([problem.value(theta, w[:, None]) for w in drawn.T]))
+    samples = draw_columns(problem, "unit", SIZED, 0)
+    values = np.abs(np.concatenate([problem.value(theta, w[:, None]) for w in samples.T]))
     size = float(values[np.isfinite(values)].max(initial=0.0))
     return 1.0 if size == 0.0 or 1.0 / EXTREME <= size <= EXTREME else 2.0 ** math.floor(math.log2(size))
 

@@ -482,7 +482,7 @@ def summarise(
     notes = _interval_remarks(deviations, difference, samples, identical)
     notes += _reference_remarks(reference, relative)
     if unbiased and bias_low > 0.0:
-        notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or 1 in 40 by chance")
+        notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or chance (about 1 row in 30)")
     scaled = tuple(value * unit * unit for value in per_sample)
     if terms is not None:
         scaled = variance_per_sample(*terms, samples)

@@ -18,7 +18,9 @@ def check(cost, gradient, theta):
 @pytest.mark.parametrize("power", [3, 5])
 def test_flat_point_of_a_power_is_right(power):
     # products, since powers of arrays round differently from place to place
-    assert check(lambda x: np.prod([x[0]] * power, axis=0), lambda x: power * x ** (power - 1), [0.0]) in gradcheck.TRUSTED
+    assert (
+        check(lambda x: np.prod([x[0]] * power, axis=0), lambda x: power * x ** (power - 1), [0.0]) in gradcheck.TRUSTED
+    )
 
 
 def test_zero_gradient_of_a_slope_is_not_taken_for_a_flat_point():

@@ -85,8 +85,7 @@ class Chaos(Claim):
         figures.append(split)
         # the same by the estimator that splits them, on fewer steps, where its weights are not too far from one half
         at, mixture = problem(Tent(sigma=0.05, steps=WEIGHED)), estimator("inverse_variance")
-        pair = [spread(terms(at, method, draw.standard_normal((1, SAMPLES)))) for method in (first, zeroth)]
-        (v1, e1), (v0, e0) = pair
+        (v1, e1), (v0, e0) = (spread(terms(at, one, draw.standard_normal((1, SAMPLES)))) for one in (first, zeroth))
         ratio = v1 / (v0 + v1)
         expected = 2.0 * v0 * ratio
         noises = (draw.standard_normal((MIXED // 8, 1000, 1)) for _ in range(8))

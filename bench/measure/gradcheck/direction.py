@@ -269,7 +269,7 @@ def _judge_one_sided(sample: Sample, noise: np.ndarray) -> str:
 def _vanishes(sample: Sample, noise: np.ndarray) -> bool:
     """Return whether differences fall to 0 with at least order 1.5 of the step, down to the smallest that noise allows.
 
-    So do those of x^3 at 0, none of which equals another.
+    An example is x^3 at 0, whose differences all differ.
     """
     sizes = np.abs(sample.differences)
     resolved = np.flatnonzero(sizes > noise)

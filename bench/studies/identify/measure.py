@@ -281,7 +281,7 @@ def _explanation(
     """Return whether the fits by single shooting explain the records, and intervals that allow for correlated noise.
 
     ``explained`` is the share of records that no test contradicts. ``reason`` states the contradictions of the first
-    record. The intervals are those of the first record's parameters.
+    record. The intervals belong to the first record's parameters.
     """
     unit = np.ones(len(model.initial_states(start[:, :1])))
     fitting = Fitting(model, "single", 1, settings.measurement, unit)
@@ -293,7 +293,7 @@ def _explanation(
     # the effects of missing terms at one fit serve all records, which have the same truth
     fitted = np.exp(solution[:, int(np.argmax(is_finite))])
     terms = missing_terms(cell, model, fitted, settings.measurement) if is_finite.any() else {}
-    found = [
+    verdicts = [
         adequacy.judge(residual[:, i], jacobian[:, :, i], channels, terms, seed=i)
         for i in np.flatnonzero(is_finite)[:TESTED]
     ]
@@ -303,8 +303,8 @@ def _explanation(
         correlated = adequacy.correlated_covariance(residual[:, 0], jacobian[:, :, 0], channels)
         half = performance.Z * np.sqrt(np.maximum(np.diag(independent), np.diag(correlated)))
         wide_low, wide_high = (np.exp(solution[:, 0] + side * half).tolist() for side in (-1.0, 1.0))
-    share = float(np.mean([one.is_explained for one in found])) if found else math.nan
-    first = found[0].sentence() if is_finite[0] else "the fit of the first record is not finite"
+    share = float(np.mean([one.is_explained for one in verdicts])) if verdicts else math.nan
+    first = verdicts[0].sentence() if is_finite[0] else "the fit of the first record is not finite"
     if first and is_finite[0]:
         intervals = ", ".join(
             f"{name} {low:.4g} to {high:.4g}" for name, low, high in zip(model.names, wide_low, wide_high, strict=True)
@@ -312,7 +312,7 @@ def _explanation(
         first += f"; under correlated noise they would be {intervals}"
     return {
         "explained": share, "reason": first, "wide_low": wide_low, "wide_high": wide_high,
-        "misfit": found[0].probability if found else math.nan,
+        "misfit": verdicts[0].probability if verdicts else math.nan,
     }  # fmt: skip
 
 
