@@ -148,7 +148,7 @@ def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> tuple[np.
     Points on rays up to 38 standard deviations show where |cost| |w| times the normal density has mass, such as the
     mean of exp(8 w), which comes from w around 8. The third value bounds the integral of the absolute integrand beyond
     the limits. It is NaN where the integrand has not vanished at the last finite point of a ray: all limits are too
-    narrow. The fourth value is a note, empty if there is no doubt.
+    narrow. The fourth value is a note, or an empty string.
     """
     turn = 2.0 * math.pi * (np.arange(RAYS) + 0.5) / RAYS
     rays = np.array([[-1.0, 1.0]]) if width == 1 else np.stack([np.cos(turn), np.sin(turn)])
