@@ -9,7 +9,7 @@ import numpy as np
 
 from bench.errors import Unsupported
 from bench.experiment.by_name import compile_problem, make
-from bench.model import Estimator, Problem, Scene
+from bench.model import Answer, Estimator, Optimizer, Problem, SampleMean, Scene
 from bench.model.identity import parse_identity
 
 used: set[tuple[str, str]] = set()
@@ -114,11 +114,17 @@ def centre(values: np.ndarray) -> tuple[float, float]:
 def descend(
     step: Callable[[np.ndarray, int], np.ndarray], start: np.ndarray, rate: float, iterations: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last point of gradient descent and the path ``(iterations + 1, ...)``. ``step(theta, i)`` is the gradient."""
+    """Return the last point of gradient descent and the path ``(iterations + 1, ...)``. ``step(theta, i)`` is the gradient.
+
+    The optimizer ``gradient_descent`` takes the steps.
+    """
+    optimizer: Optimizer = plugin("optimizers", f"gradient_descent[rate={rate!r}]")
     theta = np.array(start, dtype=float)
-    path = [theta.copy()]
+    path, state = [theta.copy()], optimizer.start(theta.ravel())
     for i in range(iterations):
-        theta = theta - rate * step(theta, i)
+        gradient = np.asarray(step(theta, i), dtype=float).reshape(-1, 1)
+        state = optimizer.tell(state, theta.reshape(-1, 1), Answer(gradient=gradient))
+        theta = state["theta"].reshape(theta.shape)
         path.append(theta.copy())
     return theta, np.array(path)
 
@@ -135,17 +141,19 @@ def stochastic_descent(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Descend on one variable in ``runs`` independent runs. Returns the last points ``(runs,)`` and the paths.
 
-    A step uses the mean of ``samples`` gradients or, with ``zeroth``, of (f - f at w = 0) w / sigma.
+    A step uses the mean of ``samples`` terms of ``fobg`` or, with ``zeroth``, of ``reinforce``.
     """
     noise = np.random.default_rng(seed).standard_normal((iterations, 1, runs * samples))
+    method = estimator("reinforce" if zeroth else "fobg")
+    assert isinstance(method, SampleMean)
 
     def step(theta: np.ndarray, i: int) -> np.ndarray:
-        every, w = np.repeat(theta, samples)[None], noise[i]
-        if zeroth:
-            base = problem.value(theta[None], np.zeros((1, runs)))
-            values = (problem.value(every, w) - np.repeat(base, samples)) * w[0] / problem.sigma
+        if not zeroth:
+            # one theta per column
+            values = method.terms(problem, np.repeat(theta, samples)[None], noise[i])[0]
         else:
-            values = problem.grad(every, w)[0]
+            parts = np.split(noise[i], runs, axis=1)
+            values = np.concatenate([method.terms(problem, at[None], w)[0] for at, w in zip(theta, parts, strict=True)])
         return np.asarray(values.reshape(runs, samples).mean(axis=1))
 
     return descend(step, np.full(runs, start), rate, iterations)

@@ -198,6 +198,8 @@ def _quote_identities(value: str) -> str:
 
 
 FORMATS = ("png", "svg", "pdf")
+DEFAULT_PLUGINS = {"optimizers": ["adam"]}
+"""Plugins of kinds that are null in the configuration, unless the study has its own default."""
 
 
 def experiment(config: Mapping[str, Any]) -> Experiment:
@@ -212,7 +214,15 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         registry.add_folder(Path(str(folder)))
     study = _study(config["study"])
     axes = {axis: registry.kind_of(axis) for axis in study.axes}
-    choices = {axis: [_choice(kind, item) for item in _at_least_one(config, kind)] for axis, kind in axes.items()}
+    named = {
+        **config,
+        **{
+            kind: list(study.default_plugins.get(kind, DEFAULT_PLUGINS[kind]))
+            for kind in DEFAULT_PLUGINS
+            if config[kind] is None
+        },
+    }
+    choices = {axis: [_choice(kind, item) for item in _at_least_one(named, kind)] for axis, kind in axes.items()}
     values = {axis: _mapping(config, axis) for axis in axes}
     for axis, kind in axes.items():
         for plugin, given in values[axis].items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -33,6 +34,9 @@ class Study(Plugin):
     """The columns of its rows."""
     timed: ClassVar[bool] = False
     """Whether its cells are timed by default: one at a time, with the machine to themselves."""
+
+    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {}
+    """Names of the plugins of a kind that the configuration leaves null, such as ``optimizers``."""
 
     @abstractmethod
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:

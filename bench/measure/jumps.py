@@ -7,6 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.measure.batches import in_columns
+from bench.model import Problem
+
 PARTS = 64
 """Default number of intervals of each line at the first level."""
 CUTS = 32
@@ -19,6 +22,14 @@ NO_JUMP = 1e-6
 """Change of a cost, relative to its range on the lines, below which rounding may hide that the change still shrinks."""
 LOUD = 100.0
 """Multiple of the cost's rounding noise below which a change counts as noise."""
+SINGLE = float(np.finfo(np.float32).eps)
+"""Relative rounding of a cost computed in single precision, whose values are all single-precision numbers."""
+
+
+REACH = 4.0
+"""Distance searched on either side of theta, in standard deviations of the noise."""
+LINES = 16
+"""Most lines along coordinates, and along random directions; twice as many lie between two random samples."""
 
 
 class Jump(NamedTuple):
@@ -28,6 +39,39 @@ class Jump(NamedTuple):
     """Change of the cost across the jump; 0 without a jump."""
     span: float
     """Range of the cost on the lines."""
+    line: int = 0
+    """Index of the line with the jump."""
+    at: float = 0.0
+    """Place of the jump on its line, from 0 at the start to 1 at the end."""
+
+
+def jump_under_noise(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> tuple[Jump, np.ndarray]:
+    """Return the largest jump of the cost at ``theta (d,)`` on lines through its noise, and the jump's noise ``(n_w,)``.
+
+    The mean of gradients misses a jump that the noise reaches, although each gradient is right. The lines go 4 standard
+    deviations to either side of w = 0, along coordinates, random directions and the direction that changes the cost
+    most, and between pairs of samples. The cost is evaluated ``columns`` samples at a time.
+    """
+    width = problem.program.n_noise
+    random = np.random.default_rng([seed, 0x6A756D70])
+    samples = random.standard_normal((width, 4 * LINES))
+
+    def cost(w: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            # one theta per column, the shape that a compiling backend has compiled for differences
+            return in_columns(lambda part: problem.value(np.repeat(theta[:, None], columns, axis=1), part), w, columns)
+
+    changes = cost(samples)
+    changes = np.where(np.isfinite(changes), changes - np.nan_to_num(np.median(changes)), 0.0)
+    chosen = np.unique(np.linspace(0, width - 1, min(width, LINES)).astype(int))
+    directions = np.concatenate([np.eye(width)[:, chosen], samples[:, :LINES], (samples @ changes)[:, None]], axis=1)
+    lengths = np.linalg.norm(directions, axis=0)
+    directions = directions[:, lengths > 0.0] / lengths[lengths > 0.0]
+    pairs = samples[:, : 2 * LINES], samples[:, 2 * LINES :]
+    starts = np.concatenate([-REACH * directions, pairs[0]], axis=1)
+    ends = np.concatenate([REACH * directions, pairs[1]], axis=1)
+    jump = largest_jump(cost, starts, ends)
+    return jump, starts[:, jump.line] + jump.at * (ends[:, jump.line] - starts[:, jump.line])
 
 
 def largest_jump(
@@ -44,7 +88,8 @@ def largest_jump(
     count = starts.shape[1]
     line = np.arange(count)
     left, width = np.zeros(count), 1.0
-    span = noise = 0.0
+    span = noise = size = 0.0
+    single = True
     changes = [0.0]
     while True:
         nodes = left[:, None] + width * np.linspace(0.0, 1.0, parts + 1)
@@ -53,8 +98,13 @@ def largest_jump(
         values = np.where(np.isfinite(values), values, np.nan)
         if not np.isfinite(values).any():
             return Jump(0.0, span)
+        known = values[np.isfinite(values)]
+        single = single and bool((known == known.astype(np.float32)).all())
+        size = max(size, float(np.abs(known).max()))
         span = max(span, float(np.nanmax(values) - np.nanmin(values)))
         steps = np.nan_to_num(np.abs(np.diff(values, axis=1)))
+        highest, part = np.unravel_index(int(steps.argmax()), steps.shape)
+        where = int(line[highest]), float(nodes[highest, part : part + 2].mean())
         bends = np.nan_to_num(np.abs(np.diff(values, 2, axis=1)))
         changes.append(float(steps.max()))
         if width / parts < FINEST:
@@ -63,5 +113,8 @@ def largest_jump(
             break
         row, place = np.unravel_index(np.argsort(bends, axis=None)[-SUSPECTS:], bends.shape)
         line, left, width, parts = line[row], nodes[row, place], 2.0 * width / parts, CUTS
+    if single:
+        # steps of rounding are flat at the last level, so that they have no median bend
+        noise = max(noise, SINGLE * size)
     stays = changes[-1] > 0.1 * changes[-2] and changes[-1] > max(NO_JUMP * span, LOUD * noise)
-    return Jump(changes[-1] if stays else 0.0, span)
+    return Jump(changes[-1] if stays else 0.0, span, *where)

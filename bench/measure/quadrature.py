@@ -15,7 +15,24 @@ from bench.model import Problem
 NODES = 8
 """Number of Gauss-Legendre nodes per panel."""
 REACH = 9.0
-"""Limit of integration on either side, in standard deviations: beyond it, the normal density is below 1e-17."""
+"""Least limit of integration on either side, in standard deviations: beyond it, the normal density is below 1e-17."""
+NEAR, FARTHEST = 12.0, 38.0
+"""Distances up to which the integrand is searched: the first, and where it has not vanished there, the second. Beyond the
+second, the normal density underflows."""
+VANISHED = 1e-18
+"""Share of the integral of absolute values in the last shell below which the search ends."""
+RAYS, SPACING = 96, 0.25
+"""Directions in which an integrand in the plane is searched, and distance of the points on a ray."""
+NEGLIGIBLE = 1e-13
+"""Share of the integral of absolute values beyond the limits that does not move the limits; the error includes it."""
+UNSETTLED = 1e-3
+"""Share of the integral of absolute values at the last finite point of a ray above which the integral may not exist."""
+MARGIN = 1.0
+"""Distance of a moved limit from the last point with a share of the integral, in standard deviations."""
+ZOOMS, PARTS = 10, 32
+"""Number of enlargements around the largest cost, and intervals of each, that distinguish a pole from a peak."""
+POLE = 0.95
+"""Least power p of a pole, where the cost grows as 1 / distance^p. From p = 1 on, its integral over a line diverges."""
 SHIFTS = {1: ((0.0, 0.5, 0.25, 0.75),), 2: ((0.0, 0.5, 0.25, 0.75), (0.0, 0.25, 0.75, 0.5))}
 """Shift of each rule's panels, as a share of a panel, by number of noise dimensions: no two rules share their points."""
 FIRST = {1: 512, 2: 12}
@@ -29,18 +46,24 @@ SETTLED = 1e-10
 """Relative error at which refinement stops."""
 SOLVED = 1e-11
 """Relative error of costs of programs whose steps solve an equation to 1e-12."""
+ROUNDED = 64.0
+"""Relative rounding error of the integral of absolute values, in unit roundoffs: a node's weight has a few."""
 PROBES, STEP = 32, 1e-7
 """Number of stencils that measure the cost's rounding noise, and the spacing of their points in standard deviations."""
 
 
 @dataclass(frozen=True)
 class Integral:
-    """A smoothed gradient ``(d,)``, the norm of its error, and the points used: their number and average spacing."""
+    """A smoothed gradient ``(d,)``, the norm of its error, and the points used: their number and average spacing.
+
+    ``note`` states a doubt that the integral exists. Where the doubt is not bounded, gradient and error are NaN.
+    """
 
     gradient: np.ndarray
     error: float
     points: int
     spacing: float
+    note: str = ""
 
 
 def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) -> Integral | None:
@@ -49,27 +72,36 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     Gauss-Legendre panels lie between the scene's breakpoints and are halved until the error is negligible or the next
     level would exceed ``points`` points. Every level averages four rules, shifted against each other. The stated error
     is twice the largest distance of a rule from the mean, or the change of the mean under the last halving if that is
-    larger, plus rounding: the cost's measured noise, and 1e-11 of its size where steps solve equations. Returns None
-    where two levels, the last of at least :data:`LEAST` points, do not fit, or a cost is not finite. A feature of the
-    cost that is narrower than the spacing and not among the breakpoints is missed. The cost is evaluated ``columns``
-    points at a time.
+    larger, plus rounding: the cost's measured noise, and 1e-11 of its size where steps solve equations. The limits
+    of integration are where the integrand has vanished, see :func:`_limits`, and the error includes the remainder
+    beyond them. Returns None where two levels, the last of at least :data:`LEAST` points, do not fit, or a cost within
+    the limits is not finite. A feature of the cost that is narrower than the spacing and not among the breakpoints is
+    missed. The cost is evaluated ``columns`` points at a time.
     """
     width, dim = problem.program.n_noise, problem.dim
     breaks = problem.program.breakpoints()
-    edges = []
-    for i in range(width):
-        inner = [(b - theta[i]) / problem.sigma for b in (breaks[i] if i < len(breaks) else ())]
-        edges.append(np.unique([-REACH, *(b for b in inner if abs(b) < REACH), REACH]))
     # E[w] = 0, so subtracting f(0) does not change the integral, and loses fewer digits
     centre = problem.value(theta, np.zeros((width, 1)))[0]
 
     def cost(nodes: np.ndarray) -> np.ndarray:
         return in_columns(lambda w: problem.value(theta, w), nodes, columns)
 
+    low, high, beyond, note = _limits(lambda w: cost(w) - centre, width)
+    beyond /= problem.sigma
+    if math.isnan(beyond):
+        return Integral(np.full(dim, math.nan), math.nan, 0, 0.0, note)
+    edges = []
+    for i in range(width):
+        inner = [(b - theta[i]) / problem.sigma for b in (breaks[i] if i < len(breaks) else ())]
+        edges.append(np.unique([low[i], *(b for b in inner if low[i] < b < high[i]), high[i]]))
+    stretch = (high - low) / (2.0 * REACH)
     rounding = _noise(cost, width) * math.sqrt(width) / problem.sigma
     panels, previous, error, used, size = FIRST[width], None, math.inf, 0, 0.0
+    peak, largest = np.zeros(width), 0.0
     while True:
-        rules = [[_panels(e, panels, shift) for shift in SHIFTS[width][i]] for i, e in enumerate(edges)]
+        rules = [
+            [_panels(e, round(panels * stretch[i]), shift) for shift in SHIFTS[width][i]] for i, e in enumerate(edges)
+        ]
         count = sum(math.prod(rule[0].size for rule in axes) for axes in zip(*rules, strict=True))
         if count > points:
             break
@@ -81,7 +113,14 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
                 weights = np.outer(weights, weight).ravel()
             f = cost(nodes)
             if not np.isfinite(f).all():
-                return None
+                if stretch.max() <= 1.0:
+                    return None
+                # samples would miss what the wider limits contain
+                note = note or "costs far in the tails are not finite, so the mean may not exist"
+                return Integral(np.full(dim, math.nan), math.nan, 0, 0.0, note)
+            dense = np.abs(f - centre) * np.exp(-np.square(nodes).sum(axis=0) / 2)
+            if dense.max() > largest:
+                peak, largest = nodes[:, np.argmax(dense)], float(dense.max())
             gradients.append(nodes[:dim] @ (weights * (f - centre)) / problem.sigma)
             size = max(size, float(np.linalg.norm(np.abs(nodes[:dim]) @ (weights * np.abs(f))) / problem.sigma))
         mean = np.mean(gradients, axis=0)
@@ -93,8 +132,92 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
         panels *= 2
     if previous is None or used < LEAST[width] or not math.isfinite(error + rounding):
         return None
-    error += rounding + (SOLVED if problem.program.needs_root else 4.0 * np.finfo(float).eps) * size
-    return Integral(previous, error, used, 2.0 * REACH / used ** (1.0 / width))
+    spacing = float(np.prod(high - low)) ** (1.0 / width) / used ** (1.0 / width)
+    if error > SETTLED * np.linalg.norm(previous) and _power(lambda w: cost(w) - centre, peak, spacing) > POLE:
+        place = ", ".join(f"{x:.6g}" for x in theta[:width] + problem.sigma * peak)
+        exists = "does not exist" if width == 1 else "may not exist"
+        note = f"the cost is infinite near theta = ({place}), a pole, so its mean {exists}"
+        return Integral(np.full(dim, math.nan), math.nan, used, spacing, note)
+    error += beyond + rounding + (SOLVED if problem.program.needs_root else ROUNDED * np.finfo(float).eps) * size
+    return Integral(previous, error, used, spacing, note)
+
+
+def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> tuple[np.ndarray, np.ndarray, float, str]:
+    """Return the limits of integration ``(width,)`` for ``excess (width, B) -> (B,)``, the cost minus that at 0.
+
+    Points on rays up to 38 standard deviations show where |cost| |w| times the normal density has mass, such as the
+    mean of exp(8 w), which comes from w around 8. The third value bounds the integral of the absolute integrand beyond
+    the limits. It is NaN where the integrand has not vanished at the last finite point of a ray: all limits are too
+    narrow. The fourth value is a note, or an empty string.
+    """
+    turn = 2.0 * math.pi * (np.arange(RAYS) + 0.5) / RAYS
+    rays = np.array([[-1.0, 1.0]]) if width == 1 else np.stack([np.cos(turn), np.sin(turn)])
+    for farthest in (NEAR, FARTHEST):
+        radii = SPACING * np.arange(1, round(farthest / SPACING) + 1)
+        points = (rays[:, :, None] * radii).reshape(width, -1)
+        with np.errstate(all="ignore"):
+            f = np.abs(excess(points)).reshape(rays.shape[1], radii.size)
+            # per ray, the share of each shell: the area of its sector times the normal density
+            shell = SPACING * radii ** (width - 1) * np.exp(-(radii**2) / 2) / math.sqrt(2.0 * math.pi) ** width
+            mass = f * radii * shell * (2.0 * math.pi / RAYS if width == 2 else 1.0)
+        if mass[:, -1].sum() <= VANISHED * mass.sum():
+            break
+    # a ray ends at its first point that is not finite
+    ended = np.logical_or.accumulate(~np.isfinite(mass), axis=1)
+    mass = np.where(ended, 0.0, mass)
+    total = float(mass.sum())
+    low, high = np.full(width, -REACH), np.full(width, REACH)
+    outside = np.abs(points).max(axis=0).reshape(mass.shape) > REACH
+    beyond = float(mass[outside].sum())
+    if beyond > NEGLIGIBLE * total:
+        # what each point and all points farther out on its ray contribute
+        rest = np.cumsum(mass[:, ::-1], axis=1)[:, ::-1]
+        inside = points[:, (rest > NEGLIGIBLE * total / rays.shape[1]).ravel()]
+        finite = points[:, ~ended.ravel()]
+        low = np.maximum(np.minimum(low, inside.min(axis=1) - MARGIN), finite.min(axis=1))
+        high = np.minimum(np.maximum(high, inside.max(axis=1) + MARGIN), finite.max(axis=1))
+        outside = ((points < low[:, None]) | (points > high[:, None])).any(axis=0).reshape(mass.shape)
+        beyond = float(mass[outside].sum())
+    note = ""
+    last = np.where(ended.any(axis=1), ended.argmax(axis=1) - 1, radii.size - 1)
+    ray = np.arange(last.size)
+    at_end, before = mass[ray, last.clip(0)], mass[ray, (last - 1).clip(0)]
+    # beyond the last finite point, shells fall at least as fast as the last two, as a geometric series
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = at_end / np.maximum(before, at_end)
+        unseen = np.where(at_end > VANISHED * total, at_end * ratio / (1.0 - ratio), 0.0)[radii[last.clip(0)] >= REACH]
+    if ended.any() and radii[last.min()] >= REACH:
+        note = f"costs beyond {radii[last.min()]:g} standard deviations are not finite, so the mean may not exist"
+    if float(unseen.sum()) > UNSETTLED * total:
+        note = note or "the cost grows as fast as the normal density falls, so its mean may not exist"
+        return low, high, math.nan, note
+    return low, high, 2.0 * (beyond + float(unseen.sum())), note
+
+
+def _power(excess: Callable[[np.ndarray], np.ndarray], peak: np.ndarray, spacing: float) -> float:
+    """Return the power p with which a cost grows as 1 / distance^p at its largest value near ``peak (width,)``.
+
+    Intervals around the largest value are enlarged :data:`ZOOMS` times, along the first axis of noise and then along
+    the others. The power is 0 at a bounded peak or jump.
+    """
+    width, sizes = spacing, []
+    at = peak.copy()
+    for _ in range(ZOOMS):
+        best = 0.0
+        for axis in range(at.size):
+            line = np.repeat(at[:, None], PARTS + 1, axis=1)
+            # not symmetric about the present point, which may lie beside the pole
+            line[axis] += width * (np.arange(PARTS + 1) / PARTS - 0.487)
+            with np.errstate(all="ignore"):
+                f = np.nan_to_num(np.abs(excess(line)), nan=0.0, posinf=0.0)
+            if f.max() > best:
+                best, at = float(f.max()), line[:, int(f.argmax())]
+        sizes.append(best)
+        width *= 4.0 / PARTS
+    if min(sizes) <= 0.0:
+        return 0.0
+    slopes = np.diff(np.log(sizes)) / math.log(PARTS / 4.0)
+    return float(np.median(slopes[-5:]))
 
 
 def _panels(edges: np.ndarray, count: int, shift: float) -> tuple[np.ndarray, np.ndarray]:

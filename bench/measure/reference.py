@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import numpy as np
 
@@ -27,6 +28,8 @@ QUADRATURE_TOLERANCE = 1e-3
 """Relative error above which quadrature is accepted only where sampling does no better."""
 TAIL_EVENTS = 10.0
 """Expected samples in the tails. Their contribution is estimated separately, as a spread may not show so few samples."""
+DEEPER = 0.2
+"""Spacing of the points along a direction beyond the deepest sample of the tails, in standard deviations."""
 DIRECTIONS = 16
 """Most coordinate directions in noise space searched for tails and jumps, besides the direction of the mean effect."""
 FAR = 4.5
@@ -35,6 +38,12 @@ ROUNDING = 1e-9
 """Difference of first and zeroth order, relative to the gradient, that rounding explains."""
 SHARED = 1e-10
 """Relative error common to the terms of all samples, from rounding and central differences."""
+EXTREME = 1e100
+"""Size of costs above which, or below the inverse of which, their squares would leave the range of float64."""
+SIZED = 4
+"""Samples that show the size of the costs."""
+CONTRACTS = "bench.model."
+"""Modules of the contracts, whose defaults are not declarations."""
 WARNED, REFUSED = 0.999, 1.0 - 1e-6
 """Confidence levels at which a difference of first from zeroth order adds a note, and makes zeroth order replace first."""
 
@@ -62,6 +71,11 @@ class Reference:
         """grad J_sigma, ``(d,)``."""
         return np.asarray(self.batches.mean(axis=0))
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether the gradient is known; if not, the note and the method state why."""
+        return bool(np.isfinite(self.batches).all())
+
     def known(self) -> Truth:
         """Return the reference as a :class:`Truth`: mean, sampling error, and the error that sampling does not show."""
         if len(self.batches) > 1:
@@ -87,7 +101,8 @@ def certify(
     Quadrature handles noise on theta of one or two dimensions, or of one only if the cost may jump at places that the
     scene does not list. If its relative error exceeds 0.1%, sampling replaces quadrature where the error of sampling is
     smaller. Sampling stops at an error of ``tolerance`` times the gradient's norm, or after ``samples`` samples.
-    ``physical (d,)`` is the gradient of the physics that the program approximates, if known.
+    ``physical (d,)`` is the gradient of the physics that the program approximates, if known. Where costs are not
+    finite, or J does not exist, the gradient is NaN and the note states why.
     """
     program = problem.program
     theta = program.theta0
@@ -98,7 +113,12 @@ def certify(
     if closed is not None:
         reference = Reference(np.asarray(closed, dtype=np.float64).reshape(1, -1), "closed_form")
     else:
-        reference = _compute(problem, theta, provides, samples, tolerance)
+        unit = _unit(problem, theta)
+        if unit == 1.0:
+            reference = _compute(problem, theta, provides, samples, tolerance)
+        else:
+            scaled = _compute(cast(Problem, _Scaled(problem, unit)), theta, provides, samples, tolerance)
+            reference = replace(scaled, batches=scaled.batches * unit, error=scaled.error * unit)
     if physical is None or "grad" not in provides:
         return reference
     plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
@@ -114,16 +134,67 @@ def _compute(
         integral = integrate(problem, theta, min(QUADRATURE_POINTS, 64 * samples), COLUMNS)
         if integral is not None:
             method = f"quadrature[points={integral.points},spacing={integral.spacing:.2g}]"
-            quadrature = Reference(integral.gradient[None, :], method, integral.error)
+            quadrature = Reference(integral.gradient[None, :], method, integral.error, note=integral.note)
+            if math.isnan(integral.error):
+                return replace(quadrature, method="quadrature[failed: the mean cost may not exist]")
             if integral.error <= QUADRATURE_TOLERANCE * np.linalg.norm(integral.gradient):
                 return quadrature
     sampled = _sample(problem, theta, provides, samples, tolerance)
     if quadrature is None:
         return sampled
     # a gradient near zero has no relative accuracy: there the method with the smaller error is used
-    if not np.isfinite(sampled.batches).all():
+    if not sampled.is_finite:
         return quadrature
+    sampled = replace(sampled, note="; ".join(part for part in (sampled.note, quadrature.note) if part))
     return sampled if 0.0 < sampled.known().standard_error < quadrature.error else quadrature
+
+
+def _unit(problem: Problem, theta: np.ndarray) -> float:
+    """Return the power of 2 that costs are divided by, so that their squares are in range; 1 for usual costs."""
+    # one column at a time, as for the cost at w = 0, so that a compiling backend compiles no other shape
+    samples = draw_columns(problem, "unit", SIZED, 0)
+    values = np.abs(np.concatenate([problem.value(theta, w[:, None]) for w in samples.T]))
+    size = float(values[np.isfinite(values)].max(initial=0.0))
+    return 1.0 if size == 0.0 or 1.0 / EXTREME <= size <= EXTREME else 2.0 ** math.floor(math.log2(size))
+
+
+class _Scaled:
+    """A problem whose costs and gradients are divided by a unit."""
+
+    def __init__(self, problem: Problem, unit: float) -> None:
+        self._problem, self._unit = problem, unit
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._problem, name)
+
+    def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._problem.value(theta, w) / self._unit
+
+    def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._problem.grad(theta, w) / self._unit
+
+    def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._problem.explicit(theta, w) / self._unit
+
+
+def assumes_continuity(program: Program) -> bool:
+    """Return whether the scene's or the contact law's class does not declare that it is continuous.
+
+    A class declares ``continuous`` itself, or inherits the declaration together with all methods: a method that a class
+    further down replaces may jump where the inherited one did not.
+    """
+    parts = (program.scene, program.contact)
+    return any(part is not None and not _declares_continuity(type(part)) for part in parts)
+
+
+def _declares_continuity(plugin: type) -> bool:
+    for owner in plugin.__mro__:
+        is_contract = owner.__module__.startswith(CONTRACTS)
+        if "continuous" in vars(owner):
+            return not is_contract
+        if not is_contract and any(callable(value) for name, value in vars(owner).items() if name[0] != "_"):
+            return False
+    return False
 
 
 def _unlisted_jumps(program: Program) -> bool:
@@ -159,7 +230,7 @@ def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], sampl
     pilots = {name: terms for name, terms in pilots.items() if np.isfinite(terms).all()}
     if not pilots:
         reason = "rollouts are not finite" if orders else "needs explicit derivatives"
-        return Reference(np.full((1, problem.dim), math.nan), f"sampling[failed: {reason}]", math.nan)
+        return _failed(problem, reason)
     effect = pilot @ (problem.value(theta, pilot) - centre)
     directions = _directions(effect if np.isfinite(effect).all() else still[:, 0])
     spread = {name: float(terms.var(axis=1, ddof=1).sum()) for name, terms in pilots.items()}
@@ -173,15 +244,21 @@ def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], sampl
         return _batches(problem, orders[order], order, pilots[order], directions, columns, samples, tolerance)
 
     reference = sample(chosen)
+    if not reference.is_finite and chosen == "first_order" and "zeroth_order" in pilots:
+        # the cost may be finite where its gradient is not
+        chosen, doubt = "zeroth_order", "first order is not finite, so zeroth order is used"
+        reference = sample(chosen)
+    if not reference.is_finite:
+        return reference
     if chosen == "zeroth_order" or "zeroth_order" not in pilots:
         return _with_note(reference, doubt)
     # a pilot of a heavy-tailed distribution underestimates its variance
     error = reference.known().standard_error
     if 2.0 * spread["zeroth_order"] < _count(reference) * error**2:
         other = sample("zeroth_order")
-        if other.known().standard_error < error:
+        if other.is_finite and other.known().standard_error < error:
             return other
-    return _cross_checked(problem, reference, orders["zeroth_order"], columns, lambda: sample("zeroth_order"))
+    return _cross_checked(problem, theta, reference, columns, samples, lambda: sample("zeroth_order"))
 
 
 def _reason_against_first_order(
@@ -232,7 +309,7 @@ def _batches(
             if spent or math.hypot(se, np.nan_to_num(unseen)) <= tolerance * np.linalg.norm(batches.mean(axis=0)):
                 break
     if not np.isfinite(batches).all():
-        return Reference(batches[:1] * math.nan, "sampling[failed: rollouts are not finite]", math.nan)
+        return _failed(problem, "rollouts are not finite")
     note = ""
     if math.isnan(unseen):
         note, unseen = "rollouts in the far tails of the noise are not finite, so the reference may not exist", 0.0
@@ -246,15 +323,48 @@ def _batches(
 
 
 def _cross_checked(
-    problem: Problem, reference: Reference, zeroth: Terms, columns: int, instead: Callable[[], Reference]
+    problem: Problem,
+    theta: np.ndarray,
+    reference: Reference,
+    columns: int,
+    samples: int,
+    instead: Callable[[], Reference],
 ) -> Reference:
     """Return a first-order reference after comparing it with zeroth order on a quarter of its samples.
 
-    The method's name records the resolution of the comparison. A clear disagreement returns ``instead()``.
+    Where the continuity of the cost is only assumed, the comparison uses all samples that the reference left, and the
+    stated error includes the comparison's resolution. The method's name records the resolution. A clear disagreement
+    returns ``instead()``.
     """
-    count = max(columns, _count(reference) // 4 // columns * columns)
-    check = in_columns(zeroth, draw_columns(problem, "check", count, 0), columns)
-    check = check.reshape(problem.dim, BATCHES, -1).mean(axis=2).T
+    assumed = assumes_continuity(problem.program)
+    n_check = max(_count(reference) // 4, samples - _count(reference) if assumed else 0)
+    centre = problem.value(theta, np.zeros((problem.program.n_noise, 1)))
+    # a linear part of the cost, whose zeroth-order estimate is known, only adds noise to the comparison
+    linear = reference.gradient if problem.noise_on_theta else np.zeros(problem.dim)
+
+    def zeroth(w: np.ndarray) -> np.ndarray:
+        if not problem.program.exogenous:
+            return _antithetic(problem, theta, w, centre, linear)
+        # the same own noise on both sides and in the baseline, so that only the noise on theta moves the terms
+        own = problem.centred(w)
+        mirrored = 2.0 * own - w
+        baseline = problem.value(theta, own)
+        terms = sum((problem.value(theta, s) - baseline) * problem.score(theta, s) for s in (w, mirrored)) / 2.0
+        step = problem.directions(w)
+        return np.asarray(terms - (linear @ step) * step + linear[:, None])
+
+    check = np.concatenate(
+        [
+            in_columns(zeroth, draw_columns(problem, "check", columns, block), columns)
+            .reshape(problem.dim, -1, max(1, columns // BATCHES))
+            .mean(axis=2)
+            for block in range(max(1, n_check // columns))
+        ],
+        axis=1,
+    ).T
+    check = check.reshape(-1, len(check) // min(BATCHES, len(check)), problem.dim).mean(axis=1)
+    if not np.isfinite(check).all():
+        return _with_note(reference, "zeroth order is not finite, so first order is not checked")
     apart = reference.gradient - check.mean(axis=0)
     errors = Sampling.of(reference.batches), Sampling.of(check)
     trace = sum(error.trace for error in errors)
@@ -266,8 +376,13 @@ def _cross_checked(
     disagreement = f"first and zeroth order disagree by {np.linalg.norm(apart):.2g} (check_z={z:.1f})"
     if at[REFUSED]:
         return _with_note(instead(), f"{disagreement}, so zeroth order is used")
-    method = reference.method.removesuffix("]") + f",check_z={z:.1f},check_resolves={2.0 * math.sqrt(trace):.2g}]"
-    return _with_note(replace(reference, method=method), disagreement if at[WARNED] else "")
+    resolved = 2.0 * math.sqrt(trace)
+    method = reference.method.removesuffix("]") + f",check_z={z:.1f},check_resolves={resolved:.2g}]"
+    reference = replace(reference, method=method)
+    if assumed:
+        method = method.removesuffix("]") + ",assumed_continuous]"
+        reference = replace(reference, method=method, error=math.hypot(reference.error, resolved))
+    return _with_note(reference, disagreement if at[WARNED] else "")
 
 
 def _tail_error(
@@ -276,7 +391,8 @@ def _tail_error(
     """Return the norm of the far tails' contribution to the mean, the largest over the directions; NaN if not finite.
 
     The tails contain few of the ``count`` samples or none, so the spread of the samples does not show the contribution.
-    Along each direction, the tails are where :data:`TAIL_EVENTS` samples are expected, and are sampled separately.
+    Along each direction, the tails are where :data:`TAIL_EVENTS` samples are expected, and are sampled separately. What
+    lies beyond these samples, as of an exponential cost, is integrated along the direction.
     """
     from scipy.special import ndtri
 
@@ -291,7 +407,15 @@ def _tail_error(
     tails = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
     if not np.isfinite(tails).all():
         return math.nan
-    return share * float(np.linalg.norm(tails.mean(axis=2) - mean[:, None], axis=0).max())
+    # the same noise across the direction, at depths beyond the deepest sample of the tails
+    depth = float(np.abs(depth).max()) + DEEPER * (np.arange(each) // 2 + 0.5)
+    side = np.where(np.arange(each) % 2, 1.0, -1.0)
+    w = w + along * (np.tile(side * depth, directions.shape[1]) - (along * w).sum(axis=0))
+    with np.errstate(over="ignore", invalid="ignore"):
+        deep = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
+        deep = np.nan_to_num(deep * np.exp(-(depth**2) / 2) * DEEPER / math.sqrt(2.0 * math.pi), posinf=0.0, neginf=0.0)
+    beyond = float(np.linalg.norm(deep.sum(axis=2), axis=0).max())
+    return beyond + share * float(np.linalg.norm(tails.mean(axis=2) - mean[:, None], axis=0).max())
 
 
 def _directions(effect: np.ndarray) -> np.ndarray:
@@ -334,7 +458,23 @@ def draw_columns(problem: Problem, stream: str, count: int, block: int) -> np.nd
     return np.moveaxis(drawn, -1, 0).reshape(program.n_noise, count)
 
 
-def _antithetic(problem: Problem, theta: np.ndarray, w: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Return zeroth-order terms averaged over w and -w, with the cost at w = 0 as baseline, ``(d, B)``."""
+def _antithetic(
+    problem: Problem, theta: np.ndarray, w: np.ndarray, centre: np.ndarray, linear: np.ndarray | None = None
+) -> np.ndarray:
+    """Return zeroth-order terms averaged over w and -w, with the cost at w = 0 as baseline, ``(d, B)``.
+
+    For noise on theta, ``linear (d,)`` is the gradient of a linear part of the cost. Its terms are replaced by their
+    mean, ``linear``, which changes no expectation.
+    """
     terms = ((problem.value(theta, s) - centre) * problem.score(theta, s) + problem.explicit(theta, s) for s in (w, -w))
-    return np.asarray(sum(terms) / 2)
+    mean = np.asarray(sum(terms) / 2)
+    if linear is None or not linear.any():
+        return mean
+    step = problem.directions(w)
+    return np.asarray(mean - (linear @ step) * step + linear[:, None])
+
+
+def _failed(problem: Problem, reason: str) -> Reference:
+    return Reference(
+        np.full((1, problem.dim), math.nan), f"sampling[failed: {reason}]", math.nan, note=f"no reference: {reason}"
+    )

@@ -30,6 +30,7 @@ __all__ = [
     "heavy_tails",
     "is_unexplained",
     "summarise",
+    "summarise_without_reference",
     "variance_interval",
     "variance_per_sample",
 ]
@@ -108,6 +109,14 @@ class Sampling:
         return float(raw - min(max(unbiased, trace**2 / self.rows.shape[1]), trace**2))
 
 
+def _length(values: np.ndarray) -> float:
+    """Return the norm of all numbers in an array, without overflow or underflow of their squares."""
+    largest = float(np.abs(values).max(initial=0.0))
+    if largest == 0.0 or 1e-100 < largest < 1e100:
+        return float(np.linalg.norm(values))
+    return float(np.linalg.norm(values / largest)) * largest
+
+
 def _trace_square(rows: np.ndarray) -> float:
     """Return the trace of (rows' rows)^2 for ``rows (K, d)``, from whichever of the two Gram matrices is smaller."""
     gram = rows @ rows.T if rows.shape[0] <= rows.shape[1] else rows.T @ rows
@@ -164,7 +173,7 @@ class Truth:
     @property
     def norm(self) -> float:
         """Length of the gradient."""
-        return float(np.linalg.norm(self.mean))
+        return _length(self.mean)
 
     @property
     def errors(self) -> tuple[Sampling, ...]:
@@ -175,7 +184,7 @@ class Truth:
     @property
     def standard_error(self) -> float:
         """Square root of the trace of the covariance of the mean, including the error that sampling does not show."""
-        return math.hypot(float(np.linalg.norm(self.sampling.rows)), self.unseen)
+        return math.hypot(_length(self.sampling.rows), self.unseen)
 
     def vanishes(self) -> bool:
         """Return whether the gradient is not distinguishable from 0, so that relative quantities are undefined."""
@@ -473,7 +482,7 @@ def summarise(
     notes = _interval_remarks(deviations, difference, samples, identical)
     notes += _reference_remarks(reference, relative)
     if unbiased and bias_low > 0.0:
-        notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or 1 in 40 by chance")
+        notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or chance (about 1 row in 30)")
     scaled = tuple(value * unit * unit for value in per_sample)
     if terms is not None:
         scaled = variance_per_sample(*terms, samples)
@@ -498,6 +507,18 @@ def summarise(
         finite_fraction=1.0,
         note="; ".join(notes),
     )
+
+
+def summarise_without_reference(estimates: np.ndarray, samples: int, reason: str) -> Summary:
+    """Return the statistics of :func:`summarise` that need no reference, for ``estimates (R, d)``; ``reason`` is a note.
+
+    All fields that compare the estimates with a reference are NaN.
+    """
+    dim = np.asarray(estimates).shape[-1]
+    summary = summarise(estimates, Truth.exact(np.zeros(dim)), samples)
+    compared = ("reference_", "bias", "rmse", "cosine", "sign")
+    fields = {name: math.nan for name in Summary.__dataclass_fields__ if name.startswith(compared)}
+    return replace(summary, note="; ".join(part for part in (summary.note, reason) if part), **fields)
 
 
 def _not_finite(truth: Truth, finite_fraction: float, note: str) -> Summary:

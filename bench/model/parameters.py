@@ -11,7 +11,7 @@ from abc import ABC
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, Self, TypeVar, cast
 
 from bench import deprecated
 from bench.errors import UserError, printable, unknown
@@ -61,6 +61,12 @@ class Plugin(ABC):  # noqa: B024, each kind has its own abstract methods
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         deprecated.rename_members(cls)
+        _require_annotations(cls)
+
+    def __new__(cls, *_: Any, **__: Any) -> Self:
+        """Return a new instance; raises :class:`UserError` if the class or a base lacks ``@dataclass``."""
+        require_decorated(cls)
+        return super().__new__(cls)
 
 
 @dataclass(frozen=True)
@@ -78,9 +84,42 @@ class Parameter:
     choices: tuple[str, ...] | None = None
 
 
+def _require_annotations(plugin: type[Plugin]) -> None:
+    """Raise TypeError if a class sets an inherited parameter without an annotation, which would not change its default."""
+    inherited = dataclasses.fields(plugin) if dataclasses.is_dataclass(plugin) else ()
+    own = vars(plugin).get("__annotations__", {})
+    for name, field in ((field.name, field) for field in inherited):
+        if name in vars(plugin) and name not in own:
+            value, annotation = vars(plugin)[name], field.type if isinstance(field.type, str) else field.type.__name__
+            given = f"param({value!r}, ...)" if isinstance(value, bool | int | float | str | None) else "..."
+            raise TypeError(
+                f"{plugin.__name__}.{name} replaces a parameter without an annotation, so the parameter would keep its "
+                f"default {field.default!r}: write `{name}: {annotation} = {given}`"
+            )
+
+
+@remember
+def require_decorated(plugin: type[Plugin]) -> None:
+    """Raise :class:`UserError` if a plugin class or a base of it declares parameters but is not a dataclass."""
+    for owner in plugin.__mro__:
+        if "__dataclass_fields__" in vars(owner) or not issubclass(owner, Plugin):
+            continue
+        annotations = vars(owner).get("__annotations__", {})
+        lost = [name for name, annotation in annotations.items() if "ClassVar" not in str(annotation)]
+        lost += [
+            name for name, value in vars(owner).items() if isinstance(value, dataclasses.Field) and name not in lost
+        ]
+        if lost:
+            raise UserError(
+                f"{owner.__name__} declares parameters ({', '.join(lost)}) but is not a dataclass, so they would be "
+                f"ignored: write @dataclass(frozen=True) above `class {owner.__name__}`"
+            )
+
+
 @remember
 def parameters(plugin: type[Plugin]) -> dict[str, Parameter]:
-    """Return the parameters of a plugin class by name."""
+    """Return the parameters of a plugin class by name; raises :class:`UserError` if it lacks ``@dataclass``."""
+    require_decorated(plugin)
     hints = typing.get_type_hints(plugin)
     return {
         f.name: Parameter(

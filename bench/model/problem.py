@@ -133,6 +133,13 @@ class Problem(ABC):
         self.usage.gradients += w.shape[1]
         return self._blocks(self._grad, theta, w, (self.dim,))
 
+    def second_gradient(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return the gradient of each sample by a second method of differentiation, ``(d, B)``.
+
+        Raises :class:`Unsupported` where the backend has only one.
+        """
+        raise Unsupported(f"{type(self).__name__} has one method of differentiation")
+
     def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return the score d log p(actions | theta)/dtheta of each sample, ``(d, B)``: w / sigma for noise on theta."""
         if self.noise_on_theta:

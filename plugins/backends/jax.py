@@ -126,6 +126,11 @@ class JaxProblem(Problem):
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._call(self._cost_gradient, theta, w)
 
+    def second_gradient(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return the gradient by forward mode if this problem uses reverse mode, and the other way round, ``(d, B)``."""
+        other = "reverse" if self._mode == "forward" else "forward"
+        return JaxProblem(self.program, self._ops, self._dtype.name, other).grad(theta, w)
+
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._call(self._score_function, theta, w)
 

@@ -23,6 +23,11 @@ class Complementarity(ImpulseLaw):
     kappa: float = param(1e-4, "central-path parameter, force times gap", "N m", positive=True)
     stiffness: float = param(float("inf"), "force per remaining penetration; inf: rigid", "N/m", positive=True)
 
+    @property
+    def continuous(self) -> bool:
+        """True: on the central path, the force is smooth in the state."""
+        return True
+
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: float) -> State:
         """Return the velocity change over the step, without an additional position change."""
         xp = ops.xp

@@ -19,6 +19,7 @@ class Billiard(ContactScene):
     """
 
     name = "billiard"
+    continuous: ClassVar[bool] = True
     neglected_effects: ClassVar[str] = "spin, friction, cushions, the third dimension"
     n_q: ClassVar[int] = 4
     n_u: ClassVar[int] = 2

@@ -22,6 +22,7 @@ class BounceOnce(EngineTwin, ContactScene):
     """
 
     name = "bounce_once"
+    continuous: ClassVar[bool] = True
     neglected_effects: ClassVar[str] = "the horizontal motion (free, uncoupled), gravity, spin"
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1

@@ -23,6 +23,7 @@ class BouncingBall(EngineTwin, ContactScene):
     """
 
     name = "bouncing_ball"
+    continuous: ClassVar[bool] = True
     neglected_effects: ClassVar[str] = "horizontal motion, spin, air, the ball's shape"
     n_q: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1

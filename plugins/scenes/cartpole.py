@@ -21,6 +21,7 @@ class Cartpole(EngineTwin, MechanicalScene):
 
     name = "cartpole"
     neglected_effects = "the track's ends, friction, the pole's inertia about its tip"
+    continuous: ClassVar[bool] = True
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 1
 

@@ -1,7 +1,7 @@
 """A constant cost: every nonzero estimate is noise of the estimator."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,6 +14,7 @@ class Constant(FunctionScene):
 
     name = "constant"
     neglected_effects = "dynamics"
+    continuous: ClassVar[bool] = True
 
     dimension: int = param(5, "d, length of theta", positive=True)
     value: float = param(3.0, "the cost")

@@ -18,6 +18,7 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
 
     name = "double_integrator"
     neglected_effects = "contact, friction, effort in the cost"
+    continuous: ClassVar[bool] = True
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1

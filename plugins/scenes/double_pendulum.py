@@ -19,6 +19,7 @@ class DoublePendulum(MechanicalScene):
 
     name = "double_pendulum"
     neglected_effects = "the rods' mass, friction, torques"
+    continuous: ClassVar[bool] = True
     n_q: ClassVar[int] = 2
 
     sigma: float = param(0.1, "standard deviation of the noise on the initial state", "rad and rad/s", positive=True)

@@ -26,6 +26,7 @@ class FrictionBlock(FrictionScene):
     """
 
     name = "friction_block"
+    continuous: ClassVar[bool] = True
     neglected_effects: ClassVar[str] = (
         "rotation and shape, a higher coefficient at rest, the second horizontal direction"
     )

@@ -23,6 +23,7 @@ class GroundWall(ContactScene):
     """
 
     name = "ground_wall"
+    continuous: ClassVar[bool] = True
     neglected_effects: ClassVar[str] = "spin, friction, air, the corner of ground and wall"
     n_q: ClassVar[int] = 2
     n_contacts: ClassVar[int] = 2

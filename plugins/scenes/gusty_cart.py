@@ -20,6 +20,7 @@ class GustyCart(ProcessNoiseScene):
     """
 
     name = "gusty_cart"
+    continuous: ClassVar[bool] = True
     neglected_effects: ClassVar[str] = "friction, wind that lasts longer than a step"
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1

@@ -25,6 +25,7 @@ class Hopper(EngineTwin, ContactScene):
     """
 
     name = "hopper"
+    continuous: ClassVar[bool] = True
     neglected_effects: ClassVar[str] = "forward motion and pitch, the leg's angle and end stops, limits of the actuator"
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 1

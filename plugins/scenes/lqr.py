@@ -20,6 +20,7 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
 
     name = "lqr"
     neglected_effects = "contact, limits"
+    continuous: ClassVar[bool] = True
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1

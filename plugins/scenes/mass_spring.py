@@ -22,6 +22,7 @@ class MassSpring(Oscillator, DampedScene):
 
     name = "mass_spring"
     neglected_effects = "the centre of mass (moves uniformly)"
+    continuous: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
 
     sigma: float = param(0.01, "standard deviation of the noise on stretch and rate", "m and m/s", positive=True)

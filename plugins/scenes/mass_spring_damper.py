@@ -19,6 +19,7 @@ class MassSpringDamper(Identified, MechanicalScene):
 
     name = "mass_spring_damper"
     neglected_effects = "dry friction, nonlinear stiffness"
+    continuous: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1
     unknowns: ClassVar[tuple[str, ...]] = ("mass", "stiffness", "damping")

@@ -18,6 +18,7 @@ class Pendulum(EngineTwin, MechanicalScene):
 
     name = "pendulum"
     neglected_effects = "the rod's mass, torque limits, contact"
+    continuous: ClassVar[bool] = True
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1

@@ -21,6 +21,7 @@ class PendulumSwing(MechanicalScene):
 
     name = "pendulum_swing"
     neglected_effects = "units, damping, torque limits, contact"
+    continuous: ClassVar[bool] = True
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     n_u: ClassVar[int] = 1

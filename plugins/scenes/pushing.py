@@ -19,6 +19,7 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
     """
 
     name = "pushing"
+    continuous: ClassVar[bool] = True
     neglected_effects: ClassVar[str] = (
         "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
     )

@@ -19,6 +19,7 @@ class SlidingBlock(Identified, MechanicalScene):
 
     name = "sliding_block"
     neglected_effects = "a higher coefficient at rest, friction that changes with speed"
+    continuous: ClassVar[bool] = True
     n_q: ClassVar[int] = 1
     unknowns: ClassVar[tuple[str, ...]] = ("friction",)
     end_only: ClassVar[bool] = True

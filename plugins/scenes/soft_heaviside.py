@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -19,6 +19,7 @@ class SoftHeaviside(FunctionScene):
 
     name = "soft_heaviside"
     neglected_effects = "dynamics; represents a stiff contact that occurs or not"
+    continuous: ClassVar[bool] = True
 
     theta: float = param(0.0, "where the gradient is estimated; the ramp is around 0")
     nu: float = param(0.1, "width of the ramp", positive=True)

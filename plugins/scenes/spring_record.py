@@ -20,6 +20,7 @@ class SpringRecord(KnownOptimum, MechanicalScene):
 
     name = "spring_record"
     neglected_effects = "noise in the record, an unknown mass or start (only k/m and c/m are identifiable)"
+    continuous: ClassVar[bool] = True
     identifies: ClassVar[bool] = True
     n_q: ClassVar[int] = 2
     n_u: ClassVar[int] = 2

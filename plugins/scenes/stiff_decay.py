@@ -20,6 +20,7 @@ class StiffDecay(MechanicalScene):
 
     name = "stiff_decay"
     neglected_effects = "positions, a second time scale"
+    continuous: ClassVar[bool] = True
     n_q: ClassVar[int] = 0
     n_v: ClassVar[int | None] = 1
 

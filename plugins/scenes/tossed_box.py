@@ -18,6 +18,7 @@ class TossedBox(EngineScene):
     """
 
     name = "tossed_box"
+    continuous: ClassVar[bool] = True
     neglected_effects: ClassVar[str] = "the third dimension, edges and faces (corners are small spheres)"
     n_q: ClassVar[int] = 3
     n_contacts: ClassVar[int] = 4

@@ -25,6 +25,7 @@ class TwoBalls(KnownOptimum, ContactScene):
     """
 
     name = "two_balls"
+    continuous: ClassVar[bool] = True
     neglected_effects: ClassVar[str] = "spin, friction, the table's edges, further balls"
     open_loop: ClassVar[bool] = True
     n_q: ClassVar[int] = 4

@@ -22,6 +22,7 @@ class WallPenalty1d(EngineTwin, ContactScene):
     """
 
     name = "wall_penalty_1d"
+    continuous: ClassVar[bool] = True
     neglected_effects: ClassVar[str] = "gravity, the second and third dimension, shapes"
     n_q: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1

@@ -34,7 +34,8 @@ REFERENCED = f"{BIAS} three_errors"
 ESTIMATED = f"{BIAS} adam cem gradient_check growth stability three_errors twins"
 MOVED = {
     "measure/__init__": "",
-    "measure/batches": REFERENCED,
+    "measure/adequacy": "identify",
+    "measure/batches": f"{REFERENCED} gradient_check",
     "measure/contacts": "gradient_check",
     "measure/gradcheck/__init__": "gradient_check",
     "measure/gradcheck/causes": "gradient_check",
@@ -44,7 +45,7 @@ MOVED = {
     "measure/gradcheck/sampling": "gradient_check",
     "measure/gradcheck/verdicts": "gradient_check",
     "measure/identification": "identify",
-    "measure/jumps": REFERENCED,
+    "measure/jumps": f"{REFERENCED} gradient_check",
     "measure/noise": f"{BIAS} adam cem gradient_check growth three_errors twins identify",
     "measure/performance": "identify",
     "measure/quadrature": REFERENCED,

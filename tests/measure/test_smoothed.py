@@ -33,6 +33,7 @@ class Windy(DisturbedScene):
 
     name = "windy"
     exogenous: ClassVar[int] = 2
+    continuous: ClassVar[bool] = True
 
     def theta0(self):
         return np.array([1.0, 2.0])

@@ -90,8 +90,40 @@ def wave(k: float, c: float = 1.0) -> Piece:
     )
 
 
+def gaussian(a: float) -> Piece:
+    """exp(a u^2), whose mean exists for a sigma^2 < 1/2, with its mass at several standard deviations, off centre."""
+
+    def slope(u: float, s: float) -> float:
+        shrink, v = 1.0 - 2.0 * a * s * s, u + 0.5
+        return 2.0 * a * v / shrink**1.5 * math.exp(a * v * v / shrink)
+
+    return Piece(f"gauss({a:g})", lambda u: np.exp(a * (u + 0.5) ** 2), slope)
+
+
 def growth(k: float) -> Piece:
     return Piece(f"exp({k:g})", lambda u: np.exp(k * u), lambda u, s: k * math.exp(k * u + (k * s) ** 2 / 2))
+
+
+class Undeclared(FunctionScene):
+    """A sum of pieces along unit vectors, without a declaration of continuity."""
+
+    name = "undeclared"
+
+    def __init__(self, pieces, along, theta, sigma):
+        values = dict(pieces=pieces, along=along, start=np.asarray(theta, float), sigma=sigma, noise="parameter")
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def theta0(self):
+        return self.start
+
+    def cost(self, xp, x):
+        return sum(piece.g(a @ x) for piece, a in zip(self.pieces, self.along, strict=True))
+
+    def truth(self):
+        return sum(
+            a * piece.slope(float(a @ self.start), self.sigma) for piece, a in zip(self.pieces, self.along, strict=True)
+        )
 
 
 class Ridge(FunctionScene):
@@ -202,6 +234,26 @@ def ridges() -> Iterator[Case]:
         yield Case(label, compose(scene), scene.truth())
 
 
+def tails() -> Iterator[Case]:
+    """Yield costs whose mean lies beyond the usual limits of integration, in one and two dimensions."""
+    for piece in (*map(growth, (3.0, 6.0, 8.0, 12.0)), *map(gaussian, (0.3, 0.4, 0.45))):
+        for dim, theta in itertools.product((1, 2), (0.0, 0.3)):
+            along = np.ones(dim) / math.sqrt(dim)
+            scene = Ridge([piece], [along], np.full(dim, theta), 1.0)
+            yield Case(f"tail d={dim} theta={theta:g} {piece.name}", compose(scene), scene.truth())
+
+
+def undeclared() -> Iterator[Case]:
+    """Yield jumps across a slanted plane in several dimensions that no class declares, some seen once in 740 samples."""
+    for dim, at, height in itertools.product((3, 5, 10), (1.0, 2.0, 3.0), (0.5, 22.6, 67.7)):
+        slanted = np.ones(dim)
+        slanted[-1] = 0.0
+        scene = Undeclared(
+            [power(1), step(at, height)], [np.eye(dim)[0], slanted / math.sqrt(dim - 1)], np.zeros(dim), 1.0
+        )
+        yield Case(f"undeclared jump d={dim} at {at:g} by {height:g}", compose(scene), scene.truth())
+
+
 def shipped() -> Iterator[Case]:
     """Yield the scenes with closed forms, at several noise levels, horizons and heights."""
     for sigma in (0.05, 0.5, 2.0):
@@ -214,6 +266,7 @@ def shipped() -> Iterator[Case]:
         yield _shipped(DoubleIntegrator(horizon=horizon), None, SemiImplicitEuler())
         yield _shipped(MassSpring(horizon=horizon, sigma=0.3), None, SemiImplicitEuler())
         yield _shipped(StiffDecay(horizon=horizon), None, SemiImplicitEuler())
+    yield _shipped(StiffDecay(horizon=1000, rate=-1.0), None, SemiImplicitEuler())
     for height in (1.0, 1.5):
         yield _shipped(BounceOnce(height=height, horizon=20, dt=0.05), Impulse(), SemiImplicitEuler())
         yield _shipped(BounceOnce(height=height, horizon=20, dt=0.05, restitution=0.3), Impulse(), SemiImplicitEuler())
@@ -244,7 +297,7 @@ def excess(case: Case, found: Reference) -> float:
 
 def cases() -> list[Case]:
     """Return every case."""
-    return [*ridges(), *shipped()]
+    return [*ridges(), *tails(), *undeclared(), *shipped()]
 
 
 def main(samples: int = 1 << 18) -> int:

@@ -20,6 +20,9 @@ SAMPLES = 400_000
 AT_GAIN = 8 * SAMPLES
 """Number of samples at T = 20, where the source states the gain with two digits."""
 
+WEIGHED, MIXED = 2, 40_000
+"""Steps at which the variance of the estimator ``inverse_variance`` is measured, and the number of its estimates."""
+
 
 @dataclass(frozen=True)
 class Tent(FunctionScene):
@@ -80,6 +83,23 @@ class Chaos(Claim):
         # half of 1.6e10, whose last digit leaves 5e8 open
         split = Figure("the same with the samples split", "8.0e9", v1 / half, v1 / half * (e0 / v0), spread=2e8)
         figures.append(split)
+        # the same by the estimator that splits them, on fewer steps, where its weights are not too far from one half
+        at, mixture = problem(Tent(sigma=0.05, steps=WEIGHED)), estimator("inverse_variance")
+        (v1, e1), (v0, e0) = (spread(terms(at, one, draw.standard_normal((1, SAMPLES)))) for one in (first, zeroth))
+        ratio = v1 / (v0 + v1)
+        expected = 2.0 * v0 * ratio
+        noises = (draw.standard_normal((MIXED // 8, 1000, 1)) for _ in range(8))
+        each = np.concatenate([mixture.estimate(at, at.program.theta0, noise) for noise in noises])
+        measured, error = spread(1000**0.5 * each)
+        error = float(np.hypot(error, expected * (e0 / v0 + (1.0 - ratio) * e1 / v1)))
+        figures.append(
+            Figure(
+                f"variance of inverse_variance, T = {WEIGHED}, over that of the best mixture",
+                "1.000",
+                measured / expected,
+                error / expected,
+            )
+        )
         return Outcome(
             figures,
             series={

@@ -1,14 +1,16 @@
 """Gradient checks: pure functions of a cost and a gradient, independent of problems."""
 
-from .check import Check, Options, Part, check
-from .direction import EPS, SHORT_WINDOW, WINDOW, Finding, Sample, best, diagnose, judge
+from .check import AGREES, Check, Options, Part, check
+from .direction import EPS, FINE, SHORT_WINDOW, WINDOW, Finding, Sample, best, diagnose, judge
 from .sampling import order, points, samples
 from .verdicts import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED, UNTRUSTED, VERDICTS, most_severe
 
 __all__ = [
+    "AGREES",
     "BROKEN",
     "EPS",
     "FAULTS",
+    "FINE",
     "MEANING",
     "SHORT_WINDOW",
     "TRUSTED",

@@ -12,7 +12,7 @@ import numpy as np
 
 from . import roughness
 from .causes import Ratio, causes_of_ratios
-from .direction import EPS, GUARD, Finding, Sample, judge
+from .direction import EPS, FINE, GUARD, Finding, Sample, judge
 from .sampling import order, points, samples
 from .verdicts import FAULTS, MEANING, TRUSTED, most_severe
 
@@ -20,8 +20,14 @@ Cost = Callable[[np.ndarray], np.ndarray]
 """Costs of columns: ``(d, B)`` to ``(B,)``."""
 Gradient = Callable[[np.ndarray], np.ndarray]
 """The gradient at one theta: ``(d,)`` to ``(d,)``."""
+Tangent = Callable[[np.ndarray, np.ndarray], float]
+"""A derivative at a theta along a direction, both ``(d,)``, from the cost's code but not from its gradient; NaN if unknown."""
 Modes = Callable[[np.ndarray], Sequence[str]]
 """Names of the contact modes of columns: ``(d, B)`` to ``B`` strings."""
+AGREES = 1e-3
+"""Relative difference of the gradient from a tangent up to which they agree: on a chaotic rollout, both have errors."""
+MATTERS = 1e3
+"""Change of the cost by a hundredth of a tiny input, in unit roundoffs, from which on the input's size is its scale."""
 SUSPICIOUS = 4
 """Default of :attr:`Options.scanned`."""
 ELSEWHERE = 4
@@ -164,32 +170,54 @@ def check(
     theta: np.ndarray,
     options: Options | None = None,
     modes: Modes | None = None,
+    tangent: Tangent | None = None,
 ) -> Check:
     """Return the verdict on a gradient at ``theta (d,)``, checked against differences of its cost.
 
     Each component is checked at the steps of ``options.eps``, relative to its own scale. Random directions check all
     components together, at theta and at other thetas. The gradient is computed at theta before and after the gradients
     at other thetas, which exposes a cached or random gradient. ``modes`` returns the names of contact modes, if any.
-    Without a gradient, only the cost is checked.
+    Directions at theta that these steps leave unsettled are checked down to steps of 1e-13, and then against
+    ``tangent``, which can only confirm a derivative. Without a gradient, only the cost is checked.
 
     Raises :class:`TypeError` for complex costs or gradients and :class:`ValueError` for wrong shapes.
     """
-    return _Checker(cost, gradient, np.array(theta, dtype=np.float64), options or Options(), modes).run()
+    return _Checker(cost, gradient, np.array(theta, dtype=np.float64), options or Options(), modes, tangent).run()
 
 
 class _Checker:
     """One check: the callables, and the counts of costs and gradients computed."""
 
     def __init__(
-        self, cost: Cost, gradient: Gradient | None, theta: np.ndarray, options: Options, modes: Modes | None
+        self,
+        cost: Cost,
+        gradient: Gradient | None,
+        theta: np.ndarray,
+        options: Options,
+        modes: Modes | None,
+        tangent: Tangent | None = None,
     ) -> None:
         if theta.ndim != 1 or not theta.size:
             raise ValueError(f"theta is a vector of at least one number, not of shape {theta.shape}")
-        self._cost, self._gradient, self._modes = cost, gradient, modes
+        self._cost, self._gradient, self._modes, self._tangent = cost, gradient, modes, tangent
         self.theta, self.options, self.unit = theta, options, options.unit
-        self.scale = scales(theta) if options.scale is None else np.asarray(options.scale, dtype=np.float64)
         self.evaluations = self.gradients = 0
+        self.scale = self._scales() if options.scale is None else np.asarray(options.scale, dtype=np.float64)
         self.random = np.random.default_rng([options.seed, 0x67726164])
+
+    def _scales(self) -> np.ndarray:
+        """Return :func:`scales`, with its own magnitude for each tiny input that changes the cost at that magnitude."""
+        scale = scales(self.theta)
+        tiny = np.flatnonzero((self.theta != 0.0) & (scale > np.abs(self.theta)))
+        if tiny.size:
+            moved = np.repeat(self.theta[:, None], tiny.size + 1, axis=1)
+            moved[tiny, np.arange(tiny.size)] *= 1.01
+            with np.errstate(all="ignore"):
+                values = self.cost(moved)
+                least = MATTERS * self.unit * np.abs(values).max(initial=0.0)
+                matters = np.abs(values[:-1] - values[-1]) > least
+            scale[tiny[matters]] = np.abs(self.theta[tiny[matters]])
+        return scale
 
     def cost(self, thetas: np.ndarray) -> np.ndarray:
         self.evaluations += thetas.shape[1]
@@ -317,13 +345,38 @@ class _Checker:
         if self._gradient is None:
             measured = [replace(s, derivative=judge(s).difference) for s in measured]
         findings = [judge(sample) for sample in measured]
+        steps = [float(sample.step[finding.index]) for sample, finding in zip(measured, findings, strict=True)]
         if twice:
             findings = self._with_staircases(thetas, vectors, measured, findings)
+            for m, finding in enumerate(findings):
+                if finding.verdict == "unsettled" and self._gradient is not None:
+                    findings[m], steps[m] = self._settle(
+                        thetas[:, m], vectors[:, m], float(lengths[m]), measured[m], finding
+                    )
         modes = [(tuple(a), tuple(b)) for a, b in zip(minus, plus, strict=True)]
         return [
-            _part(names[m], components[m], sample, finding, modes[m])
+            replace(_part(names[m], components[m], sample, finding, modes[m]), step=steps[m])
             for m, (sample, finding) in enumerate(zip(measured, findings, strict=True))
         ]
+
+    def _settle(
+        self, theta: np.ndarray, vector: np.ndarray, length: float, sample: Sample, finding: Finding
+    ) -> tuple[Finding, float]:
+        """Return the finding on an unsettled direction from smaller steps or from the tangent, and the step it is from."""
+        at = points(theta[:, None], vector[:, None], self.unit, FINE)
+        values = self.cost(at).reshape(1, -1)
+        (fine,) = samples(
+            values, np.array([length]), np.array([sample.derivative]), self.unit, FINE, doubts=np.array([sample.doubt])
+        )
+        better = judge(fine)
+        if better.verdict != "unsettled":
+            return replace(better, index=min(better.index, sample.step.size - 1)), float(fine.step[better.index])
+        step = float(sample.step[finding.index])
+        if self._tangent is not None:
+            slope = self._tangent(theta, vector) / length
+            if abs(slope - sample.derivative) <= AGREES * abs(slope):
+                return replace(finding, verdict="nonlinear", difference=slope, uncertainty=AGREES * abs(slope)), step
+        return finding, step
 
     def _sides(self, at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the contact modes on the minus side and on the plus side, each ``(M, K)``: directions by steps."""

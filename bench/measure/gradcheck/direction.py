@@ -15,6 +15,10 @@ import numpy as np
 
 EPS = np.logspace(-2, -10, 17)
 """Step sizes, two per decade, in units of the natural scale."""
+FINE = np.logspace(-2, -13, 23)
+"""Steps for directions that :data:`EPS` leaves unsettled, as on a long rollout that amplifies."""
+CONVERGING, ORDER = 8, 1.5
+"""Neighbouring steps over which differences approach a derivative of 0, and the least order in the step."""
 GUARD = 64.0
 """Allowed rounding error of a rollout's cost and of displaced thetas, in unit roundoffs."""
 MEASURED = 8.0
@@ -187,6 +191,8 @@ def _judge(sample: Sample) -> Finding:
         return _finding(sample, _classify_right(sample, index, still), index, uncertainty)
     if sample.crossing[index]:
         return _finding(sample, _judge_one_sided(sample, noise), index, uncertainty)
+    if sample.derivative == 0.0 and _vanishes(sample, noise):
+        return _finding(sample, "nonlinear", int(np.argmin(np.abs(sample.differences) + noise)), uncertainty)
     settled = apart > tolerance and _is_credible(sample, index, uncertainty, tolerance)
     return _finding(sample, _classify_wrong(sample) if settled else "unsettled", index, uncertainty)
 
@@ -258,6 +264,20 @@ def _judge_one_sided(sample: Sample, noise: np.ndarray) -> str:
             if abs(middle - sample.derivative) <= tolerance:
                 return "kink"
     return _classify_wrong(sample) if settled else "unsettled"
+
+
+def _vanishes(sample: Sample, noise: np.ndarray) -> bool:
+    """Return whether differences fall to 0 with at least order 1.5 of the step, down to the smallest that noise allows.
+
+    An example is x^3 at 0, whose differences all differ.
+    """
+    sizes = np.abs(sample.differences)
+    resolved = np.flatnonzero(sizes > noise)
+    if resolved.size < CONVERGING or not np.array_equal(resolved, np.arange(resolved.size)):
+        return False
+    last = resolved[-CONVERGING:]
+    orders = np.diff(np.log(sizes[last])) / np.diff(np.log(sample.step[last]))
+    return bool((orders >= ORDER).all())
 
 
 def _resolution(sample: Sample, index: int) -> float:

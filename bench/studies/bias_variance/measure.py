@@ -71,7 +71,7 @@ def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> 
         "auxiliaries": summarise_diagnostics([estimates.diagnostics[start] for start in sorted(estimates.diagnostics)]),
     }
     if not np.isfinite(truth.batches).all():
-        return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}
+        return result | {"status": "nonfinite", "reason": truth.note or "the reference gradient is not finite"}
     unbiased = cell.estimator.declares_unbiased(program)
     summary = asdict(statistics.summarise(values, truth.known(), cell.samples, estimates.sums, unbiased=unbiased))
     surrogate = SURROGATE if program.surrogate and "grad" in cell.estimator.needs else ""

@@ -10,6 +10,9 @@ COLUMNS = Columns.of(
     Column("scale", "natural scale of displacements of theta: its norm, at least 1"),
     Column("taylor_order", "order of the Taylor remainder along random directions: 2 for a right gradient, 1 if wrong"),
     Column("cost_noise", "measured standard deviation of the cost's own noise"),
+    Column("jump", "largest jump of the cost that the noise reaches; 0 where none was found"),
+    Column("jump_share", "that jump as a share of the range of the cost under the noise"),
+    Column("jump_distance", "distance of that jump from theta, in standard deviations of the noise"),
     text(
         "verdict",
         "the worst verdict of the checks",
@@ -26,7 +29,10 @@ COLUMNS = Columns.of(
     numbers("component_left", "of each component, the one-sided slope towards smaller values"),
     numbers("component_right", "of each component, the one-sided slope towards larger values"),
     numbers("component_verdict", "of each component, its verdict"),
-    numbers("point", "where each check was made: start, or before, at or after a contact switch"),
+    numbers(
+        "point",
+        "where each check was made: start, before, at or after a contact switch, or noise: at a jump that the noise reaches",
+    ),
     numbers("sample", "of each check, 0 without noise, 1 with it"),
     numbers("direction", "of each check, the number of its direction; -1 - i for component i"),
     numbers("derivative_program", "of each check, the program's directional derivative"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -13,12 +14,18 @@ import numpy as np
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import gradcheck, noise
+from bench.measure.batches import in_columns
 from bench.measure.contacts import active_contacts
+from bench.measure.jumps import jump_under_noise
 from bench.model import SURROGATE, ContactScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
 from bench.studies.gradient_check.points import is_trusted
 
 COLUMNS_AT_ONCE = 128
 """Rollouts per evaluation. The number is fixed, so that a compiling backend compiles once."""
+COMPLEX_STEP = 1e-100
+"""Largest imaginary part of theta in a complex step; its square underflows beside every cost."""
+SAME_COST = 1e-3
+"""Relative difference between the costs of two array libraries: a chaotic rollout amplifies their rounding."""
 NEUTRAL = 1e-9
 """Relative growth of the state per step up to which rounding may be the cause."""
 
@@ -56,8 +63,14 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     drawn = noise.draw(cell.seed, cell.scene.name, 1, 1, problem.program.n_noise, "gradient check")[0, 0]
     directions = noise.draw(cell.seed, cell.scene.name, 1, search.drawn, theta.size, "directions")[0]
     whole = start(problem, theta, unit, search, cell.seed)
-    places, samples = examine(problem, theta, drawn, directions, unit, search)
-    points = [*at_start(whole), *(_checked(place, *both) for place, both in zip(places, samples, strict=True))]
+    jump, at_jump = jump_under_noise(problem, theta, cell.seed, COLUMNS_AT_ONCE)
+    jumps = [Place("noise", theta, directions[0] / np.linalg.norm(directions[0]), at_jump, 0, 1)] if jump.height else []
+    places, samples = examine(problem, theta, drawn, directions, unit, search, jumps)
+    checked = [_checked(place, *both) for place, both in zip(places, samples, strict=True)]
+    points = [
+        *at_start(whole),
+        *(_settled(problem, unit, point, place) for point, place in zip(checked, places, strict=True)),
+    ]
     verdicts = [point.verdict for point in points]
     best = [gradcheck.best(point.sample) for point in points]
     errors = [float(point.sample.errors[i]) for point, i in zip(points, best, strict=True)]
@@ -66,6 +79,12 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     parts = whole.components
     remarks = [SURROGATE] if problem.program.surrogate else []
     remarks += [] if whole.cause in PLAIN else [whole.sentence()]
+    distance = float(np.linalg.norm(at_jump)) if jump.height else math.nan
+    if jump.height:
+        remarks.append(
+            f"the cost jumps by {jump.height:.3g}, {jump.height / jump.span:.2g} of its range, under noise of "
+            f"{distance:.2g} standard deviations: the mean of gradients misses jumps"
+        )
     return {
         "status": "nonfinite" if lost else "ok",
         "reason": "no cost is finite" if lost else "; ".join([*remarks, *beyond_stability(cell)]),
@@ -75,6 +94,9 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
         "best_eps": float(gradcheck.EPS[best[severest]]),
         "scale": scale_of(theta),
         "taylor_order": whole.order,
+        "jump": jump.height,
+        "jump_share": jump.height / jump.span if jump.height else 0.0,
+        "jump_distance": distance,
         "cost_noise": whole.noise,
         "device": problem.device,
         "component": [part.component for part in parts],
@@ -143,7 +165,44 @@ def start(problem: Problem, theta: np.ndarray, unit: float, search: SwitchSearch
     modes = contact_modes(problem)
     named = None if modes is None else lambda thetas: modes(thetas, np.zeros((still.shape[0], thetas.shape[1])))
     options = gradcheck.Options(directions=search.directions, draws=search.around, unit=unit, seed=seed)
-    return gradcheck.check(cost, gradient, theta, options, named)
+    return gradcheck.check(cost, gradient, theta, options, named, lambda at, along: tangent(problem, at, along))
+
+
+def tangent(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: np.ndarray | None = None) -> float:
+    """Return the derivative at ``theta (d,)`` along ``direction (d,)`` by the backend's second method, else a complex step.
+
+    It is NaN where neither is possible.
+    """
+    if problem.program.surrogate:
+        return math.nan
+    noise_ = np.zeros((problem.program.n_noise, 1)) if w is None else w[:, None]
+    try:
+        return float(problem.second_gradient(theta, noise_)[:, 0] @ direction)
+    except Exception:  # unsupported, or a program that the second method cannot differentiate
+        return complex_step(problem, theta, direction, w)
+
+
+def complex_step(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: np.ndarray | None = None) -> float:
+    """Return the derivative of the program at ``theta (d,)`` along ``direction (d,)`` by a complex step; NaN if invalid.
+
+    The imaginary part of the cost at theta + i h direction is h times the derivative, without cancellation (Squire and
+    Trapp 1998). It needs code that is analytic, so it is NaN for programs with contacts or equations to solve, or where
+    the real part is not the cost.
+    """
+    program = problem.program
+    if program.contact is not None or program.needs or program.surrogate or "physics" in problem.provides:
+        return math.nan
+    noise_ = np.zeros((program.n_noise, 1)) if w is None else w[:, None]
+    size = COMPLEX_STEP / max(float(np.abs(direction).max()), 1e-300)
+    try:
+        with np.errstate(all="ignore"):
+            value = program.cost(LoopOps(), theta[:, None] + 1j * size * direction[:, None], noise_.astype(complex))[0]
+            real = problem.value(theta, noise_)[0]
+    except Exception:  # code of a plugin that does not run on complex numbers
+        return math.nan
+    if not abs(complex(value).real - real) <= SAME_COST * abs(real):
+        return math.nan
+    return float(complex(value).imag / size)
 
 
 def at_start(whole: gradcheck.Check) -> list[Point]:
@@ -165,7 +224,29 @@ def _number(part: gradcheck.Part) -> int:
 
 def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, str]]) -> Point:
     minus, plus = zip(*sides, strict=True)
-    return Point(place.point, place.sample, place.number, gradcheck.diagnose(sample), sample, minus, plus)
+    verdict = "jump" if place.point == "noise" else gradcheck.diagnose(sample)
+    return Point(place.point, place.sample, place.number, verdict, sample, minus, plus)
+
+
+def _settled(problem: Problem, unit: float, point: Point, place: Place) -> Point:
+    """Return the point with the verdict from smaller steps or a complex step, if the usual steps leave it unsettled."""
+    if point.verdict != "unsettled":
+        return point
+    scale = scale_of(problem.program.theta0)
+    at = gradcheck.points(place.theta[:, None], scale * place.direction[:, None], unit, gradcheck.FINE)
+    w = np.repeat(place.w[:, None], at.shape[1], axis=1)
+    values = in_columns(
+        lambda both: problem.value(both[: at.shape[0]], both[at.shape[0] :]), np.concatenate([at, w]), COLUMNS_AT_ONCE
+    )
+    (fine,) = gradcheck.samples(
+        values.reshape(1, -1), np.array([scale]), np.array([point.sample.derivative]), unit, gradcheck.FINE
+    )
+    verdict = gradcheck.diagnose(fine)
+    if verdict == "unsettled":
+        slope = tangent(problem, place.theta, place.direction, place.w)
+        if abs(slope - point.sample.derivative) <= gradcheck.AGREES * abs(slope):
+            verdict = "nonlinear"
+    return replace(point, verdict=verdict)
 
 
 def beyond_stability(cell: Cell) -> list[str]:
@@ -203,13 +284,19 @@ Modes = Callable[[np.ndarray, np.ndarray], list[str]]
 
 
 def examine(
-    problem: Problem, theta: np.ndarray, drawn: np.ndarray, directions: np.ndarray, unit: float, search: SwitchSearch
+    problem: Problem,
+    theta: np.ndarray,
+    drawn: np.ndarray,
+    directions: np.ndarray,
+    unit: float,
+    search: SwitchSearch,
+    more: Sequence[Place] = (),
 ) -> tuple[list[Place], list[tuple[gradcheck.Sample, list[tuple[str, str]]]]]:
     """Check directional derivatives at ``theta (d,)``, without noise and with ``drawn (n_w,)``, and at contact switches.
 
     Derivatives at theta are along the first ``search.directions`` of ``directions (D, d)``. Switches are searched along
-    all directions, without noise, and checked along the first ``search.directions`` that meet one. Returns the places
-    and, for each place, its costs and the contact modes on both sides at every eps. ``unit`` is the unit roundoff of
+    all directions, without noise, and checked along the first ``search.directions`` that meet one. ``more`` places are
+    checked too. Returns the places and, for each place, its costs and the contact modes on both sides at every eps. ``unit`` is the unit roundoff of
     the program's arithmetic. All costs are one batch, which is evaluated twice.
     """
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -223,6 +310,7 @@ def examine(
     if modes is not None:
         met = (boundary(modes, theta, direction, still, number, search) for number, direction in enumerate(directions))
         places += itertools.chain(*itertools.islice(filter(None, met), search.directions))
+    places += more
     scale, count = scale_of(theta), gradcheck.EPS.size
     thetas = np.concatenate([gradcheck.points(p.theta, scale * p.direction[:, None], unit) for p in places], axis=1)
     each = thetas.shape[1] // len(places)

@@ -16,7 +16,9 @@ from bench.studies.gradient_check.report import PROBLEM, by_point, long_table, u
 
 LOOKS = {
     point: look(PALETTE[place], symbol)
-    for point, place, symbol in zip(POINTS, (0, 5, 2, 3), ("circle", "square", "diamond", "triangle-up"), strict=True)
+    for point, place, symbol in zip(
+        POINTS, (0, 5, 2, 3, 4), ("circle", "square", "diamond", "triangle-up", "x"), strict=True
+    )
 }
 """Colour and symbol of each point at which gradients are checked."""
 

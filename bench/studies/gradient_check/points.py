@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from bench.measure.gradcheck import BROKEN, TRUSTED
 
-POINTS = ("start", "before", "at", "after")
-"""``start`` is theta0. The others are on a line through theta0: before, at and after a switch of contact mode."""
+POINTS = ("start", "before", "at", "after", "noise")
+"""``start`` is theta0. The next three are on a line through theta0: before, at and after a switch of contact mode. ``noise``
+is theta0 under noise with which the cost jumps."""
 
 
 def is_trusted(point: str, verdict: str) -> bool:

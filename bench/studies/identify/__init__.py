@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -23,6 +24,7 @@ class Identify(Study):
 
     name = "identify"
     axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "optimizer")
+    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("gauss_newton",)}
     columns: ClassVar[Columns] = Columns.of(
         text("optimizer", "identity string of the optimizer"),
         text("words", "what the record can and cannot tell"),
@@ -32,6 +34,10 @@ class Identify(Study):
         Column("fits", "records that were fitted"),
         Column("step_shift", "largest relative change of an estimate when the model's step is halved, without noise"),
         text("step_note", "whether the estimate holds for its time step only"),
+        Column("explained", "share of records that no test of the residuals contradicts, at 5% false alarms"),
+        Column("misfit", "share of records of a right model that contradict it as much as the first record"),
+        numbers("wide_low", "by unknown, lower end of the 95% interval of the first fit under correlated noise"),
+        numbers("wide_high", "by unknown, its upper end"),
         numbers("unknowns", "names of the parameters"),
         numbers("truth", "true values of the parameters"),
         numbers("start", "values of the parameters where fits start"),
@@ -50,6 +56,7 @@ class Identify(Study):
         numbers("estimate", "by shooting method and invariant, the median estimate"),
         numbers("estimate_low", "by shooting method and invariant, lower end of the 95% interval of the first fit"),
         numbers("estimate_high", "by shooting method and invariant, its upper end"),
+        numbers("first", "by shooting method and invariant, the estimate of the first record"),
     )  # fmt: skip
 
     measurement: float = param(0.01, "standard deviation of the noise on each measurement", "m", positive=True)

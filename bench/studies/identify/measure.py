@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import itertools
 import math
@@ -9,10 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from bench.errors import Unsupported
 from bench.experiment.cell import Cell
-from bench.measure import noise, performance
+from bench.measure import adequacy, noise, performance
 from bench.measure.identification import Information
 from bench.model import Answer, Decision, Identified, LoopOps, MechanicalScene, Optimizer, Rollout, State, compose
 
@@ -28,6 +30,13 @@ MAX_STEP_SHIFT = 0.5
 To first order in the step, the error of the estimate is twice this change: one bound. With a bias of one bound, 17% of
 the 95% intervals miss the truth instead of 5%.
 """
+
+TESTED = 64
+"""Most records whose residuals are tested."""
+UNEXPLAINED = 1e-3
+"""Share of fits to a right model whose residuals are larger than those that count as consistent with the noise."""
+APART = 0.01
+"""Share of records of a right model whose fits by single shooting and by windows count as different."""
 
 Settings = Any
 """An ``Identify`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
@@ -254,18 +263,159 @@ def measure(cell: Cell, settings: Settings) -> dict[str, Any]:
         "invariants": known.labels, "bound": np.sqrt(np.diag(known.covariance())).tolist() if known.rank else [],
         "fisher": known.fisher.ravel().tolist(), **step_dependence(cell, model, known, settings),
     }  # fmt: skip
+    result |= _explanation(cell, model, optimizer, start, data, settings)
     lines: dict[str, list[Any]] = {name: [] for name in LISTS}
     n_windows = count_windows(scene.horizon, settings.windows)
     has_windows = len(model.steps) == scene.horizon and n_windows > 1
     for shooting in SHOOTING if has_windows else SHOOTING[:1]:
         for name, value in _fit_statistics(model, shooting, n_windows, optimizer, start, data, known, settings).items():
             lines[name].extend(value if isinstance(value, list) else [value])
+    if has_windows and (apart := _difference_of_fits(lines, known)):
+        result["reason"] = "; ".join(part for part in (result["reason"], apart) if part)
     return result | lines
+
+
+def _explanation(
+    cell: Cell, model: Model, optimizer: Optimizer, start: np.ndarray, data: np.ndarray, settings: Settings
+) -> dict[str, Any]:
+    """Return whether the fits by single shooting explain the records, and intervals that allow for correlated noise.
+
+    ``explained`` is the share of records that no test contradicts. ``reason`` states the contradictions of the first
+    record. The intervals belong to the first record's parameters.
+    """
+    unit = np.ones(len(model.initial_states(start[:, :1])))
+    fitting = Fitting(model, "single", 1, settings.measurement, unit)
+    solution = run_fits(fitting, optimizer, fitting.start(start, data), data, settings.iterations)
+    residual, p = fitting.residuals(solution, data), len(model.names)
+    jacobian = fitting.jacobians(solution, data)
+    channels = len(model.measured)
+    is_finite = np.isfinite(jacobian).all(axis=(0, 1)) & np.isfinite(residual).all(axis=0)
+    # the effects of missing terms at one fit serve all records, which have the same truth
+    fitted = np.exp(solution[:, int(np.argmax(is_finite))])
+    terms = missing_terms(cell, model, fitted, settings.measurement) if is_finite.any() else {}
+    verdicts = [
+        adequacy.judge(residual[:, i], jacobian[:, :, i], channels, terms, seed=i)
+        for i in np.flatnonzero(is_finite)[:TESTED]
+    ]
+    wide_low, wide_high = [math.nan] * p, [math.nan] * p
+    if is_finite[0]:
+        independent = np.linalg.pinv(jacobian[:, :, 0].T @ jacobian[:, :, 0], rcond=1e-11, hermitian=True)
+        correlated = adequacy.correlated_covariance(residual[:, 0], jacobian[:, :, 0], channels)
+        half = performance.Z * np.sqrt(np.maximum(np.diag(independent), np.diag(correlated)))
+        wide_low, wide_high = (np.exp(solution[:, 0] + side * half).tolist() for side in (-1.0, 1.0))
+    share = float(np.mean([one.is_explained for one in verdicts])) if verdicts else math.nan
+    first = verdicts[0].sentence() if is_finite[0] else "the fit of the first record is not finite"
+    if first and is_finite[0]:
+        intervals = ", ".join(
+            f"{name} {low:.4g} to {high:.4g}" for name, low, high in zip(model.names, wide_low, wide_high, strict=True)
+        )
+        first += f"; under correlated noise they would be {intervals}"
+    return {
+        "explained": share, "reason": first, "wide_low": wide_low, "wide_high": wide_high,
+        "misfit": verdicts[0].probability if verdicts else math.nan,
+    }  # fmt: skip
+
+
+def missing_terms(cell: Cell, model: Model, theta: np.ndarray, sigma: float) -> dict[str, np.ndarray]:
+    """Return the change of the standardised record ``(m,)`` per unit of effects that the model lacks, by name.
+
+    The effects are an offset of each sensor, and accelerations of each coordinate: constant, and quadratic, cubic and
+    signed in its velocity and position. They are computed at ``theta (p,)`` by central differences.
+    """
+    scene = model.program.scene
+    channels, columns = len(model.measured), theta[:, None]
+    plain = model.record(columns)[:, 0]
+    terms = {}
+    for c, coordinate in enumerate(model.measured):
+        terms[f"an offset of sensor {coordinate}"] = np.tile(np.eye(channels)[c], plain.size // channels) / sigma
+    states = model.simulate(columns, model.initial_states(columns), np.zeros(1, dtype=int), scene.horizon)[:, :, 0]
+    size = max(float(np.abs(np.diff(states[:, scene.n_q :], axis=0)).max()) / scene.dt, 1e-12)
+    for i in range(scene.n_q if len(states[0]) == 2 * scene.n_q else 0):
+        x, v = (max(float(np.abs(states[:, j]).max()), 1e-12) for j in (i, scene.n_q + i))
+        for name, effect in _effects(i, x, v).items():
+            record = []
+            for side in (1.0, -1.0):
+                twin = _with_acceleration(scene, i, side * RELATIVE * size, effect)
+                program = dataclasses.replace(model, program=_recomposed(cell, model, twin))
+                record.append(program.record(columns)[:, 0])
+            change = (record[0] - record[1]) / (2.0 * RELATIVE * sigma)
+            if np.isfinite(change).all():
+                terms[name] = change
+    return terms
+
+
+RELATIVE = 1e-4
+"""Size of a missing acceleration whose effect is computed, relative to the largest acceleration of the motion."""
+
+
+def _effects(i: int, x: float, v: float) -> dict[str, Any]:
+    """Return accelerations of coordinate ``i`` as functions of q and v, scaled by their largest values x and v."""
+    of = f"of coordinate {i}"
+    return {
+        f"a constant force {of}": lambda q, r: 1.0 + 0.0 * q[i],
+        f"drag {of} in v|v|": lambda q, r: r[i] * np.abs(r[i]) / v**2,
+        f"drag {of} in v^3": lambda q, r: (r[i] / v) ** 3,
+        f"friction {of} in the sign of v": lambda q, r: np.tanh(100.0 * r[i] / v),
+        f"a spring {of} in q^2": lambda q, r: (q[i] / x) ** 2,
+        f"a spring {of} in q^3": lambda q, r: (q[i] / x) ** 3,
+    }
+
+
+def _with_acceleration(scene: MechanicalScene, i: int, size: float, effect: Any) -> MechanicalScene:
+    """Return a copy of a scene with an additional acceleration of coordinate ``i``."""
+    base = type(scene)
+
+    def acceleration(self: Any, xp: Any, q: Any, v: Any, u: Any) -> Any:
+        more = np.zeros((scene.n_q, 1))
+        more[i] = size
+        return base.acceleration(self, xp, q, v, u) + more * effect(q, v)
+
+    twin = copy.copy(scene)
+    object.__setattr__(twin, "__class__", type(base.__name__, (base,), {"acceleration": acceleration}))
+    return twin
+
+
+def _recomposed(cell: Cell, model: Model, scene: MechanicalScene) -> Rollout:
+    program = compose(scene, cell.contact, cell.integrator, model.program.decision)
+    assert isinstance(program, Rollout)
+    return program
+
+
+def _difference_of_fits(lines: dict[str, list[Any]], known: Information) -> str:
+    """Return a remark if the first record's fits by single shooting and by independent windows differ, else "".
+
+    The windows use less of the record, so that the variance of the difference is at least that of the windows' estimate
+    minus that of single shooting (Hausman 1978).
+    """
+    count = known.rank
+    single, windows = 0, SHOOTING.index("windows")
+    if not count or len(lines["shooting"]) <= windows:
+        return ""
+    from scipy.special import ndtri
+
+    logs = {k: np.log(np.array(lines["first"][k * count : (k + 1) * count], dtype=float)) for k in (single, windows)}
+    halves = {
+        k: (np.log(np.array(lines["estimate_high"][k * count : (k + 1) * count], dtype=float)) - logs[k])
+        / performance.Z
+        for k in (single, windows)
+    }
+    variance = halves[windows] ** 2 - halves[single] ** 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        z = np.abs(logs[windows] - logs[single]) / np.sqrt(variance)
+    z = np.where(variance > 0.01 * halves[windows] ** 2, z, 0.0)
+    worst = int(np.argmax(np.nan_to_num(z)))
+    if np.nan_to_num(z[worst]) <= -ndtri(APART / (2.0 * count)):
+        return ""
+    values = [math.exp(logs[k][worst]) for k in (single, windows)]
+    return (
+        f"fits of the whole record and of its windows differ by {z[worst]:.1f} standard errors ({known.labels[worst]} "
+        f"{values[0]:.4g} and {values[1]:.4g}): the model does not explain the record, or a fit ended elsewhere"
+    )
 
 
 LISTS = (
     "shooting", "converged", "converged_low", "converged_high", "error", "coverage", "coverage_low", "coverage_high",
-    "hidden", "estimate", "estimate_low", "estimate_high",
+    "hidden", "estimate", "estimate_low", "estimate_high", "first",
 )  # fmt: skip
 
 
@@ -282,8 +432,9 @@ def _fit_statistics(
     residual = fitting.residuals(solution, data)
     p, measured = len(model.names), len(data)
     square = (residual[:measured] ** 2).sum(axis=0)
-    free = max(measured - fitting.dim, 1)
-    has_converged = np.isfinite(square) & (square < measured + 5 * math.sqrt(2 * max(measured, free)))
+    # gaps of multiple shooting tie its initial states to the parameters
+    free = max(measured - (fitting.dim if shooting == "windows" else p), 1)
+    has_converged = np.isfinite(square) & (square <= chdtri(free, UNEXPLAINED))
     jacobian = fitting.jacobians(solution, data)
     logs, target = known.invariants @ solution[:p], known.invariants @ np.log(model.values)
     bound = np.sqrt(np.diag(known.covariance()))
@@ -314,7 +465,7 @@ def _fit_statistics(
         "error": float(np.sqrt(np.mean(np.square(errors)))) if errors else math.nan,
         "coverage": coverage, "coverage_low": interval[0], "coverage_high": interval[1], "hidden": hidden,
         "estimate": np.exp(middle).tolist(), "estimate_low": np.exp(logs[:, 0] - halves[0]).tolist(),
-        "estimate_high": np.exp(logs[:, 0] + halves[0]).tolist(),
+        "estimate_high": np.exp(logs[:, 0] + halves[0]).tolist(), "first": np.exp(logs[:, 0]).tolist(),
     }  # fmt: skip
 
 

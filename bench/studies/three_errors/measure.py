@@ -37,7 +37,7 @@ def measure(cell: Cell, session: Session) -> dict[str, Any]:
     truth = session.references.of(cell)
     result["reference_method"] = truth.method
     if not np.isfinite(truth.batches).all():
-        return result | {"status": "nonfinite", "reason": "the reference gradient is not finite"}
+        return result | {"status": "nonfinite", "reason": truth.note or "the reference gradient is not finite"}
     w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, problem.program.n_noise)
     estimates = np.asarray(cell.estimator.estimate(problem, problem.program.theta0, w), dtype=np.float64)
     summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))

@@ -1,0 +1,58 @@
+"""The jump search of the gradient check: what the noise reaches, which gradients at theta do not show."""
+
+import math
+
+import numpy as np
+import pytest
+import trusted
+from bench.plugins.backends.numpy import Numpy
+
+from bench.measure.jumps import jump_under_noise
+from bench.model import compose
+
+SEEN = {(s.family, s.label): s for s in trusted.scenes()}
+
+
+def puck(at):
+    """A puck with viscous drag slides along a table that ends at ``at`` metres; the cost there is 1 higher."""
+
+    def cost(xp, v0):
+        x, v = 0.0 * v0[0], v0[0]
+        for _ in range(100):
+            v = v - 0.01 * v
+            x = x + 0.01 * v
+        return (x - 2.0) ** 2 + xp.where(x > at, 1.0, 0.0)
+
+    return trusted.Scene("puck", f"edge at {at}", cost, (2.0,), 0.2)
+
+
+def search(scene):
+    problem = Numpy().compile(compose(trusted.Given(scene.label, scene.cost, scene.theta, scene.sigma)))
+    return jump_under_noise(problem, np.array(scene.theta), 0, trusted.COLUMNS)
+
+
+@pytest.mark.parametrize(("at", "bias"), [(1.4, 11.15), (1.2, 2.06)])
+def test_an_edge_that_the_noise_reaches_is_found(at, bias):
+    """First order spreads by 1.5% of its mean there, and its bias is 11 or 2 times the gradient."""
+    scene = puck(at)
+    jump, w = search(scene)
+    assert jump.height == pytest.approx(1.0, rel=1e-6)
+    slope = 0.99 * (1.0 - 0.99**100)
+    assert (2.0 + 0.2 * w[0]) * slope == pytest.approx(at, abs=1e-6)
+    first = 2.0 * (2.0 * slope - 2.0) * slope
+    z = (at / slope - 2.0) / 0.2
+    missed = math.exp(-z * z / 2.0) / math.sqrt(2.0 * math.pi) / 0.2
+    assert missed / abs(first + missed) == pytest.approx(bias, rel=0.02)
+
+
+@pytest.mark.parametrize("name", [key for key in SEEN if key[0] in ("free flight", "saturation")], ids=str)
+def test_a_continuous_cost_has_no_jump(name):
+    assert search(SEEN[name])[0].height == 0.0
+
+
+@pytest.mark.parametrize("name", [key for key in SEEN if key[0] in ("gate", "edge")][::2], ids=str)
+def test_a_jump_within_reach_is_found(name):
+    jump, w = search(SEEN[name])
+    assert jump.height > 0.0
+    assert math.isfinite(jump.span)
+    assert 0.0 < np.abs(w).max() <= 4.0

@@ -1,0 +1,123 @@
+"""Plants one bug at a time in a plugin and runs claims that use it: `python tests/programs/planted_claims.py [BUG...]`.
+
+Prints a table of the bugs, the claims that were run and those that fail. A bug that no claim notices ends with status 1.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+from unittest import mock
+
+from bench.plugins.contacts.complementarity import Complementarity
+from bench.plugins.contacts.impulse import Impulse
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.estimators.fobg import Fobg
+from bench.plugins.estimators.inverse_variance import InverseVariance
+from bench.plugins.estimators.measure_valued import MeasureValued
+from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
+from bench.plugins.estimators.reinforce import Reinforce
+from bench.plugins.estimators.sphere_smoothing import SphereSmoothing
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.optimizers.gradient_descent import GradientDescent
+
+from bench.claims import discovery, results
+from bench.claims.claim import NOT_REPRODUCED
+from bench.model import Problem, State
+
+
+@contextlib.contextmanager
+def changed(owner: type, name: str, wrapper: Callable[..., Any]) -> Iterator[None]:
+    """Replace a method by ``wrapper(original, self, *arguments)``."""
+    original = getattr(owner, name)
+    with mock.patch.object(owner, name, lambda self, *a, **k: wrapper(original, self, *a, **k)):
+        yield
+
+
+def scaled(factor: float) -> Callable[..., Any]:
+    """Return a wrapper that multiplies a method's result."""
+    return lambda original, self, *a, **k: factor * original(self, *a, **k)
+
+
+def halved_kappa(original: Any, self: Any, ops: Any, contact: Any, before: Any, free: Any, dt: Any) -> Any:
+    import copy
+
+    twin = copy.copy(self)
+    object.__setattr__(twin, "kappa", self.kappa / 2)
+    return original(twin, ops, contact, before, free, dt)
+
+
+def swapped_weights(original: Any, self: Any, problem: Any, theta: Any, noise: Any) -> Any:
+    from bench.plugins.estimators import inverse_variance
+
+    plain = inverse_variance.halves
+    with mock.patch.object(inverse_variance, "halves", plain):
+        first, zeroth = plain(problem, theta, noise)
+        v1, v0 = first.var(axis=1, ddof=1), zeroth.var(axis=1, ddof=1)
+        weight = v1 / (v0 + v1)
+        return weight * first.mean(axis=1) + (1 - weight) * zeroth.mean(axis=1), {"weight": weight}
+
+
+def early_impact(original: Any, self: Any, ops: Any, contact: Any, before: Any, free: Any, dt: Any) -> Any:
+    change = original(self, ops, contact, before, free, dt)
+    return State(0.9 * change.q, change.v)
+
+
+def fast_step(original: Any, self: Any, dynamics: Any, state: Any, u: Any, dt: Any) -> Any:
+    return original(self, dynamics, state, u, 1.05 * dt)
+
+
+def long_step(original: Any, self: Any, state: Any, gradient: Any) -> Any:
+    return original(self, state, 1.3 * gradient)
+
+
+BUGS: dict[str, tuple[type, str, Callable[..., Any], tuple[str, ...]]] = {
+    "kappa halved": (Complementarity, "impulse", halved_kappa, ("C5",)),
+    "time of impact .9 dt": (Impulse, "impulse", early_impact, ("C8", "C13")),
+    "penalty force 5% large": (Penalty, "force", scaled(1.05), ("C14",)),
+    "step 5% long": (SemiImplicitEuler, "step", fast_step, ("C8", "C13")),
+    "fobg 5% large": (Fobg, "terms", scaled(1.05), ("C5", "C6", "C19")),
+    "score 5% large": (Problem, "score", scaled(1.05), ("C1", "C5", "C6")),
+    "reinforce 5% large": (Reinforce, "terms", scaled(1.05), ("C1", "C5", "C6")),
+    "measure_valued 5% large": (MeasureValued, "estimate", scaled(1.05), ("C6",)),
+    "weights swapped": (InverseVariance, "estimate_with_diagnostics", swapped_weights, ("C19",)),
+    "randomized_smoothing 5% large": (RandomizedSmoothing, "estimate", scaled(1.05), ("C7",)),
+    "sphere_smoothing 5% large": (SphereSmoothing, "estimate", scaled(1.05), ("C7",)),
+    "descent 30% fast": (GradientDescent, "step", long_step, ("C10",)),
+}
+"""The bug, the class and method that has it, the wrapper, and the claims that are run."""
+
+
+def failing(bug: str) -> tuple[list[str], list[str]]:
+    """Return the claims that are run under a bug, and those that are then not reproduced."""
+    import jax
+
+    owner, name, wrapper, claims = BUGS[bug]
+    failed = []
+    with changed(owner, name, wrapper):
+        for claim in claims:
+            # a program that was compiled without the bug would run without it
+            jax.clear_caches()
+            try:
+                verdict = results.measure(discovery.claims()[claim]).verdict
+            except Exception as error:
+                verdict = f"{type(error).__name__}: {error}"
+            failed += [claim] if verdict == NOT_REPRODUCED else []
+    jax.clear_caches()
+    return list(claims), failed
+
+
+def main(bugs: list[str]) -> int:
+    """Print a line per bug; return 1 if a bug passes every claim that is run."""
+    missed = 0
+    for bug in bugs or BUGS:
+        claims, failed = failing(bug)
+        missed += not failed
+        print(f"| {bug} | {', '.join(claims)} | {', '.join(failed) or 'none'} |", flush=True)
+    return int(missed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
