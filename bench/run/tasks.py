@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
 
 from bench.errors import StorageError, failure, printable
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint
 from bench.experiment.study import Study, study_of
-from bench.model import Backend, guard
+from bench.measure import noise
+from bench.model import Backend, Problem, guard
 from bench.run.plan import versions
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
@@ -21,6 +24,16 @@ MAX_REASON = 2000
 """Length of the longest stored reason, in characters."""
 FAILED = ("error", "crashed", "timeout")
 """Statuses of cells that failed."""
+CONVERGED = {"float64": 1e-8, "float32": 1e-4}
+"""Largest relative residual of a constraint solver that has converged, by type of the simulation."""
+
+
+@runtime_checkable
+class HasSolver(Protocol):
+    """A backend whose steps solve for contact forces iteratively."""
+
+    def solver_residual(self, problem: Problem, w: np.ndarray) -> float:
+        """Return the largest relative residual along rollouts from theta0 with noise ``w (n_w, B)``."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +95,24 @@ def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
         raise
     except BaseException as error:  # a plugin that exits must not end a run in this process
         return dict(failure(error))
-    if cell.timing:
-        return result
-    blank = study.columns.blank()
-    return result | {name: blank[name] for name in study.columns.measured}
+    if not cell.timing:
+        blank = study.columns.blank()
+        result |= {name: blank[name] for name in study.columns.measured}
+    return result | solver_columns(cell, session, result)
+
+
+def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict[str, Any]:
+    """Return the residual of the backend's constraint solver, with a remark in ``reason`` where it has not converged."""
+    backend = cell.parts.get("backend")
+    if not isinstance(backend, HasSolver) or result["status"] != "ok":
+        return {}
+    program = cell.program()
+    w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, program.n_noise)[0].T
+    residual = backend.solver_residual(session.problem(cell), w)
+    if not residual > CONVERGED[cell.backend.dtype]:
+        return {"solver_residual": residual}
+    remark = f"the constraint solver has not converged (relative residual {residual:.1e}): more iterations give another gradient"
+    return {"solver_residual": residual, "reason": "; ".join(filter(None, (result.get("reason", ""), remark)))}
 
 
 def group_by_program(tasks: list[Task]) -> list[list[Task]]:

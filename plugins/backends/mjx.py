@@ -60,17 +60,23 @@ class Mjx(Jax):
     def unsupported_reason(self, program: Program) -> str | None:
         """Return why the program cannot run: it has no twin, or MJX cannot differentiate it; or None."""
         reason = mjcf.unsupported_reason(self, program)
-        if reason or self.is_implicit:
-            return reason
-        if self.mode == "reverse" and self.iterations > 1:
+        if reason is None and self.cone == "elliptic":
+            reason = self._elliptic_reason(mjcf.contact_dimensions(program))
+        if reason is None and not self.is_implicit and self.mode == "reverse" and self.iterations > 1:
             return (
                 f"MJX's solver has no reverse mode with iterations={self.iterations} and derivative=unrolled: use "
                 "derivative=implicit, mode=forward or iterations=1"
             )
-        if self.cone == "elliptic" and mjcf.has_friction(program):
+        return reason
+
+    def _elliptic_reason(self, dimensions: set[int]) -> str | None:
+        """Return why contacts of these dimensions exclude elliptic cones, or None."""
+        if 1 in dimensions:
+            return "MJX has no contacts without friction beside elliptic cones: use cone=pyramidal, which is the same there"
+        if dimensions and not self.is_implicit:
             return (
-                f"MJX's derivatives through the solver's iterations are NaN with elliptic friction cones "
-                f"(iterations={self.iterations}, derivative={self.derivative}): use derivative=implicit with iterations=100, "
+                "MJX's derivatives through the iterations of its solver are NaN with elliptic friction cones "
+                f"(iterations={self.iterations}, derivative={self.derivative}): use derivative=implicit and iterations=100, "
                 "or cone=pyramidal"
             )
         return None

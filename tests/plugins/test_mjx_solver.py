@@ -1,0 +1,196 @@
+"""Gradients through MJX's converged solver agree with differences and forward mode, and dropped terms are caught."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from bench.plugins.backends.mjx import Mjx
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.tossed_box import TossedBox
+from programs import mjx_solver as program
+
+from bench.cli import main
+from bench.conformance.subjects import law_for
+from bench.model import compose, registry
+from bench.plugins import mjx_solver
+from bench.run import tasks
+
+for _name in ("mujoco", "mjx"):
+    _entry = registry.find("backends", _name)
+    if not _entry.available:
+        pytest.skip(f"backend {_name} is {_entry.reason}", allow_module_level=True)
+
+AGREES = 1e-6
+"""Relative difference from central differences allowed, and absolute difference for small derivatives."""
+ARM = (
+    program.Mechanism(
+        "arm on a slide, both at their limits, with friction loss",
+        '<body pos="0 0 1"><joint type="slide" axis="1 0 0" limited="true" range="-1 .002" frictionloss=".2"/>'
+        '<geom type="sphere" size=".1" mass="1"/><body><joint type="hinge" axis="0 1 0" frictionloss=".1"/>'
+        '<geom type="sphere" size=".1" pos=".2 0 0" mass="1"/></body></body>',
+        (1.0, 3.0),
+    ),
+)
+
+
+# ------------------------------------------------------------------------------------------- without compilation
+
+
+@pytest.mark.parametrize(
+    ("backend", "is_implicit"),
+    [
+        (Mjx(), False),
+        (Mjx(iterations=2), True),
+        (Mjx(iterations=2, derivative="unrolled"), False),
+        (Mjx(derivative="implicit"), True),
+    ],
+)
+def test_more_than_one_iteration_means_the_implicit_derivative(backend, is_implicit):
+    assert backend.is_implicit is is_implicit
+
+
+def test_engine_has_its_own_solver_outside_the_context():
+    from mujoco.mjx._src import solver
+
+    own = mjx_solver.library().solve
+    with mjx_solver.implicit():
+        assert solver.solve is mjx_solver.solve
+    assert solver.solve is own
+    with pytest.raises(AttributeError), mjx_solver.implicit():
+        mjx_solver.solve(None, None)
+    assert solver.solve is own
+
+
+def row(residual, tmp_path, monkeypatch):
+    """Return the row of a backend whose solver has this residual."""
+
+    def solver_residual(self, problem, w):
+        assert w.shape == (problem.program.n_noise, 3)
+        return residual
+
+    monkeypatch.setattr(Numpy, "solver_residual", solver_residual, raising=False)
+    words = [
+        "scenes=[double_integrator]",
+        "backends=[numpy]",
+        "estimators=[fobg]",
+        "samples=3",
+        "repeats=2",
+        "workers=0",
+    ]
+    assert main([*words, "name=mine", "timing=false", "reference.samples=256", f"results_dir={tmp_path}"]) == 0
+    return pd.read_parquet(tmp_path / "mine" / "rows.parquet").iloc[0]
+
+
+def test_row_has_the_residual_and_a_remark_where_the_solver_has_not_converged(tmp_path, monkeypatch):
+    found = row(1e-3, tmp_path, monkeypatch)
+    assert found["solver_residual"] == 1e-3
+    assert "the constraint solver has not converged (relative residual 1.0e-03)" in found["reason"]
+    assert found["status"] == "ok"
+
+
+def test_row_of_a_converged_solver_has_no_remark(tmp_path, monkeypatch):
+    found = row(1e-12, tmp_path, monkeypatch)
+    assert found["solver_residual"] == 1e-12
+    assert "converged" not in found["reason"]
+
+
+def test_backend_without_a_solver_has_no_residual():
+    assert not isinstance(Numpy(), tasks.HasSolver)
+    assert isinstance(Mjx(), tasks.HasSolver)
+
+
+@pytest.mark.slow
+def test_mjx_loses_the_derivative_of_a_rotation_by_an_angular_velocity_of_zero():
+    """A limit of MJX, named in the documentation: were it repaired, the documentation would be wrong."""
+    import jax
+    from mujoco.mjx._src import math
+
+    def turned(rate):
+        return math.quat_integrate(np.array([1.0, 0, 0, 0]), rate, 0.01)
+
+    assert np.all(jax.jacfwd(turned)(np.zeros(3)) == 0)
+    np.testing.assert_allclose(jax.jacfwd(turned)(np.array([0.01, 0, 0]))[1, 0], 0.005, rtol=1e-4)
+
+
+# ------------------------------------------------------------------------------------------------------- agreement
+
+
+def assert_agreement(table):
+    for name, (reverse, forward, difference) in table.items():
+        assert forward == pytest.approx(reverse, rel=1e-9, abs=1e-12), name
+        assert difference == pytest.approx(reverse, rel=AGREES, abs=1e-9), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["Newton", "CG"])
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_derivatives_of_twenty_mechanisms_agree_with_differences_and_forward_mode(cone, solver):
+    table = program.agreement(cone, solver)
+    assert len(table) == 20
+    assert_agreement(table)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+def test_derivatives_agree_with_every_integrator(integrator):
+    assert_agreement(program.agreement("pyramidal", "Newton", mechanisms=ARM, integrator=integrator))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dropped", ["_impl.efc_J", "_impl.efc_aref", "_impl.efc_D", "_impl.M", "qfrc_smooth"])
+def test_dropped_term_of_the_derivative_is_caught(dropped, monkeypatch):
+    import jax
+
+    gradient = mjx_solver._cost_gradient
+
+    def incomplete(model, data, acceleration):
+        part = data
+        for name in dropped.split("."):
+            part = getattr(part, name)
+        return gradient(model, data.tree_replace({dropped: jax.lax.stop_gradient(part)}), acceleration)
+
+    monkeypatch.setattr(mjx_solver, "_cost_gradient", incomplete)
+    with pytest.raises(AssertionError):
+        assert_agreement(program.agreement("pyramidal", "Newton", mechanisms=ARM))
+
+
+@pytest.mark.slow
+def test_forces_with_no_derivative_of_the_last_step_are_caught(monkeypatch):
+    monkeypatch.setattr(mjx_solver, "NEWTON_STEPS", 0)
+    with pytest.raises(AssertionError):
+        assert_agreement(program.agreement("pyramidal", "Newton", mechanisms=ARM))
+
+
+@pytest.mark.slow
+def test_elliptic_cone_in_reverse_agrees_with_differences_of_the_backends_own_costs():
+    scene = TossedBox(horizon=120)
+    law = law_for(scene, Penalty, {"damping_mode": "clipped"})
+    problem = Mjx(impedance=0.9, cone="elliptic", iterations=50, mode="reverse").compile(
+        compose(scene, law, SemiImplicitEuler())
+    )
+    theta, w = scene.theta0(), np.zeros((3, 16))
+    shifts = np.zeros((3, 16))
+    for i in range(3):
+        shifts[i, 2 * i : 2 * i + 2] = 1e-6, -1e-6
+    values = problem.value(theta[:, None] + shifts, w)
+    differences = (values[0:6:2] - values[1:6:2]) / 2e-6
+    np.testing.assert_allclose(problem.grad(theta, w)[:, 0], differences, rtol=1e-6)
+    assert problem.solver_residual(w) < 1e-8
+
+
+@pytest.mark.slow
+def test_study_of_the_solver_measures_writes_and_draws(tmp_path):
+    words = ["study=solver", "scenes=[pushing]", "backends=[mjx,jax]", "backend.mjx.impedance=0.9", "name=mine"]
+    words += ["sweep.iterations=[1,3]", "study.converged=3", "scene.pushing.horizon=5", "samples=4"]
+    assert main([*words, f"results_dir={tmp_path}"]) == 0
+    rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet").set_index(["backend", "iterations"])
+    assert (tmp_path / "mine" / "solver.png").exists()
+    first, last = (rows[rows["status"] == "ok"].xs(n, level="iterations").iloc[0] for n in (1, 3))
+    assert last["gradient_error_rel"] == 0
+    assert last["wrong_signs"] == 0
+    assert last["solver_residual"] < 1e-8
+    assert first["gradient_error_rel"] < 1e-6, "one contact between two bodies converges in one iteration"
+    refused = rows[rows["status"] == "unsupported"]
+    assert refused["reason"].str.contains("no parameter iterations").all()
+    assert len(refused) == 1
