@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
-
-import numpy as np
+from typing import Any
 
 from bench.errors import StorageError, failure, printable
 from bench.experiment.cell import Cell
@@ -14,7 +12,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint
 from bench.experiment.study import Study, study_of
 from bench.measure import noise
-from bench.model import Backend, Problem, guard
+from bench.model import Backend, guard
 from bench.run.plan import versions
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
@@ -26,14 +24,6 @@ FAILED = ("error", "crashed", "timeout")
 """Statuses of cells that failed."""
 CONVERGED = {"float64": 1e-8, "float32": 1e-4}
 """Largest relative residual of a constraint solver that has converged, by type of the simulation."""
-
-
-@runtime_checkable
-class HasSolver(Protocol):
-    """A backend whose steps solve for contact forces iteratively."""
-
-    def solver_residual(self, problem: Problem, w: np.ndarray) -> float:
-        """Return the largest relative residual along rollouts from theta0 with noise ``w (n_w, B)``."""
 
 
 @dataclass(frozen=True)
@@ -102,13 +92,17 @@ def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
 
 
 def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict[str, Any]:
-    """Return the residual of the backend's constraint solver, with a remark in ``reason`` where it has not converged."""
-    backend = cell.parts.get("backend")
-    if not isinstance(backend, HasSolver) or result["status"] != "ok":
+    """Return the residual of the backend's constraint solver, with a remark in ``reason`` where it has not converged.
+
+    A backend whose steps solve for contact forces iteratively has a method ``solver_residual(problem, w)``: the largest
+    residual along rollouts from theta0 with noise ``w (n_w, B)``, relative to the forces of a step.
+    """
+    solver_residual = getattr(cell.parts.get("backend"), "solver_residual", None)
+    if solver_residual is None or result["status"] != "ok":
         return {}
     program = cell.program()
     w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, program.n_noise)[0].T
-    residual = backend.solver_residual(session.problem(cell), w)
+    residual = float(solver_residual(session.problem(cell), w))
     if not residual > CONVERGED[cell.backend.dtype]:
         return {"solver_residual": residual}
     remark = f"the constraint solver has not converged (relative residual {residual:.1e}): more iterations give another gradient"

@@ -14,7 +14,6 @@ from bench.cli import main
 from bench.conformance.subjects import law_for
 from bench.model import compose, registry
 from bench.plugins import mjx_solver
-from bench.run import tasks
 
 for _name in ("mujoco", "mjx"):
     _entry = registry.find("backends", _name)
@@ -93,11 +92,6 @@ def test_row_of_a_converged_solver_has_no_remark(tmp_path, monkeypatch):
     found = row(1e-12, tmp_path, monkeypatch)
     assert found["solver_residual"] == 1e-12
     assert "converged" not in found["reason"]
-
-
-def test_backend_without_a_solver_has_no_residual():
-    assert not isinstance(Numpy(), tasks.HasSolver)
-    assert isinstance(Mjx(), tasks.HasSolver)
 
 
 @pytest.mark.slow
