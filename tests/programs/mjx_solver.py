@@ -145,7 +145,7 @@ class Rollouts:
         mjx = mjx_solver.library()
         traced, data = mjx.put_model(model), mjx.make_data(model)
         data = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype.kind == "f" else leaf, data)
-        data = data.replace(ctrl=np.full(model.nu, control))
+        data = data.replace(ctrl=jax.numpy.full(model.nu, control))
 
         def step(q: Any, v: Any, warm: Any) -> Any:
             with mjx_solver.implicit() if implicit else nullcontext():
