@@ -173,18 +173,16 @@ def test_elliptic_cone_in_reverse_agrees_with_differences_of_the_backends_own_co
     assert problem.solver_residual(w) < 1e-8
 
 
-@pytest.mark.slow
-def test_study_of_the_solver_measures_writes_and_draws(tmp_path):
-    words = ["study=solver", "scenes=[pushing]", "backends=[mjx,jax]", "backend.mjx.impedance=0.9", "name=mine"]
-    words += ["sweep.iterations=[1,3]", "study.converged=3", "scene.pushing.horizon=5", "samples=4"]
+def test_study_of_the_solver_finds_the_wrong_sign_of_one_iteration(tmp_path):
+    words = ["study=solver", "scenes=[ant]", "backends=[mujoco,jax]", "backend.mujoco.impedance=0.9", "name=mine"]
+    words += ["sweep.iterations=[1,100]", "samples=1", "workers=0", "timing=false"]
     assert main([*words, f"results_dir={tmp_path}"]) == 0
-    rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet").set_index(["backend", "iterations"])
-    assert (tmp_path / "mine" / "solver.png").exists()
-    first, last = (rows[rows["status"] == "ok"].xs(n, level="iterations").iloc[0] for n in (1, 3))
-    assert last["gradient_error_rel"] == 0
-    assert last["wrong_signs"] == 0
-    assert last["solver_residual"] < 1e-8
-    assert first["gradient_error_rel"] < 1e-6, "one contact between two bodies converges in one iteration"
+    rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet")
+    assert {"solver.png", "solver.md", "solver.csv"} <= {path.name for path in (tmp_path / "mine").iterdir()}
+    first, last = (rows[(rows["status"] == "ok") & (rows["iterations"] == n)].iloc[0] for n in (1, 100))
+    assert first["gradient"][1] == pytest.approx(-0.003658, abs=5e-7)
+    assert last["gradient"][1] == pytest.approx(0.003351, abs=5e-7)
+    assert first["wrong_signs"] == 0.25
+    assert last["wrong_signs"] == last["gradient_error_rel"] == 0
     refused = rows[rows["status"] == "unsupported"]
-    assert refused["reason"].str.contains("no parameter iterations").all()
-    assert len(refused) == 1
+    assert refused["reason"].str.contains("no parameter iterations|runs only in physics engines").all()

@@ -23,17 +23,17 @@ class SolverIterations(Claim):
 
     name = "E1"
     lesson = "Solver iterations"
-    statement = (
-        "MJX's reverse mode needs one iteration of the contact solver, and on a robot its gradient then has the other sign."
-    )
+    statement = "MJX's reverse mode needs one iteration of the contact solver, and on a robot its gradient then has the other sign."
     source = "this project, docs/engines.md"
-    learned = "A gradient can be exact for a solver that stopped early. Differentiate through the converged solution instead."
+    learned = (
+        "A gradient can be exact for a solver that stopped early. Differentiate through the converged solution instead."
+    )
     quick = False
     labels = ("iterations of the contact solver", "d(-x) / d(ankle torque) [m/(N m)]")
 
     def measure(self) -> Outcome:
         """Compute one derivative with MJX in reverse mode, and with chained differences of MuJoCo's steps in C."""
-        figures, series = [], {"iterations": list(ITERATIONS)}
+        figures: list[Figure] = []
         for iterations, published in ((1, "-0.003658"), (20, "0.003351")):
             backend = f"mjx[impedance=0.9,mode=reverse,iterations={iterations}]"
             figures.append(Figure(f"MJX, iterations={iterations}", published, _slope(backend)))
@@ -43,8 +43,8 @@ class SolverIterations(Claim):
         ]
         figures.append(Figure("MuJoCo in C, iterations=1", "-0.003658", in_c[0]))
         figures.append(Figure("MuJoCo in C, iterations=10", "0.003351", in_c[-1]))
-        series |= {"c": in_c, "mjx": [figures[0].measured, figures[1].measured]}
-        return Outcome(figures, series=series)
+        in_mjx = [figure.measured for figure in figures[:2]]
+        return Outcome(figures, series={"iterations": list(ITERATIONS), "c": in_c, "mjx": in_mjx})
 
     def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
         """Draw the derivative along the iterations."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.experiment.cell import Cell
@@ -11,6 +10,7 @@ from bench.experiment.columns import Column, Columns, ComparisonRule, numbers
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
+from bench.experiment.views import Views
 from bench.model import param
 from bench.model.parameters import values
 
@@ -28,13 +28,13 @@ class Solver(Study):
         Column("iterations", "maximum iterations of the constraint solver"),
         Column("gradient_norm", "norm of the gradient"),
         Column("converged_norm", "norm of the converged program's gradient"),
-        Column("gradient_error_rel", "norm of (gradient - converged program's gradient) / converged_norm",
+        Column("gradient_error_rel", "norm of (gradient - converged program's gradient) / converged_norm", label="error, relative",
                comparison=ComparisonRule("exact", "error of the gradient")),
-        Column("gradient_cosine", "cosine between the gradient and the converged program's gradient"),
-        Column("wrong_signs", "share of coordinates whose sign is not that of the converged program's gradient",
+        Column("gradient_cosine", "cosine between the gradient and the converged program's gradient", label="cosine"),
+        Column("wrong_signs", "share of coordinates whose sign is not that of the converged program's gradient", label="wrong signs",
                comparison=ComparisonRule("exact", "wrong signs")),
-        Column("gradient_s", "time of the gradients of `samples` rollouts", "s"),
-        Column("compile_s", "time of compiling the gradient", "s"),
+        Column("gradient_s", "time of the gradients of `samples` rollouts", "s", label="gradients", format="seconds"),
+        Column("compile_s", "time of compiling the gradient", "s", label="compilation", format="seconds"),
         numbers("gradient", "gradient at w = 0, by coordinate of theta"),
         numbers("converged_gradient", "the converged program's gradient at w = 0, by coordinate of theta"),
     )  # fmt: skip
@@ -55,20 +55,8 @@ class Solver(Study):
             return None
         return f"backend {cell.backend.name} has no parameter iterations, the iterations of a constraint solver"
 
-    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the table and the chart."""
-        from bench.studies.solver import report
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return the findings, the table of errors and times, and the chart of errors along the iterations."""
+        from bench.studies.solver.views import views
 
-        return report.write(experiment, rows)
-
-    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the table, and the reason of each cell without numbers."""
-        from bench.studies.solver import report
-
-        report.show(experiment, rows)
-
-    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the page: the finding, a chart of any two numbers, and the table."""
-        from bench.studies.solver import report
-
-        return report.content(experiment, rows)
+        return views(experiment, rows)
