@@ -32,21 +32,21 @@ NOTES = (
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the findings, the table with a line per scene, engine and iterations, and the chart of errors."""
-    shown = arrange(experiment, rows)
-    tried = attempted(shown.rows)
-    labels = label_columns(shown, ENGINE, always=("scene", "backend"), rows=tried)
+    arranged = arrange(experiment, rows)
+    tried = attempted(arranged.rows)
+    labels = label_columns(arranged, ENGINE, always=("scene", "backend"), rows=tried)
     known = experiment.columns.by_name
     own = [replace(known[name], digits=3) for name in ("solver_residual", *SHOWN)]
     lines = Table(
         "solver", tried, [*(COMMON.get(name, Column(name)) for name in labels), *own, COMMON["status"]],
         table(experiment, rows), "gradients along the iterations of the constraint solver", NOTES, terminal=True,
     )  # fmt: skip
-    good = shown.rows[shown.rows["status"] == "ok"]
+    good = arranged.rows[arranged.rows["status"] == "ok"]
     if good.empty:
         return Views(["No cell gave a result: the table has the reason of each."], [lines], remarks=reasons(rows))
     good = good.assign(
-        problem=problem_names(shown, ["scene", "contact", "integrator"], always=["scene"], rows=good),
-        engine=problem_names(shown, ["backend"], shown.axes, always=["backend"], rows=good),
+        problem=problem_names(arranged, ["scene", "contact", "integrator"], always=["scene"], rows=good),
+        engine=problem_names(arranged, ["backend"], arranged.axes, always=["backend"], rows=good),
     )
     findings = [errors(good), iterations(good)]
     return Views(findings, [lines], [_chart(experiment, good, findings[0])], remarks=reasons(rows))
@@ -71,9 +71,7 @@ def iterations(good: pd.DataFrame) -> str:
         above = part[part["gradient_error_rel"] > CONVERGED]["iterations"]
         enough = part[part["iterations"] > (above.max() if len(above) else 0)]["iterations"]
         texts.append(f"{problem} {f'{enough.min():g}' if len(enough) else 'more than measured'}")
-    return (
-        f"Iterations, of those measured, from which on the error is below {number(CONVERGED, 1)}: {', '.join(texts)}."
-    )
+    return f"Measured iterations from which on the error is below {number(CONVERGED, 1)}: {', '.join(texts)}."
 
 
 def _chart(experiment: Experiment, good: pd.DataFrame, title: str) -> Chart:
