@@ -39,7 +39,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     own = [replace(known[name], digits=3) for name in ("solver_residual", *SHOWN)]
     lines = Table(
         "solver", tried, [*(COMMON.get(name, Column(name)) for name in labels), *own, COMMON["status"]],
-        table(experiment, rows), "gradients along the iterations of the constraint solver", NOTES, terminal=True,
+        "gradients along the iterations of the constraint solver", NOTES, terminal=True, data=table(experiment, rows),
     )  # fmt: skip
     good = arranged.rows[arranged.rows["status"] == "ok"]
     if good.empty:
@@ -65,7 +65,7 @@ def errors(good: pd.DataFrame) -> str:
 
 
 def iterations(good: pd.DataFrame) -> str:
-    """Return the fewest iterations from which on all gradients are those of the converged program, by problem."""
+    """Return the fewest iterations from which on all gradients equal the converged program's, by problem."""
     texts = []
     for problem, part in good.groupby("problem", sort=False):
         above = part[part["gradient_error_rel"] > CONVERGED]["iterations"]
