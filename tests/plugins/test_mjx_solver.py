@@ -25,7 +25,7 @@ AGREES = 1e-6
 ARM = (
     program.Mechanism(
         "arm on a slide, both at their limits, with friction loss",
-        '<body pos="0 0 1"><joint type="slide" axis="1 0 0" limited="true" range="-1 .0023" frictionloss=".2"/>'
+        '<body pos="0 0 1"><joint type="slide" axis="1 0 0" limited="true" range="-1 .0023" solimplimit=".5 .95 .02" frictionloss=".2"/>'
         '<geom type="sphere" size=".1" mass="1"/><body><joint type="hinge" axis="0 1 0" frictionloss=".1"/>'
         '<geom type="sphere" size=".1" pos=".2 0 0" mass="1"/></body></body>',
         (1.0, 3.0),
