@@ -283,7 +283,7 @@ def estimate(
     unbiased = method.declares_unbiased(program)
     if not truth.is_finite:
         summary = statistics.summarise_without_reference(values, samples, truth.note)
-        return Estimates(values, truth.gradient, truth.method, summary, diagnostics)
+        return Estimates(problem, label(method), samples, values, truth.gradient, truth.method, summary, diagnostics)
     summary = statistics.summarise(values, truth.known(), samples, unbiased=unbiased)
     summary = replace(summary, note="; ".join(part for part in (summary.note, truth.note) if part))
     return Estimates(problem, label(method), samples, values, truth.gradient, truth.method, summary, diagnostics)

@@ -123,10 +123,10 @@ def _disabled(bit: Any, model: Any, lean: bool) -> int:
     return int(off)
 
 
-def has_friction(program: Program) -> bool:
-    """Return whether a contact of the scene's twin has friction directions."""
+def contact_dimensions(program: Program) -> set[int]:
+    """Return the dimensions (condim) of the contacts of the scene's twin: 1 without friction, 3 with friction."""
     import mujoco
 
     assert isinstance(program.scene, EngineTwin)
     model = mujoco.MjModel.from_xml_string(f"<mujoco>{program.scene.mjcf()}</mujoco>")
-    return bool((model.pair_dim > 1).any())
+    return {int(dimension) for dimension in model.pair_dim}

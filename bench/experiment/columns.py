@@ -136,6 +136,11 @@ HIDDEN = (
     text(
         "parameters", "JSON with every parameter of every plugin, defaults included: the cell's identity", table=False
     ),
+    Column(
+        "solver_residual",
+        "largest residual of the engine's constraint solver along rollouts, relative to the forces of a step",
+        table=False,
+    ),
     Column("wall_s", "seconds spent on the cell in total", "s", table=False),
     Column("stored_at", "time of storing, in seconds since 1970", "s", table=False),
     Column(

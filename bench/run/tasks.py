@@ -11,6 +11,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint
 from bench.experiment.study import Study, study_of
+from bench.measure import noise
 from bench.model import Backend, guard
 from bench.run.plan import versions
 from bench.run.pool import Answer
@@ -21,6 +22,8 @@ MAX_REASON = 2000
 """Length of the longest stored reason, in characters."""
 FAILED = ("error", "crashed", "timeout")
 """Statuses of cells that failed."""
+CONVERGED = {"float64": 1e-8, "float32": 1e-4}
+"""Largest relative residual of a constraint solver that has converged, by type of the simulation."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +85,28 @@ def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
         raise
     except BaseException as error:  # a plugin that exits must not end a run in this process
         return dict(failure(error))
-    if cell.timing:
-        return result
-    blank = study.columns.blank()
-    return result | {name: blank[name] for name in study.columns.measured}
+    if not cell.timing:
+        blank = study.columns.blank()
+        result |= {name: blank[name] for name in study.columns.measured}
+    return result | solver_columns(cell, session, result)
+
+
+def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict[str, Any]:
+    """Return the residual of the backend's constraint solver, with a remark in ``reason`` where it has not converged.
+
+    A backend whose steps solve for contact forces iteratively has a method ``solver_residual(problem, w)``: the largest
+    residual along rollouts from theta0 with noise ``w (n_w, B)``, relative to the forces of a step.
+    """
+    solver_residual = getattr(cell.parts.get("backend"), "solver_residual", None)
+    if solver_residual is None or result["status"] != "ok":
+        return {}
+    program = cell.program()
+    w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, program.n_noise)[0].T
+    residual = float(solver_residual(session.problem(cell), w))
+    if not residual > CONVERGED[cell.backend.dtype]:
+        return {"solver_residual": residual}
+    remark = f"the constraint solver has not converged (relative residual {residual:.1e}): more iterations give another gradient"
+    return {"solver_residual": residual, "reason": "; ".join(filter(None, (result.get("reason", ""), remark)))}
 
 
 def group_by_program(tasks: list[Task]) -> list[list[Task]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import io
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -11,18 +11,20 @@ import numpy as np
 
 from bench.model import Array, Backend, Ops, Problem, Program, Rollout, State, param, rollout
 
-from .. import mjcf
+from .. import mjcf, mjx_solver
 from .jax import Jax, JaxProblem
 
 FORWARD_UP_TO = 8
 """Maximum length of theta for forward mode: reverse mode costs as much as this number of directions."""
 LARGEST = 1e10
 """Maximum absolute value in a state; MuJoCo stops a rollout at larger values (``mjMAXVAL``)."""
+RESIDUAL_SAMPLES = 16
+"""Rollouts in which the residual of the constraint solver is measured."""
 
 
 @dataclass(frozen=True)
 class Mjx(Jax):
-    """Gradients: exact derivative of MJX's steps, forward or reverse mode; float64 or float32.
+    """Gradients: derivative of MJX's steps with one solver iteration or the converged solver; float64 or float32.
 
     Steps the scene's MJCF twin with MJX's own integrator and contact solver, compiled by XLA. The whole model is
     traced: stiffness, damping, masses, sizes and time step change without recompilation. Costs, policy and noise are
@@ -41,6 +43,11 @@ class Mjx(Jax):
     integrator: str = param("euler", "MJX's integrator", choices=("euler", "implicitfast", "rk4"))
     solver: str = param("newton", "MJX's constraint solver", choices=("newton", "cg"))
     cone: str = param("pyramidal", "friction cone", choices=("pyramidal", "elliptic"))
+    derivative: str = param(
+        "auto",
+        "through the iterations of the constraint solver, or implicit: through its converged solution; auto: implicit for iterations > 1",
+        choices=("auto", "implicit", "unrolled"),
+    )
     iterations: int = param(1, "maximum iterations of the constraint solver; 1 is exact for springs", positive=True)
     ls_iterations: int = param(4, "maximum iterations of the solver's line search", positive=True)
     lean: bool = param(True, "switch off all engine features that the scene does not use")
@@ -53,24 +60,71 @@ class Mjx(Jax):
     def unsupported_reason(self, program: Program) -> str | None:
         """Return why the program cannot run: it has no twin, or MJX cannot differentiate it; or None."""
         reason = mjcf.unsupported_reason(self, program)
-        if reason is None and self.mode == "reverse" and self.iterations > 1:
+        if reason is None and self.cone == "elliptic":
+            reason = self._elliptic_reason(mjcf.contact_dimensions(program))
+        if reason is None and not self.is_implicit and self.mode == "reverse" and self.iterations > 1:
             return (
-                f"MJX's solver has no reverse mode with iterations={self.iterations}: use mode=forward or iterations=1"
+                f"MJX's solver has no reverse mode with iterations={self.iterations} and derivative=unrolled: use "
+                "derivative=implicit, mode=forward or iterations=1"
             )
-        if reason is None and self.cone == "elliptic" and mjcf.has_friction(program):
-            return "MJX's derivatives are NaN with elliptic friction cones: use cone=pyramidal"
         return reason
+
+    def _elliptic_reason(self, dimensions: set[int]) -> str | None:
+        """Return why contacts of these dimensions exclude elliptic cones, or None."""
+        if 1 in dimensions:
+            return "MJX has no contacts without friction beside elliptic cones: use cone=pyramidal, which is the same there"
+        if dimensions and not self.is_implicit:
+            return (
+                "MJX's derivatives through the iterations of its solver are NaN with elliptic friction cones "
+                f"(iterations={self.iterations}, derivative={self.derivative}): use derivative=implicit and iterations=100, "
+                "or cone=pyramidal"
+            )
+        return None
+
+    @property
+    def is_implicit(self) -> bool:
+        """Whether the derivative is that of the solver's converged solution."""
+        return self.derivative == "implicit" or (self.derivative == "auto" and self.iterations > 1)
+
+    def solver_residual(self, problem: Problem, w: np.ndarray) -> float:
+        """Return the largest relative residual of the constraint solver along rollouts from theta0 with noise ``(n_w, B)``.
+
+        It is compared with the forces of a step. NaN if a rollout fails. At most 16 columns of the noise are used.
+        """
+        assert isinstance(problem, MjxProblem)
+        return problem.solver_residual(w)
 
     def _direction(self, program: Program) -> str:
         if self.mode != "auto":
             return self.mode
-        return "reverse" if self.iterations == 1 and program.dim > FORWARD_UP_TO else "forward"
+        has_reverse = self.iterations == 1 or self.is_implicit
+        return "reverse" if has_reverse and program.dim > FORWARD_UP_TO else "forward"
 
 
 class MjxProblem(JaxProblem):
     """A program stepped by MJX, in smaller blocks, since padding columns are expensive."""
 
     grain = 16
+
+    def solver_residual(self, w: np.ndarray) -> float:
+        """Return the largest relative residual of the constraint solver along rollouts from theta0 with ``w (n_w, B)``."""
+        theta = self.program.theta0.reshape(self.dim, 1)
+        (residuals,) = self._parts(self._residuals, theta, w[:, :RESIDUAL_SAMPLES])
+        return float(residuals.max())
+
+    def _residuals(self, parameters: Array, theta: Array, w: Array) -> tuple[Array]:
+        """Return the relative residual of each step's constraint solver, ``(horizon, B)``."""
+        import jax
+
+        program, theta, w = rollout(self.program.bind(parameters)).resolved(self._ops, theta, w)
+        assert isinstance(program, MjxProgram)
+
+        def advance(state: State, slices: Any) -> tuple[State, Array]:
+            u = program.control(self._ops, theta, state, slices)
+            return program.step(self._ops, state, u), program.residual(state, u)
+
+        theta, first, scanned = program.start(self._ops, theta, w)
+        return (jax.lax.scan(advance, first, scanned, program.scene.horizon)[1],)
 
 
 class MjxProgram(Rollout):
@@ -79,14 +133,15 @@ class MjxProgram(Rollout):
     def __init__(self, program: Rollout, backend: Mjx) -> None:
         import jax
 
-        mjx = _library()
+        mjx = mjx_solver.library()
         super().__init__(program.scene, program.contact, program.integrator, program.decision)
         model = mjcf.build(backend, program)
         leaves, self._tree = jax.tree.flatten(mjx.put_model(model))
         self._leaves = [np.asarray(leaf) for leaf in leaves]
         self._model: Any = None
         self._data = mjx.make_data(model)
-        options = tuple(getattr(backend, name) for name in ("integrator", "solver", "cone", "lean"))
+        self._solver = mjx_solver.implicit if backend.is_implicit else contextlib.nullcontext
+        options = tuple(getattr(backend, name) for name in ("integrator", "solver", "cone", "lean", "is_implicit"))
         self._settings = (*options, backend.iterations, backend.ls_iterations, int(model.opt.disableflags))
 
     @property
@@ -122,26 +177,36 @@ class MjxProgram(Rollout):
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
         """Return the state after one MJX step per column; NaN beyond MuJoCo's limit, at which MuJoCo would stop."""
-        import jax
         import jax.numpy as jnp
 
-        mjx, kind = _library(), state.q.dtype
-        data = jax.tree.map(lambda leaf: leaf.astype(kind) if leaf.dtype.kind == "f" else leaf, self._data)
-
-        def column(q: Array, v: Array, u: Array) -> State:
-            after = mjx.step(self._model, data.replace(qpos=q, qvel=v, ctrl=u))
+        def column(data: Any) -> State:
+            after = mjx_solver.library().step(self._model, data)
             return State(after.qpos, after.qvel)
 
+        after: State = self._columns(column, state, u)
+        largest = jnp.maximum(jnp.abs(after.q).max(axis=0), jnp.abs(after.v).max(axis=0))
+        factor = jnp.where(largest <= LARGEST, 1.0, jnp.nan).astype(after.q.dtype)  # makes the gradient NaN too
+        return State(after.q * factor, after.v * factor)
+
+    def residual(self, state: State, u: Array) -> Array:
+        """Return the relative residual of the constraint solver in one step per column, ``(B,)``."""
+
+        def column(data: Any) -> Array:
+            after = mjx_solver.library().forward(self._model, data)
+            return mjx_solver.relative_residual(self._model, after)
+
+        return self._columns(column, state, u)
+
+    def _columns(self, function: Callable[[Any], Any], state: State, u: Array) -> Any:
+        """Return ``function`` of the MJX data of each column, stacked along the last axis."""
+        import jax
+
+        kind = state.q.dtype
+        data = jax.tree.map(lambda leaf: leaf.astype(kind) if leaf.dtype.kind == "f" else leaf, self._data)
+
+        def column(q: Array, v: Array, u: Array) -> Any:
+            return function(data.replace(qpos=q, qvel=v, ctrl=u))
+
         # MJX creates numbers in JAX's default precision
-        with jax.enable_x64(kind == np.float64):
-            after = jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)
-            largest = jnp.maximum(jnp.abs(after.q).max(axis=0), jnp.abs(after.v).max(axis=0))
-            factor = jnp.where(largest <= LARGEST, 1.0, jnp.nan).astype(kind)  # a factor makes the gradient NaN too
-            return State(after.q * factor, after.v * factor)
-
-
-def _library() -> Any:
-    """Return ``mujoco.mjx`` without printing its messages about missing optional parts."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        from mujoco import mjx
-    return mjx
+        with jax.enable_x64(kind == np.float64), self._solver():
+            return jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)

@@ -176,8 +176,10 @@ def test_stiffness_and_mass_compile_nothing_anew(mode):
         (Mujoco(), compose(DoublePendulum(), None, SemiImplicitEuler()), "no MJCF twin"),
         (Mujoco(), compose(WallPenalty1d(), law_for(WallPenalty1d(), Penalty), SemiImplicitEuler()), "never pull"),
         (Mujoco(dtype="float32"), program(Pushing()), "double precision"),
-        (Mjx(mode="reverse", iterations=2), program(Pushing()), "no reverse mode"),
+        (Mjx(mode="reverse", iterations=2, derivative="unrolled"), program(Pushing()), "use derivative=implicit, mode="),
         (Mjx(cone="elliptic"), program(TossedBox()), "NaN"),
+        (Mjx(cone="elliptic", iterations=9, derivative="unrolled"), program(TossedBox()), "use derivative=implicit and"),
+        (Mjx(cone="elliptic", iterations=9), program(Pushing()), "without friction beside elliptic cones"),
         (Mjx(integrator="rk4"), program(Pendulum()), "not semi_implicit_euler"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -187,8 +189,11 @@ def test_what_an_engine_cannot_do_is_refused(engine, of, reason):
 
 
 def test_allowed_settings_are_not_refused():
-    for engine in (Mjx(), Mjx(iterations=5), Mjx(mode="reverse"), Mjx(cone="elliptic"), Mujoco(cone="elliptic")):
+    for engine in (Mjx(), Mjx(iterations=5), Mjx(mode="reverse", iterations=5), Mujoco(cone="elliptic")):
         assert engine.unsupported_reason(program(Pushing())) is None
+    for cone in ("pyramidal", "elliptic"):
+        assert Mjx(cone=cone, iterations=5, mode="reverse").unsupported_reason(program(TossedBox())) is None
+    assert Mjx(cone="elliptic").unsupported_reason(program(Pendulum())) is None
     assert Mjx(integrator="rk4").unsupported_reason(compose(Pendulum(), None, Rk4())) is None
 
 

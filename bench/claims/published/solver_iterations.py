@@ -1,0 +1,60 @@
+"""E1: with one iteration of the contact solver, an engine's gradient on a robot has the other sign."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.toolkit import problem
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ANKLE = 1
+"""The coordinate of theta: the torque of a front leg's ankle."""
+ITERATIONS = (1, 2, 3, 4, 6, 10)
+
+
+class SolverIterations(Claim):
+    """A robot with four legs lands on the ground with friction, at the engines' usual impedance of 0.9."""
+
+    name = "E1"
+    lesson = "Solver iterations"
+    statement = "MJX's reverse mode needs one iteration of the contact solver, and on a robot its gradient then has the other sign."
+    source = "this project, docs/engines.md"
+    learned = (
+        "A gradient can be exact for a solver that stopped early. Differentiate through the converged solution instead."
+    )
+    quick = False
+    labels = ("iterations of the contact solver", "d(-x) / d(ankle torque) [m/(N m)]")
+
+    def measure(self) -> Outcome:
+        """Compute one derivative with MJX in reverse mode, and with chained differences of MuJoCo's steps in C."""
+        figures: list[Figure] = []
+        for iterations, published in ((1, "-0.003658"), (20, "0.003351")):
+            backend = f"mjx[impedance=0.9,mode=reverse,iterations={iterations}]"
+            figures.append(Figure(f"MJX, iterations={iterations}", published, _slope(backend)))
+        in_c = [
+            _slope(f"mujoco[impedance=0.9,iterations={iterations},ls_iterations={4 if iterations == 1 else 50}]")
+            for iterations in ITERATIONS
+        ]
+        figures.append(Figure("MuJoCo in C, iterations=1", "-0.003658", in_c[0]))
+        figures.append(Figure("MuJoCo in C, iterations=10", "0.003351", in_c[-1]))
+        in_mjx = [figure.measured for figure in figures[:2]]
+        return Outcome(figures, series={"iterations": list(ITERATIONS), "c": in_c, "mjx": in_mjx})
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw the derivative along the iterations."""
+        axes.axhline(0.0, color="grey", linewidth=0.7)
+        axes.plot(series["iterations"], series["c"], marker="o", label="MuJoCo in C, differences")
+        axes.plot([1, 20], series["mjx"], "x", markersize=9, label="MJX, reverse mode")
+        axes.set_xscale("log")
+
+
+def _slope(backend: str) -> float:
+    """Return the derivative of minus the ant's forward position after 30 steps by an ankle's torque."""
+    ant = problem("ant[horizon=30]", backend=backend)
+    return float(ant.grad(ant.program.theta0, np.zeros((ant.program.n_noise, 1)))[ANKLE, 0])

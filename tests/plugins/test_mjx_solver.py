@@ -1,0 +1,197 @@
+"""Gradients through MJX's converged solver agree with differences and forward mode, and dropped terms are caught."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from bench.plugins.backends.mjx import Mjx
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.tossed_box import TossedBox
+from programs import mjx_solver as program
+
+from bench.cli import main
+from bench.conformance.subjects import law_for
+from bench.model import compose, registry
+from bench.plugins import mjx_solver
+
+for _name in ("mujoco", "mjx"):
+    _entry = registry.find("backends", _name)
+    if not _entry.available:
+        pytest.skip(f"backend {_name} is {_entry.reason}", allow_module_level=True)
+
+AGREES = 1e-6
+"""Relative difference from central differences allowed, and absolute difference for small derivatives."""
+ARM = (
+    program.Mechanism(
+        "arm on a slide, both at their limits, with friction loss",
+        '<body pos="0 0 1"><joint type="slide" axis="1 0 0" limited="true" range="-1 .0023" solimplimit=".5 .95 .02" frictionloss=".2"/>'
+        '<geom type="sphere" size=".1" mass="1"/><body><joint type="hinge" axis="0 1 0" frictionloss=".1"/>'
+        '<geom type="sphere" size=".1" pos=".2 0 0" mass="1"/></body></body>',
+        (1.0, 3.0),
+    ),
+)
+LOOP = next(mechanism for mechanism in program.MECHANISMS if "connect" in mechanism.name)
+
+
+# ------------------------------------------------------------------------------------------- without compilation
+
+
+@pytest.mark.parametrize(
+    ("backend", "is_implicit"),
+    [
+        (Mjx(), False),
+        (Mjx(iterations=2), True),
+        (Mjx(iterations=2, derivative="unrolled"), False),
+        (Mjx(derivative="implicit"), True),
+    ],
+)
+def test_more_than_one_iteration_means_the_implicit_derivative(backend, is_implicit):
+    assert backend.is_implicit is is_implicit
+
+
+def test_engine_has_its_own_solver_outside_the_context():
+    from mujoco.mjx._src import solver
+
+    own = mjx_solver.library().solve
+    with mjx_solver.implicit():
+        assert solver.solve is mjx_solver.solve
+    assert solver.solve is own
+    with pytest.raises(AttributeError), mjx_solver.implicit():
+        mjx_solver.solve(None, None)
+    assert solver.solve is own
+
+
+def row(residual, tmp_path, monkeypatch):
+    """Return the row of a backend whose solver has this residual."""
+
+    def solver_residual(self, problem, w):
+        assert w.shape == (problem.program.n_noise, 3)
+        return residual
+
+    monkeypatch.setattr(Numpy, "solver_residual", solver_residual, raising=False)
+    words = [
+        "scenes=[double_integrator]",
+        "backends=[numpy]",
+        "estimators=[fobg]",
+        "samples=3",
+        "repeats=2",
+        "workers=0",
+    ]
+    assert main([*words, "name=mine", "timing=false", "reference.samples=256", f"results_dir={tmp_path}"]) == 0
+    return pd.read_parquet(tmp_path / "mine" / "rows.parquet").iloc[0]
+
+
+def test_row_has_the_residual_and_a_remark_where_the_solver_has_not_converged(tmp_path, monkeypatch):
+    found = row(1e-3, tmp_path, monkeypatch)
+    assert found["solver_residual"] == 1e-3
+    assert "the constraint solver has not converged (relative residual 1.0e-03)" in found["reason"]
+    assert found["status"] == "ok"
+
+
+def test_row_of_a_converged_solver_has_no_remark(tmp_path, monkeypatch):
+    found = row(1e-12, tmp_path, monkeypatch)
+    assert found["solver_residual"] == 1e-12
+    assert "converged" not in found["reason"]
+
+
+@pytest.mark.slow
+def test_mjx_loses_the_derivative_of_a_rotation_by_an_angular_velocity_of_zero():
+    """A limit of MJX, named in the documentation: were it repaired, the documentation would be wrong."""
+    import jax
+    from mujoco.mjx._src import math
+
+    def turned(rate):
+        return math.quat_integrate(np.array([1.0, 0, 0, 0]), rate, 0.01)
+
+    assert np.all(jax.jacfwd(turned)(np.zeros(3)) == 0)
+    np.testing.assert_allclose(jax.jacfwd(turned)(np.array([0.01, 0, 0]))[1, 0], 0.005, rtol=1e-4)
+
+
+# ------------------------------------------------------------------------------------------------------- agreement
+
+
+def assert_agreement(table, has_reverse=True):
+    for name, (reverse, forward, difference) in table.items():
+        if has_reverse:
+            assert reverse == pytest.approx(forward, rel=1e-9, abs=1e-12), name
+        assert difference == pytest.approx(forward, rel=AGREES, abs=1e-9), name
+
+
+def is_wrong():
+    """Return whether the derivative in forward mode disagrees with differences on an arm and a closed loop."""
+    table = program.agreement("pyramidal", "Newton", reverse=False, mechanisms=(*ARM, LOOP))
+    try:
+        assert_agreement(table, has_reverse=False)
+    except AssertionError:
+        return True
+    return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["Newton", "CG"])
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_derivatives_of_twenty_mechanisms_agree_with_differences_and_forward_mode(cone, solver):
+    table = program.agreement(cone, solver)
+    assert len(table) == 20
+    assert_agreement(table)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+def test_derivatives_agree_with_every_integrator(integrator):
+    assert_agreement(program.agreement("pyramidal", "Newton", mechanisms=ARM, integrator=integrator))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dropped", ["_impl.efc_J", "_impl.efc_aref", "_impl.efc_D", "_impl.M", "qfrc_smooth"])
+def test_dropped_term_of_the_derivative_is_caught(dropped, monkeypatch):
+    import jax
+
+    gradient = mjx_solver._cost_gradient
+
+    def incomplete(model, data, acceleration):
+        part = data
+        for name in dropped.split("."):
+            part = getattr(part, name)
+        return gradient(model, data.tree_replace({dropped: jax.lax.stop_gradient(part)}), acceleration)
+
+    monkeypatch.setattr(mjx_solver, "_cost_gradient", incomplete)
+    assert is_wrong()
+
+
+@pytest.mark.slow
+def test_derivative_without_a_planted_fault_is_right():
+    assert not is_wrong()
+
+
+@pytest.mark.slow
+def test_elliptic_cone_in_reverse_agrees_with_differences_of_the_backends_own_costs():
+    scene = TossedBox(horizon=120)
+    law = law_for(scene, Penalty, {"damping_mode": "clipped"})
+    problem = Mjx(impedance=0.9, cone="elliptic", iterations=50, mode="reverse").compile(
+        compose(scene, law, SemiImplicitEuler())
+    )
+    theta, w = scene.theta0(), np.zeros((3, 16))
+    shifts = np.zeros((3, 16))
+    for i in range(3):
+        shifts[i, 2 * i : 2 * i + 2] = 1e-6, -1e-6
+    values = problem.value(theta[:, None] + shifts, w)
+    differences = (values[0:6:2] - values[1:6:2]) / 2e-6
+    np.testing.assert_allclose(problem.grad(theta, w)[:, 0], differences, rtol=1e-6)
+    assert problem.solver_residual(w) < 1e-8
+
+
+def test_study_of_the_solver_finds_the_wrong_sign_of_one_iteration(tmp_path):
+    words = ["study=solver", "scenes=[ant]", "backends=[mujoco,jax]", "backend.mujoco.impedance=0.9", "name=mine"]
+    words += ["sweep.iterations=[1,100]", "samples=1", "workers=0", "timing=false"]
+    assert main([*words, f"results_dir={tmp_path}"]) == 0
+    rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet")
+    assert {"solver.png", "solver.md", "solver.csv"} <= {path.name for path in (tmp_path / "mine").iterdir()}
+    first, last = (rows[(rows["status"] == "ok") & (rows["iterations"] == n)].iloc[0] for n in (1, 100))
+    assert first["gradient"][1] == pytest.approx(-0.003658, abs=5e-7)
+    assert last["gradient"][1] == pytest.approx(0.003351, abs=5e-7)
+    assert first["wrong_signs"] == 0.25
+    assert last["wrong_signs"] == last["gradient_error_rel"] == 0
+    refused = rows[rows["status"] == "unsupported"]
+    assert refused["reason"].str.contains("no parameter iterations|runs only in physics engines").all()
