@@ -37,9 +37,8 @@ HOSTILE = (
 """Names that would do something if they were taken for HTML, or for a part of the page's template."""
 
 
-CLOUD, ALONG = (
-    "charts.find((c) => c.table.startsWith('%s'))" % name for name in ("error_against_time", "bias_variance_")
-)
+CLOUD = "charts.find((c) => c.table === 'error_against_time')"
+ALONG = "charts.find((c) => c.table.startsWith('bias_variance_'))"
 """The charts of errors against time and along an axis, in the page's script."""
 
 
