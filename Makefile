@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m bench
 
-.PHONY: run test lint slow docs gallery examples clean
+.PHONY: run test lint slow docs site gallery examples clean
 
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
@@ -20,15 +20,19 @@ lint: $(VENV)/.installed
 	$(BIN)/mypy
 	$(BIN)/python tests/programs/words.py
 
-# The generated pages: gallery, columns and API.
+# The generated parts of the documents: findings, columns and marked figures.
 docs: $(VENV)/.installed
-	$(BIN)/python docs/build.py
+	$(BIN)/python -m docs.build
 
-# Run the missing cells of all experiments into results/standard, then build the gallery from them.
+# The site as HTML, from the documents and the stored results: build/site/html/index.html.
+site: $(VENV)/.installed
+	$(BIN)/python -m docs.build site
+
+# Run the missing cells of all experiments into results/standard, then write findings and figures into the documents.
 gallery: $(VENV)/.installed
 	for name in $$(cd conf/experiment && find * -name '*.yaml' | sed 's/\.yaml$$//' | sort); do \
 	  $(RUN) +experiment=$$name results_dir=results/standard || exit 1; done
-	$(BIN)/python docs/build.py gallery
+	$(BIN)/python -m docs.build results figures
 
 # The examples on other people's engines, in environments of their own: their pins and ours do not live together.
 examples: .venv-engines/.installed .venv-nimble/.installed

@@ -24,6 +24,8 @@ PAGES = [
     *(ROOT / folder / "README.md" for folder in ("plugins", "conf", "results")), *(ROOT / "docs" / name for name in DOCS),
 ]  # fmt: skip
 EXAMPLES = dict(re.findall(r"```python\n# (\S+\.py)\n(.*?)```", DOCS["extending.md"], re.DOTALL))
+START = 2500
+"""Most words of what one reads to begin: the README, how to read a result, and Python."""
 SOFT = "# @package _global_\nscenes: [heaviside]\nbackends: [numpy]\n"
 """The experiment that docs/experiments.md has the reader write."""
 
@@ -102,12 +104,29 @@ def test_every_page_is_linked_from_the_readme():
         assert f"(docs/{name}" in README, name
 
 
+def test_start_takes_few_words():
+    start = [README, DOCS["reading-results.md"], DOCS["python.md"]]
+    assert sum(len(text.split()) for text in start) < START
+
+
+def test_installation_names_this_package():
+    name = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["name"]
+    for path in PAGES:
+        for requirement in re.findall(r"pip install[^\n]*?[\s'\"]([\w-]+)\[", path.read_text()):
+            assert requirement in (name, "tesseract-core"), path
+
+
+def test_own_sweeps_in_documents_have_names_of_their_own():
+    for page, words in COMMANDS:
+        name = next((word.removeprefix("name=") for word in words if word.startswith("name=")), "")
+        assert name not in config.experiments(), (page, words)
+
+
 def test_every_scene_and_experiment_is_described():
     for name in registry.entries()["scenes"]:
         assert f"| `{name}` |" in DOCS["experiments.md"]
     for name in config.experiments():
-        assert f"| `{name}` |" in README
-        assert f"| `{name}` |" in DOCS["experiments.md"]
+        assert f"\n## {name}\n" in DOCS["results.md"]
 
 
 def test_every_command_and_setting_is_described():

@@ -1,0 +1,1 @@
+"""The documents: their generated parts, their figures, and the site."""

@@ -1,0 +1,341 @@
+"""Figures in the documents: each stands between two marks, and is written again from the stored results.
+
+A document has ``<!--=name-->231<!--/-->``, where ``name`` is a key of :data:`FIGURES`. Renderers hide the marks.
+``python -m docs.build figures`` writes the present values, and a test fails where a document has another one.
+
+A section whose figures come from a command that takes long has ``<!-- figures: COMMAND -->``; one whose numbers are
+definitions, settings or published by others has ``<!-- figures: given -->``.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.report.text import number
+from bench.studies.bias_variance import trust
+from docs.results import STANDARD, comparison, rmse_interval, rows_of, select
+
+MARK = re.compile(r"<!--=([\w.-]+)-->(.*?)<!--/-->", re.DOTALL)
+SOURCE = re.compile(r"<!-- figures: (.*?) -->\n?")
+FOUR = ("fobg", "reinforce", "randomized_smoothing", "inverse_variance")
+SOFT, STIFF = (0.0, 3000.0), (1e4, 1e6)
+"""Stiffnesses [N/m] of ``stiffness_sweep`` below and above the limit of the step."""
+
+
+def span(values: Any, digits: int = 2, suffix: str = "") -> str:
+    """Return the smallest and largest value, ``0.10 to 0.15``, or one number if both look the same.
+
+    Raises LookupError if a value is missing.
+    """
+    if not np.size(values) or not np.all(np.isfinite(values)):
+        raise LookupError(f"not finite: {values}")
+    low, high = (number(float(value), digits) + suffix for value in (np.min(values), np.max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
+def percent(share: float) -> str:
+    """Return a share as a percentage with two digits."""
+    return f"{number(100 * share)}%"
+
+
+def count(value: float, zero: str = "0") -> str:
+    """Return a whole number with commas between thousands; ``zero`` replaces 0."""
+    return f"{int(value):,}" if value else zero
+
+
+def pushing(estimator: str, contact: str = "penalty", sigma: float = 0.1, **conditions: Any) -> pd.DataFrame:
+    """Return rows of ``stiffness_sweep`` of an estimator with its default parameters, on compiling backends."""
+    rows = select(rows_of("stiffness_sweep"), estimator=estimator, estimator_params="", contact=contact, sigma=sigma)
+    backend = {"backend": "implicit" if contact == "complementarity" else "jax"}
+    return select(rows, status="ok", **{**backend, **conditions})
+
+
+def interval(rows: pd.DataFrame) -> str:
+    """Return the relative RMSE of the only row with its 95% interval."""
+    (value,), (low,), (high,) = rows["rmse_rel"], *rmse_interval(rows)
+    return f"{number(value)} [{number(low)}, {number(high)}]"
+
+
+def implicit_time() -> pd.Series:
+    """Return the time of an implicit contact's estimate over that of the explicit contact on ``jax``, by stiffness."""
+    implicit, explicit = (
+        pushing("fobg", contact).set_index("stiffness")["time_s"] for contact in ("complementarity", "penalty")
+    )
+    return implicit / explicit
+
+
+@cache
+def trusted(*estimators: str) -> dict[str, Any]:
+    """Return the counts of the rule on the spread: cells, trusted cells, wrong ones among both, and the worst error."""
+    rows = trust.cells(STANDARD, estimators)
+    keep, wrong = trust.spread(rows) < trust.SPREAD, rows["rmse_rel"] >= trust.WRONG
+    worst = number(rows.loc[keep, "rmse_rel"].max())
+    others, missed = (~keep).sum(), (~keep & ~wrong).sum()
+    return dict(
+        cells=len(rows), trusted=keep.sum(), wrong=(keep & wrong).sum(), worst=worst, others=others, missed=missed
+    )
+
+
+def three_errors(**conditions: Any) -> pd.DataFrame:
+    """Return the gradients of ``three_errors``, once each, although two estimators have rows of them."""
+    rows = select(rows_of("three_errors"), status="ok", **conditions)
+    return rows.drop_duplicates(
+        ["scene", "contact", "integrator", "backend", "horizon", "dt", "stiffness", "smoothing"]
+    )
+
+
+def confirmed() -> pd.DataFrame:
+    """Return the gradients of ``three_errors`` that agree with differences of their program to 0.1%."""
+    return three_errors().query("program_error_rel < 1e-3")
+
+
+def trap(**conditions: Any) -> pd.DataFrame:
+    """Return ``bounce_once`` with an impulse at the step boundary, from large to small steps."""
+    contact = "impulse[time_of_impact=false]"
+    return three_errors(scene="bounce_once", contact=contact).sort_values("dt", ascending=False)
+
+
+def stability(**conditions: Any) -> pd.DataFrame:
+    """Return the rows of ``stability_map`` that were simulated."""
+    return select(rows_of("stability_map").query("verdict != ''"), **conditions)
+
+
+def right(scene: str, law: str = "") -> pd.Series:
+    """Return the share of right cells of the stability map by integrator, for a scene at any damping, and a law."""
+    rows = stability()
+    rows = rows[(rows["scene"].str.partition("[")[0] == scene) & (not law or rows["contact"] == law)]
+    return (rows["verdict"] == "ok").groupby(rows["integrator"]).mean()
+
+
+def wrong_gradients() -> pd.DataFrame:
+    """Return the rows of ``stability_map`` with a finite but wrong gradient."""
+    return stability().query("verdict in ['inaccurate', 'wrong_sign', 'zero']")
+
+
+def causes(stiffness: float) -> pd.Series:
+    """Return the causes of wrong gradients with a penalty spring of some stiffness [N/m], at any damping."""
+    rows = wrong_gradients()
+    return rows[rows["contact"].str.startswith("penalty") & (rows["stiffness"] == stiffness)]["cause"]
+
+
+def score(method: str, column: str = "rmse_rel", **conditions: Any) -> float:
+    """Return one number of the only row of an estimator."""
+    (value,) = select(rows_of(conditions.pop("experiment")), estimator=method, **conditions)[column]
+    return float(value)
+
+
+CONTACT, JUMP = "pushing, penalty", "heaviside[theta=0.05]"
+"""The stiff contact and the jump of ``estimators``."""
+
+
+def estimators(estimator: str, params: str = "", column: str = "rmse_rel", **conditions: Any) -> pd.Series:
+    """Return a column of ``estimators`` for a setting, by problem or of one problem."""
+    rows = select(comparison("estimators"), estimator=estimator, estimator_params=params, **conditions)
+    return rows[column]
+
+
+def windows(params: str, scene: str = "") -> pd.DataFrame:
+    """Return the supported rows of ``windows`` whose windows are shorter than the horizon, with some terminal value."""
+    rows = rows_of("windows")
+    keep = rows["estimator_params"].str.endswith(params) & (rows["estimator"] == "windowed")
+    keep &= (rows["status"] == "ok") & rows["scene"].str.startswith(scene) & (rows["steps"] < rows["horizon"])
+    return rows[keep]
+
+
+def short_windows() -> pd.DataFrame:
+    """Return the rows of ``windows`` without a terminal value and with windows of up to half the horizon."""
+    rows = windows("")
+    return rows[~rows["estimator_params"].str.contains("terminal") & (rows["steps"] <= rows["horizon"] / 2)]
+
+
+def window_lqr() -> str:
+    """Return how the error of a learned terminal value falls with the length of the window, on ``lqr``."""
+    rows = windows("learned", "lqr").sort_values("steps").iloc[[0, -1]]
+    (first, last), (short, long) = (number(value) for value in rows["rmse_rel"]), rows["steps"]
+    return f"{first} at {short:.0f} step to {last} at {long:.0f}"
+
+
+def learning_rates() -> pd.DataFrame:
+    """Return the score of each method over the learning rates, the best first."""
+    return pd.read_csv(STANDARD / "learning_rates" / "summary.csv").sort_values("score", ascending=False)
+
+
+def learning_rates_table() -> str:
+    """Return the scores of ``learning_rates`` as a Markdown table."""
+    rows = [
+        f"| {row.method} | {row.score:.3f} [{row.score_low:.3f}, {row.score_high:.3f}] | {number(float(row.median_score))} |"
+        for row in learning_rates().itertuples()
+    ]
+    head = ["| method | score at its best rate on each problem | median over the rates |", "|---|--:|--:|"]
+    return block([*head, *rows])
+
+
+def block(lines: list[str]) -> str:
+    """Return lines as a block that stands between its marks on lines of their own."""
+    return "\n" + "\n".join(lines) + "\n"
+
+
+def diverged(experiment: str) -> str:
+    """Return how many of an experiment's searches diverged."""
+    rows = rows_of(experiment)
+    return f"{(rows['status'] == 'diverged').sum()} of {count(len(rows))}"
+
+
+def fits(column: str, integrator: str, methods: tuple[int, ...], scene: str = "mass_spring_damper") -> np.ndarray:
+    """Return a number of each case of ``identify`` for methods of shooting: 0 single, 1 multiple, 2 windows."""
+    rows = rows_of("identify")
+    rows = rows[rows["scene"].str.startswith(scene) & (rows["integrator"] == integrator)]
+    values = np.array([values[method] for values in rows[column] for method in methods], dtype=float)
+    return np.asarray(values[np.isfinite(values)])
+
+
+def hidden() -> str:
+    """Return how many fits of ``identify`` had more identifiable directions than the record, of how many."""
+    rows = rows_of("identify")
+    known = [np.isfinite(np.array(values, dtype=float)) for values in rows["hidden"]]
+    total = sum(fits * keep.sum() for fits, keep in zip(rows["fits"], known, strict=True))
+    return f"{count(sum(np.sum(values) for values in rows['hidden']))} of {count(total)}"
+
+
+@cache
+def speeds() -> dict[str, float]:
+    """Return the lines of the stored run of ``bench-self`` by name."""
+    lines = json.loads((STANDARD / "bench_self" / "bench_self.json").read_text())["lines"]
+    return {line["what"]: line["value"] for line in lines if line["value"] is not None}
+
+
+BATCHES = ("1000", "10000", "100000", "1e+06")
+
+
+def speed(name: str) -> list[float]:
+    """Return the values of ``bench-self`` whose name, without the number of rollouts, is ``name``; ``*`` for the number."""
+    return [speeds()[key] for batch in BATCHES if (key := name.replace("*", batch)) in speeds()]
+
+
+def rollouts_table() -> str:
+    """Return microseconds per rollout by backend and batch as a Markdown table."""
+    c = speed("native C kernel, one thread, * rollouts")
+    lines = [
+        ("`fused` gradient", "0.6", speed("fused grad, penalty, * rollouts")),
+        ("`jax` gradient", "1.2", speed("jax grad, penalty, * rollouts")),
+        ("`implicit` gradient", "6", speed("implicit grad, complementarity, * rollouts")),
+        ("`torch` gradient", "25", speed("torch grad, penalty, * rollouts")),
+        ("`numpy` cost", "8", speed("numpy value, penalty, * rollouts")),
+        ("plain NumPy loop, gradient", "", speed("plain NumPy loop with its adjoint, * rollouts")),
+        ("C loop, gradient", "", c),
+    ]
+    head = [
+        "| microseconds per rollout | target | 1,000 | 10,000 | 100,000 | 1,000,000 | times the C loop |",
+        "|---" + "|--:" * 6 + "|",
+    ]
+    return block(head + [
+        f"| {name} | {target} | " + " | ".join([*map(number, values), *[""] * (4 - len(values))])
+        + f" | {span(np.divide(values, c[: len(values)]))} |"
+        for name, target, values in lines
+    ])  # fmt: skip
+
+
+def scenes_table() -> str:
+    """Return the time of ``fused`` over that of ``jax`` by scene as a Markdown table."""
+    scenes = ("pushing", "pendulum", "cartpole", "double_pendulum", "hopper", "bounce_once")
+    head = ["| gradient, `fused` over `jax` on the same cores (target 0.33) | 1,000 | 100,000 |", "|---|--:|--:|"]
+    ratios = {scene: speed(f"fused over jax, {scene}, * rollouts") for scene in scenes}
+    return block(head + [f"| {scene} | " + " | ".join(map(number, values)) + " |" for scene, values in ratios.items()])
+
+
+FIGURES: dict[str, Callable[[], str]] = {
+    "fobg-soft": lambda: span(pushing("fobg", stiffness=SOFT)["rmse_rel"]),
+    "reinforce-soft": lambda: span(pushing("reinforce", stiffness=SOFT)["rmse_rel"]),
+    "fobg-stiff": lambda: interval(pushing("fobg", stiffness=1e4)),
+    "fobg-stiff-numpy": lambda: interval(pushing("fobg", stiffness=1e4, backend="numpy")),
+    "smoothing-stiff": lambda: span(pushing("randomized_smoothing", stiffness=STIFF)["rmse_rel"]),
+    "fobg-implicit-stiff": lambda: span(pushing("fobg", "complementarity", stiffness=STIFF)["rmse_rel"]),
+    "fobg-implicit-0.3": lambda: span(pushing("fobg", "complementarity", sigma=0.3)["rmse_rel"]),
+    "implicit-time": lambda: span(implicit_time()),
+    "trust-cells": lambda: count(trusted("fobg")["cells"]),
+    "trust-trusted": lambda: count(trusted("fobg")["trusted"]),
+    "trust-wrong": lambda: count(trusted("fobg")["wrong"], "none"),
+    "trust-worst": lambda: str(trusted("fobg")["worst"]),
+    "trust-others": lambda: count(trusted("fobg")["others"]),
+    "trust-missed": lambda: count(trusted("fobg")["missed"], "none"),
+    "trust-all-cells": lambda: count(trusted(*FOUR)["cells"]),
+    "trust-all-trusted": lambda: count(trusted(*FOUR)["trusted"]),
+    "trust-all-wrong": lambda: count(trusted(*FOUR)["wrong"]),
+    "trust-all-worst": lambda: str(trusted(*FOUR)["worst"]),
+    "heaviside-fobg": lambda: number(score("fobg", experiment="quick", scene="heaviside", backend="jax")),
+    "heaviside-smoothing": lambda: number(
+        score("randomized_smoothing", experiment="quick", scene="heaviside", backend="jax")
+    ),
+    "pushing-16": lambda: number(
+        score("fobg", experiment="speed_accuracy", scene="pushing", backend="jax", samples=16)
+    ),
+    "three-confirmed": lambda: count(len(confirmed())),
+    "three-missed": lambda: count((confirmed()["model_error_rel"] > 0.1).sum()),
+    "trap-program": lambda: number(trap()["program_error_rel"].max()),
+    "trap-forward": lambda: " to ".join(percent(value) for value in trap()["forward_error_rel"].iloc[[0, -1]]),
+    "trap-cosine": lambda: span(trap()["model_cosine"]),
+    "stability-cells": lambda: count(len(stability())),
+    "stability-wrong": lambda: count(len(wrong_gradients())),
+    "stability-diverged": lambda: count(stability()["verdict"].isin(["diverged", "nonfinite"]).sum()),
+    "spring-rk4": lambda: percent(right("mass_spring")["rk4"]),
+    "spring-implicit": lambda: percent(right("mass_spring")["implicit_euler"]),
+    "ball-event": lambda: percent(right("bouncing_ball", "impulse")["event_driven"]),
+    "clip-90": lambda: span(estimators("clipped", problem=CONTACT)),
+    "clip-50": lambda: span(estimators("clipped", "quantile=0.5", problem=CONTACT)),
+    "difference-short": lambda: span(estimators("finite_difference", problem=CONTACT)),
+    "difference-long": lambda: span(estimators("finite_difference", "step=0.1", problem=CONTACT)),
+    "weights-contact": lambda: span(estimators("total_propagation", "per=action", problem=CONTACT)),
+    "weights-jump": lambda: span(estimators("total_propagation", problem=JUMP)),
+    "measure-samples": lambda: count(estimators("measure_valued", column="best").sum()),
+    "window-bias": lambda: number(short_windows()["bias_rel"].min()),
+    "window-hopper": lambda: number(windows("steps=100", "hopper")["bias_rel"].max()),
+    "window-learned": lambda: f"{(windows('learned')['bias_low'] == 0).sum()} of {len(windows('learned'))}",
+    "window-exact": lambda: span(windows("exact", "lqr")["bias_rel"]),
+    "window-lqr": window_lqr,
+    "learning-rates": learning_rates_table,
+    "rate-effect": lambda: span((rates := learning_rates())["score"] - rates["median_score"]),
+    "rate-methods": lambda: number(float(np.ptp(learning_rates()["score"]))),
+    "rate-diverged": lambda: diverged("learning_rates"),
+    "fits-hidden": hidden,
+    "fits-bound": lambda: span(fits("error", "rk4", (0, 1))),
+    "fits-coverage": lambda: span(100 * fits("coverage", "rk4", (0, 1)), suffix="%"),
+    "fits-windows": lambda: span(fits("error", "rk4", (2,))),
+    "fits-sliding": lambda: percent(fits("coverage", "semi_implicit_euler", (0,), "sliding_block").min()),
+    "speed-fused": lambda: span(speed("fused grad, penalty, * rollouts")),
+    "speed-jax": lambda: span(speed("jax grad, penalty, * rollouts")),
+    "speed-cell": lambda: number(speeds()["overhead of a cell"]),
+    "speed-rollouts": rollouts_table,
+    "speed-scenes": scenes_table,
+    "speed-one-thread": lambda: span(speed("fused on one thread over the C kernel, * rollouts")),
+    "speed-agree": lambda: number(speeds()["native C kernel: largest relative difference"]),
+    "speed-memory-fused": lambda: span(speed("fused grad, penalty, * rollouts: peak memory"), 3),
+    "speed-memory-jax": lambda: span(speed("jax grad, penalty, * rollouts: peak memory"), 3),
+    "speed-compilations": lambda: count(speeds()["compilations over 27 values of stiffness x beta x sigma"]),
+    "speed-plan": lambda: number(speeds()["planning 10000 cells"]),
+    "speed-resume": lambda: number(speeds()["resuming 10000 stored cells"]),
+    "speed-list": lambda: number(speeds()["python -m bench list"]),
+    "soft-law": lambda: f"{(causes(100) == 'law').sum()} of {len(causes(100))}",
+    "stiff-step": lambda: f"{(causes(1e4) == 'step').sum()} of {len(causes(1e4))}",
+    "stiff-both": lambda: count((causes(1e4) == "both").sum()),
+    **{
+        f"cause-{cause}": lambda cause=cause: count((wrong_gradients()["cause"] == cause).sum())  # type: ignore[misc]
+        for cause in ("step", "law", "both", "unknown")
+    },
+}
+
+
+def with_figures(text: str) -> str:
+    """Return a document with the present value of each marked figure; raises KeyError for an unknown name."""
+    return MARK.sub(lambda match: f"<!--={match[1]}-->{FIGURES[match[1]]()}<!--/-->", text)
+
+
+def without_marks(text: str) -> str:
+    """Return a document with its figures and without the marks around them."""
+    return SOURCE.sub("", MARK.sub(lambda match: match[2], text))

@@ -1,0 +1,138 @@
+"""Standard results as the documents need them: findings, files, and errors compared between estimators."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import bench
+from bench.errors import UserError
+from bench.experiment import config
+from bench.report.views import arrange
+from bench.studies.bias_variance import comparisons
+
+ROOT = Path(__file__).resolve().parent.parent
+STANDARD = ROOT / "results" / "standard"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One experiment: its question, and its findings and files where it has been run."""
+
+    name: str
+    question: str
+    folder: Path
+    findings: tuple[str, ...] = ()
+    chart: Path | None = None
+
+    @property
+    def page(self) -> str:
+        """The name of the experiment's page on the site, that of its folder."""
+        return f"experiment/{self.folder.name}"
+
+    @property
+    def charts(self) -> list[Path]:
+        """The experiment's charts."""
+        return sorted(self.folder.glob("*.png"))
+
+    @property
+    def tables(self) -> list[Path]:
+        """The experiment's tables in Markdown, those that summarise first."""
+        return sorted(self.folder.glob("*.md"), key=lambda path: path.stat().st_size)
+
+    @property
+    def made(self) -> str:
+        """When and with which cells and library versions the stored rows were made, as one sentence."""
+        path = self.folder / "run.json"
+        record = json.loads(path.read_text()) if path.exists() else {}
+        counts = ", ".join(f"{count} {status}" for status, count in sorted(record.get("counts", {}).items()))
+        return f"Stored cells by status: {counts}." if counts else ""
+
+    def data(self) -> Iterator[tuple[Path, str]]:
+        """Yield each data file and its content in words."""
+        words = {".csv": "table, every digit", ".parquet": "all rows with all columns", ".md": "readable table"}
+        words |= {".tex": "table for a paper", ".json": "settings, versions, machine and counts"}
+        for path in sorted(self.folder.iterdir()):
+            if path.suffix in words and not path.name.endswith(".plotted.csv") and path.name != "findings.json":
+                yield path, words[path.suffix]
+
+
+def entries_of(results: Path) -> list[Entry]:
+    """Return every experiment with its findings, in alphabetical order; those not run yet have none."""
+    return [entry_of(*experiment) for experiment in experiments(results)]
+
+
+@cache
+def experiments(results: Path) -> list[tuple[str, str, Path]]:
+    """Return the name, question and folder of every experiment."""
+    loaded = {name: config.load([f"experiment={name}", f"results_dir={results}"]) for name in config.experiments()}
+    return [(name, experiment.question, experiment.directory) for name, experiment in loaded.items()]
+
+
+def entry_of(name: str, question: str, folder: Path) -> Entry:
+    """Return an experiment with the content of its ``findings.json``; raises :class:`UserError` if that is malformed."""
+    path = folder / "findings.json"
+    if not path.exists():
+        return Entry(name, question, folder)
+    record = json.loads(path.read_text())
+    record = record if isinstance(record, dict) else {}
+    findings, chart = record.get("findings"), record.get("chart") or ""
+    if not (isinstance(findings, list) and all(isinstance(text, str) for text in findings) and isinstance(chart, str)):
+        raise UserError(
+            f"'{path}' is not a record of findings: it needs a list of strings 'findings' and a string 'chart'"
+        )
+    picture = folder / f"{Path(chart).name}.png"
+    return Entry(name, question, folder, tuple(findings), picture if picture.exists() else None)
+
+
+@cache
+def rows_of(experiment: str, results: Path = STANDARD) -> pd.DataFrame:
+    """Return an experiment's stored rows, one per cell, with a column per swept axis."""
+    return bench.load(results / experiment)
+
+
+def select(rows: pd.DataFrame, **conditions: Any) -> pd.DataFrame:
+    """Return the rows whose columns have the given values; a pair is the lowest and highest value of a range.
+
+    Raises LookupError if there is no such row.
+    """
+    for column, value in conditions.items():
+        keep = rows[column].between(*value) if isinstance(value, tuple) else rows[column] == value
+        rows = rows[keep]
+    if rows.empty:
+        raise LookupError(f"no rows with {conditions}")
+    return rows
+
+
+def rmse_interval(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
+    """Return the ends of the 95% interval of the relative RMSE, from those of bias and variance."""
+    norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
+    low, high = (np.sqrt(rows[f"bias_{end}"] ** 2 + rows[f"variance_{end}"]) / norm for end in ("low", "high"))
+    return low, high
+
+
+@cache
+def comparison(experiment: str, results: Path = STANDARD) -> pd.DataFrame:
+    """Return the relative RMSE of each setting of an estimator on each problem, with its 95% interval and verdict.
+
+    Verdicts are those of :mod:`bench.studies.bias_variance.comparisons`, as in the experiment's findings. ``best``: lowest,
+    or not distinguishable from the lowest. ``biased``: more than half of the squared error is bias.
+    """
+    loaded = config.load([f"experiment={experiment}", f"results_dir={results}"])
+    methods = comparisons.method_table(arrange(loaded, rows_of(experiment, results)))
+    settings = comparisons.compare_errors(methods).to_dict("records")
+    best = {(row["problem"], name) for row in settings for name in (row["first"], *row["tied"])}
+    parts = methods["estimator"].str.partition("[")
+    return methods.rename(columns={"error": "rmse_rel"}).assign(
+        estimator=parts[0],
+        estimator_params=parts[2].str.removesuffix("]"),
+        best=[pair in best for pair in zip(methods["problem"], methods["method"], strict=True)],
+        biased=methods["bias_share"] > 0.5,
+    )

@@ -1,0 +1,59 @@
+"""Each figure in the documents is computed from the stored results, or its section names the command that gives it."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from docs import figures, website
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = {path: (ROOT / path).read_text() for path in website.PAGES.values()}
+FREE = ("CHANGELOG.md", "CONTRIBUTING.md", "docs/columns.md", "docs/results.md", "docs/sources.md")
+"""Documents without figures of their own: history, rules, and pages that are generated."""
+NUMBER = re.compile(r"(?<![\w.,=/-])(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e-?\d+)?%?(?![\w-]|\.\d)")
+PLAIN = re.compile(r"\d{1,2}|10*(?:,000)*%?|(?:19|20)\d\d|95%|2\.0|3\.11")
+"""Numbers that are not figures: small counts, powers of ten, years, the level of intervals, versions."""
+
+
+def sections(text):
+    """The sections of a document, each with its heading and without code."""
+    text = re.sub(r"^```.*?^```|^ {4,}\S[^\n]*$|`[^`\n]*`|\]\([^)]*\)", "", text, flags=re.DOTALL | re.MULTILINE)
+    return re.split(r"^(?=#+ )", text, flags=re.MULTILINE)
+
+
+@pytest.mark.parametrize("path", [path for path, text in PAGES.items() if figures.MARK.search(text)])
+def test_marked_figures_are_those_of_the_stored_results(path):
+    assert figures.with_figures(PAGES[path]) == PAGES[path], "run: python -m docs.build figures"
+
+
+def test_every_figure_is_used():
+    used = {match[1] for text in PAGES.values() for match in figures.MARK.finditer(text)}
+    assert used == set(figures.FIGURES)
+
+
+def test_a_wrong_figure_is_written_again():
+    wrong = "is <!--=trust-cells-->1<!--/--> of"
+    right = figures.with_figures(wrong)
+    assert right != wrong
+    assert figures.with_figures(right) == right
+    assert figures.without_marks(right) == f"is {figures.FIGURES['trust-cells']()} of"
+
+
+@pytest.mark.parametrize("path", [path for path in PAGES if path not in FREE])
+def test_sections_with_figures_name_their_source(path):
+    missing = []
+    for section in sections(PAGES[path]):
+        plain = figures.SOURCE.sub("", figures.MARK.sub("", section))
+        numbers = [number for number in NUMBER.findall(plain) if not PLAIN.fullmatch(number)]
+        if numbers and not figures.SOURCE.search(section):
+            missing.append((section.partition("\n")[0], numbers))
+    assert not missing, "add <!-- figures: COMMAND --> to these sections"
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_named_sources_exist(path):
+    for source in figures.SOURCE.findall(PAGES[path]):
+        files = re.findall(r"[\w/]+\.py", source)
+        assert files or "python -m bench" in source or source in ("given", "the commands in the table"), source
+        assert all((ROOT / file).exists() for file in files), source

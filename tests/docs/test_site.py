@@ -1,0 +1,168 @@
+"""The site: every document and result has a page, the pages agree with the stored results, and it works offline."""
+
+import json
+import math
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+
+from bench.errors import UserError
+from bench.model import registry
+from docs import results, website
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+HOSTILE = "<meta http-equiv=refresh content=0> [a](b) `c` *d* {math}`e` | <div style='position:fixed'>"
+
+
+@pytest.fixture(scope="module")
+def pages():
+    """The Markdown text of every page, by name."""
+    return website.sources()
+
+
+def test_every_page_is_in_the_navigation_once(pages):
+    listed = [name for text in pages.values() for block in re.findall(r"```{toctree}\n(.*?)```", text, re.DOTALL)
+              for name in re.findall(r"^(?:.* <)?([\w/-]+)>?$", block.replace(":hidden:", ""), re.MULTILINE)]  # fmt: skip
+    assert sorted(listed) == sorted(set(pages) - {"index"})
+
+
+def test_site_has_five_entries(pages):
+    block = pages["index"].partition("```{toctree}")[2]
+    assert len(re.findall(r"^[A-Z].* <|^[a-z]+$", block, re.MULTILINE)) == len(website.SECTIONS) == 5
+
+
+def test_every_experiment_with_findings_has_a_page(pages):
+    for entry in results.entries_of(results.STANDARD):
+        assert (entry.page in pages) == bool(entry.findings)
+
+
+def test_every_claim_with_a_result_has_a_page(pages):
+    names = {path.stem for path in (results.STANDARD / "claims").glob("[A-Z]*.json")}
+    assert {name for name in pages if name.startswith("claim/")} == {f"claim/{name}" for name in names}
+    assert website.expand("claim/*", ["claim/C10", "claim/L1", "claim/C2"]) == ["claim/C2", "claim/C10", "claim/L1"]
+
+
+def test_every_estimator_has_a_page_with_its_source(pages):
+    for name, entry in registry.entries()["estimators"].items():
+        page = pages[f"estimator/{name}"]
+        assert "## Where it wins and fails" in page
+        for year in re.findall(r"et al\. (\d{4})", entry.plugin.__doc__):
+            assert year in page.partition("## Source")[2].partition("\n## ")[0], (name, year)
+
+
+def test_verdicts_are_those_of_the_rows():
+    """Recomputes failing estimators row by row."""
+    rows = pd.read_parquet(results.STANDARD / "estimators" / "rows.parquet").query("status == 'ok'").to_dict("records")
+    ends = {}
+    for row in rows:
+        low, high = (
+            math.hypot(row[f"bias_{end}"], math.sqrt(row[f"variance_{end}"])) / row["reference_norm"]
+            for end in ("low", "high")
+        )
+        ends.setdefault(row["scene"], {})[row["estimator"], row["estimator_params"]] = low, high
+    fails = {(scene, *name) for scene, part in ends.items() for name, (low, _) in part.items() if low > 1}
+    table = results.comparison("estimators").assign(scene=lambda rows: rows["problem"].str.partition(", penalty")[0])
+    failing = table[table["verdict"] == "fails"]
+    assert set(zip(failing["scene"], failing["estimator"], failing["estimator_params"], strict=True)) == fails
+    assert fails
+    for problem, part in table.groupby("problem"):
+        assert part.loc[part["rmse_rel"].idxmin(), "best"], problem
+        assert not part[part["best"]]["low"].gt(part["high"].min()).any(), "intervals that are apart are no tie"
+
+
+def entry(folder, finding):
+    (folder / "findings.json").write_text(json.dumps({"question": finding, "findings": [finding], "chart": "../x"}))
+    return results.entry_of("quick", finding, folder)
+
+
+def test_findings_are_text(tmp_path):
+    from markdown_it import MarkdownIt
+
+    page = website.experiment_page(entry(tmp_path, HOSTILE))
+    html = MarkdownIt("commonmark").render(page)
+    assert "<meta" not in html
+    assert "<div" not in html
+    assert 'href="b"' not in html
+    assert "<em>" not in html
+
+
+@pytest.mark.parametrize("record", [[], {"findings": "text"}, {"findings": [1]}, {"findings": ["a"], "chart": 3}])
+def test_malformed_findings_are_refused(tmp_path, record):
+    (tmp_path / "findings.json").write_text(json.dumps(record))
+    with pytest.raises(UserError, match="is not a record of findings"):
+        results.entry_of("quick", "Why?", tmp_path)
+
+
+def test_an_experiment_without_findings_has_its_question(tmp_path):
+    found = results.entry_of("quick", "Why?", tmp_path)
+    assert found.question == "Why?"
+    assert not found.findings
+
+
+def test_long_tables_are_shortened():
+    table = "| a |\n|---|\n" + "".join(f"| {i} |\n" for i in range(100))
+    short = website.short_tables(f"# title\n\n{table}\n## Every cell\n\n{table}")
+    assert short.count("\n| ") == website.LONGEST
+    assert "further rows" in short
+
+
+def test_links_to_files_become_copies():
+    text = website.localise(
+        "[a](docs/trust.md#three-errors) [b](LICENSE) [c](docs) ![d](docs/site.css)", Path("README.md")
+    )
+    assert text == "[a](trust.md#three-errors) {download}`b </repo/LICENSE>` c ![d](/repo/docs/site.css)"
+
+
+def test_the_workflow_publishes_what_make_site_builds():
+    workflow = yaml.safe_load((website.ROOT / ".github" / "workflows" / "site.yml").read_text())
+    steps = workflow["jobs"]["build"]["steps"]
+    assert {"run": "make site"} in steps
+    assert "\nsite: $(VENV)/.installed\n\t$(BIN)/python -m docs.build site\n" in (website.ROOT / "Makefile").read_text()
+    assert steps[-1]["with"]["path"] == "build/site/html"
+    assert workflow["jobs"]["publish"]["needs"] == "build"
+
+
+# --------------------------------------------------------------------------------------------------- the built site
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder of the built site."""
+    return website.build(tmp_path_factory.mktemp("site")).parent
+
+
+def dom(page, query=""):
+    """The page as Chromium renders it from disk, offline."""
+    command = [CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=10000", "--dump-dom"]
+    done = subprocess.run([*command, page.as_uri() + query], capture_output=True, text=True, timeout=120)
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_site_needs_no_network(site):
+    for page in site.rglob("*.html"):
+        assert not re.search(r"<(?:script|link|img)[^>]*(?:src|href)=\"(?:https?:)?//", page.read_text()), page
+
+
+@pytest.mark.slow
+def test_every_finding_has_a_link_of_its_own(site):
+    for found in results.entries_of(results.STANDARD):
+        for count in range(1, len(found.findings) + 1):
+            name = f"{found.folder.name.replace('_', '-')}-{count}"
+            text = (site / f"{found.page}.html").read_text()
+            assert f'id="{name}"' in text
+            assert f'href="#{name}"' in text
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+@pytest.mark.parametrize(
+    ("word", "page"), [("leave_one_out", "estimator/reinforce.html"), ("stiffness", "stability.html")]
+)
+def test_search_works_from_disk(site, word, page):
+    assert f'href="{page}' in dom(site / "search.html", f"?q={word}")
