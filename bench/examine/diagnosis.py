@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from bench.examine.gradient import GradientStages
-from bench.examine.lines import LineScan
+from bench.examine.lines import LineScan, scan
 from bench.examine.quick import QuickCheck
 from bench.examine.subspace import choose
 from bench.measure.gradcheck import Check
@@ -18,17 +18,19 @@ from bench.model.simulator.simulator import Simulator
 
 SUSPICIOUS = ("wrong_factor", "missing_term", "wrong_adjoint")
 """Causes that adaptive steps imitate."""
-NEAR = 0.1
+NEAR = 0.05
 """Largest relative error of a gradient for which adaptive steps are considered."""
-EXPLAINED = 0.3
-"""Largest share of the local error, summed over a line, that may remain where jumps of adaptive steps cancel it."""
-FEWEST_JUMPS = 3
-"""Fewest jumps on a line that count as those of adaptive steps."""
-PANELS = 24
-"""Panels of the integral of the gradient along a line."""
+EXPLAINED = 10.0
+"""Largest error of a gradient on a line, in multiples of the jumps' total height over the length of the line."""
+SMALL_JUMPS = 0.05
+"""Largest total height of such jumps, as a share of the cost's change along the line."""
+FEWEST_JUMPS = 2
+"""Fewest jumps on the lines that count as those of adaptive steps."""
+LONGER = 10.0
+"""Length of the line on which more jumps are searched, in multiples of the first line."""
 THETAS = 4
 """Number of other thetas at which two costs are compared."""
-GROWTH = 10.0
+GROWTH = 2.0
 """Least ratio of errors at the largest and at the first wrong number of steps that counts as growth."""
 
 
@@ -117,37 +119,45 @@ def grows(horizons: Sequence[Horizon], tolerance: float) -> bool:
 
 
 def is_adaptive(stages: GradientStages, outcome: Check, lines: Sequence[LineScan]) -> bool:
-    """Return whether the cost is a sawtooth around a smooth curve whose derivative the gradient is.
+    """Return whether small jumps of the cost are as large as the error of the gradient, as with adaptive steps.
 
-    A solver with adaptive steps has another discretisation error on either side of each change of its steps: its cost
-    has small jumps, and a slope between them that differs from that of the solution. Over a line with many jumps, the
-    jumps cancel this difference, so the integral of the gradient explains the change of the cost although the slope at
-    theta differs. The error of a gradient with a missing term adds up instead.
+    A solver with adaptive steps has another discretisation error on either side of each change of its number of steps.
+    Its cost has a small jump there, and slopes between jumps that differ from those of the solution by about the height
+    of a jump over the distance between jumps. Reverse mode through such a solver holds the steps fixed, so its gradient
+    differs by as much. Where few jumps are found, a line ten times as long is searched.
     """
     errors = [part.error for part in outcome.worst_parts if np.isfinite(part.error)]
     if stages.gradient is None or not errors or max(errors) > NEAR:
         return False
+    lines = [line for line in lines if np.isfinite(line.costs).all()]
+    if lines and sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
+        first = lines[0]
+        reach = LONGER * float(first.at[-1])
+
+        def cost(t: np.ndarray) -> np.ndarray:
+            return stages.costs(stages.theta[:, None] + first.direction[:, None] * t)
+
+        noise = max(outcome.noise, stages.spread)
+        lines = [replace(scan(cost, np.zeros(1), np.ones(1), noise, reach, unit=stages.simulator.unit), direction=first.direction)]
+    jumps = [jump for line in lines for jump in line.jumps]
+    if len(jumps) < FEWEST_JUMPS:
+        return False
     votes = []
     for line in lines:
-        if len(line.jumps) < FEWEST_JUMPS:
-            continue
-        step = 0.1 * min(np.diff(sorted([0.0, *(abs(b.at) for b in line.jumps)])[:2])[0], 1e-2)
-        at = stages.theta[:, None] + line.direction[:, None] * np.array([-step, step])
-        costs = stages.costs(at)
-        local = float((costs[1] - costs[0]) / (2 * step) - line.direction @ stages.gradient)
-        noise = (outcome.noise + stages.simulator.unit * abs(stages.value)) / step
-        if abs(local) < 10.0 * noise:
-            continue
-        start, end = float(line.at[0]), float(line.at[-1])
-        rest = line.costs[-1] - line.costs[0] - stages.integrate(line.direction, start, end, PANELS)
-        votes.append(abs(rest) < EXPLAINED * abs(local) * (end - start))
-    return bool(votes) and all(votes)
+        height = sum(jump.size for jump in line.jumps)
+        length = float(line.at[-1] - line.at[0])
+        step = 1e-3 * float(line.at[1] - line.at[0])
+        costs = stages.costs(stages.theta[:, None] + line.direction[:, None] * np.array([-step, step]))
+        apart = abs(float((costs[1] - costs[0]) / (2 * step) - line.direction @ stages.gradient))
+        is_small = height < SMALL_JUMPS * float(np.abs(np.diff(line.costs)).sum())
+        votes.append(is_small and apart <= EXPLAINED * height / length)
+    return any(votes)
 
 
 def _simulator(stages: GradientStages, cost: Callable[..., Any], grad: Any) -> Simulator:
     own = stages.simulator
     batch = own.batch + (f":{own.fixed}" if own.fixed else "")
-    return Simulator(cost, stages.layout, grad, own.noise, batch, stages.clock)
+    return Simulator(cost, stages.layout, grad, own.noise, batch, stages.clock, own.library)
 
 
 def _quick(stages: GradientStages, other: Simulator, space: Any, slope: np.ndarray | None = None) -> QuickCheck:

@@ -42,10 +42,10 @@ EXPLANATIONS = {
     "raised": "the gradient could not be computed",
     "undecided": "the budget ended before the gradient was checked",
     "rough": "the cost changes as much between neighbouring thetas as over a wide step: a seed or hash taken from theta, or chaos",
-    "adaptive": "the cost is a sawtooth around a smooth curve, as from adaptive steps or meshes: the gradient is the derivative of "
-    "the curve, the differences follow the sawtooth, and neither is exactly the derivative of the solution",
-    "overwritten": "right after few steps and wrong after many: memory overwritten between forward and backward, such as arrays "
-    "shared by all steps of one tape, or a term that acts only later",
+    "adaptive": "gradient and differences differ by as much as the discretisation does, as with adaptive steps or meshes: the gradient "
+    "holds the steps fixed, the differences do not, and neither is exactly the derivative of the solution",
+    "overwritten": "memory overwritten between forward and backward, such as arrays shared by all steps of one tape, or a term that "
+    "acts only later",
     "twin": "the two costs that must agree differ",
     "no_effect": "an input has no effect on the cost and is not in allow_zero: does it reach the simulator?",
     "jumps": "the gradient is right at theta, and misses jumps around it that no gradient sees",
@@ -64,8 +64,8 @@ NOT_SHOWN = ("undecided", "unsettled", "nonfinite", "adaptive", "zero", "spread"
 """Causes that decide neither for nor against a gradient: exit status 3."""
 DIFFERENT = 1e-6
 """Relative difference of two costs that must agree, in double precision."""
-REFINED = 0.5
-"""Largest error against a refined cost, relative to the error against the cost itself, that shows a discretisation gap."""
+REFINED = 0.1
+"""Least distance of the differences from those of a refined cost, relative to the gradient's error, of a discretisation gap."""
 SHOWN = 8
 """Most numbers of theta in the table of breaks."""
 HEADLINE = 200
@@ -147,7 +147,7 @@ class Findings:
     n_failed: int
     """Number of gradient calls that raised an exception."""
     is_adaptive: bool
-    """Whether the cost is a sawtooth around a smooth curve whose derivative the gradient is."""
+    """Whether small jumps of the cost are as large as the error of the gradient."""
     printed: Printed
     notes: Sequence[str]
     left_out: Sequence[str]
@@ -253,14 +253,16 @@ class Findings:
 
     @property
     def is_discretisation_gap(self) -> bool:
-        """Whether the gradient agrees better with a refined cost than with the cost itself."""
+        """Whether the differences of the cost are as far from those of the refined cost as the gradient is from them."""
         if self.refined is None or self.check is None:
             return False
-        before = {part.name: part.error for part in self.check.components}
-        after = {part.name: part.error for part in self.refined.components}
-        names = [name for name in after if name in before]
-        worst = max(names, key=lambda name: np.nan_to_num(before[name]), default="")
-        return bool(worst) and after[worst] < REFINED * before[worst]
+        cost = {part.name: part for part in self.check.components}
+        pairs = [(cost[part.name], part) for part in self.refined.components if part.name in cost]
+        pairs = [(a, b) for a, b in pairs if a.verdict in FAULTS and math.isfinite(a.error)]
+        if not pairs:
+            return False
+        own, other = max(pairs, key=lambda pair: pair[0].error)
+        return abs(own.difference - other.difference) > REFINED * abs(own.program - own.difference)
 
     @property
     def is_overwritten(self) -> bool:
@@ -386,8 +388,8 @@ class Findings:
     def _overwritten_text(self) -> str:
         if self.twin_error is not None:
             own, other = self.twin_error
-            return f"; the second gradient is off by {number(100 * other)}%, this one by {number(100 * own)}%"
-        return "; off by " + ", ".join(f"{number(100 * one.error)}% after {one.steps} steps" for one in self.growth)
+            return f"; the second gradient is right to {number(100 * other)}%, this one is off by {number(100 * own)}%"
+        return "; right after few steps and wrong after many, off by " + ", ".join(f"{number(100 * one.error)}% after {one.steps} steps" for one in self.growth)
 
     def _noise_problems(self) -> list[str]:
         problems = []
@@ -448,6 +450,8 @@ class Findings:
         if not self.gradient:
             return ""
         where = f"Under noise of sigma {', '.join(number(one) for one in self.requested)}" if self.requested else "Around theta"
+        if self.derivative != RIGHT and not self.requested:
+            where = "Under noise"
         if self.noise_cause and self.noise_cause != "unmeasured":
             answer = "not shown" if self.noise_cause in NOT_SHOWN else "NOT usable"
             return f"{where}: {answer}. {self._noise_problems()[0]}"
@@ -538,14 +542,21 @@ class Findings:
         """Return the verdict of a failed check as a sentence, with the numbers of the worst part."""
         cause = EXPLANATIONS.get(check.cause, check.cause)
         if check.cause == "disconnected" and any(part.verdict in ("smooth", "nonlinear") for part in check.components):
-            cause = "the gradient of one input is exactly 0 where the cost has a slope: this input is detached"
+            cause = "the gradient of some inputs is exactly 0 where the cost has a slope: they are detached"
         size = self._worst_size(check)
         if not size or check.cause in ("nan_gradient", "nonfinite"):
             return f"{check.cause}: {cause}" + (f" ({size})" if size else "")
         return f"{check.cause}: {cause} ({size})"
 
+    def _named_parts(self, check: Check) -> list[Part]:
+        """Return the worst parts that name an input: located groups, then components, then directions."""
+        located = [part for part in check.worst_parts if part.name in self.located]
+        inside = [part for part in check.worst_parts if part.component is not None]
+        exact = [part for part in inside if self.label(part) in self.located.values()]
+        return exact or located or inside or list(check.worst_parts)
+
     def _worst_size(self, check: Check) -> str:
-        parts = [part for part in check.worst_parts if part.component is not None] or list(check.worst_parts)
+        parts = self._named_parts(check)
         if not parts:
             return ""
         part = max(parts, key=lambda p: np.nan_to_num(p.error, nan=math.inf))
@@ -559,7 +570,7 @@ class Findings:
         """Return a part's error in words, with the numbers behind it."""
         name = self.label(part)
         if part.name in self.located:
-            name = self.located[part.name]
+            name = f"{self.located[part.name]}, along a random direction,"
         good = abs(part.uncertainty / part.difference) if part.difference else math.nan
         text = f"{name}: program {_shown(part.program)}, differences {_shown(part.difference)}"
         if math.isfinite(part.error):
@@ -705,8 +716,8 @@ class Findings:
         if cause in ("zero", "no_effect"):
             return f"check that these inputs reach the simulator, or {self._again('allow_zero=NAME')}"
         if cause in SUSPICIOUS or cause == "disconnected":
-            parts = [part for part in self.wrong_checks[0].worst_parts if part.component is not None] if self.wrong_checks else []
-            names = ", ".join(self.label(part) for part in parts[:3]) or "the cost"
+            parts = self._named_parts(self.wrong_checks[0]) if self.wrong_checks else []
+            names = ", ".join(self.located.get(part.name, self.label(part)) for part in parts[:3]) or "the cost"
             return f"follow {names} through the cost: cut it into parts until the ratio is 1; horizons=1,2,5 if it takes steps=T"
         if cause in TRUSTED and self.gradient and not self.requested:
             return f"{self._again('sigma=SIGMA')} for use under noise"

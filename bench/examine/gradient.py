@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -186,11 +187,11 @@ class GradientStages:
             return
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         try:
-            self._compare_quickly(space)
-            self._repeat()
-            if self.simulator.precision == "float64" and self.simulator.has_single_precision:
-                self.simulator.precision, self.is_hidden_single = "float32", True
-                self._compare_quickly(space)
+            for stage in (partial(self._compare_quickly, space), self._repeat):
+                stage()
+                if self.simulator.precision == "float64" and self.simulator.has_single_precision:
+                    self.simulator.precision, self.is_hidden_single = "float32", True
+                    self._compare_quickly(space)
         except OutOfTime:
             self.left_out.append("the check at more than one step")
             return

@@ -19,6 +19,12 @@ MIN_ALARM_S, ALARM_INTERVAL_S = 1e-3, 1.0
 """Minimum delay of the alarm, and the interval at which the alarm repeats, in seconds."""
 PROGRESS_INTERVAL_S = 0.2
 """Minimum time between two updates of the progress line, in seconds."""
+MOST_WAITED = 1.0
+"""Most time lost to other programs that is not charged, in multiples of the budget."""
+READ_INTERVAL_S = 0.02
+"""Minimum time between two readings of the lost time, in seconds."""
+SCHEDULE = "/proc/thread-self/schedstat"
+"""On Linux: nanoseconds on a processor, nanoseconds of waiting for one, and number of time slices."""
 
 
 class OutOfTime(BaseException):
@@ -41,18 +47,29 @@ def parse_duration(budget: float | str, what: str = "budget") -> float:
     return value
 
 
+def _run_delay() -> float:
+    """Return the seconds for which this thread has been ready but waited for a processor; 0 where unknown."""
+    try:
+        with open(SCHEDULE) as file:
+            return int(file.read().split()[1]) * 1e-9
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
+
 class Clock:
     """Remaining budget, time spent per call, and the progress line.
 
     ``budget`` is the time for warm calls and everything between them [s]. The first call of each kind and shape may
-    compile: its time counts against ``compile_budget`` instead. ``calls`` limits the number of costs and
+    compile: its time counts against ``compile_budget`` instead. Time for which the process waits because other programs
+    use the processors is not charged, up to as much as the budget. ``calls`` limits the number of costs and
     gradients together. With a limit of calls and no finite ``budget``, no decision depends on time.
     """
 
     def __init__(
         self, budget: float, shown: bool = False, calls: float = math.inf, compile_budget: float = math.inf
     ) -> None:
-        self.start = time.perf_counter()
+        self.start, self._delay, self._compile_delay = time.perf_counter(), _run_delay(), 0.0
+        self._read, self._last_read = self._delay, self.start
         self.budget, self.calls, self.compile_budget = budget, calls, compile_budget
         self.costs = self.gradients = 0
         """Number of evaluated costs and gradients, one per sample."""
@@ -70,8 +87,16 @@ class Clock:
 
     @property
     def spent(self) -> float:
-        """Seconds since the start, without first calls."""
-        return time.perf_counter() - self.start - self.compile_s
+        """Seconds since the start, without first calls and without most of the time lost to other programs."""
+        return self.elapsed - self.compile_s - min(self.waited, MOST_WAITED * self.budget)
+
+    @property
+    def waited(self) -> float:
+        """Seconds of warm calls for which this thread waited for a processor that other programs used; 0 where unknown."""
+        now = time.perf_counter()
+        if now - self._last_read > READ_INTERVAL_S:
+            self._last_read, self._read = now, _run_delay()
+        return max(0.0, self._read - self._delay - self._compile_delay)
 
     @property
     def elapsed(self) -> float:
@@ -138,13 +163,15 @@ class Clock:
         code uses the alarm signal.
         """
         allowed = self.compile_budget - self.compile_s if first else self.remaining
-        began = time.perf_counter()
+        began, delay = time.perf_counter(), _run_delay()
         is_free = threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
         is_free = is_free and math.isfinite(allowed)
         is_free = is_free and signal.getsignal(signal.SIGALRM) in (signal.SIG_DFL, None)
 
         def raise_out_of_time(number: int, frame: FrameType | None) -> None:
-            raise OutOfTime
+            # time lost to other programs is not charged: the alarm repeats until the budget is really spent
+            if first or self.remaining <= 0.0:
+                raise OutOfTime
 
         try:
             self._is_inside = True
@@ -160,6 +187,7 @@ class Clock:
                 signal.signal(signal.SIGALRM, signal.SIG_DFL)
             if first:
                 self.compile_s += time.perf_counter() - began
+                self._compile_delay += _run_delay() - delay
 
     def count(self, kind: str, calls: int, taken: float, warm: bool) -> None:
         """Add ``calls`` samples of ``kind`` (costs or gradients), and their seconds if ``warm`` (nothing was compiled)."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import sys
-import time
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from typing import Any
@@ -25,8 +24,8 @@ CHUNK = 256
 """Columns per batch that is not compiled."""
 HELD = 4_000_000
 """Most numbers in the thetas of one batch."""
-DISTINCT = 8
-"""Fewest costs that show that all costs have single precision."""
+DISTINCT = 3
+"""Fewest costs that show that all costs have single precision: each is one in double precision once in 2^29."""
 SIMPLE_BITS = 12
 """Costs with at most this many significant bits, such as 0.5, show nothing about the precision."""
 KEPT_LINES = 1000
@@ -59,12 +58,12 @@ def _guarded(function: Callable[..., Any], printed: Printed) -> Callable[..., An
     A test must not pass because a simulator exits with status 0.
     """
 
-    def call(*arguments: Any) -> Any:
+    def call(*arguments: Any, **settings: Any) -> Any:
         try:
             if sys.stdout is printed:
-                return function(*arguments)
+                return function(*arguments, **settings)
             with redirect_stdout(printed), redirect_stderr(printed):
-                return function(*arguments)
+                return function(*arguments, **settings)
         except SystemExit as error:
             code = "" if error.code is None else error.code
             raise RuntimeError(f"it ended the process by sys.exit({code})") from None
@@ -75,7 +74,8 @@ def _guarded(function: Callable[..., Any], printed: Printed) -> Callable[..., An
 class Simulator:
     """A cost f(theta) or f(theta, w) and optionally its gradient, on NumPy batches with one sample per column.
 
-    ``noise`` is the length of w, 0 for a cost without its own noise. An exception in a call yields NaN, except in the
+    ``noise`` is the length of w, 0 for a cost without its own noise. ``library`` is the library of the arrays that the
+    functions receive; by default that of ``grad`` or of theta. An exception in a call yields NaN, except in the
     first call, where it becomes a :class:`UserError`.
     """
 
@@ -87,6 +87,7 @@ class Simulator:
         noise: int = 0,
         batch: str | int | None = None,
         clock: Clock | None = None,
+        library: str = "",
     ) -> None:
         if not callable(cost):
             raise UserError(f"the cost is a function of theta, not {type(cost).__name__}")
@@ -118,7 +119,7 @@ class Simulator:
         self._compiled: dict[str, tuple[Any, ...]] = {}
         self._distinct: set[float] = set()
         self._double = True
-        self.library = self._detect_library()
+        self.library = library or self._detect_library()
         self.batch = self._detect_batch(batch)
 
     # ------------------------------------------------------------------------------------------- columns
@@ -176,13 +177,13 @@ class Simulator:
                 columns = np.r_[columns, np.repeat(columns[-1:], size - columns.size)]
             is_first = (kind, columns.size) not in self._shapes
             self._shapes.add((kind, columns.size))
-            began = time.perf_counter()
+            began = self.clock.spent
             with self.clock.interrupt_when_over(first=is_first):
                 results = function(thetas[:, columns], None if w is None else w[:, columns])
-            taken = time.perf_counter() - began
+            taken = max(self.clock.spent - began, 0.0)
             self.clock.count(kind, part.stop - part.start, taken, warm=not is_first)
             out[..., part] = results[..., : part.stop - part.start]
-            if kind == "costs" and len(self._distinct) < 4 * DISTINCT:
+            if kind == "costs" and len(self._distinct) < 16 * DISTINCT:
                 self._distinct.update(float(one) for one in out[part] if _is_telling(one))
         return out
 
@@ -268,6 +269,7 @@ class Simulator:
             if value.size == 1:
                 self._check_cost(value)
                 self.first_value = float(value.ravel()[0])
+                self._distinct |= {self.first_value} if _is_telling(self.first_value) else set()
                 return self._detect_vmap(vector, self.first_value, batch)
         for layout in ("columns", "rows"):
             if self.layout.flat and self._accepts(layout):
