@@ -30,7 +30,7 @@ LONGER = 10.0
 """Length of the line on which more jumps are searched, in multiples of the first line."""
 THETAS = 4
 """Number of other thetas at which two costs are compared."""
-GROWTH = 2.0
+GROWTH = 1.5
 """Least ratio of errors at the largest and at the first wrong number of steps that counts as growth."""
 
 

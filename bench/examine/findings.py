@@ -249,7 +249,7 @@ class Findings:
             return "zero"
         if self.allow_zero is not None and self.zeros:
             return "no_effect"
-        return check.cause
+        return "saturated" if check.cause == "zero" else check.cause
 
     @property
     def is_discretisation_gap(self) -> bool:

@@ -277,10 +277,11 @@ class GradientStages:
             components=size, directions=0, draws=0, eps=few, unit=unit, scanned=0, repeated=False, seed=self.seed,
         )  # fmt: skip
         repeated = self.spread == 0.0
-        scanned = 0 if is_right else 4
+        # a wrong gradient is named by its ratios at other thetas first, and then searched for staircases
+        scanned = 4 if is_right else 0
         return [
             ("more steps", base),
-            ("all steps and random directions", replace(base, eps=eps, directions=2, scanned=4, repeated=repeated)),
+            ("all steps and random directions", replace(base, eps=eps, directions=2, scanned=scanned, repeated=repeated)),
             ("2 other thetas", replace(base, eps=eps, directions=2, draws=2, scanned=scanned)),
             ("8 other thetas", replace(base, eps=eps, directions=2, draws=8, scanned=4)),
         ]
@@ -304,8 +305,9 @@ class GradientStages:
         self.clock.start_stage("checking the gradient")
         assert self.check is not None
         is_done: list[str] = []
-        stages = self._plan(space.size, self.check.trusted)
-        for name, options in stages:
+        for index in range(4):
+            stages = self._plan(space.size, self.check.trusted)
+            name, options = stages[index]
             if not self.clock.can_afford(*self._cost_of(options, space.size), share=self._share):
                 self.left_out.append(name)
                 if name != "2 other thetas":
@@ -350,6 +352,9 @@ class GradientStages:
         outcome = check(
             cost, slope if self.gradient is not None else None, space.origin(), replace(options, scale=space.scale)
         )
+        if self.simulator.n_failed_gradients:
+            # a gradient that raises at other thetas is reported as such
+            outcome = recaused(replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program))))
         return self._with_roughness(self._without_small_spread(outcome))
 
     def _without_small_spread(self, outcome: Check) -> Check:

@@ -125,7 +125,7 @@ def groups_of(layout: ParameterTree, scale: np.ndarray, seed: int) -> list[Group
     random = np.random.default_rng([seed, 0x67726F75])
     leaves = layout.leaves
     spans: list[tuple[str, int, int]] = []
-    if len(leaves) <= GROUPS // BLOCKS:
+    if len(leaves) == 1:
         for leaf in leaves:
             edges = np.linspace(0, leaf.size, min(BLOCKS, leaf.size) + 1).astype(int)
             for first, last in zip(edges[:-1], edges[1:], strict=True):
