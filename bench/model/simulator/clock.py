@@ -228,16 +228,22 @@ class Clock:
 
 @contextmanager
 def end_on_sigterm(clock: Clock) -> Iterator[None]:
-    """End the clock's budget when the process receives SIGTERM, so that results are still reported.
+    """End the clock's budget when a command of ``bench`` receives SIGTERM, so that its results are still reported.
 
-    Nothing changes outside the main thread, or where other code handles SIGTERM.
+    A second SIGTERM stops the command. Programs that use ``bench`` as a library handle SIGTERM as before.
     """
     is_main = threading.current_thread() is threading.main_thread()
-    if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+    previous = signal.getsignal(signal.SIGTERM) if is_main else None
+    if getattr(previous, "__module__", "") != "bench.cli":
         yield
         return
-    signal.signal(signal.SIGTERM, lambda number, frame: clock.terminate())
+
+    def end(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, previous)
+        clock.terminate()
+
+    signal.signal(signal.SIGTERM, end)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, previous)
