@@ -1,17 +1,15 @@
 """A cart and pole in Newton's Featherstone solver: one tape over all steps reads matrices that later steps overwrote.
 
-    python examples/newton_cartpole.py     (pip install "newton[sim]"; CPU, a minute to compile)
+python examples/newton_cartpole.py     (pip install "newton[sim]"; CPU, a minute to compile)
 """
 
+import newton
 import numpy as np
 import warp as wp
 
 import bench
 
-wp.init()
 wp.set_device("cpu")
-import newton  # noqa: E402
-
 theta = [0.3, 0.5]  # angle of the pole [rad] and its speed [rad/s]
 builder = newton.ModelBuilder()
 cart = builder.add_link(mass=1.0, inertia=wp.mat33(np.eye(3) * 0.1))
@@ -34,7 +32,9 @@ def rollout(x, steps, fresh):
     q, qd = states[-1].joint_q.numpy()[1], states[-1].joint_qd.numpy()[1]
     seeds = {states[-1].joint_q: [0, 2 * q], states[-1].joint_qd: [0, 0.2 * qd]}
     tape.backward(grads={array: wp.array(np.float32(seed)) for array, seed in seeds.items()})
-    return float(q * q + np.float32(0.1) * qd * qd), [float(a.grad.numpy()[1]) for a in (states[0].joint_q, states[0].joint_qd)]
+    return float(q * q + np.float32(0.1) * qd * qd), [
+        float(a.grad.numpy()[1]) for a in (states[0].joint_q, states[0].joint_qd)
+    ]
 
 
 if __name__ == "__main__":

@@ -125,8 +125,8 @@ def as_junit(reports: Sequence[Findings], refused: Mapping[str, str] | None = No
     failures = sum(report.status == 1 for report in reports)
     errors = sum(report.status == 3 for report in reports) + len(refused)
     counts = {"tests": str(len(reports) + len(refused)), "failures": str(failures), "errors": str(errors)}
-    root = ElementTree.Element("testsuites", name="examine", **counts)
-    suite = ElementTree.SubElement(root, "testsuite", name="examine", **counts)
+    root = ElementTree.Element("testsuites", {"name": "examine", **counts})
+    suite = ElementTree.SubElement(root, "testsuite", {"name": "examine", **counts})
     for report in reports:
         case = ElementTree.SubElement(
             suite, "testcase", classname="examine", name=_xml_safe(report.name),

@@ -90,9 +90,7 @@ def _examined(cost: str, settings: Mapping[str, Any], progress: bool) -> Report:
         name=cost,
         progress=progress,
         calls=_count(settings, "calls"),
-        **{
-            key: _by_input(settings[key], key, False) for key in ("tolerance", "atol") if key in settings
-        },
+        **{key: _by_input(settings[key], key, False) for key in ("tolerance", "atol") if key in settings},
         **({"compile_budget": settings["compile_budget"]} if "compile_budget" in settings else {}),
         allow_zero=_names(settings["allow_zero"]) if "allow_zero" in settings else None,
         expect=str(settings.get("expect", "")),

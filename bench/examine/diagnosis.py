@@ -138,7 +138,11 @@ def is_adaptive(stages: GradientStages, outcome: Check, lines: Sequence[LineScan
             return stages.costs(stages.theta[:, None] + first.direction[:, None] * t)
 
         noise = max(outcome.noise, stages.spread)
-        lines = [replace(scan(cost, np.zeros(1), np.ones(1), noise, reach, unit=stages.simulator.unit), direction=first.direction)]
+        lines = [
+            replace(
+                scan(cost, np.zeros(1), np.ones(1), noise, reach, unit=stages.simulator.unit), direction=first.direction
+            )
+        ]
     jumps = [jump for line in lines for jump in line.jumps]
     if len(jumps) < FEWEST_JUMPS:
         return False

@@ -204,8 +204,8 @@ def _allowed(layout: ParameterTree, given: bool | str | Sequence[str] | None) ->
 
 
 def _expected(cause: str) -> str:
-    from bench.examine.findings import CAUSES
     from bench.errors import unknown
+    from bench.examine.findings import CAUSES
 
     if cause and cause not in CAUSES:
         raise unknown("expect", cause, CAUSES)
@@ -345,7 +345,9 @@ class _Examination:
         try:
             for direction in along:
                 size = abs(self.stages.value)
-                rounding = max(measured, self.stages.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0))
+                rounding = max(
+                    measured, self.stages.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
+                )
                 cost = partial(self._costs_along, direction)
                 line = scan(cost, np.zeros(1), np.ones(1), rounding, 3.0, points, halvings, most, self.simulator.unit)
                 line = replace(line, direction=direction)
@@ -404,7 +406,9 @@ class _Examination:
             self.clock.start_stage(f"noise of sigma {level:g}")
             self.clock.limit(1.0 / (len(levels) - index))
             pairs = min(PAIRS, max(FEWEST, HELD // self.theta.size))
-            one = measure_smoothed(self.simulator, self.theta, level, spread / level, plain, self.clock, self.seed, pairs)
+            one = measure_smoothed(
+                self.simulator, self.theta, level, spread / level, plain, self.clock, self.seed, pairs
+            )
             self.clock.limit(1.0)
             if one is None:
                 self.left_out.append(f"noise of sigma {level:g}")

@@ -330,7 +330,9 @@ class Findings:
         if self.derivative in (WRONG, UNSHOWN):
             problems.append(self._derivative_problem())
             if self.derivative_cause in ("nondeterministic", "twin") and self.wrong_checks:
-                problems += [self.sentence(one) for one in self.wrong_checks[:1] if one.cause in (*SUSPICIOUS, "disconnected")]
+                problems += [
+                    self.sentence(one) for one in self.wrong_checks[:1] if one.cause in (*SUSPICIOUS, "disconnected")
+                ]
         elif self.noise_cause:
             problems += self._noise_problems()
         return problems
@@ -344,7 +346,9 @@ class Findings:
             return f"{text} by {number(100 * (self.twin or 0.0))}% at theta or near it"
         if cause == "nondeterministic":
             if self.has_state:
-                text = f"{cause}: the cost depends on the call before it: a warm start, a cache or a count that persists"
+                text = (
+                    f"{cause}: the cost depends on the call before it: a warm start, a cache or a count that persists"
+                )
             if self.spread > 0:
                 return f"{text} (costs differ by {number(self.spread)}{self._relative(self.spread)})"
             if self.gradient_spread > 0:
@@ -389,7 +393,9 @@ class Findings:
         if self.twin_error is not None:
             own, other = self.twin_error
             return f"; the second gradient is right to {number(100 * other)}%, this one is off by {number(100 * own)}%"
-        return "; right after few steps and wrong after many, off by " + ", ".join(f"{number(100 * one.error)}% after {one.steps} steps" for one in self.growth)
+        return "; right after few steps and wrong after many, off by " + ", ".join(
+            f"{number(100 * one.error)}% after {one.steps} steps" for one in self.growth
+        )
 
     def _noise_problems(self) -> list[str]:
         problems = []
@@ -449,7 +455,11 @@ class Findings:
         """The answer about the gradient under noise in one line."""
         if not self.gradient:
             return ""
-        where = f"Under noise of sigma {', '.join(number(one) for one in self.requested)}" if self.requested else "Around theta"
+        where = (
+            f"Under noise of sigma {', '.join(number(one) for one in self.requested)}"
+            if self.requested
+            else "Around theta"
+        )
         if self.derivative != RIGHT and not self.requested:
             where = "Under noise"
         if self.noise_cause and self.noise_cause != "unmeasured":
@@ -503,9 +513,13 @@ class Findings:
                 "errors below what this allows are not seen"
             )
         if self.elsewhere:
-            warnings.append(f"the gradient raised an exception {self.n_failed} times away from theta: {shortened(self.elsewhere)}")
+            warnings.append(
+                f"the gradient raised an exception {self.n_failed} times away from theta: {shortened(self.elsewhere)}"
+            )
         if self.printed.count:
-            warnings.append(f"cost and gradient printed {counted(self.printed.count, 'line')}; the first: {shortened(self.printed.lines[0])}")
+            warnings.append(
+                f"cost and gradient printed {counted(self.printed.count, 'line')}; the first: {shortened(self.printed.lines[0])}"
+            )
         if not self.status and self.missed > SEEN and self.noise_cause != "jumps":
             warnings.append(
                 f"jumps: along a line the integral of the gradient misses {number(100 * self.missed)}% of the cost's change"
@@ -575,7 +589,11 @@ class Findings:
         text = f"{name}: program {_shown(part.program)}, differences {_shown(part.difference)}"
         if math.isfinite(part.error):
             ratio = abs(part.program) / abs(part.difference) if part.difference else math.inf
-            off = f"{number(ratio, 3)} times too large" if 2 < ratio < math.inf else f"{number(100 * abs(part.program - part.difference) / abs(part.difference)) if part.difference else '-'}%"
+            off = (
+                f"{number(ratio, 3)} times too large"
+                if 2 < ratio < math.inf
+                else f"{number(100 * abs(part.program - part.difference) / abs(part.difference)) if part.difference else '-'}%"
+            )
             text = f"{name} off by {off}: program {_shown(part.program)}, differences {_shown(part.difference)}"
             text = text.replace("off by", "is" if 2 < ratio < math.inf else "off by", 1)
         return text + (f", good to {number(good, 1)}" if math.isfinite(good) else "")
@@ -688,7 +706,11 @@ class Findings:
             lines.append(text)
         rest = [] if self.gradient else ["any gradient"]
         rest += [f"{what} (budget)" for what in self.left_out]
-        rest += ["the gradient under noise on theta (no sigma)"] if self.gradient and not self.requested and not self.smoothed else []
+        rest += (
+            ["the gradient under noise on theta (no sigma)"]
+            if self.gradient and not self.requested and not self.smoothed
+            else []
+        )
         lines.append(f"not checked: {'; '.join([*rest, 'thetas far from this one'])}")
         advice = self.advice
         return [*lines, f"next: {advice}"] if advice else lines
@@ -697,7 +719,9 @@ class Findings:
     def advice(self) -> str:
         """The next step, with the setting that takes it."""
         cause = self.cause
-        longer = f"calls={int(2 * self.calls)}" if math.isfinite(self.calls) else f"budget={max(2 * self.budget, 60.0):.0f}s"
+        longer = (
+            f"calls={int(2 * self.calls)}" if math.isfinite(self.calls) else f"budget={max(2 * self.budget, 60.0):.0f}s"
+        )
         if cause in ("undecided", "unmeasured") or (cause == "unsettled" and self.left_out):
             return f"{self._again(longer)}: the rest needs more calls"
         if cause in ("kink", "jump"):
@@ -734,7 +758,10 @@ class Findings:
         if not self.growth:
             return []
         rows = [["steps", "error of the gradient", "differences good to"]]
-        rows += [[str(one.steps), f"{number(100 * one.error)}%", f"{number(100 * one.uncertainty, 1)}%"] for one in self.growth]
+        rows += [
+            [str(one.steps), f"{number(100 * one.error)}%", f"{number(100 * one.uncertainty, 1)}%"]
+            for one in self.growth
+        ]
         return ["The gradient after fewer or more steps:", *_table(rows)]
 
     def _head(self) -> list[str]:
@@ -784,7 +811,9 @@ class Findings:
                 f"  elsewhere: {counted(len(check.draws), 'direction')} at other thetas around this one, "
                 + (f"{len(wrong)} wrong: {wrong[0].verdict}" if wrong else "none wrong")
             )
-        orders = [part.order for part in (check.parts if check.trusted else check.worst_parts) if math.isfinite(part.order)]
+        orders = [
+            part.order for part in (check.parts if check.trusted else check.worst_parts) if math.isfinite(part.order)
+        ]
         if self.gradient and orders:
             order = float(np.median(orders)) if check.trusted else min(orders)
             lines.append(f"  Taylor remainder |f(x + h d) - f(x) - h g.d|: order {order:.2f} in h (2 right, 1 wrong)")

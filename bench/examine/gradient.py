@@ -127,14 +127,16 @@ class GradientStages:
             self._compute(thetas, keys, taken, missing)
         return np.array([float(value) for value in taken if value is not None])
 
-    def _compute(self, thetas: np.ndarray, keys: list[bytes], taken: list[np.ndarray | None], missing: list[int]) -> None:
+    def _compute(
+        self, thetas: np.ndarray, keys: list[bytes], taken: list[np.ndarray | None], missing: list[int]
+    ) -> None:
         """Compute missing costs and store them batch by batch, so that an interrupted stage keeps its costs."""
         width = self.simulator.width
         for first in range(0, len(missing), width):
             part = missing[first : first + width]
             for i, value in zip(part, self.costs(thetas[:, part]), strict=True):
-                taken[i] = np.asarray(value)
-                self._costs_store.put(keys[i], taken[i])
+                taken[i] = computed = np.asarray(value)
+                self._costs_store.put(keys[i], computed)
 
     def _stored_gradient(self, theta: np.ndarray) -> np.ndarray:
         if not self._is_storing:
@@ -281,7 +283,10 @@ class GradientStages:
         scanned = 4 if is_right else 0
         return [
             ("more steps", base),
-            ("all steps and random directions", replace(base, eps=eps, directions=2, scanned=scanned, repeated=repeated)),
+            (
+                "all steps and random directions",
+                replace(base, eps=eps, directions=2, scanned=scanned, repeated=repeated),
+            ),
             ("2 other thetas", replace(base, eps=eps, directions=2, draws=2, scanned=scanned)),
             ("8 other thetas", replace(base, eps=eps, directions=2, draws=8, scanned=4)),
         ]
@@ -354,7 +359,9 @@ class GradientStages:
         )
         if self.simulator.n_failed_gradients:
             # a gradient that raises at other thetas is reported as such
-            outcome = recaused(replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program))))
+            outcome = recaused(
+                replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
+            )
         return self._with_roughness(self._without_small_spread(outcome))
 
     def _without_small_spread(self, outcome: Check) -> Check:

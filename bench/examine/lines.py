@@ -113,7 +113,9 @@ def scan(
     f = along(t)
     finite = f[np.isfinite(f)]
     # a break that is this small beside the cost or its change is rounding
-    noise = max(noise, unit * float(np.abs(finite).max(initial=0.0)), LEAST * float(np.ptp(finite)) if finite.size else 0.0)
+    noise = max(
+        noise, unit * float(np.abs(finite).max(initial=0.0)), LEAST * float(np.ptp(finite)) if finite.size else 0.0
+    )
     turns = np.abs(np.diff(f, 2))
     order = np.argsort(np.nan_to_num(turns, nan=-1.0, posinf=-1.0))[::-1]
     places: list[int] = []

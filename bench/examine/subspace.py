@@ -44,7 +44,12 @@ class Subspace:
     """
 
     def __init__(
-        self, layout: ParameterTree, scale: np.ndarray, components: list[int], groups: list[Group], theta: np.ndarray | None = None
+        self,
+        layout: ParameterTree,
+        scale: np.ndarray,
+        components: list[int],
+        groups: list[Group],
+        theta: np.ndarray | None = None,
     ) -> None:
         self.layout, self.components, self.groups = layout, components, groups
         self.theta = layout.vector if theta is None else theta
@@ -84,13 +89,15 @@ class Subspace:
         if self.is_whole:
             return gradient
         along = [float(group.vector @ gradient[group.first : group.last]) for group in self.groups]
-        return np.r_[gradient[self.components], along]
+        return np.asarray(np.r_[gradient[self.components], along])
 
     def costs(self, cost: Callable[[np.ndarray], np.ndarray], z: np.ndarray, width: int) -> np.ndarray:
         """Return the costs ``(B,)`` at ``z (m, B)``, from ``cost`` of at most ``width`` thetas ``(d, width)`` at a time."""
         if self.is_whole:
             return cost(z)
-        return np.concatenate([cost(self.place(z[:, i : i + width])) for i in range(0, z.shape[1], width)] or [np.zeros(0)])
+        return np.concatenate(
+            [cost(self.place(z[:, i : i + width])) for i in range(0, z.shape[1], width)] or [np.zeros(0)]
+        )
 
     def restore(self, check: Check) -> Check:
         """Return a check in these coordinates with its parts named after theta's components and groups."""
@@ -106,7 +113,9 @@ class Subspace:
         return replace(part, component=None, name=self.groups[part.component - len(self.components)].name)
 
 
-def choose(layout: ParameterTree, scale: np.ndarray, gradient: np.ndarray | None, seed: int, most: int = MOST) -> Subspace:
+def choose(
+    layout: ParameterTree, scale: np.ndarray, gradient: np.ndarray | None, seed: int, most: int = MOST
+) -> Subspace:
     """Return the coordinates for a theta: all of its components, or those with the largest and smallest |gradient * scale|.
 
     ``gradient (d,)`` decides which components of a large theta are checked one by one.

@@ -114,9 +114,7 @@ def test_a_warm_start_is_one_finding():
 
 @pytest.mark.parametrize(("factor", "status", "cause"), [(1.0, 0, None), (1.55, 1, "wrong_factor")])
 def test_float32_behind_float_is_checked_as_float32(factor, status, cause):
-    report = bench.examine(
-        mechanisms.single, START, grad=lambda x: factor * mechanisms.single_gradient(x), **QUICK
-    )
+    report = bench.examine(mechanisms.single, START, grad=lambda x: factor * mechanisms.single_gradient(x), **QUICK)
     assert report.status == status, str(report)
     assert cause is None or report.cause == cause
     assert (report.precision, report.is_hidden_single) == ("float32", True)
@@ -154,7 +152,7 @@ def test_errors_within_the_tolerance_are_warnings_with_their_size():
         assert report.status == 0, str(report)
         assert "small error, within the tolerance" in str(report)
     assert bench.examine(swing, START, grad=off, tolerance={"theta[0]": 2e-3}, **QUICK).status == 1
-    with pytest.raises(UserError, match="unknown input 'theta.7.'"):
+    with pytest.raises(UserError, match=r"unknown input 'theta.7.'"):
         bench.examine(swing, START, grad=off, tolerance={"theta[7]": 1e-3}, **QUICK)
 
 
@@ -253,7 +251,9 @@ def test_a_batch_of_a_fixed_width(batch):
 
 def test_numbers_with_float_only_are_numbers():
     value = decimal.Decimal
-    report = bench.examine(lambda x: value(float(x[0]) ** 2), [value("1.5"), value(2)], grad=lambda x: [2 * x[0], 0.0], **QUICK)
+    report = bench.examine(
+        lambda x: value(float(x[0]) ** 2), [value("1.5"), value(2)], grad=lambda x: [2 * x[0], 0.0], **QUICK
+    )
     assert report.status == 0, str(report)
 
 
@@ -277,13 +277,16 @@ def test_a_linear_cost_has_no_jumps_and_no_missed_integral():
     assert not any("integral" in text for text in report.warnings)
 
 
-@pytest.mark.parametrize("cost", [lambda t: np.tanh(300 * t), lambda t: np.exp(-((t * 100) ** 2)), lambda t: np.sqrt(t * t + 1e-6)])
+@pytest.mark.parametrize(
+    "cost", [lambda t: np.tanh(300 * t), lambda t: np.exp(-((t * 100) ** 2)), lambda t: np.sqrt(t * t + 1e-6)]
+)
 def test_steep_smooth_lines_have_no_breaks(cost):
     assert not lines.scan(lambda x: cost(x[0] - 0.113), np.zeros(1), np.ones(1), 1e-16).breaks
 
 
 def test_roughness_has_no_breaks():
     """Noise that is a function of theta, as from a loose solver, has second differences of every size."""
+
     def rough(x):
         return np.sin(x[0]) + 1e-6 * np.sin(1e7 * x[0]) * np.cos(3.1e7 * x[0])
 
@@ -305,7 +308,9 @@ def test_the_table_and_the_text_recommend_the_same_method():
 
 
 def test_a_narrow_bias_interval_has_no_remark_on_heavy_tails():
-    report = bench.examine(lambda x: x[0] ** 2 * x[1], [2.0, 3.0], grad=lambda x: [2 * x[0] * x[1], x[0] ** 2], sigma=0.01, **QUICK)
+    report = bench.examine(
+        lambda x: x[0] ** 2 * x[1], [2.0, 3.0], grad=lambda x: [2 * x[0] * x[1], x[0] ** 2], sigma=0.01, **QUICK
+    )
     assert report.smoothed[0].remark == ""
 
 
@@ -348,5 +353,5 @@ def test_groups_cover_every_number_once():
     for theta in (np.ones(1000), {"a": np.ones(50), "b": [np.ones(3), 2.0]}, {f"x{i}": np.ones(7) for i in range(100)}):
         layout = ParameterTree(theta)
         groups = groups_of(layout, layout.scales(), 0)
-        assert sum(([*range(g.first, g.last)] for g in groups), []) == list(range(layout.vector.size))
+        assert [i for g in groups for i in range(g.first, g.last)] == list(range(layout.vector.size))
         assert len(groups) <= 16

@@ -47,7 +47,9 @@ def test_fewer_calls_than_components_decide_nothing():
 
 def test_more_calls_only_add_to_what_was_checked():
     steps = [
-        max(part.sample.step.size for part in bench.examine(cost, THETA, grad=grad, progress=False, calls=n).check.parts)
+        max(
+            part.sample.step.size for part in bench.examine(cost, THETA, grad=grad, progress=False, calls=n).check.parts
+        )
         for n in (8, 200, 900)
     ]
     assert steps == [1, 9, 17]

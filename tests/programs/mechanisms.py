@@ -41,7 +41,9 @@ def adaptive(x, rtol=1e-4, end=3.0):
 
 def frozen(x, **settings):
     """Return the derivative of :func:`adaptive` with its steps held fixed."""
-    return np.array([adaptive([*map(complex, row)], **settings).imag for row in np.array(x) + 1e-30j * np.eye(3)]) / 1e-30
+    return (
+        np.array([adaptive([*map(complex, row)], **settings).imag for row in np.array(x) + 1e-30j * np.eye(3)]) / 1e-30
+    )
 
 
 def refined(x):

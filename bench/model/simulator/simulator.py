@@ -416,7 +416,6 @@ class Simulator:
         return torch.stack([cost.reshape(()) for cost in doubles])
 
     def _jax_values(self, thetas: np.ndarray, w: np.ndarray | None, batch: str) -> Any:
-        import jax
 
         compiled, _, eager, _ = self._jax_functions(batch)
         return self._call_compiled(compiled, eager, thetas, w, batch)
@@ -507,7 +506,9 @@ def _parse_batch(batch: str | int | None) -> tuple[str | None, int]:
     mode, _, width = str(batch).partition(":")
     if mode.isdigit() and not width:
         mode, width = "", mode
-    if mode not in ("", *BATCHES) or (width and not (width.isdigit() and int(width) > 1 and mode in ("", "columns", "rows"))):
+    if mode not in ("", *BATCHES) or (
+        width and not (width.isdigit() and int(width) > 1 and mode in ("", "columns", "rows"))
+    ):
         raise unknown("batch", batch, (*BATCHES, "columns:WIDTH", "rows:WIDTH", "WIDTH"))
     return mode or None, int(width or 0)
 
