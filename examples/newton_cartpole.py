@@ -1,7 +1,6 @@
-"""A cart and pole in Newton's Featherstone solver: one tape over all steps reads matrices that later steps overwrote.
+"""A cart and pole in Newton's Featherstone solver: one tape over all steps reads matrices that later steps overwrote."""
 
-python examples/newton_cartpole.py     (pip install "newton[sim]"; CPU, a minute to compile)
-"""
+import itertools
 
 import newton
 import numpy as np
@@ -14,9 +13,8 @@ theta = [0.3, 0.5]  # angle of the pole [rad] and its speed [rad/s]
 builder = newton.ModelBuilder()
 cart = builder.add_link(mass=1.0, inertia=wp.mat33(np.eye(3) * 0.1))
 pole = builder.add_link(mass=0.2, com=wp.vec3(0, 0, -0.5), inertia=wp.mat33(np.eye(3) * 0.02))
-rail = builder.add_joint_prismatic(-1, cart, axis=(1, 0, 0))
-hinge = builder.add_joint_revolute(cart, pole, axis=(0, 1, 0))
-builder.add_articulation([rail, hinge])
+joints = [builder.add_joint_prismatic(-1, cart, axis=(1, 0, 0)), builder.add_joint_revolute(cart, pole, axis=(0, 1, 0))]
+builder.add_articulation(joints)
 model = builder.finalize(requires_grad=True)
 
 
@@ -26,15 +24,14 @@ def rollout(x, steps, fresh):
     states[0].joint_q.assign(np.float32([0, x[0]]))
     states[0].joint_qd.assign(np.float32([0, x[1]]))
     with wp.Tape() as tape:
-        for before, after in zip(states[:-1], states[1:], strict=True):
+        for before, after in itertools.pairwise(states):
             solver = newton.solvers.SolverFeatherstone(model) if fresh else shared
             solver.step(before, after, model.control(), None, 0.01)
     q, qd = states[-1].joint_q.numpy()[1], states[-1].joint_qd.numpy()[1]
     seeds = {states[-1].joint_q: [0, 2 * q], states[-1].joint_qd: [0, 0.2 * qd]}
     tape.backward(grads={array: wp.array(np.float32(seed)) for array, seed in seeds.items()})
-    return float(q * q + np.float32(0.1) * qd * qd), [
-        float(a.grad.numpy()[1]) for a in (states[0].joint_q, states[0].joint_qd)
-    ]
+    slopes = [float(first.grad.numpy()[1]) for first in (states[0].joint_q, states[0].joint_qd)]
+    return float(q * q + np.float32(0.1) * qd * qd), slopes
 
 
 if __name__ == "__main__":

@@ -154,8 +154,8 @@ def as_line(reports: Sequence[Findings], refused: Mapping[str, str] | None = Non
 
 def status(reports: Sequence[Findings], refused: Mapping[str, str] | None = None) -> int:
     """Return the exit status of several reports: 1 if one is wrong, else 2 for bad input, else 3 if one is not decided."""
-    found = {report.status for report in reports} | ({2} if refused else set())
-    return next((one for one in (1, 2, 3) if one in found), 0)
+    statuses = {report.status for report in reports} | ({2} if refused else set())
+    return next((one for one in (1, 2, 3) if one in statuses), 0)
 
 
 def _cell(text: str) -> str:

@@ -145,7 +145,7 @@ def _run_matrix(words: Sequence[str]) -> int:
 
 
 def read_matrix(path: Path) -> list[tuple[str, str, dict[str, Any]]]:
-    """Return name, cost and settings of each ``[[cost]]`` of a TOML file, with those of ``[defaults]`` where absent.
+    """Return name, cost and settings of each ``[[cost]]`` of a TOML file, completed by ``[defaults]``.
 
     Costs of files are relative to the TOML file. Raises :class:`UserError` for a file that is not such a table.
     """

@@ -25,7 +25,7 @@ EXPLAINED = 10.0
 SMALL_JUMPS = 0.05
 """Largest total height of such jumps, as a share of the cost's change along the line."""
 FEWEST_JUMPS = 2
-"""Fewest jumps on the lines that count as those of adaptive steps."""
+"""Fewest jumps on the lines that count as jumps of adaptive steps."""
 LONGER = 10.0
 """Length of the line on which more jumps are searched, in multiples of the first line."""
 THETAS = 4
@@ -122,7 +122,7 @@ def is_adaptive(stages: GradientStages, outcome: Check, lines: Sequence[LineScan
     """Return whether small jumps of the cost are as large as the error of the gradient, as with adaptive steps.
 
     A solver with adaptive steps has another discretisation error on either side of each change of its number of steps.
-    Its cost has a small jump there, and slopes between jumps that differ from those of the solution by about the height
+    Its cost has a small jump there, and slopes between jumps that differ from the solution's slopes by about the height
     of a jump over the distance between jumps. Reverse mode through such a solver holds the steps fixed, so its gradient
     differs by as much. Where few jumps are found, a line ten times as long is searched.
     """

@@ -78,7 +78,7 @@ def examine(
     have the same w.
 
     ``budget`` is the time limit of the whole examination in seconds or as text (``60``, ``"2m"``), 60 s by default.
-    ``calls`` limits the number of costs and gradients together; alone, it makes the report independent of the machine.
+    ``calls`` limits the number of costs and gradients together; without ``budget`` it makes the report independent of the machine.
     The first call of each kind may compile and counts against ``compile_budget`` instead. A call that exceeds its limit
     is interrupted, compiled code as soon as it returns. ``batch`` is the way to pass several thetas in one call:
     ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``, with a fixed B as ``columns:64``; detected by

@@ -65,7 +65,7 @@ NOT_SHOWN = ("undecided", "unsettled", "nonfinite", "adaptive", "zero", "spread"
 DIFFERENT = 1e-6
 """Relative difference of two costs that must agree, in double precision."""
 REFINED = 0.1
-"""Least distance of the differences from those of a refined cost, relative to the gradient's error, of a discretisation gap."""
+"""Least distance between the differences of the cost and of a refined cost, relative to the gradient's error, of a discretisation gap."""
 SHOWN = 8
 """Most numbers of theta in the table of breaks."""
 HEADLINE = 200
@@ -121,7 +121,7 @@ class Findings:
     is_complete: bool
     """Whether every chosen component and group was checked."""
     located: dict[str, str]
-    """By name of a wrong group of numbers: those that cause its error."""
+    """By name of a wrong group: the numbers that cause its error."""
     more: Sequence[Check]
     """Checks under further draws of the simulator's own noise."""
     rtol: np.ndarray
@@ -253,7 +253,7 @@ class Findings:
 
     @property
     def is_discretisation_gap(self) -> bool:
-        """Whether the differences of the cost are as far from those of the refined cost as the gradient is from them."""
+        """Whether the differences of the cost are as far from the refined cost's as the gradient is from them."""
         if self.refined is None or self.check is None:
             return False
         cost = {part.name: part for part in self.check.components}
@@ -586,7 +586,7 @@ class Findings:
         if part.name in self.located:
             name = f"{self.located[part.name]}, along a random direction,"
         good = abs(part.uncertainty / part.difference) if part.difference else math.nan
-        text = f"{name}: program {_shown(part.program)}, differences {_shown(part.difference)}"
+        text = f"{name}: program {_as_text(part.program)}, differences {_as_text(part.difference)}"
         if math.isfinite(part.error):
             ratio = abs(part.program) / abs(part.difference) if part.difference else math.inf
             off = (
@@ -594,7 +594,7 @@ class Findings:
                 if 2 < ratio < math.inf
                 else f"{number(100 * abs(part.program - part.difference) / abs(part.difference)) if part.difference else '-'}%"
             )
-            text = f"{name} off by {off}: program {_shown(part.program)}, differences {_shown(part.difference)}"
+            text = f"{name} off by {off}: program {_as_text(part.program)}, differences {_as_text(part.difference)}"
             text = text.replace("off by", "is" if 2 < ratio < math.inf else "off by", 1)
         return text + (f", good to {number(good, 1)}" if math.isfinite(good) else "")
 
@@ -606,18 +606,18 @@ class Findings:
         import pandas as pd
 
         parts = [(self.label(part), part) for part in (*self.check.parts, *self.check.draws)] if self.check else []
-        shown = bool(self.gradient)
+        has_gradient = bool(self.gradient)
         return pd.DataFrame(
             {
                 "name": [name for name, _ in parts],
-                "program": [part.program if shown else math.nan for _, part in parts],
+                "program": [part.program if has_gradient else math.nan for _, part in parts],
                 "difference": [part.difference for _, part in parts],
                 "uncertainty": [part.uncertainty for _, part in parts],
                 "step": [part.step for _, part in parts],
-                "ratio": [part.ratio if shown else math.nan for _, part in parts],
+                "ratio": [part.ratio if has_gradient else math.nan for _, part in parts],
                 "left": [part.left for _, part in parts],
                 "right": [part.right for _, part in parts],
-                "order": [part.order if shown else math.nan for _, part in parts],
+                "order": [part.order if has_gradient else math.nan for _, part in parts],
                 "verdict": [part.verdict for _, part in parts],
             }
         )
@@ -766,13 +766,13 @@ class Findings:
 
     def _head(self) -> list[str]:
         first = [(self.names[i], self.theta[i]) for i in range(min(6, self.theta.size))]
-        shown = ", ".join(f"{name}={value:g}" for name, value in first)
-        shown += f", ... ({self.theta.size:,} numbers)" if self.theta.size > 6 else ""
+        point = ", ".join(f"{name}={value:g}" for name, value in first)
+        point += f", ... ({self.theta.size:,} numbers)" if self.theta.size > 6 else ""
         repeats = "repeats exactly" if self.repeats else f"DOES NOT REPEAT: calls differ by {number(self.spread)}"
         if self.repeats and self.check is not None and self.check.noise > 0:
             repeats += f", rough by {number(self.check.noise)}"
         lines = [
-            f"{self.name}: cost {self.cost:.6g} at {shown}",
+            f"{self.name}: cost {self.cost:.6g} at {point}",
             f"{self.precision}, {repeats}; gradient: {self.gradient or 'none, only differences'}; batch: {self.batch}",
         ]
         spent = f"spent: {counted(self.costs, 'cost')}"
@@ -796,8 +796,8 @@ class Findings:
             rows.append(
                 [
                     self.label(part),
-                    _shown(part.program) if self.gradient else "-",
-                    f"{_shown(part.difference)} +- {number(part.uncertainty, 1)}",
+                    _as_text(part.program) if self.gradient else "-",
+                    f"{_as_text(part.difference)} +- {number(part.uncertainty, 1)}",
                     number(part.step, 1),
                     number(part.ratio, 5) if self.gradient else "-",
                     part.verdict,
@@ -920,7 +920,7 @@ def shortened(text: str) -> str:
     return line if len(line) <= HEADLINE else f"{line[:HEADLINE]} ..."
 
 
-def _shown(value: float) -> str:
+def _as_text(value: float) -> str:
     """Return a derivative as text; ``NaN`` where it is not a number."""
     return "NaN" if math.isnan(value) else number(value, 6)
 

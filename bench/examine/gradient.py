@@ -24,7 +24,7 @@ from bench.model.simulator.simulator import Simulator
 SINGLE_EPS = np.logspace(-1, -7, 13)
 """Steps of a check in single precision, relative to each input's scale: the best is near 5e-3."""
 NOISE_POINTS = 17
-"""Costs per direction beside those of the steps: the centre, and the points at which the noise is measured."""
+"""Costs per direction that no step needs: the centre, and the points at which the noise is measured."""
 SCAN = 7 * 65
 """Number of costs of a staircase search along one direction that is not clearly right."""
 SMALL = 0.6

@@ -8,6 +8,7 @@ few thetas.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -137,7 +138,7 @@ def groups_of(layout: ParameterTree, scale: np.ndarray, seed: int) -> list[Group
     if len(leaves) == 1:
         for leaf in leaves:
             edges = np.linspace(0, leaf.size, min(BLOCKS, leaf.size) + 1).astype(int)
-            for first, last in zip(edges[:-1], edges[1:], strict=True):
+            for first, last in itertools.pairwise(edges):
                 spans.append((leaf.block(int(first), int(last)), leaf.start + int(first), leaf.start + int(last)))
     else:
         for part in np.array_split(np.arange(len(leaves)), min(GROUPS, len(leaves))):
@@ -173,13 +174,13 @@ def locate(
         part = group.vector[first - group.first : middle - group.first]
         moved[first:middle] += part[:, None] * np.array([-step, step])
         costs = cost(moved)
-        found = float((costs[1] - costs[0]) / (2 * step) - part @ gradient[first:middle])
-        rest = error - found
-        if not np.isfinite(found) or min(abs(found), abs(rest)) > (1 - SHARE) * abs(error):
+        left_error = float((costs[1] - costs[0]) / (2 * step) - part @ gradient[first:middle])
+        rest = error - left_error
+        if not np.isfinite(left_error) or min(abs(left_error), abs(rest)) > (1 - SHARE) * abs(error):
             break
-        if max(abs(found), abs(rest)) < 2.0 * noise:
+        if max(abs(left_error), abs(rest)) < 2.0 * noise:
             break
-        first, last, error = (first, middle, found) if abs(found) > abs(rest) else (middle, last, rest)
+        first, last, error = (first, middle, left_error) if abs(left_error) > abs(rest) else (middle, last, rest)
     inside = [leaf for leaf in layout.leaves if leaf.start < last and leaf.start + leaf.size > first]
     blocks = [leaf.block(max(first - leaf.start, 0), min(last - leaf.start, leaf.size)) for leaf in inside]
     return blocks[0] if len(blocks) == 1 else f"{blocks[0]} to {blocks[-1]}"
