@@ -42,16 +42,27 @@ unexpectedly; 2 bad input.
 """
 EXAMINE = """\
   theta=1,0            the point: numbers, names with numbers (mass:1,gain:2), or a name in the file; by default theta
-  grad=jax             jax, torch, or a function: a name in the file, or FILE:NAME; without it, differences alone
-  sigma=0.003,0.05     standard deviations of noise on theta
+  grad=jax             jax, torch, or a function: a name in the file, or FILE:NAME; without it, only differences
+  sigma=0.003,0.05     standard deviations of noise on theta; by input: sigma=mass:0.1,gain:0.2
   noise=200            the cost is cost(theta, w), with w of that many standard normal numbers
   budget=60s           time for the whole examination
-  batch=loop           batching of thetas: loop, vmap, columns (d, B) or rows (B, d); by default detected
+  calls=500            number of costs and gradients; only with calls=, the report is the same on any machine
+  compile_budget=300s  time for the first calls, which may compile
+  tolerance=1e-4       relative error that only causes a warning; by input: tolerance=mass:1e-3; absolute: atol=1e-9
+  allow_zero=friction  inputs that may have no effect; true: all, false: none
+  expect=kink          the known cause, with which the status is 0
+  baseline=FILE        compare with this file, which is written if absent: status 0 unless something is worse
+  twin=NAME            a second cost that must agree; twin_grad=NAME: a second gradient, such as one with a tape per step
+  refined=NAME         the cost at a tighter tolerance or finer step
+  horizons=1,2,10      numbers of steps T: cost(theta, steps=T) and its gradient
+  batch=loop           batching of thetas: loop, vmap, columns (d, B), rows (B, d), columns:64; by default detected
   scale=1,0.1          the typical size of each input; by default its value
   seed=0               of the random directions and noise
   save=DIR             write text, tables, charts and report.html there
+  markdown=FILE        append a summary in Markdown; junit=FILE: write JUnit XML
+  --matrix FILE.toml   examine each [[cost]] of the file, with the settings above
   --quiet              no progress
-Exit status: 0 the gradient can be trusted; 1 it cannot; 2 bad input.
+Exit status: 0 right; 1 wrong; 3 not decided; 2 bad input.
 """
 FAMILY = """\
 Three commands ask whether something is right, each about its own subject:

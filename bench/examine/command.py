@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bench.errors import UserError, unknown
+from bench.errors import StorageError, UserError, unknown
+from bench.examine import ci
 from bench.examine.examination import examine
 from bench.examine.report import Report
 from bench.model.simulator import imports
 from bench.model.simulator.simulator import LIBRARIES
 
-SETTINGS = ("theta", "grad", "sigma", "noise", "budget", "batch", "scale", "seed", "save")
-QUIET = "--quiet"
+SETTINGS = (
+    "theta", "grad", "sigma", "noise", "budget", "batch", "scale", "seed", "calls", "compile_budget", "tolerance", "atol",
+    "allow_zero", "expect", "twin", "twin_grad", "refined", "horizons", "baseline", "save",
+)  # fmt: skip
+"""Settings of one cost."""
+OUTPUTS = ("markdown", "junit")
+"""Files of a whole command."""
+QUIET, MATRIX = "--quiet", "--matrix"
 
 
 def run(words: Sequence[str]) -> Report:
@@ -24,6 +34,26 @@ def run(words: Sequence[str]) -> Report:
 
     Raises :class:`UserError` for a command line that cannot be parsed.
     """
+    (cost, settings), _ = _parse(words)
+    report = _examined(cost, settings, QUIET not in words)
+    print(report)
+    _save(report, settings)
+    return report
+
+
+def main(words: Sequence[str]) -> int:
+    """Run the command, and return the exit status: 0 right, 1 wrong, 3 not decided; 2 is bad input."""
+    if any(word == MATRIX or word.startswith(f"{MATRIX}=") for word in words):
+        return _run_matrix(words)
+    _, outputs = _parse(words)
+    report = run(words)
+    _write(outputs, [report], {})
+    sys.stdout.flush()
+    return report.status
+
+
+def _parse(words: Sequence[str]) -> tuple[tuple[str, dict[str, str]], dict[str, str]]:
+    """Return the cost with its settings, and the files to write."""
     costs = [word for word in words if "=" not in word and word != QUIET]
     if len(costs) != 1:
         given = f", not {len(costs)}" if costs else ""
@@ -32,71 +62,205 @@ def run(words: Sequence[str]) -> Report:
     for word in words:
         if "=" in word:
             key, _, value = word.partition("=")
-            if key not in SETTINGS:
-                raise unknown("setting of examine", key, SETTINGS)
+            if key not in (*SETTINGS, *OUTPUTS):
+                raise unknown("setting of examine", key, (*SETTINGS, *OUTPUTS))
             settings[key] = value
-    file = costs[0].rpartition(":")[0]
-    cost = imports.load_attribute(costs[0])
-    module = imports.load_module(file)
+    outputs = {key: settings.pop(key) for key in OUTPUTS if key in settings}
+    return (costs[0], settings), outputs
+
+
+def _examined(cost: str, settings: Mapping[str, Any], progress: bool) -> Report:
+    """Return the report on a cost ``FILE:NAME`` with settings as on the command line, or as in a TOML file."""
+    function = imports.load_attribute(cost)
+    module = imports.load_module(cost.rpartition(":")[0])
+
+    def other(key: str) -> Any:
+        return _function(str(settings[key]), module, key) if settings.get(key) else None
+
     report = examine(
-        cost,
+        function,
         _theta(settings.get("theta", "theta"), module, "theta" in settings),
         grad=_gradient(settings.get("grad"), module),
-        sigma=_numbers(settings["sigma"], "sigma") if "sigma" in settings else (),
-        noise=_count(settings, "noise"),
-        budget=settings.get("budget", "60s"),
+        sigma=_by_input(settings["sigma"], "sigma", True) if "sigma" in settings else (),
+        noise=_count(settings, "noise") or 0,
+        budget=settings.get("budget"),
         batch=settings.get("batch"),
         scale=_theta(settings["scale"], module, True) if "scale" in settings else None,
-        seed=_count(settings, "seed"),
-        name=costs[0],
-        progress=QUIET not in words,
+        seed=_count(settings, "seed") or 0,
+        name=cost,
+        progress=progress,
+        calls=_count(settings, "calls"),
+        **{key: _by_input(settings[key], key, False) for key in ("tolerance", "atol") if key in settings},
+        **({"compile_budget": settings["compile_budget"]} if "compile_budget" in settings else {}),
+        allow_zero=_names(settings["allow_zero"]) if "allow_zero" in settings else None,
+        expect=str(settings.get("expect", "")),
+        twin=other("twin"),
+        twin_grad=_gradient(settings.get("twin_grad"), module),
+        refined=other("refined"),
+        horizons=[int(one) for one in _numbers(settings["horizons"], "horizons")] if "horizons" in settings else (),
     )
-    print(report)
+    given = " ".join(f"{key}={value}" for key, value in settings.items() if key != "expect")
+    report = replace(report, command=f"python -m bench examine {cost} {given}".strip())
+    return report.compared(settings["baseline"]) if "baseline" in settings else report
+
+
+def _save(report: Report, settings: Mapping[str, Any]) -> None:
     if "save" in settings:
         print("\nWritten:")
         for path in report.save(settings["save"]):
             print(f"  {path}")
-    return report
 
 
-def main(words: Sequence[str]) -> int:
-    """Run the command, and return the exit status."""
-    report = run(words)
+# ---------------------------------------------------------------------------------------------- many costs
+
+
+def _run_matrix(words: Sequence[str]) -> int:
+    """Examine every cost of a TOML file, print one table, and return the exit status."""
+    joined = [word.partition("=")[2] for word in words if word.startswith(f"{MATRIX}=")]
+    rest = [word for word in words if not word.startswith(MATRIX) and word != QUIET]
+    outputs = {key: value for key, _, value in (word.partition("=") for word in rest if "=" in word)}
+    files = [*joined, *(word for word in rest if "=" not in word)]
+    if wrong := [key for key in outputs if key not in OUTPUTS]:
+        raise unknown("setting of examine --matrix", wrong[0], OUTPUTS)
+    if len(files) != 1:
+        raise UserError("name one file: python -m bench examine --matrix FILE.toml [markdown=FILE] [junit=FILE]")
+    reports: list[Report] = []
+    refused: dict[str, str] = {}
+    for name, cost, settings in read_matrix(Path(files[0])):
+        try:
+            report = _examined(cost, settings, QUIET not in words)
+        except UserError as error:
+            refused[name] = str(error)
+            print(f"{name}: bad input: {error}\n")
+            continue
+        report = replace(report, name=name)
+        reports.append(report)
+        print(f"{report}\n")
+        _save(report, settings)
+    print(ci.as_text(reports, refused))
+    print(ci.as_line(reports, refused))
+    _write(outputs, reports, refused)
     sys.stdout.flush()
-    return report.status
+    return ci.status(reports, refused)
 
 
-def _numbers(text: str, what: str) -> list[float]:
+def read_matrix(path: Path) -> list[tuple[str, str, dict[str, Any]]]:
+    """Return name, cost and settings of each ``[[cost]]`` of a TOML file, completed by ``[defaults]``.
+
+    Costs of files are relative to the TOML file. Raises :class:`UserError` for a file that is not such a table.
+    """
     try:
-        return [float(part) for part in text.strip("[]() ").split(",") if part.strip()]
-    except ValueError:
-        raise UserError(f"{what}={text} is not a list of numbers: write {what}=1,0.5") from None
+        table = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} is not TOML: {error}") from None
+    defaults, costs = table.pop("defaults", {}), table.pop("cost", [])
+    if table or not isinstance(defaults, dict) or not isinstance(costs, list) or not costs:
+        extra = f" (unknown: {', '.join(table)})" if table else ""
+        raise UserError(f"{path} needs one [[cost]] or more, and may have [defaults]{extra}")
+    rows = []
+    for index, one in enumerate(costs):
+        settings = {**defaults, **one}
+        cost = settings.pop("cost", None)
+        if not isinstance(cost, str):
+            raise UserError(f'{path}: [[cost]] number {index + 1} has no cost: write cost = "FILE:NAME"')
+        name = str(settings.pop("name", cost))
+        for key in settings:
+            if key not in SETTINGS:
+                raise unknown(f"setting of {name}:", key, SETTINGS)
+        place, _, function = cost.rpartition(":")
+        if place.endswith(".py"):
+            cost = f"{path.parent / Path(place).expanduser()}:{function}"
+        for key in ("baseline", "save"):
+            if key in settings:
+                settings[key] = str(path.parent / str(settings[key]))
+        rows.append((name, cost, settings))
+    return rows
 
 
-def _count(settings: dict[str, str], key: str) -> int:
-    text = settings.get(key, "0")
+def _write(outputs: Mapping[str, str], reports: Sequence[Report], refused: Mapping[str, str]) -> None:
+    """Write the Markdown summary, appended as a CI server's summary file needs, and the JUnit file."""
+    try:
+        if "markdown" in outputs:
+            with Path(outputs["markdown"]).expanduser().open("a") as file:
+                file.write(ci.as_markdown(reports, refused))
+        if "junit" in outputs:
+            Path(outputs["junit"]).expanduser().write_text(ci.as_junit(reports, refused))
+    except OSError as error:
+        raise StorageError(f"the summary cannot be written: {error}") from None
+
+
+# ---------------------------------------------------------------------------------------------- values
+
+
+def _numbers(given: Any, what: str) -> list[float]:
+    try:
+        parts = given.strip("[]() ").split(",") if isinstance(given, str) else np.ravel(given)
+        return [float(part) for part in parts if str(part).strip()]
+    except (TypeError, ValueError):
+        raise UserError(f"{what}={given} is not a list of numbers: write {what}=1,0.5") from None
+
+
+def _count(settings: Mapping[str, Any], key: str) -> int | None:
+    if key not in settings:
+        return None
+    text = str(settings[key])
     if not re.fullmatch(r"\d+", text):
         raise UserError(f"{key}={text} is not a whole number")
     return int(text)
 
 
-def _theta(text: str, module: Any, given: bool) -> Any:
-    """Return theta from numbers, ``name:number`` pairs, or a name in the file, called if it is a function."""
-    if re.fullmatch(r"[A-Za-z_][\w.]*", text):
-        if not given and not hasattr(module, text):
-            raise UserError("theta is missing: give theta=1,0 or define theta in the file")
-        theta = imports.load_attribute(text, module)
-        return theta() if callable(theta) else theta
-    pairs = re.findall(r"([A-Za-z_]\w*):([^,]+)", text)
+def _pairs(text: str) -> dict[str, float] | None:
+    """Return the numbers of ``name:number,name:number``; None for another text."""
+    pairs = re.findall(r"([A-Za-z_][\w.\[\]]*):([^,]+)", text)
     if pairs and len(pairs) == text.count(",") + 1:
         return {name: _numbers(value, name)[0] for name, value in pairs}
-    return np.array(_numbers(text, "theta"))
+    return None
 
 
-def _gradient(text: str | None, module: Any) -> Any:
-    if text is None or text in LIBRARIES:
-        return text
+def _by_input(given: Any, what: str, is_list: bool) -> Any:
+    """Return one number per input as a mapping, or a number, or a list of numbers."""
+    if isinstance(given, Mapping):
+        return dict(given)
+    if isinstance(given, str) and (pairs := _pairs(given)) is not None:
+        return pairs
+    values = _numbers(given, what)
+    if is_list:
+        return values
+    if len(values) != 1:
+        raise UserError(f"{what}={given} is not valid: write one number, or {what}=mass:1e-3,gain:1e-2")
+    return values[0]
+
+
+def _names(given: Any) -> Any:
+    if isinstance(given, bool):
+        return given
+    words = {"true": True, "false": False}
+    if isinstance(given, str):
+        return words.get(given.lower(), [name.strip() for name in given.split(",") if name.strip()])
+    return [str(name) for name in given]
+
+
+def _theta(given: Any, module: Any, is_given: bool) -> Any:
+    """Return theta from numbers, ``name:number`` pairs, or a name in the file, called if it is a function."""
+    if not isinstance(given, str):
+        return dict(given) if isinstance(given, Mapping) else np.array(given, dtype=np.float64)
+    if re.fullmatch(r"[A-Za-z_][\w.]*", given):
+        if not is_given and not hasattr(module, given):
+            raise UserError("theta is missing: give theta=1,0 or define theta in the file")
+        theta = imports.load_attribute(given, module)
+        return theta() if callable(theta) else theta
+    pairs = _pairs(given)
+    return pairs if pairs is not None else np.array(_numbers(given, "theta"))
+
+
+def _function(text: str, module: Any, what: str) -> Any:
     if ":" not in text and not hasattr(module, text):
         names = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
-        raise unknown("grad", text, (*LIBRARIES, *names))
+        raise unknown(what, text, (*LIBRARIES, *names) if what == "grad" else names)
     return imports.load_attribute(text, module)
+
+
+def _gradient(text: Any, module: Any) -> Any:
+    return text if text is None or text in LIBRARIES else _function(str(text), module, "grad")

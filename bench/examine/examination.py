@@ -1,21 +1,24 @@
-"""Runs the examination: checks a cost and its gradient, in order, within one time budget."""
+"""Runs the examination of a cost and its gradient: cheap, decisive checks first, each kept when a later one is cut off."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from bench.errors import UserError
+from bench.examine import diagnosis
+from bench.examine.gradient import GradientStages
 from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
 from bench.examine.report import Report
 from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, measure_smoothed
-from bench.measure.gradcheck import EPS, Check, Options, check
-from bench.model.simulator.clock import Clock, OutOfTime, parse_duration
+from bench.measure.gradcheck import FAULTS, Check
+from bench.model.simulator.clock import Clock, OutOfTime, end_on_sigterm, parse_duration
 from bench.model.simulator.simulator import Simulator
 from bench.model.simulator.tree import ParameterTree
 
@@ -23,20 +26,10 @@ GENERATED_SUFFIX = re.compile(r"_[0-9a-f]{8}$")
 """Suffix of the generated name of a module that is loaded from a file."""
 RELATIVE = 0.01
 """Default sigma of the line scans, and of a cost with its own noise, in units of each input's scale."""
-SHARES = {"check": 0.75, "again": 0.5, "lines": 0.3}
-"""Share of the remaining time planned for each part; the next part may use the remainder. Lines may take twice theirs."""
-POINTS_EACH = 2 * (2 * EPS.size + 17)
-"""Approximate number of costs per checked direction."""
-SCAN = 7 * 65
-"""Number of costs of a staircase search along one direction that is not clearly right."""
-EFFORTS = (
-    Options(),
-    Options(draws=2, scanned=1),
-    Options(draws=2, directions=1, scanned=0),
-    Options(components=4, draws=2, directions=1, scanned=0),
-    Options(components=0, draws=0, directions=1, eps=EPS[::2], scanned=0),
-)
-"""Scopes of a check, from the full check to the smallest, which is for slow simulators."""
+TOLERANCE = 1e-4
+"""Default relative error of a derivative below which it only causes a warning."""
+COMPILE_S = 300.0
+"""Default time limit of all first calls together [s]."""
 PANELS = (7, 12)
 """Numbers of panels, of 4 Gauss-Legendre points each, of the two integrals of the gradient along a line."""
 LEAST_MISSED = 0.002
@@ -47,34 +40,58 @@ FEWEST_POINTS = 17
 """Fewest points of a line scan."""
 HELD = 20_000_000
 """Most numbers in the thetas of the pairs of one sigma, since memory stores several copies."""
-OTHER_NOISE = 2
-"""Number of further draws of the simulator's own noise under which the gradient is checked along random directions."""
+MOST_NOISY = 50_000
+"""Most numbers of theta for which noise is measured."""
 
 
 def examine(
     cost: Callable[..., Any],
     theta: Any,
     grad: str | Callable[..., Any] | None = None,
-    sigma: float | Sequence[float] = (),
+    sigma: Any = (),
     noise: int = 0,
-    budget: float | str = 60.0,
-    batch: str | None = None,
+    budget: float | str | None = None,
+    batch: str | int | None = None,
     scale: Any = None,
     seed: int = 0,
     name: str = "",
     progress: bool = True,
+    *,
+    calls: int | None = None,
+    compile_budget: float | str = COMPILE_S,
+    tolerance: Any = TOLERANCE,
+    atol: Any = 0.0,
+    allow_zero: bool | str | Sequence[str] | None = None,
+    expect: str = "",
+    twin: Callable[..., Any] | None = None,
+    twin_grad: str | Callable[..., Any] | None = None,
+    refined: Callable[..., Any] | None = None,
+    horizons: Sequence[int] = (),
 ) -> Report:
     """Report whether a gradient is right, where the cost breaks, which method to use under noise, and its cost.
 
     ``cost(theta)`` returns one number. ``theta`` is an array, a number, or nested dicts, lists and dataclasses of
     arrays and numbers. ``grad`` is ``"jax"``, ``"torch"`` or a function of theta. Without ``grad``, only the cost is
-    examined, by differences. ``sigma`` is one or more standard deviations of noise on theta. With ``noise=n`` the call
-    is ``cost(theta, w)``, where ``w (n,)`` is standard normal, the simulator's own randomness. Costs that are compared
-    have the same w. ``budget`` is the time limit of the whole examination in seconds or as text (``60``, ``"2m"``). A
-    call that exceeds it is interrupted, compiled code as soon as it returns. ``batch`` is the way to pass several
-    thetas in one call: ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``; detected by default.
-    ``scale`` is the size of each input, with theta's structure. By default it is the input's magnitude, or for an input
-    of 0 the root mean square of its array, else 1.
+    examined, by differences. ``sigma`` is one or more standard deviations of noise on theta: numbers, or per input a
+    mapping such as ``{"mass": 0.1}``, theta's structure, or an array ``(levels, d)``. With ``noise=n`` the call is
+    ``cost(theta, w)``, where ``w (n,)`` is standard normal, the simulator's own randomness. Costs that are compared
+    have the same w.
+
+    ``budget`` is the time limit of the whole examination in seconds or as text (``60``, ``"2m"``), 60 s by default.
+    ``calls`` limits the number of costs and gradients together; without ``budget`` it makes the report independent of the machine.
+    The first call of each kind may compile and counts against ``compile_budget`` instead. A call that exceeds its limit
+    is interrupted, compiled code as soon as it returns. ``batch`` is the way to pass several thetas in one call:
+    ``vmap``, ``columns`` (``(d, B)``), ``rows`` (``(B, d)``) or ``loop``, with a fixed B as ``columns:64``; detected by
+    default. ``scale`` is the size of each input, with theta's structure. By default it is the input's magnitude, or for
+    an input of 0 the root mean square of its array, else 1.
+
+    An error up to ``atol + tolerance * |derivative|`` only causes a warning; both are numbers or mappings of inputs to
+    numbers. ``allow_zero`` names the inputs that may have no effect (True: all; False: none; by default they cause a
+    warning). ``expect`` is a known cause, such as ``"kink"``, with which the report passes.
+
+    ``twin`` is a second cost that must agree, and ``twin_grad`` a second gradient, such as one with a tape per step.
+    ``refined`` is the cost at a tighter tolerance or finer step. ``horizons`` are numbers of steps T at which
+    ``cost(theta, steps=T)`` and its gradient are compared, which shows an error that grows with T.
 
     Raises :class:`bench.UserError` for a cost that cannot be called.
 
@@ -82,43 +99,117 @@ def examine(
     >>> report.status, report.cause
     (0, 'smooth')
     """
-    clock = Clock(parse_duration(budget), progress)
-    levels = _levels(sigma)
+    clock = Clock(
+        _time_limit(budget, calls), progress, _call_limit(calls), parse_duration(compile_budget, "compile_budget")
+    )
     if not isinstance(noise, int | np.integer) or noise < 0:
         raise UserError(f"noise={noise} is not the length of w in cost(theta, w): give a whole number")
     layout = ParameterTree(theta)
-    scales = layout.scales() if scale is None else _scales(layout, scale)
+    setup = Setup(
+        levels=_levels(sigma, layout),
+        scale=layout.scales() if scale is None else _positive(layout.spread(scale, "scale", 1.0), "scale", "size"),
+        rtol=_tolerance(layout, tolerance, "tolerance", TOLERANCE),
+        atol=_tolerance(layout, atol, "atol", 0.0),
+        allow_zero=_allowed(layout, allow_zero),
+        expect=_expected(expect),
+        seed=seed,
+        name=name or _function_name(cost),
+        horizons=tuple(int(steps) for steps in horizons),
+    )
     clock.start_stage("first call")
-    try:
-        simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
-    except OutOfTime:
-        took = f"the first call of the cost took longer than budget={clock.budget:g} seconds"
-        raise UserError(f"{took}: give a larger budget or a shorter rollout") from None
-    try:
-        return _Examination(simulator, layout, scales, levels, clock, seed, name or _function_name(cost)).run(
-            _function_name(grad)
-        )
-    finally:
-        clock.clear_progress()
+    with end_on_sigterm(clock):
+        try:
+            simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
+        except OutOfTime:
+            limit = "compile_budget" if not clock.is_terminated else "the time until SIGTERM"
+            took = f"the first call of the cost took longer than {limit}={clock.compile_budget:g} seconds"
+            raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
+        examination = _Examination(simulator, setup, clock)
+        try:
+            return examination.run(_function_name(grad), twin, twin_grad, refined)
+        finally:
+            clock.clear_progress()
 
 
-def _levels(sigma: float | Sequence[float]) -> list[float]:
-    try:
-        levels = [float(one) for one in np.atleast_1d(np.asarray(sigma, dtype=np.float64)).ravel()]
-    except (TypeError, ValueError):
-        levels = [math.nan]
-    if not all(one > 0 and math.isfinite(one) for one in levels):
+@dataclass(frozen=True)
+class Setup:
+    """The settings of an examination, per entry of theta where they are arrays ``(d,)``."""
+
+    levels: Sequence[tuple[float, np.ndarray]]
+    """Each sigma as a number for tables, its largest entry, and as an array."""
+    scale: np.ndarray
+    rtol: np.ndarray
+    atol: np.ndarray
+    allow_zero: np.ndarray | None
+    """Whether each input may have no effect; None: such inputs cause a warning."""
+    expect: str
+    seed: int
+    name: str
+    horizons: tuple[int, ...]
+
+
+def _time_limit(budget: float | str | None, calls: int | None) -> float:
+    if budget is None:
+        return 60.0 if calls is None else math.inf
+    return parse_duration(budget)
+
+
+def _call_limit(calls: int | None) -> float:
+    if calls is None:
+        return math.inf
+    if not isinstance(calls, int | np.integer) or calls < 1:
+        raise UserError(f"calls={calls} is not a number of calls: give a whole number above 0")
+    return float(calls)
+
+
+def _levels(sigma: Any, layout: ParameterTree) -> list[tuple[float, np.ndarray]]:
+    size = layout.vector.size
+    if isinstance(sigma, Mapping) or (isinstance(sigma, Sequence) and sigma and isinstance(sigma[0], Mapping)):
+        every = [layout.spread(one, "sigma", 0.0) for one in ([sigma] if isinstance(sigma, Mapping) else sigma)]
+    else:
+        try:
+            given = np.asarray(sigma, dtype=np.float64)
+        except (TypeError, ValueError):
+            given = np.array([math.nan])
+        if given.ndim == 2 and given.shape[1] == size:
+            every = list(given)
+        else:
+            every = [np.full(size, one) for one in given.ravel()]
+    if not all(np.isfinite(one).all() and (one >= 0).all() and one.any() for one in every):
         raise UserError(f"sigma={sigma} is not valid: sigma has standard deviations of noise on theta, numbers above 0")
-    return levels
+    return [(float(one.max()), one) for one in every]
 
 
-def _scales(layout: ParameterTree, scale: Any) -> np.ndarray:
-    given = (
-        np.full(layout.vector.size, float(scale)) if isinstance(scale, int | float) else layout.flatten(scale, "scale")
-    ).astype(np.float64)
+def _positive(given: np.ndarray, what: str, meaning: str) -> np.ndarray:
     if not (np.isfinite(given).all() and (given > 0).all()):
-        raise UserError("scale is the size of each input: numbers above 0")
+        raise UserError(f"{what} is the {meaning} of each input: numbers above 0")
     return given
+
+
+def _tolerance(layout: ParameterTree, given: Any, what: str, default: float) -> np.ndarray:
+    values = layout.spread(given, what, default)
+    if not (np.isfinite(values).all() and (values >= 0).all()):
+        raise UserError(f"{what}={given} is not valid: give a number of at least 0, or one per input")
+    return values
+
+
+def _allowed(layout: ParameterTree, given: bool | str | Sequence[str] | None) -> np.ndarray | None:
+    if given is None:
+        return None
+    allowed = np.full(layout.vector.size, given is True)
+    if not isinstance(given, bool):
+        for name in [given] if isinstance(given, str) else given:
+            allowed[layout.match(name)] = True
+    return allowed
+
+
+def _expected(cause: str) -> str:
+    from bench.errors import unknown
+    from bench.examine.findings import CAUSES
+
+    if cause and cause not in CAUSES:
+        raise unknown("expect", cause, CAUSES)
+    return cause
 
 
 def _function_name(function: Any) -> str:
@@ -136,182 +227,111 @@ def _function_name(function: Any) -> str:
 
 
 class _Examination:
-    def __init__(
-        self,
-        simulator: Simulator,
-        layout: ParameterTree,
-        scale: np.ndarray,
-        levels: Sequence[float],
-        clock: Clock,
-        seed: int,
-        name: str,
-    ) -> None:
-        self.simulator, self.layout, self.scale, self.levels = simulator, layout, scale, levels
-        self.clock, self.seed, self.name = clock, seed, name
-        self.theta = layout.vector
+    def __init__(self, simulator: Simulator, setup: Setup, clock: Clock) -> None:
+        self.simulator, self.layout, self.setup, self.clock = simulator, simulator.layout, setup, clock
+        self.scale, self.levels, self.seed = setup.scale, setup.levels, setup.seed
+        self.theta = self.layout.vector
         self.left_out: list[str] = []
-        self.random = np.random.default_rng([seed, 0x6578616D])
-        self.w = self.random.standard_normal((simulator.noise, 1)) if simulator.noise else None
+        random = np.random.default_rng([setup.seed, 0x6578616D])
+        w = random.standard_normal((simulator.noise, 1)) if simulator.noise else None
+        self.stages = GradientStages(simulator, setup.scale, clock, setup.seed, w, bool(self.levels), random)
 
-    def run(self, gradient: str) -> Report:
-        """Run the checks that the time allows, the gradient check first, and return the report."""
-        value, spread = self._repeat_cost()
-        simulator, clock = self.simulator, self.clock
-        checked, more = None, []
-        if spread == 0 and self._request_gradient():
-            checked = self._check_gradient()
-            more = self._check_under_other_noise(checked)
-        lines = self._scan_lines(checked) if not simulator.gradient_error else []
-        smoothed = self._measure_noise(checked, spread == 0) if not simulator.gradient_error else []
-        notes = list(simulator.notes)
-        notes += [f"the cost raised {count} times: {text}" for text, count in list(simulator.raised.items())[:3]]
-        relative = not self.levels
+    def run(self, gradient: str, twin: Any, twin_grad: Any, refined: Any) -> Report:
+        """Run the checks that the budget allows, the decisive ones first, and return the report."""
+        simulator, clock, stages, setup = self.simulator, self.clock, self.stages, self.setup
+        stages.run()
+        self.left_out += stages.left_out
+        checked = stages.check
+        other: dict[str, Any] = {}
+        if twin is not None:
+            other["twin"] = self._attempt("comparison with the twin", lambda: diagnosis.compare_costs(stages, twin))
+        if twin_grad is not None and stages.gradient is not None:
+            other["twin_error"] = self._attempt(
+                "comparison with the twin's gradient", lambda: diagnosis.compare_gradients(stages, twin_grad)
+            )
+        if refined is not None:
+            other["refined"] = self._attempt("the refined cost", lambda: diagnosis.check_refined(stages, refined))
+        if setup.horizons:
+            growth = self._attempt("horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons))
+            other["growth"] = growth or []
+        can_go_on = not (stages.gradient is None and simulator.has_gradient) and not stages.is_failed
+        lines = self._scan_lines(checked) if can_go_on else []
+        smoothed = self._measure_noise(checked) if can_go_on else []
+        is_adaptive = False
+        if checked is not None and checked.cause in diagnosis.SUSPICIOUS and lines:
+            is_adaptive = bool(
+                self._attempt("the comparison along lines", lambda: diagnosis.is_adaptive(stages, checked, lines))
+            )
+        if clock.is_terminated:
+            self.left_out.append("everything after SIGTERM")
         return Report(
-            name=self.name,
+            name=setup.name,
             gradient=gradient,
             names=self.layout.names,
             theta=self.theta,
-            cost=value,
+            cost=stages.value,
             precision=simulator.precision,
-            repeats=spread == 0,
-            spread=spread,
-            batch=simulator.batch,
+            is_hidden_single=stages.is_hidden_single,
+            spread=stages.spread,
+            gradient_spread=stages.gradient_spread,
+            is_small_spread=stages.is_small_spread,
+            has_state=stages.has_state,
+            batch=simulator.batch + (f":{simulator.fixed}" if simulator.fixed else ""),
             costs=clock.costs,
             gradients=clock.gradients,
             seconds=clock.spent,
+            compile_s=clock.compile_s,
             budget=clock.budget,
+            calls=clock.calls,
             cost_s=clock.per_cost(),
             gradient_s=clock.per_gradient() if simulator.has_gradient else math.nan,
             check=checked,
-            more=more,
+            is_quick=stages.is_quick,
+            is_complete=stages.is_complete,
+            located=stages.located,
+            more=stages.more,
+            rtol=setup.rtol,
+            atol=setup.atol,
+            allow_zero=setup.allow_zero,
+            expect=setup.expect,
             lines=lines,
-            reach=max(self.levels, default=RELATIVE),
-            relative=relative,
+            reach=max((level for level, _ in self.levels), default=RELATIVE),
+            relative=not self.levels,
+            requested=tuple(level for level, _ in self.levels),
             smoothed=smoothed,
-            error=simulator.gradient_error,
-            notes=notes,
+            error=simulator.gradient_error if stages.is_failed else "",
+            elsewhere=simulator.gradient_error if not stages.is_failed else "",
+            n_failed=simulator.n_failed_gradients,
+            is_adaptive=is_adaptive,
+            printed=simulator.printed,
+            notes=[*simulator.notes, *self._exceptions()],
             left_out=self.left_out,
+            **other,
         )
 
-    # ------------------------------------------------------------------------------------------------ parts
+    def _exceptions(self) -> list[str]:
+        return [f"the cost raised {count} times: {text}" for text, count in list(self.simulator.raised.items())[:3]]
 
-    def _costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
-        """Return the costs ``(B,)`` of ``thetas (d, B)``, all under the same draw of the simulator's own noise."""
-        w = self.w if w is None else w
-        return self.simulator.costs(thetas, None if w is None else np.repeat(w, thetas.shape[1], axis=1))
-
-    def _repeat_cost(self) -> tuple[float, float]:
-        """Return the cost at theta, and the largest difference between equal calls.
-
-        Calls at theta alternate with calls at another theta, which exposes a cost that depends on earlier calls.
-        """
-        self.clock.start_stage("repeating a call")
-        other = self.theta + 1e-3 * self.scale
-        values: list[float] = []
+    def _attempt(self, what: str, function: Callable[[], Any]) -> Any:
+        """Return a function's result, or None where the budget ends."""
+        self.clock.start_stage(what)
         try:
-            for at in (self.theta, other, self.theta, other, self.theta):
-                values.append(float(self._costs(at[:, None])[0]))
+            return function()
         except OutOfTime:
-            self.left_out.append("repeating a call")
-        if not values:
-            return math.nan, 0.0
-        same = np.array(values[::2])
-        pairs = [same, np.array(values[1::2] or [0.0])]
-        return values[0], max(0.0 if np.isnan(one).all() else float(np.ptp(one)) for one in pairs)
+            self.left_out.append(what)
+            return None
 
-    def _request_gradient(self) -> bool:
-        """Compute the gradient twice, the second time to measure its duration, and return whether it succeeded."""
-        if self.simulator.has_gradient:
-            self.clock.start_stage("first gradient")
-            try:
-                for _ in range(2):
-                    self.simulator.gradients(self.theta[:, None], self.w)
-            except OutOfTime:
-                return True
-        return not self.simulator.gradient_error
-
-    def _seconds_each(self) -> float:
-        """Return the time per cost [s], in batches as wide as those of a check."""
-        width = self.simulator.width
-        if width == 1:
-            return self.clock.per_cost()
-        columns = np.repeat(self.theta[:, None], width, axis=1)
-        taken = math.nan
-        try:
-            for _ in range(2):  # the first call with this shape may compile
-                began = self.clock.spent
-                self._costs(columns)
-                taken = (self.clock.spent - began) / width
-        except OutOfTime:
-            return self.clock.per_cost()
-        return taken
-
-    def _options(self) -> Options:
-        """Return the largest scope of a check that fits the remaining time."""
-        each, slope = self._seconds_each(), self.clock.per_gradient()
-        each = 0.0 if math.isnan(each) else each
-        slope = 4 * each if math.isnan(slope) else slope
-        for effort in EFFORTS[:-1]:
-            chosen = min(effort.components, self.theta.size) + effort.directions
-            calls = chosen * POINTS_EACH + effort.draws * effort.directions * POINTS_EACH // 2
-            # a wrong gradient needs further calls: scans, ratios at other thetas, and checks at thetas farther away
-            calls += effort.scanned * SCAN + effort.draws * POINTS_EACH
-            calls += min(effort.draws, 4) * min(effort.components, self.theta.size) * POINTS_EACH // 2
-            if calls * each + (3 * effort.draws + 3) * slope < SHARES["check"] * self.clock.remaining:
-                break
-        else:
-            effort = EFFORTS[-1]
-        if effort is not EFFORTS[0]:
-            what = f"{effort.components} components, {effort.directions} directions and {effort.draws} other thetas"
-            self.left_out.append(f"the full check: it is limited to {what}")
-        return replace(effort, scale=self.scale, unit=self.simulator.unit, seed=self.seed)
-
-    def _check_gradient(self) -> Check | None:
-        self.clock.start_stage("checking the gradient")
-        options = self._options()
-        for attempt in (options, replace(options, components=0, draws=0, directions=1, eps=EPS[::2], scanned=0)):
-            self.clock.limit(SHARES["check"] if attempt is options else 1.0)
-            try:
-                return self._check_once(attempt)
-            except OutOfTime:
-                continue
-            finally:
-                self.clock.limit(1.0)
-        self.left_out.append("the gradient check")
-        return None
-
-    def _check_once(self, options: Options, w: np.ndarray | None = None) -> Check:
-        def gradient(theta: np.ndarray) -> np.ndarray:
-            drawn = self.w if w is None else w
-            return np.asarray(self.simulator.gradients(theta[:, None], drawn)[:, 0])
-
-        slope = gradient if self.simulator.has_gradient else None
-        return check(lambda thetas: self._costs(thetas, w), slope, self.theta, options)
-
-    def _check_under_other_noise(self, checked: Check | None) -> list[Check]:
-        """Return checks along random directions under other draws of the simulator's own noise."""
-        if self.w is None or checked is None or not checked.trusted:
-            return []
-        checks = []
-        options = replace(EFFORTS[0], components=0, draws=0, scale=self.scale, unit=self.simulator.unit, seed=self.seed)
-        self.clock.limit(SHARES["again"])
-        try:
-            for _ in range(OTHER_NOISE):
-                checks.append(self._check_once(options, self.random.standard_normal((self.simulator.noise, 1))))
-        except OutOfTime:
-            self.left_out.append("checks under other noise")
-        self.clock.limit(1.0)
-        return checks
+    # ------------------------------------------------------------------------------------------------ lines
 
     def _scan_lines(self, checked: Check | None) -> list[LineScan]:
         """Return scans of the cost for jumps and kinks, along random directions through theta."""
         self.clock.start_stage("scanning lines")
-        spread = self.scale * RELATIVE if not self.levels else np.full(self.theta.size, max(self.levels))
+        spread = self.scale * RELATIVE if not self.levels else max(self.levels, key=lambda level: level[0])[1]
         along = directions(2, spread, self.seed)
-        each = self.clock.per_cost()
-        room = SHARES["lines"] * self.clock.remaining / len(along) / each if each > 0 else math.inf
+        share = 0.5 if self.levels else 0.9
+        room = self.clock.affordable(share) / len(along)
         for most, halvings in LINE_EFFORTS:
-            points = int(min(POINTS, room - 2 * most * halvings))
+            points = int(min(POINTS, room - most * (2 * halvings + 8)))
             if points >= FEWEST_POINTS:
                 break
         else:
@@ -321,17 +341,27 @@ class _Examination:
             self.left_out.append(f"fine line scans: {points} points instead of {POINTS}, and {most} places searched")
         lines = []
         measured = checked.noise if checked is not None and math.isfinite(checked.noise) else 0.0
-        self.clock.limit(2 * SHARES["lines"])
+        self.clock.limit(min(1.0, 2 * share))
         try:
             for direction in along:
-                size = float(np.abs(self._costs(self.theta[:, None])).max())
-                rounding = max(measured, self.simulator.unit * (size if math.isfinite(size) else 0.0))
-                line = scan(self._costs, self.theta, direction, rounding, 3.0, points, halvings, most)
+                size = abs(self.stages.value)
+                rounding = max(
+                    measured, self.stages.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
+                )
+                cost = partial(self._costs_along, direction)
+                line = scan(cost, np.zeros(1), np.ones(1), rounding, 3.0, points, halvings, most, self.simulator.unit)
+                line = replace(line, direction=direction)
                 lines.append(replace(line, missed=self._missed_share(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
         self.clock.limit(1.0)
         return lines
+
+    def _costs_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return the costs ``(B,)`` at theta + t * direction for ``t (1, B)``."""
+        width = max(self.simulator.width, 1)
+        parts = [t[0, i : i + width] for i in range(0, t.shape[1], width)]
+        return np.concatenate([self.stages.costs(self.theta[:, None] + direction[:, None] * part) for part in parts])
 
     def _missed_share(self, line: LineScan, checked: Check | None) -> float:
         """Return the share of the cost's change along a line that its gradient does not explain.
@@ -343,38 +373,48 @@ class _Examination:
         if checked is None or not checked.trusted or not self.simulator.has_gradient:
             return math.nan
         changes = np.abs(np.diff(line.costs)).sum()
-        if not (np.isfinite(changes) and changes > 0):
+        rounding = self.simulator.unit * np.abs(line.costs).max(initial=0.0) + checked.noise
+        # where the cost hardly changes, its rounding is all that the integral could miss
+        if not (np.isfinite(changes) and changes > 0 and rounding < 0.1 * LEAST_MISSED * changes):
             return math.nan
-        integrals = []
-        for panels in PANELS:
-            x, weight = np.polynomial.legendre.leggauss(4)
-            edges = np.linspace(line.at[0], line.at[-1], panels + 1)
-            half = np.diff(edges)[:, None] / 2
-            t, weights = ((edges[:-1, None] + half) + half * x).ravel(), (half * weight).ravel()
-            at = self.theta[:, None] + line.direction[:, None] * t
-            w = None if self.w is None else np.repeat(self.w, t.size, axis=1)
-            integrals.append(float(weights @ (line.direction @ self.simulator.gradients(at, w))))
+        if not self.clock.can_afford(0, 4 * sum(PANELS)):
+            self.left_out.append("the integral of the gradient along a line")
+            return math.nan
+        integrals = [self._integral(line, panels) for panels in PANELS]
         missed = abs(line.costs[-1] - line.costs[0] - integrals[-1]) / changes
         doubt = abs(integrals[-1] - integrals[0]) / changes
         return float(missed) if doubt < max(0.1 * missed, LEAST_MISSED) else math.nan
 
-    def _measure_noise(self, checked: Check | None, repeats: bool) -> list[Smoothed]:
-        """Return the gradient's bias and the methods' costs at each sigma, which all get an equal share of the time."""
-        levels, scale = list(self.levels), np.ones(self.theta.size)
+    def _integral(self, line: LineScan, panels: int) -> float:
+        return self.stages.integrate(line.direction, float(line.at[0]), float(line.at[-1]), panels)
+
+    # ------------------------------------------------------------------------------------------------ noise
+
+    def _measure_noise(self, checked: Check | None) -> list[Smoothed]:
+        """Return the gradient's bias and the methods' costs at each sigma, which all get an equal share of the budget."""
+        levels = list(self.levels)
         if not levels and self.simulator.noise:
-            levels, scale = [RELATIVE], self.scale
+            levels = [(RELATIVE, RELATIVE * self.scale)]
+        if levels and self.theta.size > MOST_NOISY:
+            self.left_out.append(f"noise on theta: it has more than {MOST_NOISY:,} numbers")
+            return []
         plain = None
-        if checked is not None and checked.trusted and repeats and not self.simulator.noise:
-            plain = checked.gradient if self.simulator.has_gradient else None
+        if checked is not None and checked.trusted and not self.simulator.noise:
+            plain = self.stages.gradient
         results = []
-        for index, level in enumerate(levels):
+        for index, (level, spread) in enumerate(levels):
             self.clock.start_stage(f"noise of sigma {level:g}")
             self.clock.limit(1.0 / (len(levels) - index))
             pairs = min(PAIRS, max(FEWEST, HELD // self.theta.size))
-            one = measure_smoothed(self.simulator, self.theta, level, scale, plain, self.clock, self.seed, pairs)
+            one = measure_smoothed(
+                self.simulator, self.theta, level, spread / level, plain, self.clock, self.seed, pairs
+            )
             self.clock.limit(1.0)
             if one is None:
                 self.left_out.append(f"noise of sigma {level:g}")
             else:
                 results.append(one)
         return results
+
+
+__all__ = ["FAULTS", "Setup", "examine"]

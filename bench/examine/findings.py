@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.examine.diagnosis import SUSPICIOUS, Horizon, grows
+from bench.examine.gradient import recaused
 from bench.examine.lines import ALIKE, LineScan
-from bench.examine.smoothing import TARGET_ERROR, Smoothed
-from bench.measure.gradcheck import FAULTS, MEANING, Check, Part
+from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
+from bench.measure.gradcheck import FAULTS, MEANING, TRUSTED, VERDICTS, Check, Part
+from bench.model.simulator.simulator import Printed
 from bench.report.text import counted, duration, number
 
 if TYPE_CHECKING:
@@ -35,12 +39,39 @@ EXPLANATIONS = {
     "kink": "theta is on a kink, with two slopes and no derivative",
     "saturated": "the gradient is right and exactly 0, though wider steps show a slope: the input is clipped, or has no effect here",
     "zero": "the gradient and all differences are exactly 0: does this input have any effect?",
+    "raised": "the gradient could not be computed",
+    "undecided": "the budget ended before the gradient was checked",
+    "rough": "the cost changes as much between neighbouring thetas as over a wide step: a seed or hash taken from theta, or chaos",
+    "adaptive": "gradient and differences differ by as much as the discretisation does, as with adaptive steps or meshes: the gradient "
+    "holds the steps fixed, the differences do not, and neither is exactly the derivative of the solution",
+    "overwritten": "memory overwritten between forward and backward, such as arrays shared by all steps of one tape, or a term that "
+    "acts only later",
+    "twin": "the two costs that must agree differ",
+    "no_effect": "an input has no effect on the cost and is not in allow_zero: does it reach the simulator?",
+    "jumps": "the gradient is right at theta, and misses jumps around it that no gradient sees",
+    "biased": "each gradient is right, and their mean misses jumps",
+    "spread": "the gradients vary too widely to show whether their mean is grad J",
+    "unmeasured": "the budget ended before the noise of sigma was measured",
 }
 """The meaning of each cause for the simulator's author, with likely reasons."""
+CAUSES = (*VERDICTS, *(cause for cause in EXPLANATIONS if cause not in VERDICTS))
+"""All causes."""
 SEEN = 0.01
 """Share of a cost's change along a line that the integral of the gradient may miss without a warning."""
 NOTEWORTHY = ("zero", "saturated")
 """Verdicts of right gradients that deserve a warning."""
+NOT_SHOWN = ("undecided", "unsettled", "nonfinite", "adaptive", "zero", "spread", "unmeasured")
+"""Causes that decide neither for nor against a gradient: exit status 3."""
+DIFFERENT = 1e-6
+"""Relative difference of two costs that must agree, in double precision."""
+REFINED = 0.1
+"""Least distance between the differences of the cost and of a refined cost, relative to the gradient's error, of a discretisation gap."""
+SHOWN = 8
+"""Most numbers of theta in the table of breaks."""
+HEADLINE = 200
+"""Most characters of an exception in a headline."""
+RIGHT, WRONG, UNSHOWN, NONE = "right", "wrong", "not shown", "none given"
+"""Answers about the derivative."""
 
 
 @dataclass(frozen=True)
@@ -57,142 +88,439 @@ class Findings:
     """``(d,)``."""
     cost: float
     precision: str
-    repeats: bool
-    """Whether equal calls return equal costs."""
+    is_hidden_single: bool
+    """Whether the cost returns float64 numbers with single precision."""
     spread: float
-    """Largest difference between equal calls."""
+    """Largest difference between equal calls of the cost."""
+    gradient_spread: float
+    """Largest difference between equal calls of the gradient, relative to its norm."""
+    is_small_spread: bool
+    """Whether these differences only limit the accuracy of the check."""
+    has_state: bool
+    """Whether the cost depends on the call before it."""
     batch: str
     costs: int
     """Number of costs computed, one per theta."""
     gradients: int
     """Number of gradients computed, one per theta."""
     seconds: float
+    """Time within the budget [s]."""
+    compile_s: float
+    """Time of first calls [s]."""
     budget: float
+    calls: float
+    """Limit of costs and gradients together."""
     cost_s: float
     """Time of one cost [s]."""
     gradient_s: float
     """Time of one gradient [s]; NaN without a gradient."""
     check: Check | None
     """The gradient check; None if it did not finish within the budget."""
+    is_quick: bool
+    """Whether the check has at most three steps per component."""
+    is_complete: bool
+    """Whether every chosen component and group was checked."""
+    located: dict[str, str]
+    """By name of a wrong group: the numbers that cause its error."""
     more: Sequence[Check]
     """Checks under further draws of the simulator's own noise."""
+    rtol: np.ndarray
+    """Tolerated relative error of each derivative, ``(d,)``."""
+    atol: np.ndarray
+    """Tolerated absolute error of each derivative, ``(d,)``."""
+    allow_zero: np.ndarray | None
+    """Whether each input may have no effect; None: a warning."""
+    expect: str
+    """The known cause with which the report passes."""
     lines: Sequence[LineScan]
     reach: float
     """One standard deviation on the lines: a sigma of theta, or a share of the scale of each input."""
     relative: bool
     """Whether sigma is relative to the scale of each input, as it is by default."""
+    requested: Sequence[float]
+    """The given values of sigma."""
     smoothed: Sequence[Smoothed]
     error: str
-    """The exception that the gradient raised; empty if none."""
+    """The exception that the gradient at theta raised; empty if none."""
+    elsewhere: str
+    """The exception that the gradient raised at another theta; empty if none."""
+    n_failed: int
+    """Number of gradient calls that raised an exception."""
+    is_adaptive: bool
+    """Whether small jumps of the cost are as large as the error of the gradient."""
+    printed: Printed
     notes: Sequence[str]
     left_out: Sequence[str]
     """The parts of the examination that the budget did not allow."""
+    twin: float | None = None
+    """Largest relative difference between the cost and its twin."""
+    twin_error: tuple[float, float] | None = None
+    """Relative errors of the gradient and of the second gradient."""
+    refined: Check | None = None
+    """The gradient against differences of a refined cost."""
+    growth: Sequence[Horizon] = ()
+    """The error of the gradient by number of steps."""
+    command: str = ""
+    """The command line of this report, or empty."""
+    changes: Sequence[str] = ()
+    """Differences from the baseline."""
+    is_as_before: bool = False
+    """Whether there is a baseline and nothing is worse."""
 
     # -------------------------------------------------------------------------------------------- verdicts
 
     @property
-    def cause(self) -> str:
-        """The cause of the first problem, or the verdict on a right gradient.
+    def repeats(self) -> bool:
+        """Whether equal calls return equal costs."""
+        return self.spread == 0.0
 
-        A cause is a verdict of the gradient check or one of these. ``raised``: the gradient could not be computed.
-        ``undecided``: the budget ended before the check. ``jumps`` or ``biased``: the gradient is right at theta, but
-        misses jumps around theta. ``spread``: the gradient's values around theta vary too widely to decide.
-        """
+    @cached_property
+    def settled(self) -> Check | None:
+        """The check with tolerated errors counted as right."""
+        if self.check is None or self.check.cause not in (*SUSPICIOUS, "disconnected"):
+            return self.check
+        return recaused(self.check, lambda part: replace(part, verdict="nonlinear") if self._is_small(part) else part)
+
+    def _is_small(self, part: Part) -> bool:
+        """Return whether a wrong part's error is within the tolerance."""
+        assert self.check is not None
+        if part.verdict not in (*SUSPICIOUS, "disconnected"):
+            return False
+        if part.component is not None:
+            rtol, atol = self.rtol[part.component], self.atol[part.component]
+            allowed = atol + rtol * abs(part.difference)
+        else:  # along a direction of length 1 in units of the scales
+            sizes = [p.difference * p.sample.scale for p in self.check.components]
+            along = max(float(np.linalg.norm(np.nan_to_num(sizes))), abs(part.difference))
+            allowed = float(self.rtol.max()) * along
+        return bool(abs(part.program - part.difference) <= allowed)
+
+    @property
+    def small_errors(self) -> list[Part]:
+        """The components with an error within the tolerance, the largest first."""
+        if self.check is None or self.settled is self.check:
+            return []
+        parts = [part for part in self.check.parts if self._is_small(part)]
+        return sorted(parts, key=lambda part: -part.error)
+
+    @property
+    def zeros(self) -> list[str]:
+        """The inputs without any effect that ``allow_zero`` does not name."""
+        if self.check is None:
+            return []
+        parts = [part for part in self.check.components if part.verdict == "zero"]
+        return [
+            self.label(part)
+            for part in parts
+            if self.allow_zero is None or part.component is None or not self.allow_zero[part.component]
+        ]
+
+    @property
+    def wrong_checks(self) -> list[Check]:
+        """The failed checks: at theta, and under other noise."""
+        checks = [self.settled, *self.more]
+        return [one for one in checks if one is not None and not one.trusted]
+
+    @cached_property
+    def derivative_cause(self) -> str:
+        """The cause of the first problem with the derivative at theta, or the verdict on a right one."""
+        check = self.settled
         if self.error:
             return "raised"
-        if not self.repeats:
-            return "nondeterministic"
-        if self.check is None:
+        if check is None:
             return "undecided"
-        bad = [one.cause for one in (self.check, *self.more) if not one.trusted]
-        if not bad and (any(line.steps for line in self.lines) or self.tread):
+        if self.twin is not None and self.twin > max(DIFFERENT, self._unit ** (2 / 3)):
+            return "twin"
+        if not self.is_small_spread and (self.spread > 0 or self.gradient_spread > 0 or self.has_state):
+            return "nondeterministic"
+        if self.wrong_checks:
+            cause = self.wrong_checks[0].cause
+            if cause in SUSPICIOUS and (self.is_adaptive or self.is_discretisation_gap):
+                return "adaptive"
+            if cause in (*SUSPICIOUS, "unsettled", "disconnected") and self.is_overwritten:
+                return "overwritten"
+            return cause
+        if not check.components or not self.is_complete:
+            return "undecided"
+        if any(line.steps for line in self.lines) or self.tread:
             return "staircase"
-        if not bad and self.missed > TARGET_ERROR:
+        is_allowed = self.allow_zero is not None and bool(self.allow_zero.all())
+        if all(part.verdict == "zero" for part in check.parts) and not is_allowed:
+            return "zero"
+        if self.allow_zero is not None and self.zeros:
+            return "no_effect"
+        return "saturated" if check.cause == "zero" else check.cause
+
+    @property
+    def is_discretisation_gap(self) -> bool:
+        """Whether the differences of the cost are as far from the refined cost's as the gradient is from them."""
+        if self.refined is None or self.check is None:
+            return False
+        cost = {part.name: part for part in self.check.components}
+        pairs = [(cost[part.name], part) for part in self.refined.components if part.name in cost]
+        pairs = [(a, b) for a, b in pairs if a.verdict in FAULTS and math.isfinite(a.error)]
+        if not pairs:
+            return False
+        own, other = max(pairs, key=lambda pair: pair[0].error)
+        return abs(own.difference - other.difference) > REFINED * abs(own.program - own.difference)
+
+    @property
+    def is_overwritten(self) -> bool:
+        """Whether another gradient is right where this one is wrong, or its error grows with the number of steps."""
+        if self.twin_error is not None:
+            own, other = self.twin_error
+            return other <= max(float(self.rtol.max()), 0.01 * own)
+        return grows(self.growth, max(float(self.rtol.max()), 1e-3))
+
+    @property
+    def derivative(self) -> str:
+        """The answer about the derivative at theta: ``right``, ``wrong``, ``not shown`` or ``none given``."""
+        cause = self.derivative_cause
+        if cause in NOT_SHOWN:
+            return UNSHOWN
+        if cause in TRUSTED:
+            return RIGHT if self.gradient else NONE
+        return WRONG
+
+    @cached_property
+    def noise_cause(self) -> str:
+        """The cause of the first problem around theta or under noise; empty if there is none."""
+        if self.derivative not in (RIGHT, NONE):
+            return ""
+        if self.missed > TARGET_ERROR:
             return "jumps"
-        if not bad and not all(one.defined for one in self.smoothed):
-            return "nonfinite"
-        if not bad and any(one.biased for one in self.smoothed):
-            return "biased"
-        if not bad and any(one.unshown for one in self.smoothed):
-            return "spread"
-        return bad[0] if bad else self.check.cause
+        for cause, is_found in (
+            ("nonfinite", [not one.defined for one in self.smoothed]),
+            ("biased", [one.biased for one in self.smoothed]),
+            ("spread", [one.unshown for one in self.smoothed]),
+        ):
+            if any(is_found):
+                return cause
+        return "unmeasured" if self.gradient and len(self.smoothed) < len(self.requested) else ""
+
+    @property
+    def cause(self) -> str:
+        """The cause of the first problem, or the verdict on a right gradient: one of :data:`CAUSES`."""
+        return self.noise_cause or self.derivative_cause
+
+    @property
+    def status(self) -> int:
+        """The exit status: 0 right, 1 wrong, 3 not decided; 0 also for the expected cause, and as in the baseline."""
+        if self.is_as_before or (self.expect and self.expect == self.cause):
+            return 0
+        if self.derivative == WRONG:
+            return 1
+        if self.derivative == UNSHOWN:
+            return 3
+        return 0 if not self.noise_cause else 3 if self.noise_cause in NOT_SHOWN else 1
+
+    @property
+    def size(self) -> float:
+        """Largest relative error of a checked derivative, NaN if unknown."""
+        if self.check is None or not self.gradient:
+            return math.nan
+        parts = [part for part in self.check.worst_parts if part.component is not None] or list(self.check.worst_parts)
+        parts = parts if self.check.cause in FAULTS else list(self.check.components)
+        return max((part.error for part in parts if math.isfinite(part.error)), default=math.nan)
 
     @property
     def problems(self) -> list[str]:
         """The problems as sentences, worst first; empty if there are none."""
         problems = []
-        if self.error:
-            problems.append(f"raised: the gradient could not be computed: {self.error}")
-        elif not self.repeats:
-            problems.append(
-                f"nondeterministic: {EXPLANATIONS['nondeterministic']} (costs differ by {number(self.spread)})"
-            )
-        elif self.check is None:
-            problems.append("undecided: the budget ended before the gradient was checked")
-        else:
-            problems += [self.sentence(one) for one in (self.check, *self.more) if not one.trusted][:1]
-        if not problems and any(line.steps for line in self.lines):
-            problems.append(
-                "staircase: the cost is constant between jumps, here and on a line: its derivative is 0 and carries no "
-                "information; smooth the cost, as sigma= does"
-            )
-        elif not problems and self.tread:
-            problems.append(
+        if self.derivative in (WRONG, UNSHOWN):
+            problems.append(self._derivative_problem())
+            if self.derivative_cause in ("nondeterministic", "twin") and self.wrong_checks:
+                problems += [
+                    self.sentence(one) for one in self.wrong_checks[:1] if one.cause in (*SUSPICIOUS, "disconnected")
+                ]
+        elif self.noise_cause:
+            problems += self._noise_problems()
+        return problems
+
+    def _derivative_problem(self) -> str:
+        cause = self.derivative_cause
+        text = f"{cause}: {EXPLANATIONS.get(cause, MEANING.get(cause, ''))}"
+        if cause == "raised":
+            return f"{text}: {shortened(self.error)}"
+        if cause == "twin":
+            return f"{text} by {number(100 * (self.twin or 0.0))}% at theta or near it"
+        if cause == "nondeterministic":
+            if self.has_state:
+                text = (
+                    f"{cause}: the cost depends on the call before it: a warm start, a cache or a count that persists"
+                )
+            if self.spread > 0:
+                return f"{text} (costs differ by {number(self.spread)}{self._relative(self.spread)})"
+            if self.gradient_spread > 0:
+                return f"{text} (gradients differ by {number(100 * self.gradient_spread)}%)"
+            return text
+        if cause == "staircase" and self.settled is not None and self.settled.trusted:
+            if any(line.steps for line in self.lines):
+                return (
+                    "staircase: the cost is constant between jumps, here and on a line: its derivative is 0 and carries no "
+                    "information; smooth the cost, as sigma= does"
+                )
+            return (
                 f"staircase: jumps of one height, {number(self.tread)}, at even distances on every line: a part of the cost "
                 "is rounded, cast to int or looked up on a grid, and the gradient misses this part, "
                 f"{number(100 * self.missed)}% of the cost's change on a line"
             )
-        if not problems:
-            missed = self.missed
-            if missed > TARGET_ERROR:
+        if cause == "adaptive":
+            return f"{text} ({self._worst_size(self.wrong_checks[0])}{self._refined_text()})"
+        if cause == "overwritten":
+            return f"{text}{self._overwritten_text()} ({self._worst_size(self.wrong_checks[0])})"
+        if cause == "zero":
+            return "zero: no input moves the cost, and its gradient is exactly 0: does theta reach the simulator?"
+        if cause == "no_effect":
+            return f"{text} ({', '.join(self.zeros[:6])})"
+        if cause == "rough":
+            return f"{text} (by {number(self.settled.noise if self.settled else math.nan)})"
+        if cause == "undecided":
+            return f"{text}: {self._n_checked()}"
+        return self.sentence(self.wrong_checks[0])
+
+    def _relative(self, spread: float) -> str:
+        size = abs(self.cost)
+        return f", {number(100 * spread / size)}% of the cost" if size > 0 and math.isfinite(size) else ""
+
+    def _refined_text(self) -> str:
+        if self.refined is None:
+            return ""
+        errors = [part.error for part in self.refined.components if math.isfinite(part.error)]
+        return f"; from the refined cost {number(100 * max(errors, default=math.nan))}%"
+
+    def _overwritten_text(self) -> str:
+        if self.twin_error is not None:
+            own, other = self.twin_error
+            return f"; the second gradient is right to {number(100 * other)}%, this one is off by {number(100 * own)}%"
+        return "; right after few steps and wrong after many, off by " + ", ".join(
+            f"{number(100 * one.error)}% after {one.steps} steps" for one in self.growth
+        )
+
+    def _noise_problems(self) -> list[str]:
+        problems = []
+        missed = self.missed
+        if missed > TARGET_ERROR:
+            problems.append(
+                f"jumps: along a line the integral of the gradient misses {number(100 * missed)}% of the cost's change, "
+                "which comes from jumps that no gradient sees"
+            )
+        for one in self.smoothed:
+            if not one.defined:
+                problems.append(f"nonfinite: at sigma {number(one.sigma)} J is not defined: {one.remark}")
+            if one.unshown:
                 problems.append(
-                    f"jumps: along a line the integral of the gradient misses {number(100 * missed)}% of the cost's change, "
-                    "which comes from jumps that no gradient sees"
+                    f"spread: at sigma {number(one.sigma)} the gradients vary so widely that {one.pairs} pairs do not show "
+                    "whether their mean is grad J: use costs, as the table recommends"
                 )
-            for one in self.smoothed:
-                if not one.defined:
-                    problems.append(f"nonfinite: at sigma {number(one.sigma)} J is not defined: {one.remark}")
-                if one.unshown:
-                    problems.append(
-                        f"spread: at sigma {number(one.sigma)} the gradients vary so widely that {one.pairs} pairs do not show "
-                        "whether their mean is grad J: use costs, as the table recommends"
-                    )
-                if one.biased:
-                    low, high = one.bias_low / one.norm, one.bias_high / one.norm
-                    problems.append(
-                        f"biased: at sigma {number(one.sigma)} the mean of the gradients misses {number(100 * low)} to "
-                        f"{number(100 * high)}% of grad J, though each gradient is right: it does not see the jumps"
-                    )
-        return problems
+            if one.biased:
+                low, high = one.bias_low / one.norm, one.bias_high / one.norm
+                problems.append(
+                    f"biased: at sigma {number(one.sigma)} the mean of the gradients misses {number(100 * low)} to "
+                    f"{number(100 * high)}% of grad J, though each gradient is right: it does not see the jumps"
+                )
+        if self.noise_cause == "unmeasured":
+            problems.append(f"unmeasured: {EXPLANATIONS['unmeasured']}")
+        return sorted(problems, key=lambda text: not text.startswith(self.noise_cause))
 
     @property
     def conclusion(self) -> str:
-        """One-line verdict: the first problem, otherwise what was verified."""
-        if self.problems:
-            return f"CANNOT BE TRUSTED: {self.problems[0]}"
-        how = MEANING[self.cause].removeprefix("right").lstrip(":; ")
-        if self.gradient:
-            return f"RIGHT: the gradient is the derivative of its cost ({self.cause}: {how})"
-        return (
-            f"NO GRADIENT GIVEN, none was checked: by differences the cost has a derivative here ({self.cause}: {how})"
+        """The answer about the derivative in one line."""
+        if self.derivative in (WRONG, UNSHOWN):
+            first = self._derivative_problem()
+            return f"Derivative: {self.derivative.upper()}. {first[:1].lower()}{first[1:]}"
+        how = MEANING[self.derivative_cause].removeprefix("right").lstrip(":; ")
+        if self.derivative == NONE:
+            return f"Derivative: none given. By differences the cost has one here ({self.derivative_cause}: {how})"
+        size = self._agreement()
+        return f"Derivative: right. {size} ({self.derivative_cause}: {'at few steps' if self.is_quick else how})"
+
+    def _agreement(self) -> str:
+        """Return how far a right gradient agrees with the differences."""
+        assert self.check is not None
+        parts = [part for part in self.check.components if part.difference != 0.0 and math.isfinite(part.error)]
+        if not parts:
+            return f"{self._n_checked()} checked"
+        largest = max(part.error for part in parts)
+        doubt = max(part.uncertainty / abs(part.difference) for part in parts)
+        within = number(100 * max(largest, min(doubt, 1.0)), 1)
+        return f"{self._n_checked()} agree with differences to {within}%"
+
+    def _n_checked(self) -> str:
+        n_seen = len(self.check.components) if self.check is not None else 0
+        return f"{n_seen} of {counted(self.theta.size, 'component')}"
+
+    @property
+    def noise_answer(self) -> str:
+        """The answer about the gradient under noise in one line."""
+        if not self.gradient:
+            return ""
+        where = (
+            f"Under noise of sigma {', '.join(number(one) for one in self.requested)}"
+            if self.requested
+            else "Around theta"
         )
+        if self.derivative != RIGHT and not self.requested:
+            where = "Under noise"
+        if self.noise_cause and self.noise_cause != "unmeasured":
+            answer = "not shown" if self.noise_cause in NOT_SHOWN else "NOT usable"
+            return f"{where}: {answer}. {self._noise_problems()[0]}"
+        if self.derivative != RIGHT:
+            return f"{where}: not usable, since the derivative at theta is {self.derivative}"
+        if not self.requested:
+            return "Under noise: not measured, since no sigma is given"
+        if self.noise_cause:
+            return f"{where}: not measured, since the budget ended"
+        worst = max(self.smoothed, key=lambda one: one.bias_high / one.norm if one.norm > 0 else math.inf)
+        if not worst.known:
+            return f"{where}: not shown. grad J is not distinguishable from 0"
+        return f"{where}: usable. The bias of the mean gradient is below {number(100 * worst.bias_high / worst.norm)}%"
 
     @property
     def warnings(self) -> list[str]:
         """The warnings as sentences: findings that are not problems but deserve attention."""
         warnings = []
+        if self.expect and self.expect == self.cause:
+            warnings.append(f"the cause is {self.cause}, as expected")
+        elif self.expect:
+            warnings.append(f"expected {self.expect}, found {self.cause}: remove expect={self.expect} if that is right")
+        if self.small_errors and self.derivative == RIGHT:
+            part = self.small_errors[0]
+            warnings.append(
+                f"small error, within the tolerance: {self._size_of(part)}"
+                + (f", and {len(self.small_errors) - 1} more" if len(self.small_errors) > 1 else "")
+            )
         if self.check is not None and self.check.trusted:
             for verdict in NOTEWORTHY:
                 parts = [self.label(part) for part in self.check.components if part.verdict == verdict]
-                if parts:
+                parts = self.zeros if verdict == "zero" else parts
+                if parts and self.derivative_cause not in ("zero", "no_effect"):
                     warnings.append(
                         f"{verdict}: {', '.join(parts[:6])}{' ...' if len(parts) > 6 else ''}: {EXPLANATIONS[verdict]}"
                     )
-        if self.precision != "float64":
+        if self.is_hidden_single:
+            warnings.append(
+                "precision: the cost has the digits of float32, though it returns a float64: it is checked as float32, "
+                f"which detects errors above about {self.resolution}"
+            )
+        elif self.precision != "float64":
             warnings.append(
                 f"{self.precision}: a check in {self.precision} detects errors above about {self.resolution}"
             )
-        if not self.status and self.missed > SEEN:
+        if self.is_small_spread and (self.spread > 0 or self.gradient_spread > 0):
+            warnings.append(
+                f"equal calls differ in the last digits, costs by {number(self.spread)}{self._relative(self.spread)}: "
+                "errors below what this allows are not seen"
+            )
+        if self.elsewhere:
+            warnings.append(
+                f"the gradient raised an exception {self.n_failed} times away from theta: {shortened(self.elsewhere)}"
+            )
+        if self.printed.count:
+            warnings.append(
+                f"cost and gradient printed {counted(self.printed.count, 'line')}; the first: {shortened(self.printed.lines[0])}"
+            )
+        if not self.status and self.missed > SEEN and self.noise_cause != "jumps":
             warnings.append(
                 f"jumps: along a line the integral of the gradient misses {number(100 * self.missed)}% of the cost's change"
             )
@@ -212,15 +540,13 @@ class Findings:
         return max(treads) if alike and self.missed > SEEN else 0.0
 
     @property
-    def resolution(self) -> str:
-        """The smallest relative error that central differences detect in this precision, about u^(2/3), as text in %."""
-        unit = 2.0**-7 if self.precision == "bfloat16" else float(np.finfo(self.precision).eps)
-        return f"{100 * unit ** (2 / 3):.1g}%"
+    def _unit(self) -> float:
+        return 2.0**-7 if self.precision == "bfloat16" else float(np.finfo(self.precision).eps)
 
     @property
-    def status(self) -> int:
-        """The exit status: 0 without problems, else 1."""
-        return 1 if self.problems else 0
+    def resolution(self) -> str:
+        """The smallest relative error that central differences detect in this precision, about u^(2/3), as text in %."""
+        return f"{100 * self._unit ** (2 / 3):.1g}%"
 
     def label(self, part: Part) -> str:
         """Return a part's name: the name of its component of theta, or the name of its direction, ``direction 0``."""
@@ -228,17 +554,49 @@ class Findings:
 
     def sentence(self, check: Check) -> str:
         """Return the verdict of a failed check as a sentence, with the numbers of the worst part."""
-        text = f"{check.cause}: {EXPLANATIONS.get(check.cause, check.cause)}"
-        parts = [part for part in check.worst_parts if part.component is not None] or list(check.worst_parts)
+        cause = EXPLANATIONS.get(check.cause, check.cause)
+        if check.cause == "disconnected" and any(part.verdict in ("smooth", "nonlinear") for part in check.components):
+            cause = "the gradient of some inputs is exactly 0 where the cost has a slope: they are detached"
+        size = self._worst_size(check)
+        if not size or check.cause in ("nan_gradient", "nonfinite"):
+            return f"{check.cause}: {cause}" + (f" ({size})" if size else "")
+        return f"{check.cause}: {cause} ({size})"
+
+    def _named_parts(self, check: Check) -> list[Part]:
+        """Return the worst parts that name an input: located groups, then components, then directions."""
+        located = [part for part in check.worst_parts if part.name in self.located]
+        inside = [part for part in check.worst_parts if part.component is not None]
+        exact = [part for part in inside if self.label(part) in self.located.values()]
+        return exact or located or inside or list(check.worst_parts)
+
+    def _worst_size(self, check: Check) -> str:
+        parts = self._named_parts(check)
         if not parts:
-            return text
+            return ""
         part = max(parts, key=lambda p: np.nan_to_num(p.error, nan=math.inf))
         if check.cause == "kink":
-            return f"{text} ({self.label(part)}: {number(part.left, 4)} and {number(part.right, 4)})"
-        if check.cause not in FAULTS:
-            return f"{text} ({self.label(part)})"
-        program = "" if not self.gradient else f"program {number(part.program, 6)}, "
-        return f"{text} ({self.label(part)}: {program}differences {number(part.difference, 6)})"
+            return f"{self.label(part)}: {number(part.left, 4)} and {number(part.right, 4)}"
+        if check.cause not in FAULTS or not self.gradient:
+            return self.label(part)
+        return self._size_of(part) + (f", and {len(parts) - 1} more" if len(parts) > 1 else "")
+
+    def _size_of(self, part: Part) -> str:
+        """Return a part's error in words, with the numbers behind it."""
+        name = self.label(part)
+        if part.name in self.located:
+            name = f"{self.located[part.name]}, along a random direction,"
+        good = abs(part.uncertainty / part.difference) if part.difference else math.nan
+        text = f"{name}: program {_as_text(part.program)}, differences {_as_text(part.difference)}"
+        if math.isfinite(part.error):
+            ratio = abs(part.program) / abs(part.difference) if part.difference else math.inf
+            off = (
+                f"{number(ratio, 3)} times too large"
+                if 2 < ratio < math.inf
+                else f"{number(100 * abs(part.program - part.difference) / abs(part.difference)) if part.difference else '-'}%"
+            )
+            text = f"{name} off by {off}: program {_as_text(part.program)}, differences {_as_text(part.difference)}"
+            text = text.replace("off by", "is" if 2 < ratio < math.inf else "off by", 1)
+        return text + (f", good to {number(good, 1)}" if math.isfinite(good) else "")
 
     # ---------------------------------------------------------------------------------------------- tables
 
@@ -248,18 +606,18 @@ class Findings:
         import pandas as pd
 
         parts = [(self.label(part), part) for part in (*self.check.parts, *self.check.draws)] if self.check else []
-        shown = bool(self.gradient)
+        has_gradient = bool(self.gradient)
         return pd.DataFrame(
             {
                 "name": [name for name, _ in parts],
-                "program": [part.program if shown else math.nan for _, part in parts],
+                "program": [part.program if has_gradient else math.nan for _, part in parts],
                 "difference": [part.difference for _, part in parts],
                 "uncertainty": [part.uncertainty for _, part in parts],
                 "step": [part.step for _, part in parts],
-                "ratio": [part.ratio if shown else math.nan for _, part in parts],
+                "ratio": [part.ratio if has_gradient else math.nan for _, part in parts],
                 "left": [part.left for _, part in parts],
                 "right": [part.right for _, part in parts],
-                "order": [part.order if shown else math.nan for _, part in parts],
+                "order": [part.order if has_gradient else math.nan for _, part in parts],
                 "verdict": [part.verdict for _, part in parts],
             }
         )
@@ -276,7 +634,8 @@ class Findings:
                 bias_high=one.bias_high, moved=one.moved, remark=one.remark,
             )  # fmt: skip
             for method in one.methods:
-                best = one.best is not None and one.best.name == method.name
+                recommended = self.recommended(one)
+                best = recommended is not None and recommended.name == method.name
                 rows.append(
                     base
                     | dict(
@@ -293,36 +652,135 @@ class Findings:
 
     @property
     def breaks(self) -> pd.DataFrame:
-        """A row per jump or kink: line, position in standard deviations, and size."""
+        """A row per jump or kink: line, position in standard deviations, size, and the first numbers of theta there."""
         import pandas as pd
 
+        moved = range(min(self.theta.size, SHOWN))
         rows = [
             dict(line=index + 1, kind=b.kind, at=b.at, size=b.size)
+            | {self.names[i]: self.theta[i] + b.at * line.direction[i] for i in moved}
             for index, line in enumerate(self.lines)
             for b in line.breaks
         ]
-        return pd.DataFrame(rows, columns=["line", "kind", "at", "size"])
+        return pd.DataFrame(rows, columns=["line", "kind", "at", "size", *(self.names[i] for i in moved)])
 
     # ------------------------------------------------------------------------------------------------ text
 
     def __str__(self) -> str:
-        parts = [self._head(), self._components(), self._breaks(), self._sigmas(), self._end()]
+        parts = [
+            self._answers(), self._scope(), self._head(), self._components(), self._growth(), self._breaks(), self._sigmas(),
+            self._exception(),
+        ]  # fmt: skip
         return "\n\n".join("\n".join(part) for part in parts if part)
 
+    def _answers(self) -> list[str]:
+        lines = [self.conclusion]
+        lines += [f"  {text}" for text in self.problems[1:] if self.derivative in (WRONG, UNSHOWN)]
+        if self.noise_answer:
+            lines += [self.noise_answer]
+            lines += [f"  {text}" for text in self._noise_problems()[1:] if self.noise_cause]
+        lines += [f"since the baseline: {text}" for text in self.changes]
+        return lines + [f"warning: {text}" for text in self.warnings]
+
+    def _scope(self) -> list[str]:
+        """Return lines that state what was checked, what was not, and what to do next."""
+        lines = []
+        if self.check is not None:
+            check = self.check
+            whole = [part for part in check.parts if part.component is None]
+            groups = [part for part in whole if not part.name.startswith("direction ")]
+            steps = max((part.sample.step.size for part in check.parts), default=0)
+            text = f"checked: {self._n_checked()}"
+            text += f", {counted(len(groups), 'group')} of numbers" if groups else ""
+            n_random = len(whole) - len(groups)
+            text += f" and {counted(n_random, 'random direction')}" if n_random else ""
+            text += f" at theta, {counted(steps, 'step')} each"
+            if check.draws:
+                text += f", {counted(len(check.draws), 'direction')} at other thetas around it"
+            if self.lines:
+                text += f", jumps on {counted(len(self.lines), 'line')}"
+            if self.smoothed:
+                text += f", noise of sigma {', '.join(number(one.sigma) for one in self.smoothed)}"
+            if self.twin is not None:
+                text += f", the twin (differs by {number(100 * self.twin)}%)"
+            lines.append(text)
+        rest = [] if self.gradient else ["any gradient"]
+        rest += [f"{what} (budget)" for what in self.left_out]
+        rest += (
+            ["the gradient under noise on theta (no sigma)"]
+            if self.gradient and not self.requested and not self.smoothed
+            else []
+        )
+        lines.append(f"not checked: {'; '.join([*rest, 'thetas far from this one'])}")
+        advice = self.advice
+        return [*lines, f"next: {advice}"] if advice else lines
+
+    @property
+    def advice(self) -> str:
+        """The next step, with the setting that takes it."""
+        cause = self.cause
+        longer = (
+            f"calls={int(2 * self.calls)}" if math.isfinite(self.calls) else f"budget={max(2 * self.budget, 60.0):.0f}s"
+        )
+        if cause in ("undecided", "unmeasured") or (cause == "unsettled" and self.left_out):
+            return f"{self._again(longer)}: the rest needs more calls"
+        if cause in ("kink", "jump"):
+            return f"choose a theta beside the {cause}, or {self._again(f'expect={cause}')} if it is known"
+        if cause == "adaptive":
+            return (
+                f"{self._again('refined=COST')}, the cost at a tighter tolerance, and compare; "
+                f"or {self._again('expect=adaptive')} if it is known"
+            )
+        if cause in ("biased", "jumps", "spread", "staircase"):
+            return "estimate the gradient from costs (smoothing), as the table recommends for each sigma"
+        if cause == "nondeterministic":
+            return "fix the seed, or pass the noise as w and set noise=N; reset states that persist between calls"
+        if cause == "overwritten":
+            return "use one tape per step, or arrays of its own for each step; check with twin_grad=GRADIENT"
+        if cause in ("zero", "no_effect"):
+            return f"check that these inputs reach the simulator, or {self._again('allow_zero=NAME')}"
+        if cause in SUSPICIOUS or cause == "disconnected":
+            parts = self._named_parts(self.wrong_checks[0]) if self.wrong_checks else []
+            names = ", ".join(self.located.get(part.name, self.label(part)) for part in parts[:3]) or "the cost"
+            return f"follow {names} through the cost: cut it into parts until the ratio is 1; horizons=1,2,5 if it takes steps=T"
+        if cause in TRUSTED and self.gradient and not self.requested:
+            return f"{self._again('sigma=SIGMA')} for use under noise"
+        return ""
+
+    def _again(self, setting: str) -> str:
+        return f"{self.command} {setting}" if self.command else setting
+
+    def _exception(self) -> list[str]:
+        text = self.error or self.elsewhere
+        return ["The gradient's exception:", f"  {text}"] if len(text) > HEADLINE else []
+
+    def _growth(self) -> list[str]:
+        if not self.growth:
+            return []
+        rows = [["steps", "error of the gradient", "differences good to"]]
+        rows += [
+            [str(one.steps), f"{number(100 * one.error)}%", f"{number(100 * one.uncertainty, 1)}%"]
+            for one in self.growth
+        ]
+        return ["The gradient after fewer or more steps:", *_table(rows)]
+
     def _head(self) -> list[str]:
-        shown = ", ".join(f"{name}={value:g}" for name, value in list(zip(self.names, self.theta, strict=True))[:6])
-        shown += f", ... ({self.theta.size} numbers)" if self.theta.size > 6 else ""
+        first = [(self.names[i], self.theta[i]) for i in range(min(6, self.theta.size))]
+        point = ", ".join(f"{name}={value:g}" for name, value in first)
+        point += f", ... ({self.theta.size:,} numbers)" if self.theta.size > 6 else ""
         repeats = "repeats exactly" if self.repeats else f"DOES NOT REPEAT: calls differ by {number(self.spread)}"
         if self.repeats and self.check is not None and self.check.noise > 0:
             repeats += f", rough by {number(self.check.noise)}"
         lines = [
-            f"{self.name}: cost {self.cost:.6g} at {shown}",
+            f"{self.name}: cost {self.cost:.6g} at {point}",
             f"{self.precision}, {repeats}; gradient: {self.gradient or 'none, only differences'}; batch: {self.batch}",
         ]
         spent = f"spent: {counted(self.costs, 'cost')}"
         if self.gradient:
             spent += f" and {counted(self.gradients, 'gradient')}"
-        spent += f" in {duration(self.seconds)} of {duration(self.budget)}; a cost takes {duration(self.cost_s)}"
+        limit = f" of {duration(self.budget)}" if math.isfinite(self.budget) else ""
+        spent += f" in {duration(self.seconds)}{limit}, first calls {duration(self.compile_s)}"
+        spent += f"; a cost takes {duration(self.cost_s)}"
         if math.isfinite(self.gradient_s):
             spent += f", a gradient {duration(self.gradient_s)}"
         return [*lines, spent, *(f"note: {note}" for note in self.notes)]
@@ -338,8 +796,8 @@ class Findings:
             rows.append(
                 [
                     self.label(part),
-                    number(part.program, 6) if self.gradient else "-",
-                    f"{number(part.difference, 6)} +- {number(part.uncertainty, 1)}",
+                    _as_text(part.program) if self.gradient else "-",
+                    f"{_as_text(part.difference)} +- {number(part.uncertainty, 1)}",
                     number(part.step, 1),
                     number(part.ratio, 5) if self.gradient else "-",
                     part.verdict,
@@ -353,10 +811,12 @@ class Findings:
                 f"  elsewhere: {counted(len(check.draws), 'direction')} at other thetas around this one, "
                 + (f"{len(wrong)} wrong: {wrong[0].verdict}" if wrong else "none wrong")
             )
-        if self.gradient and math.isfinite(check.order):
-            lines.append(
-                f"  Taylor remainder |f(x + h d) - f(x) - h g.d|: order {check.order:.2f} in h (2 right, 1 wrong)"
-            )
+        orders = [
+            part.order for part in (check.parts if check.trusted else check.worst_parts) if math.isfinite(part.order)
+        ]
+        if self.gradient and orders:
+            order = float(np.median(orders)) if check.trusted else min(orders)
+            lines.append(f"  Taylor remainder |f(x + h d) - f(x) - h g.d|: order {order:.2f} in h (2 right, 1 wrong)")
         return lines
 
     def _breaks(self) -> list[str]:
@@ -369,7 +829,7 @@ class Findings:
             remarks = []
             for kind, breaks in (("jump", line.jumps), ("kink", line.kinks)):
                 if breaks:
-                    first = ", ".join(f"{b.at:+.3f} ({number(b.size)})" for b in breaks[:4])
+                    first = ", ".join(f"{b.at:+.3f}{self._place(line, b.at)} ({number(b.size)})" for b in breaks[:4])
                     size = "height" if kind == "jump" else "change of slope"
                     remarks.append(
                         f"{counted(len(breaks), kind)} at t = {first}{' ...' if len(breaks) > 4 else ''} [{size}]"
@@ -389,6 +849,12 @@ class Findings:
         if any(len(line.breaks) > 5 for line in self.lines):
             lines.append("  at most six places are searched on a line, so there may be more")
         return lines
+
+    def _place(self, line: LineScan, at: float) -> str:
+        """Return the numbers of theta at a place on a line, where there are few."""
+        if self.theta.size > 3:
+            return ""
+        return f", theta = {', '.join(f'{value:.5g}' for value in self.theta + at * line.direction)}"
 
     def _sigmas(self) -> list[str]:
         if not self.smoothed:
@@ -422,14 +888,17 @@ class Findings:
             return f"none seen, below {number(high)}%"
         return f"{number(100 * one.bias / one.norm)}% [{number(low)}, {number(high)}]"
 
-    def _use(self, one: Smoothed) -> tuple[str, str]:
+    def recommended(self, one: Smoothed) -> Method | None:
+        """Return the fastest usable method at a sigma; None if none is known."""
         best = one.best
+        if best is not None and best.name == "gradient" and self.derivative == WRONG:
+            return next((m for m in one.methods if m.name == "smoothing" and math.isfinite(m.seconds)), None)
+        return best
+
+    def _use(self, one: Smoothed) -> tuple[str, str]:
+        best = self.recommended(one)
         if best is None:
             return "unknown", "-"
-        if self.problems and self.cause in (*FAULTS, "raised") and best.name == "gradient":
-            best = next((m for m in one.methods if m.name == "smoothing" and math.isfinite(m.seconds)), None)
-            if best is None:
-                return "unknown", "-"
         kind = "gradient" if best.name == "gradient" else "cost"
         return f"{best.name}, N = {int(best.samples):,}", f"{counted(int(best.calls), kind)}, {duration(best.seconds)}"
 
@@ -444,30 +913,16 @@ class Findings:
             lines[0] += f"; the gradient {duration(self.gradient_s)}: {fewer}"
         return lines
 
-    def _end(self) -> list[str]:
-        lines = [f"warning: {text}" for text in self.warnings]
-        if self.problems:
-            return [*lines, *(f"CANNOT BE TRUSTED: {text}" for text in self.problems)]
-        return [*lines, self.conclusion, *self._scope()]
 
-    def _scope(self) -> list[str]:
-        """Return lines that state what was and was not checked, for a report without problems."""
-        check = self.check
-        assert check is not None
-        dim, seen = self.theta.size, len(check.components)
-        whole = len(check.parts) - seen
-        checked = f"checked: {seen} of {dim} components" if seen < dim else f"checked: {counted(dim, 'component')}"
-        checked += f" and {counted(whole, 'random direction')} at theta"
-        if check.draws:
-            checked += f", {counted(len(check.draws), 'direction')} at other thetas around it"
-        if self.lines:
-            checked += f", jumps on {counted(len(self.lines), 'line')}"
-        if self.smoothed:
-            checked += f", noise of sigma {', '.join(number(one.sigma) for one in self.smoothed)}"
-        rest = [] if self.gradient else ["any gradient"]
-        rest += ["the gradient under noise on theta: give sigma"] if self.gradient and not self.smoothed else []
-        rest += ["thetas far from this one"]
-        return [checked, f"not checked: {'; '.join(rest)}"]
+def shortened(text: str) -> str:
+    """Return the first characters of a text on one line, for a headline."""
+    line = " ".join(text.split())
+    return line if len(line) <= HEADLINE else f"{line[:HEADLINE]} ..."
+
+
+def _as_text(value: float) -> str:
+    """Return a derivative as text; ``NaN`` where it is not a number."""
+    return "NaN" if math.isnan(value) else number(value, 6)
 
 
 def _table(rows: Sequence[Sequence[str]]) -> list[str]:

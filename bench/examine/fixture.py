@@ -6,6 +6,7 @@ In a project's ``conftest.py``: ``pytest_plugins = ["bench.examine.fixture"]``.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,11 +16,18 @@ from bench.examine.report import Report
 
 
 @pytest.fixture
-def examine() -> Callable[..., Report]:
-    """Return :func:`bench.examine` as a function that fails the test if the report has a problem."""
+def examine(record_property: Callable[[str, object], None]) -> Callable[..., Report]:
+    """Return :func:`bench.examine` as a function that fails the test unless the status is 0.
 
-    def examined(cost: Callable[..., Any], theta: Any, **settings: Any) -> Report:
+    It also accepts ``baseline``, a file to compare with. pytest's own JUnit file gets the cause and the size of the
+    error as properties.
+    """
+
+    def examined(cost: Callable[..., Any], theta: Any, *, baseline: str | Path = "", **settings: Any) -> Report:
         report = _examine(cost, theta, **{"progress": False, **settings})
+        report = report.compared(baseline) if baseline else report
+        for name in ("derivative", "cause", "size"):
+            record_property(f"{report.name} {name}", getattr(report, name))
         report.assert_right()
         return report
 

@@ -9,7 +9,7 @@ level. This search follows each place separately with two costs per halving, sin
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,14 @@ ALIKE = 0.01
 """Relative difference between heights of jumps that count as equal; the slope of the cost adds to each height."""
 EVEN = 0.02
 """Largest deviation from even spacing of the jumps of a staircase, as a share of the spacing."""
+LEAST = 1e-12
+"""Smallest break that is searched, as a share of the cost's change along the line over :data:`GUARD`."""
+SIDES = 4
+"""Points on either side of a break that confirm it."""
+WIDER = 3.0
+"""Spacing of these points, in multiples of the last width."""
+CONFIRMED = 0.1
+"""Largest deviation of the cost from smoothness on either side of a break, as a share of the break."""
 GUARD = 64.0
 """Multiple of the cost's rounding error that a change of slope has to exceed."""
 
@@ -39,6 +47,8 @@ class Break:
     """Position t on the line ``theta + t * direction``."""
     size: float
     """The height of a jump, or the change of slope per unit of t at a kink."""
+    near: tuple[tuple[float, float], ...] = ()
+    """Values of t beside the break with their costs, in rising order, for a picture."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +100,12 @@ def scan(
     points: int = POINTS,
     halvings: int = HALVINGS,
     most: int = PLACES,
+    unit: float = float(np.finfo(np.float64).eps),
 ) -> LineScan:
     """Return a scan of ``cost``, ``(d, B)`` to ``(B,)``, along ``theta + t * direction`` for t from -reach to +reach.
 
-    ``theta`` and ``direction`` are ``(d,)``. ``noise`` is the size of the cost's rounding errors. At most ``most``
-    places are searched for breaks.
+    ``theta`` and ``direction`` are ``(d,)``. ``noise`` is the size of the cost's rounding errors at theta, and ``unit``
+    the unit roundoff, from which they follow elsewhere. At most ``most`` places are searched for breaks.
     """
 
     def along(t: np.ndarray) -> np.ndarray:
@@ -102,6 +113,11 @@ def scan(
 
     t = np.linspace(-reach, reach, points)
     f = along(t)
+    finite = f[np.isfinite(f)]
+    # a break that is this small beside the cost or its change is rounding
+    noise = max(
+        noise, unit * float(np.abs(finite).max(initial=0.0)), LEAST * float(np.ptp(finite)) if finite.size else 0.0
+    )
     turns = np.abs(np.diff(f, 2))
     order = np.argsort(np.nan_to_num(turns, nan=-1.0, posinf=-1.0))[::-1]
     places: list[int] = []
@@ -143,7 +159,7 @@ def _locate_breaks(
         widths.append(width)
     # (halvings + 1, places): second differences, of order 2 in the width, 1 for a kink, 0 for a jump
     change = np.array(turns)
-    breaks = []
+    breaks, ends = [], []
     for k in range(count):
         clear = np.flatnonzero(change[:, k] > GUARD * noise)
         clear = clear[clear == np.arange(clear.size)]
@@ -156,7 +172,37 @@ def _locate_breaks(
             breaks.append(Break("jump", at, float(change[end, k])))
         elif order < 1.5:
             breaks.append(Break("kink", at, float(bends[end][k])))
+        else:
+            continue
+        ends.append(widths[end])
+    breaks = _confirmed(along, breaks, ends, noise)
     return _without_duplicates(breaks, 4 * (t[1] - t[0]) / 2**halvings)
+
+
+def _confirmed(
+    along: Callable[[np.ndarray], np.ndarray], breaks: list[Break], widths: list[float], noise: float
+) -> list[Break]:
+    """Return the breaks on both sides of which the cost is smooth, from four more costs on each side.
+
+    A rough cost has second differences of every size, which look like jumps. Beside a jump its values scatter as much as
+    across, and beside a kink its slopes do.
+    """
+    if not breaks:
+        return []
+    away = np.arange(1, SIDES + 1)
+    at = np.array([one.at for one in breaks])[:, None]
+    step = np.array(widths)[:, None] * WIDER
+    sides = along(np.concatenate([at - step * away, at + step * away], axis=1)).reshape(len(breaks), 2, SIDES)
+    confirmed = []
+    for one, both, width in zip(breaks, sides, step[:, 0], strict=True):
+        left = zip(one.at - width * away[::-1], both[0, ::-1], strict=True)
+        right = zip(one.at + width * away, both[1], strict=True)
+        near = tuple((float(t), float(f)) for t, f in (*left, *right))
+        bends = np.abs(np.diff(both, 2, axis=1)).max()
+        size = one.size if one.kind == "jump" else one.size * width
+        if bends <= CONFIRMED * size + 4.0 * noise:
+            confirmed.append(replace(one, near=near))
+    return confirmed
 
 
 def _second_difference(values: np.ndarray) -> np.ndarray:

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.examine.ci import as_junit, as_markdown
 from bench.examine.findings import Findings
+from bench.examine.lines import Break
 from bench.report.figures import save, styled
 from bench.report.style import GREY, MARKERS, PALETTE
 from bench.report.text import number
@@ -29,6 +31,7 @@ BODY = """<header>
 </header>
 <main>
 {charts}
+{breaks}
 <h2>All numbers</h2>
 <pre class="lines" tabindex="0">{text}</pre>
 <h2>Every derivative checked</h2>
@@ -39,11 +42,15 @@ BODY = """<header>
 def write(report: Findings, directory: Path) -> list[Path]:
     """Write the text, the tables, the charts and ``report.html`` into ``directory``, and return their paths.
 
-    The files are ``report.txt``, ``derivatives.csv``, ``sigmas.csv``, ``breaks.csv``, the charts and ``report.html``.
+    The files are ``report.txt``, ``summary.md``, ``junit.xml``, ``derivatives.csv``, ``sigmas.csv``, ``breaks.csv``, the
+    charts and ``report.html``, and ``printed.txt`` where the cost prints.
     """
     make_directory(directory)
     tables = {"derivatives": report.frame, "sigmas": report.sigmas, "breaks": report.breaks}
     texts = {f"{name}.csv": table.to_csv(index=False, lineterminator="\n") for name, table in tables.items()}
+    texts |= {"summary.md": as_markdown([report]), "junit.xml": as_junit([report])}
+    if report.printed.count:
+        texts["printed.txt"] = "".join(f"{line}\n" for line in report.printed.lines)
     paths = write_all(directory, {"report.txt": f"{report}\n", **texts})
     pictures = []
     with styled():
@@ -55,13 +62,50 @@ def write(report: Findings, directory: Path) -> list[Path]:
     body = BODY.format(
         title=escape(title),
         state="bad" if report.status else "good",
-        verdict=escape(" ".join(report.problems) or report.conclusion),
+        verdict="<br>".join(escape(text) for text in (report.conclusion, report.noise_answer, report.advice) if text),
         charts="\n".join(pictures),
+        breaks=_breaks(report),
         text=_wrapping(str(report)),
         table=report.frame.to_html(index=False, float_format=lambda x: number(x, 5), border=0),
     )
     write_whole(directory / "report.html", shell.document(title, body).encode())
     return [*paths, directory / "report.html"]
+
+
+def _breaks(report: Findings) -> str:
+    """Return HTML with an entry per jump or kink that opens its picture."""
+    entries = []
+    for index, line in enumerate(report.lines):
+        for one in line.breaks:
+            size = "height" if one.kind == "jump" else "change of slope"
+            place = ", ".join(
+                f"{report.names[i]} = {report.theta[i] + one.at * line.direction[i]:.6g}"
+                for i in range(min(report.theta.size, SHOWN))
+            )
+            title = f"line {index + 1}: {one.kind} at t = {one.at:+.4f}, {size} {number(one.size)}"
+            entries.append(
+                f"<details><summary>{escape(title)}</summary><p>{escape(place)}</p>{_picture(one, title)}</details>"
+            )
+    return "<h2>Jumps and kinks</h2>" + "\n".join(entries) if entries else ""
+
+
+def _picture(one: Break, title: str) -> str:
+    """Return the costs beside a break as an SVG picture."""
+    points = [(t, f) for t, f in one.near if np.isfinite(f)]
+    if len(points) < 2:
+        return ""
+    t, f = np.array(points).T
+    x = 40 + 320 * (t - t.min()) / (np.ptp(t) or 1.0)
+    y = 150 - 120 * (f - f.min()) / (np.ptp(f) or 1.0)
+    dots = "".join(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="4" fill="{PALETTE[0]}"/>' for a, b in zip(x, y, strict=True))
+    middle = 40 + 320 * (one.at - t.min()) / (np.ptp(t) or 1.0)
+    return (
+        f'<svg viewBox="0 0 400 190" width="400" role="img" aria-label="{escape(title)}">'
+        f'<line x1="{middle:.1f}" x2="{middle:.1f}" y1="15" y2="165" stroke="{PALETTE[2]}"/>{dots}'
+        f'<text x="40" y="182" font-size="12" fill="currentColor">t = {t.min():.6f}</text>'
+        f'<text x="360" y="182" font-size="12" fill="currentColor" text-anchor="end">{t.max():.6f}</text>'
+        f'<text x="4" y="14" font-size="12" fill="currentColor">cost, from {f.min():.6g} to {f.max():.6g}</text></svg>'
+    )
 
 
 def _wrapping(text: str) -> str:

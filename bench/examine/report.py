@@ -1,13 +1,14 @@
-"""The report of an examination: findings that can be asserted and saved as a page."""
+"""The report of an examination: findings that can be asserted, compared with a baseline, and saved as files."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from bench.errors import UserError, unknown
+from bench.examine import ci
 from bench.examine.findings import Findings
 
 if TYPE_CHECKING:
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
 class Report(Findings):
     """The findings about a cost and its gradient at one theta; ``print`` shows them as text.
 
-    ``frame``, ``sigmas`` and ``breaks`` are tables, ``problems`` and ``warnings`` are sentences, and ``status`` is the
-    exit status.
+    ``derivative`` and ``noise_answer`` are the two answers, ``frame``, ``sigmas`` and ``breaks`` are tables,
+    ``problems`` and ``warnings`` are sentences, and ``status`` is the exit status: 0 right, 1 wrong, 3 not decided.
     """
 
     def __repr__(self) -> str:
@@ -51,9 +52,30 @@ class Report(Findings):
         return displayable(figures[chart or next(iter(figures))][1])
 
     def assert_right(self) -> None:
-        """Raise AssertionError with the full report if there is a problem."""
-        if self.problems:
+        """Raise AssertionError with the full report unless the status is 0."""
+        if self.status:
             raise AssertionError(f"{'; '.join(self.problems)}\n\n{self}")
+
+    def compared(self, baseline: str | Path) -> Self:
+        """Return the report compared with a baseline file, which is written if it does not exist.
+
+        The compared report has status 0 where it is not worse than the baseline.
+        """
+        path = Path(baseline).expanduser()
+        before = ci.read_baseline(path)
+        if before is None:
+            ci.write_baseline(path, self)
+            return replace(self, changes=[f"none before, written to {path}"])
+        changes, is_worse = ci.differences(before, self)
+        return replace(self, changes=changes or ["no change"], is_as_before=not is_worse)
+
+    def markdown(self) -> str:
+        """Return a summary in Markdown, as for a CI server's job summary."""
+        return ci.as_markdown([self])
+
+    def junit(self) -> str:
+        """Return JUnit XML with one test case."""
+        return ci.as_junit([self])
 
     def save(self, directory: str | Path) -> list[Path]:
         """Write text, tables, charts and ``report.html`` into a directory, and return the paths of the files."""

@@ -11,9 +11,10 @@ UNNAMED = ("rounded",)
 
 def judge(case):
     report = simulators.examined(case)
-    assert report.status == bool(case.causes), f"{case.name}: {report.cause}\n{report}"
+    assert bool(report.status) == bool(case.causes), f"{case.name}: {report.cause}\n{report}"
     if case.causes and case.name not in UNNAMED:
         assert report.cause in case.causes, case.name
+    assert not case.warned or any(case.warned in text for text in report.warnings), case.name
 
 
 @pytest.mark.parametrize("case", [c for c in simulators.numpy_cases() if c.name not in SLOW], ids=lambda c: c.name)

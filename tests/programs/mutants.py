@@ -47,7 +47,10 @@ X = "plugins/estimators/"
 OF_TIMING = "tests/studies/test_flat.py tests/benchself/test_speed.py::test_timing_repeats_fast_calls_and_keeps_the_results_asked_for tests/benchself/test_speed.py::test_slow_calls_are_made_once_each tests/measure/test_timing.py"
 OF_STORE = "-m not\\ slow tests/run/test_store.py tests/run/test_nothing_lost.py"
 OF_CHECKS = "tests/measure/test_direction.py tests/measure/test_check.py"
-EL, EF, EX, ES = (f"bench/examine/{name}.py" for name in ("lines", "findings", "examination", "smoothing"))
+EL, EF, EX, ES, EG, EQ = (
+    f"bench/examine/{name}.py" for name in ("lines", "findings", "examination", "smoothing", "gradient", "quick")
+)
+OF_PLAN, OF_MECHANISMS = "tests/examine/test_plan.py", "tests/examine/test_mechanisms.py"
 OF_EXAMINE = "-m not\\ slow tests/examine/test_examine.py --deselect tests/examine/test_examine.py::test_python_number_from_torch_is_disconnected_in_double_precision"
 OF_ESTIMATORS = "tests/plugins/test_weights.py tests/plugins/test_estimators.py"
 
@@ -270,18 +273,21 @@ FAULTS = [
     Fault(EL, "elif order < 1.5:", "elif order < 2.5:", OF_EXAMINE),
     Fault(EL, "float(bends[end][k])", "float(bends[0][k])", OF_EXAMINE),
     Fault(EL, "(np.abs(level) <= noise).mean() > 0.5", "True", OF_EXAMINE),
-    Fault(EF, "or self.tread):", "):", OF_EXAMINE),
+    Fault(EF, "for line in self.lines) or self.tread:", "for line in self.lines):", OF_EXAMINE),
     Fault(EF, "return max(treads) if alike and self.missed > SEEN else 0.0", "return max(treads) if alike else 0.0", OF_EXAMINE),
     Fault(EF, "return max(treads) if alike and self.missed > SEEN else 0.0", "return max(treads) if self.missed > SEEN else 0.0", OF_EXAMINE),
-    Fault(EF, "        if not bad and self.missed > TARGET_ERROR:\n            return \"jumps\"", "        pass", OF_EXAMINE),
-    Fault(EF, "bad = [one.cause for one in (self.check, *self.more) if not one.trusted]", "bad = [one.cause for one in (self.check,) if not one.trusted]", OF_EXAMINE),
-    Fault(EF, "any(one.unshown for one in self.smoothed):", "False:", OF_EXAMINE),
-    Fault(EF, "if not bad and any(one.biased for one in self.smoothed):", "if False:", OF_EXAMINE),
-    Fault(EF, "return 1 if self.problems else 0", "return 0", OF_EXAMINE),
+    Fault(EF, "        if self.missed > TARGET_ERROR:\n            return \"jumps\"", "        pass", OF_EXAMINE),
+    Fault(EF, "checks = [self.settled, *self.more]", "checks = [self.settled]", OF_EXAMINE),
+    Fault(EF, "[one.unshown for one in self.smoothed]", "[False]", OF_EXAMINE),
+    Fault(EF, "[one.biased for one in self.smoothed]", "[False]", OF_EXAMINE),
+    Fault(EF, "        if self.derivative == WRONG:\n            return 1", "        if self.derivative == WRONG:\n            return 0", OF_EXAMINE),
     Fault(EX, "doubt < max(0.1 * missed, LEAST_MISSED)", "True", OF_EXAMINE),
-    Fault(EX, "(half * weight).ravel()", "(0.0 * half + weight).ravel()", OF_EXAMINE),
+    Fault(EG, "(half * weight).ravel()", "(0.0 * half + weight).ravel()", OF_EXAMINE),
     Fault(EX, "replace(line, missed=self._missed_share(line, checked))", "line", OF_EXAMINE),
-    Fault(EX, "chosen = min(effort.components, self.theta.size)", "chosen = 0 * min(effort.components, self.theta.size)", OF_EXAMINE),
+    Fault(EQ, 'return "disconnected" if program == 0.0 else "wrong_adjoint"', 'return "smooth"', OF_PLAN),
+    Fault(EQ, 'return "smooth" if uncertainty <= SETTLED * size else "unsettled"', 'return "unsettled"', OF_PLAN),
+    Fault(EF, "return bool(abs(part.program - part.difference) <= allowed)", "return True", OF_MECHANISMS),
+    Fault(EG, "return not self.has_state and self.spread <=", "return True or self.spread <=", OF_MECHANISMS),
     Fault(ES, "return self.known and bool(self.bias_low > TARGET_ERROR * self.norm)", "return bool(self.bias_low > TARGET_ERROR * self.norm)", OF_EXAMINE),
     Fault(ES, "return self.known and bool(self.bias_low > TARGET_ERROR * self.norm)", "return self.known and bool(self.bias_low > 1e9 * self.norm)", OF_EXAMINE),
     Fault(ES, "return self.known and not self.biased and bool(self.bias_high > self.norm)", "return False", OF_EXAMINE),

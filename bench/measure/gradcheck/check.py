@@ -58,6 +58,8 @@ class Options:
     """The scale of each input ``(d,)``; None uses :func:`scales`."""
     scanned: int = SUSPICIOUS
     """Most directions scanned for a staircase, at about 450 costs each."""
+    repeated: bool = True
+    """Whether every cost at theta is computed twice, which exposes costs that do not repeat."""
     seed: int = 0
     """Seed of the random directions and thetas."""
 
@@ -307,7 +309,9 @@ class _Checker:
         dim, count = self.theta.size, self.options.directions
         random = self.random.standard_normal((dim, count))
         random *= self.scale[:, None] / np.linalg.norm(random, axis=0)
-        vectors = np.concatenate([np.diag(self.scale)[:, chosen], random], axis=1)
+        single = np.zeros((dim, len(chosen)))
+        single[chosen, range(len(chosen))] = self.scale[chosen]
+        vectors = np.concatenate([single, random], axis=1)
         return vectors, np.concatenate([self.scale[chosen], np.ones(count)])
 
     def _check_parts(
@@ -328,7 +332,7 @@ class _Checker:
         at = points(thetas, vectors, self.unit, eps)
         values = self.cost(at).reshape(count, -1)
         repeatable = np.ones(count, bool)
-        if twice:
+        if twice and self.options.repeated:
             # in reverse order, which exposes columns that depend on their neighbours
             again = self.cost(at[:, ::-1])[::-1].reshape(count, -1)
             repeatable = np.asarray(((values == again) | (np.isnan(values) & np.isnan(again))).all(axis=1))

@@ -1,4 +1,4 @@
-"""A time budget for all calls of the user's code."""
+"""A budget of time and calls for all calls of the user's code."""
 
 from __future__ import annotations
 
@@ -19,13 +19,19 @@ MIN_ALARM_S, ALARM_INTERVAL_S = 1e-3, 1.0
 """Minimum delay of the alarm, and the interval at which the alarm repeats, in seconds."""
 PROGRESS_INTERVAL_S = 0.2
 """Minimum time between two updates of the progress line, in seconds."""
+MOST_WAITED = 1.0
+"""Most time lost to other programs that is not charged, in multiples of the budget."""
+READ_INTERVAL_S = 0.02
+"""Minimum time between two readings of the lost time, in seconds."""
+SCHEDULE = "/proc/thread-self/schedstat"
+"""On Linux: nanoseconds on a processor, nanoseconds of waiting for one, and number of time slices."""
 
 
 class OutOfTime(BaseException):
     """Raised when the budget is spent, also inside a call. A BaseException, since a simulator may catch Exception."""
 
 
-def parse_duration(budget: float | str) -> float:
+def parse_duration(budget: float | str, what: str = "budget") -> float:
     """Return a budget such as ``60``, ``"60s"`` or ``"2m"`` in seconds; raises :class:`UserError` if invalid.
 
     >>> parse_duration("2m"), parse_duration(0.5)
@@ -37,67 +43,151 @@ def parse_duration(budget: float | str) -> float:
     with suppress(ValueError, KeyError):
         value = float(number) * UNITS[text[len(number) :].strip()]
     if not (value > 0 and math.isfinite(value)):
-        raise UserError(f"budget={budget} is not a duration: give seconds or a unit, budget=60s, 500ms or 2m")
+        raise UserError(f"{what}={budget} is not a duration: give seconds or a unit, {what}=60s, 500ms or 2m")
     return value
 
 
-class Clock:
-    """Remaining budget, time spent per call, and the progress line."""
+def _run_delay() -> float:
+    """Return the seconds for which this thread has been ready but waited for a processor; 0 where unknown."""
+    try:
+        with open(SCHEDULE) as file:
+            return int(file.read().split()[1]) * 1e-9
+    except (OSError, ValueError, IndexError):
+        return 0.0
 
-    def __init__(self, budget: float, shown: bool = False) -> None:
-        self.start = time.perf_counter()
-        self.budget = budget
+
+class Clock:
+    """Remaining budget, time spent per call, and the progress line.
+
+    ``budget`` is the time for warm calls and everything between them [s]. The first call of each kind and shape may
+    compile: its time counts against ``compile_budget`` instead. Time for which the process waits because other programs
+    use the processors is not charged, up to as much as the budget. ``calls`` limits the number of costs and
+    gradients together. With a limit of calls and no finite ``budget``, no decision depends on time.
+    """
+
+    def __init__(
+        self, budget: float, shown: bool = False, calls: float = math.inf, compile_budget: float = math.inf
+    ) -> None:
+        self.start, self._delay, self._compile_delay = time.perf_counter(), _run_delay(), 0.0
+        self._read, self._last_read = self._delay, self.start
+        self.budget, self.calls, self.compile_budget = budget, calls, compile_budget
         self.costs = self.gradients = 0
         """Number of evaluated costs and gradients, one per sample."""
         self.cost_s = self.gradient_s = 0.0
         """Seconds spent in cost and gradient calls, except the first call of each shape."""
+        self.compile_s = 0.0
+        """Seconds spent in the first call of each kind and shape."""
+        self.is_terminated = False
+        """Whether the process was asked to end, by SIGTERM."""
         self._timed = {"costs": 0, "gradients": 0}
         self._shown = shown and sys.stderr.isatty()
         self._stage, self._last_shown = "", 0.0
-        self._deadline = math.inf
+        self._deadline, self._last_call = math.inf, math.inf
+        self._is_inside = False
 
     @property
     def spent(self) -> float:
-        """Seconds since the start."""
+        """Seconds since the start, without first calls and without most of the time lost to other programs."""
+        return self.elapsed - self.compile_s - min(self.waited, MOST_WAITED * self.budget)
+
+    @property
+    def waited(self) -> float:
+        """Seconds of warm calls for which this thread waited for a processor that other programs used; 0 where unknown."""
+        now = time.perf_counter()
+        if now - self._last_read > READ_INTERVAL_S:
+            self._last_read, self._read = now, _run_delay()
+        return max(0.0, self._read - self._delay - self._compile_delay)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start, including first calls."""
         return time.perf_counter() - self.start
+
+    @property
+    def used(self) -> int:
+        """Number of costs and gradients computed so far."""
+        return self.costs + self.gradients
 
     @property
     def remaining(self) -> float:
         """Remaining seconds of the budget."""
         return self.budget - self.spent
 
+    @property
+    def remaining_calls(self) -> float:
+        """Remaining calls, infinite without a limit."""
+        return self.calls - self.used
+
+    def can_afford(self, costs: float, gradients: float = 0.0, share: float = 1.0) -> bool:
+        """Return whether these numbers of costs and gradients fit a share (0 to 1) of the remaining budget."""
+        if self.is_terminated or costs + gradients > share * self.remaining_calls:
+            return False
+        if math.isinf(self.budget):
+            return True
+        each, slope = self.per_cost(), self.per_gradient()
+        each = 0.0 if math.isnan(each) else each
+        slope = 4.0 * each if math.isnan(slope) else slope
+        return costs * each + gradients * slope <= share * self.remaining
+
+    def affordable(self, share: float = 1.0) -> float:
+        """Return the number of costs that fit a share (0 to 1) of the remaining budget."""
+        each = self.per_cost()
+        if self.is_terminated:
+            return 0.0
+        timed = share * self.remaining / each if each > 0 and math.isfinite(self.budget) else math.inf
+        return max(0.0, min(timed, share * self.remaining_calls))
+
     def limit(self, share: float) -> None:
         """Limit subsequent calls to ``share`` (0 to 1) of the remaining budget."""
         self._deadline = self.spent + share * max(self.remaining, 0.0)
+        self._last_call = self.used + share * max(self.remaining_calls, 0.0)
 
-    def check(self) -> None:
-        """Raise :class:`OutOfTime` if the budget or the limit of :meth:`limit` is spent."""
-        if self.spent > min(self.budget, self._deadline):
+    def check(self, calls: int = 0) -> None:
+        """Raise :class:`OutOfTime` if the budget or the limit of :meth:`limit` is spent, or ``calls`` would exceed it."""
+        if self.is_terminated or self.spent > min(self.budget, self._deadline):
+            raise OutOfTime
+        if self.used + calls > min(self.calls, self._last_call):
+            raise OutOfTime
+
+    def terminate(self) -> None:
+        """End the budget now, also inside a call."""
+        self.is_terminated = True
+        if self._is_inside:
             raise OutOfTime
 
     @contextmanager
-    def interrupt_when_over(self) -> Iterator[None]:
-        """Raise :class:`OutOfTime` inside the block when the budget is spent.
+    def interrupt_when_over(self, first: bool = False) -> Iterator[None]:
+        """Raise :class:`OutOfTime` inside the block when the budget is spent, or ``compile_budget`` for a first call.
 
         Compiled code is interrupted only when it returns. Only the main thread can be interrupted, and only if no other
         code uses the alarm signal.
         """
-        free = threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
-        if not (free and math.isfinite(self.budget) and signal.getsignal(signal.SIGALRM) in (signal.SIG_DFL, None)):
-            yield
-            return
+        allowed = self.compile_budget - self.compile_s if first else self.remaining
+        began, delay = time.perf_counter(), _run_delay()
+        is_free = threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
+        is_free = is_free and math.isfinite(allowed)
+        is_free = is_free and signal.getsignal(signal.SIGALRM) in (signal.SIG_DFL, None)
 
         def raise_out_of_time(number: int, frame: FrameType | None) -> None:
-            raise OutOfTime
+            # time lost to other programs is not charged: the alarm repeats until the budget is really spent
+            if first or self.remaining <= 0.0:
+                raise OutOfTime
 
-        signal.signal(signal.SIGALRM, raise_out_of_time)
         try:
-            # the alarm repeats, since an exception raised in a callback may be lost
-            signal.setitimer(signal.ITIMER_REAL, max(self.remaining, MIN_ALARM_S), ALARM_INTERVAL_S)
+            self._is_inside = True
+            if is_free:
+                signal.signal(signal.SIGALRM, raise_out_of_time)
+                # the alarm repeats, since an exception raised in a callback may be lost
+                signal.setitimer(signal.ITIMER_REAL, max(allowed, MIN_ALARM_S), ALARM_INTERVAL_S)
             yield
         finally:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            self._is_inside = False
+            if is_free:
+                signal.setitimer(signal.ITIMER_REAL, 0.0)
+                signal.signal(signal.SIGALRM, signal.SIG_DFL)
+            if first:
+                self.compile_s += time.perf_counter() - began
+                self._compile_delay += _run_delay() - delay
 
     def count(self, kind: str, calls: int, taken: float, warm: bool) -> None:
         """Add ``calls`` samples of ``kind`` (costs or gradients), and their seconds if ``warm`` (nothing was compiled)."""
@@ -124,12 +214,36 @@ class Clock:
         self._show_progress(force=True)
 
     def _show_progress(self, force: bool = False) -> None:
-        if self._shown and (force or self.spent - self._last_shown > PROGRESS_INTERVAL_S):
-            self._last_shown = self.spent
-            text = f"{self._stage}: {self.costs} costs, {self.gradients} gradients, {self.spent:.0f} of {self.budget:.0f} s"
+        if self._shown and (force or self.elapsed - self._last_shown > PROGRESS_INTERVAL_S):
+            self._last_shown = self.elapsed
+            limit = f"{self.budget:.0f} s" if math.isfinite(self.budget) else f"{self.calls:,.0f} calls"
+            text = f"{self._stage}: {self.costs} costs, {self.gradients} gradients, {self.spent:.0f} s of {limit}"
             print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
 
     def clear_progress(self) -> None:
         """Remove the progress line."""
         if self._shown:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def end_on_sigterm(clock: Clock) -> Iterator[None]:
+    """End the clock's budget when a command of ``bench`` receives SIGTERM, so that its results are still reported.
+
+    A second SIGTERM stops the command. Programs that use ``bench`` as a library handle SIGTERM as before.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    previous = signal.getsignal(signal.SIGTERM) if is_main else None
+    if getattr(previous, "__module__", "") != "bench.cli":
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, previous)
+        clock.terminate()
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import time
+import io
+import sys
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from typing import Any
 
 import numpy as np
 
 from bench.errors import UserError, failure, unknown
-from bench.model.simulator.clock import Clock
+from bench.model.simulator.clock import Clock, OutOfTime
 from bench.model.simulator.tree import ParameterTree, as_numpy
 
 BATCHES = ("loop", "vmap", "columns", "rows")
@@ -20,14 +22,48 @@ BLOCK = 16
 """Columns per compiled batch: one size, so that it compiles once, and small, since a simulator may be expensive."""
 CHUNK = 256
 """Columns per batch that is not compiled."""
+HELD = 4_000_000
+"""Most numbers in the thetas of one batch."""
+DISTINCT = 3
+"""Fewest costs that show that all costs have single precision: each is one in double precision once in 2^29."""
+SIMPLE_BITS = 12
+"""Costs with at most this many significant bits, such as 0.5, show nothing about the precision."""
+KEPT_LINES = 1000
+"""Most lines printed by the user's functions that are kept."""
 
 
-def _without_exit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a user's function so that ``sys.exit`` raises RuntimeError: a test must not pass by exiting with status 0."""
+class Printed(io.TextIOBase):
+    """Collects what the user's functions print: the first lines, and the number of lines."""
 
-    def call(*arguments: Any) -> Any:
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.count = 0
+        self._partial = ""
+
+    def write(self, text: str) -> int:
+        """Collect text."""
+        *whole, self._partial = (self._partial + text).split("\n")
+        self.count += len(whole)
+        self.lines += whole[: KEPT_LINES - len(self.lines)]
+        return len(text)
+
+    def isatty(self) -> bool:
+        """Return False."""
+        return False
+
+
+def _guarded(function: Callable[..., Any], printed: Printed) -> Callable[..., Any]:
+    """Wrap a user's function: its printing is collected, and ``sys.exit`` raises RuntimeError.
+
+    A test must not pass because a simulator exits with status 0.
+    """
+
+    def call(*arguments: Any, **settings: Any) -> Any:
         try:
-            return function(*arguments)
+            if sys.stdout is printed:
+                return function(*arguments, **settings)
+            with redirect_stdout(printed), redirect_stderr(printed):
+                return function(*arguments, **settings)
         except SystemExit as error:
             code = "" if error.code is None else error.code
             raise RuntimeError(f"it ended the process by sys.exit({code})") from None
@@ -38,7 +74,8 @@ def _without_exit(function: Callable[..., Any]) -> Callable[..., Any]:
 class Simulator:
     """A cost f(theta) or f(theta, w) and optionally its gradient, on NumPy batches with one sample per column.
 
-    ``noise`` is the length of w, 0 for a cost without its own noise. An exception in a call yields NaN, except in the
+    ``noise`` is the length of w, 0 for a cost without its own noise. ``library`` is the library of the arrays that the
+    functions receive; by default that of ``grad`` or of theta. An exception in a call yields NaN, except in the
     first call, where it becomes a :class:`UserError`.
     """
 
@@ -48,13 +85,13 @@ class Simulator:
         layout: ParameterTree,
         grad: str | Callable[..., Any] | None = None,
         noise: int = 0,
-        batch: str | None = None,
+        batch: str | int | None = None,
         clock: Clock | None = None,
+        library: str = "",
     ) -> None:
         if not callable(cost):
             raise UserError(f"the cost is a function of theta, not {type(cost).__name__}")
-        if batch is not None and batch not in BATCHES:
-            raise unknown("batch", batch, BATCHES)
+        batch, self.fixed = _parse_batch(batch)
         if not (grad is None or callable(grad) or grad in LIBRARIES):
             raise unknown("grad", grad, (*LIBRARIES, "a function of theta"))
         if batch in ("columns", "rows") and not layout.flat:
@@ -68,13 +105,21 @@ class Simulator:
         """Number of failed calls of the cost, after the first call, by exception."""
         self.gradient_error = ""
         """The first exception of the gradient, or an empty string."""
+        self.n_failed_gradients = 0
+        """Number of gradient calls that raised an exception."""
         self.precision = "float64"
-        """Floating-point type that the cost returns."""
-        self._cost, self._grad = _without_exit(cost), _without_exit(grad) if callable(grad) else grad
+        """Floating-point type of the cost: its own, or float32 where all its values have single precision."""
+        self.printed = Printed()
+        """What cost and gradient print."""
+        self.first_value = float("nan")
+        """The cost at theta, from the first call, with w = 0."""
+        self._cost = _guarded(cost, self.printed)
+        self._grad = _guarded(grad, self.printed) if callable(grad) else grad
         self._shapes: set[Any] = set()
-        self._single: Callable[..., Any] | None = None
+        self._compiled: dict[str, tuple[Any, ...]] = {}
+        self._distinct: set[float] = set()
         self._double = True
-        self.library = self._detect_library()
+        self.library = library or self._detect_library()
         self.batch = self._detect_batch(batch)
 
     # ------------------------------------------------------------------------------------------- columns
@@ -88,7 +133,15 @@ class Simulator:
     @property
     def width(self) -> int:
         """Number of thetas per call."""
-        return 1 if self.batch == "loop" else BLOCK if self.library == "jax" else CHUNK
+        if self.batch == "loop":
+            return 1
+        most = self.fixed or (BLOCK if self.library == "jax" else CHUNK)
+        return self.fixed or max(1, min(most, HELD // self.layout.vector.size))
+
+    @property
+    def has_single_precision(self) -> bool:
+        """Whether the cost returns float64 numbers that all have single precision, as from ``float(loss)``."""
+        return len(self._distinct) >= DISTINCT and all(float(np.float32(one)) == one for one in self._distinct)
 
     @property
     def has_gradient(self) -> bool:
@@ -113,22 +166,30 @@ class Simulator:
     ) -> np.ndarray:
         count = thetas.shape[1]
         out = np.full((*lead, count), np.nan)
-        size = self.width
+        # one gradient needs no batch, which would compute and compile more
+        is_single = kind == "gradients" and count == 1 and self._is_mapped
+        size = 1 if is_single else self.width
         for start in range(0, count, size):
-            self.clock.check()
             part = slice(start, min(start + size, count))
+            self.clock.check(part.stop - part.start)
             columns = np.arange(part.start, part.stop)
-            if self.library == "jax" and size > 1:
+            if (self.library == "jax" or self.fixed) and size > 1:
                 columns = np.r_[columns, np.repeat(columns[-1:], size - columns.size)]
-            began = time.perf_counter()
-            with self.clock.interrupt_when_over():
-                results = function(thetas[:, columns], None if w is None else w[:, columns])
-            taken = time.perf_counter() - began
-            warm = (kind, columns.size) in self._shapes
+            is_first = (kind, columns.size) not in self._shapes
             self._shapes.add((kind, columns.size))
-            self.clock.count(kind, part.stop - part.start, taken, warm)
+            began = self.clock.spent
+            with self.clock.interrupt_when_over(first=is_first):
+                results = function(thetas[:, columns], None if w is None else w[:, columns])
+            taken = max(self.clock.spent - began, 0.0)
+            self.clock.count(kind, part.stop - part.start, taken, warm=not is_first)
             out[..., part] = results[..., : part.stop - part.start]
+            if kind == "costs" and len(self._distinct) < 16 * DISTINCT:
+                self._distinct.update(float(one) for one in out[part] if _is_telling(one))
         return out
+
+    @property
+    def _is_mapped(self) -> bool:
+        return self.library == "jax" and self.batch == "vmap"
 
     def _costs(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
         try:
@@ -144,6 +205,7 @@ class Simulator:
             raise
         except Exception as error:
             self.gradient_error = self.gradient_error or failure(error)["reason"]
+            self.n_failed_gradients += 1
             return np.full(thetas.shape, np.nan)
         if np.iscomplexobj(gradients):
             raise UserError("the gradient is complex: the gradient of a real cost of real numbers is real")
@@ -206,7 +268,9 @@ class Simulator:
             problem = f"it returned an array of shape {value.shape}"
             if value.size == 1:
                 self._check_cost(value)
-                return self._detect_vmap(vector, float(value.ravel()[0]), batch)
+                self.first_value = float(value.ravel()[0])
+                self._distinct |= {self.first_value} if _is_telling(self.first_value) else set()
+                return self._detect_vmap(vector, self.first_value, batch)
         for layout in ("columns", "rows"):
             if self.layout.flat and self._accepts(layout):
                 self.notes.append(f"the cost takes batches as {layout}")
@@ -215,10 +279,14 @@ class Simulator:
 
     def _call_once(self, vector: np.ndarray, w: np.ndarray | None) -> np.ndarray:
         """Return the cost of a single theta as an array, and note whether the cost modifies its argument."""
-        began = time.perf_counter()
+        if self.library == "jax":
+            with self.clock.interrupt_when_over(first=True):
+                value = self._jax_values(vector[:, None], None if w is None else w[:, None], "loop")
+            self.clock.count("costs", 1, 0.0, warm=False)
+            return as_numpy(value)
         theta = self._build_theta(self._array(vector))
         try:
-            with self.clock.interrupt_when_over():
+            with self.clock.interrupt_when_over(first=True):
                 value = self._call(theta, None if w is None else self._array(w))
         except RuntimeError as error:
             if self.library != "torch" or "dtype" not in str(error) or not self._double:
@@ -227,7 +295,8 @@ class Simulator:
             self.notes.append("theta is passed in float32, as the torch module requires")
             return self._call_once(vector, w)
         array = as_numpy(value)
-        self.clock.count("costs", 1, time.perf_counter() - began, warm=False)
+        self.clock.count("costs", 1, 0.0, warm=False)
+        self._shapes.add(("costs", 1))
         if self._is_modified(theta, vector):
             self.notes.append("the cost modifies its argument in place, so each call gets a copy")
         return array
@@ -260,17 +329,17 @@ class Simulator:
             try:
                 columns = np.repeat(vector[:, None], BLOCK, axis=1)
                 w = np.zeros((self.noise, BLOCK)) if self.noise else None
-                self._single = None
-                with self.clock.interrupt_when_over():
+                with self.clock.interrupt_when_over(first=True):
                     mapped = np.asarray(self._jax_values(columns, w, "vmap"), dtype=np.float64)
                 tolerance = 1e3 * self.unit * max(abs(value), 1.0)
                 if np.allclose(mapped, value, rtol=1e3 * self.unit, atol=tolerance, equal_nan=True):
                     self._shapes.add(("costs", BLOCK))
                     return "vmap"
+            except OutOfTime:
+                self.notes.append("compiling jax.vmap of the cost took longer than compile_budget")
             except Exception as error:
                 if batch == "vmap":
                     raise UserError(f"jax.vmap cannot map the cost: {failure(error)['reason']}") from None
-            self._single = None
             self.notes.append("jax.vmap cannot map the cost, so thetas are evaluated one by one")
             return "loop"
         if batch == "vmap":
@@ -282,17 +351,19 @@ class Simulator:
     def _accepts(self, batch: str) -> bool:
         """Return whether the cost accepts several thetas as columns or rows and returns one number per theta."""
         dim = self.layout.vector.size
-        count = 5 if dim != 5 else 7
+        count = self.fixed or (5 if dim != 5 else 7)
         thetas = np.repeat(self.layout.vector[:, None], count, axis=1)
         w = np.zeros((self.noise, count)) if self.noise else None
         self._batch_error = ""
         try:
-            with self.clock.interrupt_when_over():
+            with self.clock.interrupt_when_over(first=True):
                 costs = as_numpy(self._call_batch(self._array(thetas), None if w is None else self._array(w), batch))
         except Exception as error:
             self._batch_error = failure(error)["reason"]
             return False
         self.clock.count("costs", count, 0.0, warm=False)
+        if costs.shape == (count,) and costs.dtype.kind in "fiub":
+            self.first_value = float(costs[0])
         if costs.shape != (count,):
             self._batch_error = f"{count} thetas gave an array of shape {costs.shape}, not {(count,)}"
             return False
@@ -345,21 +416,30 @@ class Simulator:
         return torch.stack([cost.reshape(()) for cost in doubles])
 
     def _jax_values(self, thetas: np.ndarray, w: np.ndarray | None, batch: str) -> Any:
+
+        compiled, _, eager, _ = self._jax_functions(batch)
+        return self._call_compiled(compiled, eager, thetas, w, batch)
+
+    def _jax_functions(self, batch: str) -> tuple[Any, ...]:
+        """Return cost and gradient for a batching mode: both compiled, then both as Python functions."""
         import jax
 
-        if self._single is None:
+        if batch not in self._compiled:
+
+            def raw(vector: Any, *rest: Any) -> Any:
+                return self._call(self._build_theta(vector), *rest or (None,))
 
             def one(vector: Any, *rest: Any) -> Any:
-                return jax.numpy.reshape(self._call(self._build_theta(vector), *rest or (None,)), ())
+                return jax.numpy.reshape(raw(vector, *rest), ())
 
-            def all_at_once(columns: Any, *rest: Any) -> Any:
+            def all_columns(columns: Any, *rest: Any) -> Any:
                 return self._call_batch(columns, rest[0] if rest else None, batch)
 
-            whole = one if batch == "loop" else jax.vmap(one, in_axes=1) if batch == "vmap" else all_at_once
+            whole = raw if batch == "loop" else jax.vmap(one, in_axes=1) if batch == "vmap" else all_columns
             summed = one if batch == "loop" else lambda columns, *rest: whole(columns, *rest).sum()
-            self._single = jax.jit(whole)
-            self._slope, self._eager = jax.jit(jax.grad(summed)), (whole, jax.grad(summed))
-        return self._call_compiled(self._single, self._eager[0], thetas, w, batch)
+            slope = jax.grad(summed)
+            self._compiled[batch] = jax.jit(whole), jax.jit(slope), whole, slope
+        return self._compiled[batch]
 
     def _call_compiled(self, compiled: Any, eager: Any, thetas: np.ndarray, w: np.ndarray | None, batch: str) -> Any:
         """Return a compiled function's values; one theta per call runs uncompiled if JAX cannot trace the function."""
@@ -374,7 +454,11 @@ class Simulator:
             if batch != "loop":
                 raise
             result = eager(*arguments)
-        return np.asarray(result)[..., None] if batch == "loop" else np.asarray(result)
+        if batch != "loop":
+            return np.asarray(result)
+        array = as_numpy(result)
+        # a cost is one number, of shape () or (1,); gradients are vectors
+        return array.reshape(1) if compiled is self._compiled["loop"][0] and array.size == 1 else array[..., None]
 
     # ---------------------------------------------------------------------------------------- gradients
 
@@ -382,9 +466,9 @@ class Simulator:
         if callable(self._grad):
             return self._user_slopes(thetas, w)
         if self._grad == "jax":
-            if self._single is None:
-                self._jax_values(thetas, w, self.batch)
-            return np.asarray(self._call_compiled(self._slope, self._eager[1], thetas, w, self.batch))
+            mode = "loop" if self._is_mapped and thetas.shape[1] == 1 else self.batch
+            _, compiled, _, eager = self._jax_functions(mode)
+            return np.asarray(self._call_compiled(compiled, eager, thetas, w, mode))
         return self._torch_slopes(thetas, w)
 
     def _user_slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
@@ -413,3 +497,23 @@ class Simulator:
             return np.zeros(thetas.shape)
         (gradient,) = torch.autograd.grad(total, leaf, allow_unused=True)
         return np.zeros(thetas.shape) if gradient is None else gradient.detach().cpu().numpy()
+
+
+def _parse_batch(batch: str | int | None) -> tuple[str | None, int]:
+    """Return the batching mode and its fixed width, 0 without one: ``columns``, ``columns:64``, ``64``."""
+    if batch is None:
+        return None, 0
+    mode, _, width = str(batch).partition(":")
+    if mode.isdigit() and not width:
+        mode, width = "", mode
+    if mode not in ("", *BATCHES) or (
+        width and not (width.isdigit() and int(width) > 1 and mode in ("", "columns", "rows"))
+    ):
+        raise unknown("batch", batch, (*BATCHES, "columns:WIDTH", "rows:WIDTH", "WIDTH"))
+    return mode or None, int(width or 0)
+
+
+def _is_telling(cost: float) -> bool:
+    """Return whether a cost has enough significant bits to show its precision."""
+    mantissa = np.frexp(cost)[0] * 2.0**SIMPLE_BITS
+    return bool(np.isfinite(cost) and mantissa != np.round(mantissa))

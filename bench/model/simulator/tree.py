@@ -5,20 +5,23 @@ Each number is named by its path: ``mass``, ``gains[3]``, ``legs[0].stiffness``.
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
-import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
-from bench.errors import UserError
+from bench.errors import UserError, unknown
 
 ROUNDING = 1e-14
 """Size relative to the array's root mean square up to which a number counts as 0 with rounding errors."""
-MAX_SIZE = 100_000
-"""Maximum number of entries of theta: several thousand thetas are stored at the same time."""
+MAX_SIZE = 20_000_000
+"""Maximum number of entries of theta: a few dozen thetas are stored at the same time."""
+
+MAX_NAMED = 100_000
+"""Largest array whose entries are searched by name."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +41,53 @@ class Leaf:
         """Number of entries."""
         return int(np.prod(self.shape, dtype=int))
 
-    def names(self) -> list[str]:
-        """Return the name of each entry, such as ``gains[3]``."""
-        path = self.path or "theta"
+    @property
+    def name(self) -> str:
+        """Name of the whole array: its path, or ``theta``."""
+        return self.path or "theta"
+
+    def entry(self, index: int) -> str:
+        """Return the name of one entry, such as ``gains[3]``."""
         if not self.shape:
-            return [path]
-        return [f"{path}[{','.join(map(str, at))}]" for at in itertools.product(*map(range, self.shape))]
+            return self.name
+        return f"{self.name}[{','.join(str(at) for at in np.unravel_index(index, self.shape))}]"
+
+    def block(self, first: int, last: int) -> str:
+        """Return the name of the entries from ``first`` up to ``last``, such as ``gains[0] to gains[3]``."""
+        if last - first == 1:
+            return self.entry(first)
+        return self.name if last - first == self.size else f"{self.entry(first)} to {self.entry(last - 1)}"
+
+
+class Names(Sequence[str]):
+    """The names of all entries of theta, computed on access, since there may be millions."""
+
+    def __init__(self, leaves: Sequence[Leaf]) -> None:
+        self._leaves = leaves
+        self._starts = [leaf.start for leaf in leaves]
+        self._size = sum(leaf.size for leaf in leaves)
+
+    def __len__(self) -> int:
+        return self._size
+
+    @overload
+    def __getitem__(self, index: int) -> str: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[str]: ...
+    def __getitem__(self, index: int | slice) -> str | list[str]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(self._size))]
+        position = index + self._size if index < 0 else index
+        if not 0 <= position < self._size:
+            raise IndexError(index)
+        leaf = self._leaves[bisect.bisect_right(self._starts, position) - 1]
+        return leaf.entry(position - leaf.start)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)
+
+    def __hash__(self) -> int:
+        return id(self)
 
 
 class ParameterTree:
@@ -77,9 +121,51 @@ class ParameterTree:
             raise UserError(f"{bad} is not finite: give a theta of finite numbers")
 
     @property
-    def names(self) -> list[str]:
+    def names(self) -> Names:
         """The name of each entry, ``d`` names."""
-        return [name for leaf in self.leaves for name in leaf.names()]
+        return Names(self.leaves)
+
+    def match(self, name: str) -> list[int]:
+        """Return the indices of the entries with a name or path: ``gains[3]``, ``gains`` or ``legs[0]``.
+
+        Raises :class:`UserError` if there is none.
+        """
+        inside = [leaf for leaf in self.leaves if leaf.name == name or leaf.name.startswith((f"{name}.", f"{name}["))]
+        if inside:
+            return [i for leaf in inside for i in range(leaf.start, leaf.start + leaf.size)]
+        for leaf in self.leaves:
+            if name.startswith(f"{leaf.name}[") and leaf.size <= MAX_NAMED:
+                entries = [leaf.entry(i) for i in range(leaf.size)]
+                if name in entries:
+                    return [leaf.start + entries.index(name)]
+        raise unknown("input", name, [leaf.name for leaf in self.leaves])
+
+    def spread(self, value: Any, what: str, default: float) -> np.ndarray:
+        """Return one number per entry ``(d,)``, from a number, a mapping of names to numbers, or theta's structure.
+
+        Entries that a mapping does not name get ``default``.
+        """
+        size = self.vector.size
+        if isinstance(value, int | float | np.number):
+            return np.full(size, float(value))
+        if isinstance(value, Mapping) and not self._has_structure(value):
+            result = np.full(size, default)
+            for name, given in value.items():
+                index = self.match(str(name))
+                try:
+                    result[index] = np.asarray(as_numpy(given), dtype=np.float64).ravel()
+                except ValueError:
+                    raise UserError(f"{what}: {name} has {len(index)} numbers: give one number, or as many") from None
+            return result
+        return self.flatten(value, what).astype(np.float64)
+
+    def _has_structure(self, value: Any) -> bool:
+        """Return whether a mapping has an array of theta's size for each leaf."""
+        try:
+            self.flatten(value)
+        except UserError:
+            return False
+        return True
 
     @property
     def flat(self) -> bool:
@@ -138,9 +224,13 @@ def as_numpy(value: Any) -> np.ndarray:
     if hasattr(value, "detach"):
         value = value.detach().cpu()
     try:
-        return np.asarray(value)
+        array = np.asarray(value)
+        if array.dtype.kind == "O" and all(hasattr(part, "__float__") for part in array.ravel()):
+            # numbers of a library without arrays, such as Decimal
+            array = np.array([float(part) for part in array.ravel()]).reshape(array.shape)
     except (TypeError, ValueError) as error:
         raise UserError(f"{type(value).__name__} is not an array of numbers: {error}") from None
+    return array
 
 
 def _library(value: Any) -> str:
@@ -149,7 +239,8 @@ def _library(value: Any) -> str:
         return "jax"
     if root == "torch" or hasattr(value, "detach"):
         return "torch"
-    return "number" if isinstance(value, int | float) else "numpy"
+    is_number = isinstance(value, int | float) or (hasattr(value, "__float__") and not hasattr(value, "dtype"))
+    return "number" if is_number else "numpy"
 
 
 def _restore(part: np.ndarray, leaf: Leaf) -> Any:

@@ -1,0 +1,179 @@
+"""Comparisons that explain a wrong gradient: other costs, other gradients, other numbers of steps, and long lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from bench.examine.gradient import GradientStages
+from bench.examine.lines import LineScan, scan
+from bench.examine.quick import QuickCheck
+from bench.examine.subspace import choose
+from bench.measure.gradcheck import Check
+from bench.model.simulator.simulator import Simulator
+
+SUSPICIOUS = ("wrong_factor", "missing_term", "wrong_adjoint")
+"""Causes that adaptive steps imitate."""
+NEAR = 0.05
+"""Largest relative error of a gradient for which adaptive steps are considered."""
+EXPLAINED = 10.0
+"""Largest error of a gradient on a line, in multiples of the jumps' total height over the length of the line."""
+SMALL_JUMPS = 0.05
+"""Largest total height of such jumps, as a share of the cost's change along the line."""
+FEWEST_JUMPS = 2
+"""Fewest jumps on the lines that count as jumps of adaptive steps."""
+LONGER = 10.0
+"""Length of the line on which more jumps are searched, in multiples of the first line."""
+THETAS = 4
+"""Number of other thetas at which two costs are compared."""
+GROWTH = 1.5
+"""Least ratio of errors at the largest and at the first wrong number of steps that counts as growth."""
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """The error of a gradient after a number of steps."""
+
+    steps: int
+    error: float
+    """Largest |gradient - difference|, relative to the largest difference, in units of each input's scale."""
+    uncertainty: float
+    """The error of the differences, relative to the largest."""
+
+
+def compare_costs(stages: GradientStages, twin: Callable[..., Any]) -> float:
+    """Return the largest relative difference between the cost and its twin, at theta and at thetas around it."""
+    other = _simulator(stages, twin, None)
+    random = np.random.default_rng([stages.seed, 0x7477696E])
+    thetas = stages.theta[:, None] + 1e-2 * stages.scale[:, None] * np.c_[
+        np.zeros(stages.theta.size), random.standard_normal((stages.theta.size, THETAS))
+    ]  # fmt: skip
+    w = None if stages.w is None else np.repeat(stages.w, thetas.shape[1], axis=1)
+    a, b = stages.costs(thetas), other.costs(thetas, w)
+    size = np.maximum(np.abs(a), np.abs(b)).max()
+    return float(np.abs(a - b).max() / size) if size > 0 else 0.0
+
+
+def compare_gradients(stages: GradientStages, twin_grad: Any) -> tuple[float, float]:
+    """Return the relative errors of the gradient and of a second one, both against the checked differences."""
+    simulator = stages.simulator
+    other = Simulator(simulator._cost, stages.layout, twin_grad, simulator.noise, simulator.batch, stages.clock)
+    second = other.gradients(stages.theta[:, None], stages.w)[:, 0]
+    assert stages.gradient is not None
+    space = choose(stages.layout, stages.scale, stages.gradient, stages.seed)
+    if stages.check is None:
+        return float("nan"), float("nan")
+    by_name = {part.name: part for part in stages.check.parts}
+    names = [f"component {i}" for i in space.components] + [group.name for group in space.groups]
+    parts = [by_name.get(name) for name in names]
+    differences = np.array([np.nan if part is None else part.difference for part in parts]) * space.scale
+    own, others = space.project(stages.gradient) * space.scale, space.project(second) * space.scale
+    size = np.nanmax(np.abs(differences))
+    return float(np.nanmax(np.abs(own - differences)) / size), float(np.nanmax(np.abs(others - differences)) / size)
+
+
+def check_refined(stages: GradientStages, refined: Callable[..., Any]) -> Check | None:
+    """Return a check of the same gradient against few differences of a refined cost."""
+    space = choose(stages.layout, stages.scale, stages.gradient, stages.seed)
+    other = _simulator(stages, refined, None)
+    quick = _quick(stages, other, space)
+    for _ in range(2):
+        quick.run_round(other.width)
+    outcome = quick.check([f"component {i}" for i in range(space.size)])
+    return None if outcome is None else space.restore(outcome)
+
+
+def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[Horizon]:
+    """Return the error of the gradient after each number of steps, from few differences."""
+    result = []
+    simulator = stages.simulator
+    for steps in sorted(horizons):
+        grad = partial(simulator._grad, steps=steps) if callable(simulator._grad) else simulator._grad
+        other = _simulator(stages, partial(simulator._cost, steps=steps), grad)
+        gradient = other.gradients(stages.theta[:, None], stages.w)[:, 0]
+        space = choose(stages.layout, stages.scale, gradient, stages.seed, most=4)
+        quick = _quick(stages, other, space, space.project(gradient))
+        quick.run_round(other.width)
+        outcome = quick.check([f"component {i}" for i in range(space.size)])
+        if outcome is None:
+            continue
+        program = np.array([part.program for part in outcome.parts]) * space.scale
+        differences = np.array([part.difference for part in outcome.parts]) * space.scale
+        doubts = np.array([part.uncertainty for part in outcome.parts]) * space.scale
+        size = float(np.abs(differences).max()) or 1.0
+        result.append(Horizon(steps, float(np.abs(program - differences).max() / size), float(doubts.max() / size)))
+    return result
+
+
+def grows(horizons: Sequence[Horizon], tolerance: float) -> bool:
+    """Return whether the gradient is right after few steps and its error grows with the number of steps."""
+    wrong = [one for one in horizons if one.error > tolerance + 2.0 * one.uncertainty]
+    if len(horizons) < 2 or not wrong or horizons[0] in wrong:
+        return False
+    last = horizons[-1]
+    return last in wrong and (len(wrong) == 1 or last.error > GROWTH * wrong[0].error)
+
+
+def is_adaptive(stages: GradientStages, outcome: Check, lines: Sequence[LineScan]) -> bool:
+    """Return whether small jumps of the cost are as large as the error of the gradient, as with adaptive steps.
+
+    A solver with adaptive steps has another discretisation error on either side of each change of its number of steps.
+    Its cost has a small jump there, and slopes between jumps that differ from the solution's slopes by about the height
+    of a jump over the distance between jumps. Reverse mode through such a solver holds the steps fixed, so its gradient
+    differs by as much. Where few jumps are found, a line ten times as long is searched.
+    """
+    errors = [part.error for part in outcome.worst_parts if np.isfinite(part.error)]
+    if stages.gradient is None or not errors or max(errors) > NEAR:
+        return False
+    lines = [line for line in lines if np.isfinite(line.costs).all()]
+    if lines and sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
+        first = lines[0]
+        reach = LONGER * float(first.at[-1])
+
+        def cost(t: np.ndarray) -> np.ndarray:
+            return stages.costs(stages.theta[:, None] + first.direction[:, None] * t)
+
+        noise = max(outcome.noise, stages.spread)
+        lines = [
+            replace(
+                scan(cost, np.zeros(1), np.ones(1), noise, reach, unit=stages.simulator.unit), direction=first.direction
+            )
+        ]
+    jumps = [jump for line in lines for jump in line.jumps]
+    if len(jumps) < FEWEST_JUMPS:
+        return False
+    votes = []
+    for line in lines:
+        height = sum(jump.size for jump in line.jumps)
+        length = float(line.at[-1] - line.at[0])
+        step = 1e-3 * float(line.at[1] - line.at[0])
+        costs = stages.costs(stages.theta[:, None] + line.direction[:, None] * np.array([-step, step]))
+        apart = abs(float((costs[1] - costs[0]) / (2 * step) - line.direction @ stages.gradient))
+        is_small = height < SMALL_JUMPS * float(np.abs(np.diff(line.costs)).sum())
+        votes.append(is_small and apart <= EXPLAINED * height / length)
+    return any(votes)
+
+
+def _simulator(stages: GradientStages, cost: Callable[..., Any], grad: Any) -> Simulator:
+    own = stages.simulator
+    batch = own.batch + (f":{own.fixed}" if own.fixed else "")
+    return Simulator(cost, stages.layout, grad, own.noise, batch, stages.clock, own.library)
+
+
+def _quick(stages: GradientStages, other: Simulator, space: Any, slope: np.ndarray | None = None) -> QuickCheck:
+    """Return a quick check of another cost in the coordinates of a space, with the given or theta's gradient."""
+
+    def cost(z: np.ndarray) -> np.ndarray:
+        def costs(thetas: np.ndarray) -> np.ndarray:
+            return other.costs(thetas, None if stages.w is None else np.repeat(stages.w, thetas.shape[1], axis=1))
+
+        return np.asarray(space.costs(costs, z, other.width))
+
+    if slope is None and stages.gradient is not None:
+        slope = space.project(stages.gradient)
+    centre = float(cost(space.origin()[:, None])[0])
+    return QuickCheck(cost, space.origin(), space.scale, slope, centre, stages.simulator.unit, stages.spread)

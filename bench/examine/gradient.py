@@ -1,0 +1,430 @@
+"""The stages of a gradient check: what decides comes first, and each finished stage is kept when the next is cut off.
+
+1. The cost and its gradient at theta, once.
+2. Two costs per component, at one step: enough to detect a gradient that is 10% off.
+3. Repeated calls, which show whether the cost repeats and whether it depends on the call before.
+4. Nine steps per component, then all steps with random directions, then other thetas.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from bench.examine.quick import ROUNDS, QuickCheck
+from bench.examine.subspace import Subspace, choose, locate
+from bench.measure.gradcheck import EPS, FAULTS, Check, Options, Part, check, most_severe
+from bench.model.simulator.clock import Clock, OutOfTime
+from bench.model.simulator.simulator import Simulator
+
+SINGLE_EPS = np.logspace(-1, -7, 13)
+"""Steps of a check in single precision, relative to each input's scale: the best is near 5e-3."""
+NOISE_POINTS = 17
+"""Costs per direction that no step needs: the centre, and the points at which the noise is measured."""
+SCAN = 7 * 65
+"""Number of costs of a staircase search along one direction that is not clearly right."""
+SMALL = 0.6
+"""Power of the unit roundoff: a relative difference between equal calls below it is a floor, not a fault."""
+MOST_STORED = 10_000
+"""Largest theta whose costs and gradients are stored between stages."""
+OTHER_NOISE = 2
+"""Number of further draws of the simulator's own noise under which the gradient is checked along random directions."""
+ROUGH = 0.1
+"""Share of the cost's change over the widest step that noise between neighbouring thetas makes up where a cost is rough."""
+STATE = 0.1
+"""Largest share of the difference between histories by which a cost with equal histories differs."""
+
+
+class Store:
+    """Values by theta. A stored value is used once; the next request computes it again and compares."""
+
+    def __init__(self) -> None:
+        self._values: dict[bytes, tuple[np.ndarray, bool]] = {}
+        self.spread = 0.0
+        """Largest difference between two values of one theta."""
+
+    def take(self, key: bytes) -> np.ndarray | None:
+        """Return a value that has not been used since it was computed, or None."""
+        value, is_fresh = self._values.get(key, (None, False))
+        if value is None or not is_fresh:
+            return None
+        self._values[key] = value, False
+        return value
+
+    def put(self, key: bytes, value: np.ndarray, is_fresh: bool = False) -> None:
+        """Store a computed value, for one more request if ``is_fresh``."""
+        if key in self._values:
+            with np.errstate(invalid="ignore"):
+                apart = np.abs(self._values[key][0] - value)
+            self.spread = max(self.spread, float(np.nan_to_num(apart).max(initial=0.0)))
+        self._values[key] = value, is_fresh
+
+
+class GradientStages:
+    """Checks a simulator's gradient at theta, stage by stage, within the budget of its clock."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        scale: np.ndarray,
+        clock: Clock,
+        seed: int,
+        w: np.ndarray | None,
+        has_sigma: bool,
+        random: np.random.Generator,
+    ) -> None:
+        self.simulator, self.scale, self.clock, self.seed, self.w = simulator, scale, clock, seed, w
+        self.layout, self.theta = simulator.layout, simulator.layout.vector
+        self.value = math.nan
+        self.gradient: np.ndarray | None = None
+        """The gradient at theta, ``(d,)``; None without a gradient, or where it failed."""
+        self.check: Check | None = None
+        """The outcome of the last finished stage."""
+        self.is_quick = True
+        """Whether only few steps per component were checked."""
+        self.is_complete = False
+        """Whether every chosen component and group was checked."""
+        self.is_failed = False
+        """Whether the gradient at theta raised an exception."""
+        self.more: list[Check] = []
+        """Checks under other draws of the simulator's own noise."""
+        self.located: dict[str, str] = {}
+        """By name of a wrong group: the numbers that cause its error."""
+        self.left_out: list[str] = []
+        self.spread = self.gradient_spread = 0.0
+        """Largest difference between equal calls, of the cost, and of the gradient relative to its norm."""
+        self.has_state = False
+        """Whether the cost depends on the call before it, in a repeatable way."""
+        self.is_hidden_single = False
+        """Whether the cost has single precision, though it returns a float64."""
+        self._share = 0.5 if has_sigma else 0.8
+        self._random = random
+        self._costs_store, self._gradients_store = Store(), Store()
+        self._is_storing = self.theta.size <= MOST_STORED
+
+    # ------------------------------------------------------------------------------------------------ calls
+
+    def costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+        """Return the costs ``(B,)`` of ``thetas (d, B)``, all under the same draw of the simulator's own noise."""
+        w = self.w if w is None else w
+        return self.simulator.costs(thetas, None if w is None else np.repeat(w, thetas.shape[1], axis=1))
+
+    def gradient_at(self, theta: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+        """Return the simulator's gradient at ``theta (d,)``."""
+        return np.asarray(self.simulator.gradients(theta[:, None], self.w if w is None else w)[:, 0])
+
+    def _stored_costs(self, thetas: np.ndarray) -> np.ndarray:
+        if not self._is_storing:
+            return self.costs(thetas)
+        keys = [column.tobytes() for column in np.ascontiguousarray(thetas.T)]
+        taken = [self._costs_store.take(key) for key in keys]
+        missing = [i for i, value in enumerate(taken) if value is None]
+        if missing:
+            self._compute(thetas, keys, taken, missing)
+        return np.array([float(value) for value in taken if value is not None])
+
+    def _compute(
+        self, thetas: np.ndarray, keys: list[bytes], taken: list[np.ndarray | None], missing: list[int]
+    ) -> None:
+        """Compute missing costs and store them batch by batch, so that an interrupted stage keeps its costs."""
+        width = self.simulator.width
+        for first in range(0, len(missing), width):
+            part = missing[first : first + width]
+            for i, value in zip(part, self.costs(thetas[:, part]), strict=True):
+                taken[i] = computed = np.asarray(value)
+                self._costs_store.put(keys[i], computed)
+
+    def _stored_gradient(self, theta: np.ndarray) -> np.ndarray:
+        if not self._is_storing:
+            return self.gradient_at(theta)
+        key = theta.tobytes()
+        value = self._gradients_store.take(key)
+        if value is None:
+            value = self.gradient_at(theta)
+            self._gradients_store.put(key, value)
+        return value
+
+    def _refresh(self) -> None:
+        """Let the next stage use every stored value once."""
+        for store in (self._costs_store, self._gradients_store):
+            store._values = {key: (value, True) for key, (value, _) in store._values.items()}
+
+    def integrate(self, direction: np.ndarray, start: float, end: float, panels: int) -> float:
+        """Return the integral of the gradient along ``theta + t * direction`` by Gauss-Legendre, 4 points per panel."""
+        x, weight = np.polynomial.legendre.leggauss(4)
+        edges = np.linspace(start, end, panels + 1)
+        half = np.diff(edges)[:, None] / 2
+        t, weights = ((edges[:-1, None] + half) + half * x).ravel(), (half * weight).ravel()
+        slopes = []
+        for first in range(0, t.size, max(self.simulator.width, 1)):
+            part = t[first : first + max(self.simulator.width, 1)]
+            at = self.theta[:, None] + direction[:, None] * part
+            w = None if self.w is None else np.repeat(self.w, part.size, axis=1)
+            slopes.append(direction @ self.simulator.gradients(at, w))
+        return float(weights @ np.concatenate(slopes))
+
+    # ------------------------------------------------------------------------------------------------ stages
+
+    @property
+    def is_small_spread(self) -> bool:
+        """Whether differences between equal calls are so small that they only limit the accuracy of the check."""
+        limit = self.simulator.unit**SMALL
+        size = abs(self.value) if math.isfinite(self.value) else 0.0
+        return not self.has_state and self.spread <= limit * size and self.gradient_spread <= limit
+
+    def run(self) -> None:
+        """Run all stages that the budget allows."""
+        try:
+            self._start()
+        except OutOfTime:
+            if math.isnan(self.value):
+                self.left_out.append("the cost at theta")
+            self.left_out.append("the gradient check")
+            return
+        if self.is_failed:
+            return
+        space = choose(self.layout, self.scale, self.gradient, self.seed)
+        try:
+            for stage in (partial(self._compare_quickly, space), self._repeat):
+                stage()
+                if self.simulator.precision == "float64" and self.simulator.has_single_precision:
+                    self.simulator.precision, self.is_hidden_single = "float32", True
+                    self._compare_quickly(space)
+        except OutOfTime:
+            self.left_out.append("the check at more than one step")
+            return
+        if self.check is None:
+            return
+        self._check_in_stages(space)
+        self._locate(space)
+        self._check_under_other_noise()
+
+    def _start(self) -> None:
+        """Compute the cost at theta, once more, and the gradient."""
+        simulator, clock = self.simulator, self.clock
+        clock.start_stage("the cost at theta")
+        self.value = simulator.first_value
+        if simulator.noise or simulator.batch != "loop" or math.isnan(self.value):
+            self.value = float(self.costs(self.theta[:, None])[0])
+        if not simulator.has_gradient:
+            return
+        clock.start_stage("first gradient")
+        gradient = self.gradient_at(self.theta)
+        self.is_failed = simulator.n_failed_gradients > 0
+        if not self.is_failed:
+            self.gradient = gradient
+            if self._is_storing:
+                self._gradients_store.put(self.theta.tobytes(), gradient, is_fresh=True)
+
+    def _compare_quickly(self, space: Subspace) -> None:
+        """Compare the gradient with two costs per coordinate, and with more where the full steps do not fit."""
+        self.clock.start_stage("one step per component")
+        slope = None if self.gradient is None else space.project(self.gradient)
+
+        def cost(z: np.ndarray) -> np.ndarray:
+            return space.costs(self._stored_costs, z, self.simulator.width)
+
+        quick = QuickCheck(cost, space.origin(), space.scale, slope, self.value, self.simulator.unit, self.spread)
+        names = [f"component {i}" for i in range(space.size)]
+        try:
+            for _ in ROUNDS:
+                quick.run_round(self.simulator.width)
+                steps = self._plan(space.size, True)[0][1]
+                if self.clock.can_afford(*self._cost_of(steps, space.size), share=self._share):
+                    break
+        finally:
+            outcome = quick.check(names)
+            if outcome is not None:
+                self.check, self.is_quick = space.restore(outcome), True
+                self.is_complete = len(outcome.parts) == space.size
+
+    def _repeat(self) -> None:
+        """Repeat calls, after equal and after other thetas, and compare the results."""
+        self.clock.start_stage("repeating a call")
+        other = self.theta + 1e-3 * self.scale
+        after: dict[str, list[float]] = {"theta": [], "other": []}
+        others: list[float] = []
+        try:
+            for before, at in (
+                ("other", self.theta), ("theta", other), ("other", self.theta), ("theta", self.theta), ("theta", other),
+                ("other", self.theta), ("theta", self.theta),
+            ):  # fmt: skip
+                value = float(self.costs(at[:, None])[0])
+                if at is other:
+                    others.append(value)
+                else:
+                    after[before].append(value)
+        except OutOfTime:
+            self.left_out.append("repeating a call")
+        spreads = []
+        for values in ([*after["theta"], *after["other"], self.value], others):
+            if len(values) > 1 and np.isfinite(values).all():
+                spreads.append(float(np.ptp(values)))
+        self.spread = max([self._costs_store.spread, *spreads])
+        last = after["other"][1:]  # the first of them followed the differences, so other thetas
+        if self.spread > 0 and len(after["theta"]) > 1 and len(last) > 1:
+            apart = abs(after["theta"][-1] - last[-1])
+            self.has_state = max(np.ptp(after["theta"]), np.ptp(last)) <= STATE * apart
+
+    def _plan(self, size: int, is_right: bool) -> list[tuple[str, Options]]:
+        """Return the stages after the quick one, from the cheapest to the full check."""
+        unit = self.simulator.unit
+        eps = EPS if unit < 1e-10 else SINGLE_EPS
+        few = EPS[::2] if unit < 1e-10 else SINGLE_EPS
+        base = Options(
+            components=size, directions=0, draws=0, eps=few, unit=unit, scanned=0, repeated=False, seed=self.seed,
+        )  # fmt: skip
+        repeated = self.spread == 0.0
+        # a wrong gradient is named by its ratios at other thetas first, and then searched for staircases
+        scanned = 4 if is_right else 0
+        return [
+            ("more steps", base),
+            (
+                "all steps and random directions",
+                replace(base, eps=eps, directions=2, scanned=scanned, repeated=repeated),
+            ),
+            ("2 other thetas", replace(base, eps=eps, directions=2, draws=2, scanned=scanned)),
+            ("8 other thetas", replace(base, eps=eps, directions=2, draws=8, scanned=4)),
+        ]
+
+    def _cost_of(self, options: Options, size: int) -> tuple[int, int]:
+        """Return the numbers of costs and gradients of a stage that no stored value makes cheaper."""
+        each = 2 * options.eps.size + NOISE_POINTS
+        here = size + options.directions
+        costs = here * each * (2 if options.repeated else 0) + options.draws * options.directions * each
+        if not options.repeated and not options.draws:
+            costs = here * each
+        wrong = 0 if self.check is None else sum(part.verdict in FAULTS for part in self.check.parts)
+        if wrong and options.draws:
+            costs += min(4, options.draws) * wrong * each + 4 * options.draws * each
+        if wrong and options.scanned:
+            costs += min(wrong + options.directions, options.scanned) * SCAN
+        gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)
+        return costs, gradients
+
+    def _check_in_stages(self, space: Subspace) -> None:
+        self.clock.start_stage("checking the gradient")
+        assert self.check is not None
+        is_done: list[str] = []
+        for index in range(4):
+            stages = self._plan(space.size, self.check.trusted)
+            name, options = stages[index]
+            if not self.clock.can_afford(*self._cost_of(options, space.size), share=self._share):
+                self.left_out.append(name)
+                if name != "2 other thetas":
+                    break
+                continue
+            if name == "2 other thetas" and self.clock.can_afford(
+                *self._cost_of(stages[-1][1], space.size), share=self._share
+            ):
+                continue
+            self._refresh()
+            self.clock.limit(max(self._share, 0.9))
+            try:
+                self._run_stage(space, options)
+                is_done.append(name)
+            except OutOfTime:
+                self.left_out.append(name)
+                break
+            finally:
+                self.clock.limit(1.0)
+        if "8 other thetas" in is_done:
+            self.left_out = [name for name in self.left_out if name != "2 other thetas"]
+
+    def _run_stage(self, space: Subspace, options: Options) -> None:
+        outcome = self._check_once(space, options)
+        self.spread = max(self.spread, self._costs_store.spread)
+        size = float(np.linalg.norm(np.nan_to_num(self.gradient) if self.gradient is not None else 0.0))
+        self.gradient_spread = self._gradients_store.spread / size if size else 0.0
+        if outcome.cause == "nondeterministic" and self.is_small_spread and self.spread > 0.0:
+            self._refresh()
+            outcome = self._check_once(space, replace(options, repeated=False))
+        self.check, self.is_quick = space.restore(outcome), False
+
+    def _check_once(self, space: Subspace, options: Options, w: np.ndarray | None = None) -> Check:
+        def cost(z: np.ndarray) -> np.ndarray:
+            known = self._stored_costs if w is None else lambda thetas: self.costs(thetas, w)
+            return space.costs(known, z, self.simulator.width)
+
+        def slope(z: np.ndarray) -> np.ndarray:
+            theta = space.place(z[:, None])[:, 0]
+            return space.project(self._stored_gradient(theta) if w is None else self.gradient_at(theta, w))
+
+        outcome = check(
+            cost, slope if self.gradient is not None else None, space.origin(), replace(options, scale=space.scale)
+        )
+        if self.simulator.n_failed_gradients:
+            # a gradient that raises at other thetas is reported as such
+            outcome = recaused(
+                replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
+            )
+        return self._with_roughness(self._without_small_spread(outcome))
+
+    def _without_small_spread(self, outcome: Check) -> Check:
+        """Return a check without the verdict ``nondeterministic`` where only the last digits of the gradient differ."""
+        size = float(np.linalg.norm(np.nan_to_num(self.gradient) if self.gradient is not None else 0.0))
+        spread = self._gradients_store.spread / size if size else 0.0
+        is_own = any(part.verdict == "nondeterministic" for part in outcome.parts)
+        if outcome.cause != "nondeterministic" or is_own or spread > self.simulator.unit**SMALL:
+            return outcome
+        return recaused(outcome)
+
+    def _with_roughness(self, outcome: Check) -> Check:
+        """Return a check with the cause ``rough`` where the cost varies as much between neighbours as over a wide step."""
+        if outcome.cause != "unsettled":
+            return outcome
+        rough = []
+        for part in outcome.parts:
+            sample, finite = part.sample, part.sample.finite
+            change = np.abs(sample.plus - sample.minus)[finite].max(initial=0.0)
+            noise = sample.noise or 0.0
+            rough.append(noise > ROUGH * change and noise > 1e6 * sample.unit * abs(sample.centre))
+        parts = tuple(
+            replace(part, verdict="unsettled") if is_rough else part
+            for part, is_rough in zip(outcome.parts, rough, strict=True)
+        )
+        return replace(outcome, parts=parts, cause="rough" if any(rough) else outcome.cause)
+
+    def _locate(self, space: Subspace) -> None:
+        """Find the numbers that cause the error of each wrong group."""
+        if self.check is None or self.gradient is None:
+            return
+        self.clock.start_stage("locating the error")
+        groups = {group.name: group for group in space.groups}
+        try:
+            for part in self.check.parts:
+                if part.name in groups and part.verdict in FAULTS and math.isfinite(part.program):
+                    group = groups[part.name]
+                    self.located[part.name] = locate(
+                        self.layout, group, self.theta, self.gradient, self.costs, part.step,
+                        part.difference - part.program, part.uncertainty,
+                    )  # fmt: skip
+        except OutOfTime:
+            self.left_out.append("the place of the error in its group")
+
+    def _check_under_other_noise(self) -> None:
+        """Check the gradient along random directions under other draws of the simulator's own noise."""
+        if self.w is None or self.check is None or not self.check.trusted or self.is_quick:
+            return
+        space = choose(self.layout, self.scale, self.gradient, self.seed)
+        options = replace(self._plan(space.size, True)[1][1], components=0, scanned=0, repeated=False)
+        if not self.clock.can_afford(*self._cost_of(options, 0), share=self._share):
+            self.left_out.append("checks under other noise")
+            return
+        try:
+            for _ in range(OTHER_NOISE):
+                drawn = self._random.standard_normal((self.simulator.noise, 1))
+                self.more.append(space.restore(self._check_once(space, options, drawn)))
+        except OutOfTime:
+            self.left_out.append("checks under other noise")
+
+
+def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:
+    """Return a check with replaced parts and the cause that follows from its parts."""
+    parts, draws = tuple(map(replaced, outcome.parts)), tuple(map(replaced, outcome.draws))
+    causes = [part.verdict for part in parts] + [part.verdict for part in draws if part.verdict in FAULTS]
+    return replace(outcome, parts=parts, draws=draws, cause=most_severe(causes))

@@ -1,0 +1,357 @@
+"""How gradients of engines fail, imitated in NumPy: each is named, and a right gradient beside it passes."""
+
+import collections
+import decimal
+import math
+
+import mechanisms
+import numpy as np
+import pytest
+
+import bench
+from bench.errors import UserError
+from bench.examine import lines
+from bench.examine.subspace import groups_of
+from bench.model.simulator.tree import ParameterTree
+
+QUICK = {"progress": False, "calls": 3000}
+START = [0.7, 0.3]
+
+
+def swing(x, steps=20):
+    return mechanisms.swinging(x, steps)
+
+
+def slope(x, steps=20):
+    return mechanisms.swinging(x, steps, slope=True)
+
+
+def shared(x, steps=20):
+    return mechanisms.swinging(x, steps, shared=True, slope=True)
+
+
+# ------------------------------------------------------------------------------------- adaptive, overwritten
+
+
+def adaptive(**settings):
+    def cost(x):
+        return mechanisms.adaptive(x, rtol=1e-3)
+
+    def grad(x):
+        return mechanisms.frozen(x, rtol=1e-3)
+
+    return bench.examine(cost, [1.0, 1.0, 0.5], grad=grad, progress=False, calls=1500, **settings)
+
+
+def test_adaptive_steps_are_no_missing_term():
+    report = adaptive()
+    assert (report.status, report.cause, report.derivative) == (3, "adaptive", "not shown")
+    assert "refined=COST" in report.advice
+    assert adaptive(expect="adaptive").status == 0
+
+
+def test_refined_cost_shows_a_discretisation_gap_and_a_missing_term():
+    assert "from the refined cost 0.6" in adaptive(refined=mechanisms.refined).conclusion
+    report = bench.examine(swing, START, grad=lambda x: slope(x) * [1, 1.2], refined=swing, **QUICK)
+    assert report.cause == "wrong_factor"
+
+
+def test_memory_overwritten_between_forward_and_backward_is_named_by_growth_or_by_a_second_gradient():
+    grown = bench.examine(swing, START, grad=shared, horizons=[1, 2, 5, 20], **QUICK)
+    assert (grown.status, grown.cause) == (1, "overwritten")
+    assert [one.steps for one in grown.growth] == [1, 2, 5, 20]
+    assert grown.growth[0].error < 1e-6 < grown.growth[1].error < grown.growth[-1].error
+    beside = bench.examine(swing, START, grad=shared, twin_grad=slope, **QUICK)
+    assert (beside.status, beside.cause) == (1, "overwritten")
+    assert "the second gradient is right" in beside.conclusion
+    assert bench.examine(swing, START, grad=slope, horizons=[1, 20], **QUICK).status == 0
+
+
+def test_a_wrong_factor_at_every_number_of_steps_is_not_overwritten_memory():
+    report = bench.examine(swing, START, grad=lambda x, steps=20: 2 * slope(x, steps), horizons=[1, 20], **QUICK)
+    assert report.cause == "wrong_factor"
+
+
+def test_twins_that_differ_are_named():
+    report = bench.examine(swing, START, grad=slope, twin=lambda x: 1.01 * swing(x), **QUICK)
+    assert (report.status, report.cause) == (1, "twin")
+    assert bench.examine(swing, START, grad=slope, twin=lambda x: swing(x), **QUICK).status == 0
+
+
+# ------------------------------------------------------------------------------------- noise and precision
+
+
+def test_last_digits_that_do_not_repeat_are_a_floor():
+    random = np.random.default_rng(0)
+
+    def cost(x):
+        value = swing(x)
+        return np.nextafter(value, value + random.integers(-1, 2))
+
+    right = bench.examine(cost, START, grad=slope, **QUICK)
+    assert right.status == 0, str(right)
+    assert "equal calls differ in the last digits" in str(right)
+    twice = bench.examine(cost, START, grad=lambda x: 2 * slope(x), **QUICK)
+    assert (twice.status, twice.cause) == (1, "wrong_factor")
+
+
+def test_noise_above_the_last_digits_is_a_fault_that_does_not_hide_another():
+    random = np.random.default_rng(0)
+    report = bench.examine(
+        lambda x: swing(x) + 1e-7 * random.standard_normal(), START, grad=lambda x: 2 * slope(x), **QUICK
+    )
+    assert report.cause == "nondeterministic"
+    assert "wrong_factor" in str(report)
+
+
+def test_a_warm_start_is_one_finding():
+    solver = mechanisms.WarmStarted()
+    report = bench.examine(solver.cost, [1.0, 2.0], grad=solver.gradient, **QUICK)
+    assert (report.status, report.cause) == (1, "nondeterministic")
+    assert "depends on the call before it" in report.conclusion
+    assert len(report.problems) == 1
+
+
+@pytest.mark.parametrize(("factor", "status", "cause"), [(1.0, 0, None), (1.55, 1, "wrong_factor")])
+def test_float32_behind_float_is_checked_as_float32(factor, status, cause):
+    report = bench.examine(mechanisms.single, START, grad=lambda x: factor * mechanisms.single_gradient(x), **QUICK)
+    assert report.status == status, str(report)
+    assert cause is None or report.cause == cause
+    assert (report.precision, report.is_hidden_single) == ("float32", True)
+    assert report.check.components[0].step > 1e-4  # where float32 resolves a difference
+
+
+def test_float64_is_not_taken_for_float32():
+    report = bench.examine(lambda x: float(np.floor(8 * x[0]) + x[0] * 0.5), [0.75], grad=lambda x: [0.5], **QUICK)
+    assert report.precision == "float64"
+
+
+def test_a_seed_taken_from_theta_is_named():
+    def cost(x):
+        seed = int(np.frombuffer(x.tobytes(), np.uint32).sum())
+        return swing(x) + 0.38 * np.random.default_rng(seed).standard_normal()
+
+    report = bench.examine(cost, START, grad=slope, **QUICK)
+    assert (report.status, report.cause) == (1, "rough")
+    assert "a seed or hash taken from theta" in str(report)
+
+
+# ------------------------------------------------------------------------------------- tolerance, zeros, raised
+
+
+def test_errors_within_the_tolerance_are_warnings_with_their_size():
+    def off(x):
+        return slope(x) * [1, 1 + 1e-3]
+
+    strict = bench.examine(swing, START, grad=off, **QUICK)
+    assert strict.status == 1
+    assert "theta[1] off by 0.1" in strict.conclusion
+    assert strict.size == pytest.approx(1e-3, rel=0.01)
+    for tolerance in (2e-3, {"theta[1]": 2e-3}):
+        report = bench.examine(swing, START, grad=off, tolerance=tolerance, **QUICK)
+        assert report.status == 0, str(report)
+        assert "small error, within the tolerance" in str(report)
+    assert bench.examine(swing, START, grad=off, tolerance={"theta[0]": 2e-3}, **QUICK).status == 1
+    with pytest.raises(UserError, match=r"unknown input 'theta.7.'"):
+        bench.examine(swing, START, grad=off, tolerance={"theta[7]": 1e-3}, **QUICK)
+
+
+def test_an_error_of_1e_5_passes_with_a_warning():
+    report = bench.examine(swing, START, grad=lambda x: slope(x) * (1 + 1e-5), **QUICK)
+    assert (report.status, report.derivative) == (0, "right")
+    assert "small error" in str(report)
+
+
+def test_inputs_without_effect_fail_where_they_are_not_allowed():
+    def cost(p):
+        return swing([p["q"], p["v"]])
+
+    def grad(p):
+        by_q, by_v = slope([p["q"], p["v"]])
+        return {"q": by_q, "v": by_v, "friction": 0.0}
+
+    theta = {"q": 0.7, "v": 0.3, "friction": 1.0}
+    reports = {
+        allow: bench.examine(cost, theta, grad=grad, allow_zero=allow, **QUICK) for allow in (None, False, "friction")
+    }
+    assert {allow: report.status for allow, report in reports.items()} == {None: 0, False: 1, "friction": 0}
+    assert "zero: friction" in str(reports[None])
+    assert reports[False].cause == "no_effect"
+    assert not any("zero" in text for text in reports["friction"].warnings)
+
+
+def test_a_cost_that_no_input_moves_is_never_right():
+    report = bench.examine(lambda x: 3.3, START, grad=lambda x: 0 * x, **QUICK)
+    assert (report.status, report.cause, report.derivative) == (3, "zero", "not shown")
+
+
+def test_an_exception_at_other_thetas_does_not_hide_an_error_at_theta():
+    def grad(x):
+        if abs(x[0] - START[0]) > 1e-3:
+            raise RuntimeError("line one\nline two " * 100)
+        return 75300 * slope(x)
+
+    report = bench.examine(swing, START, grad=grad, **QUICK)
+    assert report.status == 1
+    assert report.cause in ("wrong_factor", "wrong_adjoint")
+    assert "7.53e4 times too large" in report.conclusion
+    assert "raised an exception" in str(report)
+    assert all(len(text) < 400 for text in (*report.problems, *report.warnings))
+
+
+def test_nan_is_printed_as_nan():
+    report = bench.examine(swing, START, grad=lambda x: [math.nan, slope(x)[1]], **QUICK)
+    assert report.cause == "nan_gradient"
+    assert "NaN" in str(report)
+
+
+def test_a_kink_is_known_where_it_is_expected():
+    settings = {"grad": lambda x: np.sign(x - 1.0), **QUICK}
+    assert bench.examine(lambda x: abs(x[0] - 1.0), [1.0], **settings).status == 1
+    assert bench.examine(lambda x: abs(x[0] - 1.0), [1.0], expect="kink", **settings).status == 0
+    assert bench.examine(lambda x: abs(x[0] - 1.0), [1.0], expect="jump", **settings).status == 1
+    with pytest.raises(UserError, match="did you mean 'kink'"):
+        bench.examine(swing, START, expect="kinks", **QUICK)
+
+
+# ------------------------------------------------------------------------------------- inputs
+
+
+def test_sigma_by_input():
+    def cost(p):
+        return p["mass"] ** 2 + p["gains"][0] * p["gains"][1]
+
+    def grad(p):
+        return {"mass": 2 * p["mass"], "gains": p["gains"][::-1]}
+
+    theta = {"mass": 1.0, "gains": np.array([1.0, 2.0])}
+    report = bench.examine(cost, theta, grad=grad, sigma={"mass": 0.1, "gains": [0.0, 0.2]}, **QUICK)
+    assert report.status == 0, str(report)
+    (found,) = report.smoothed
+    np.testing.assert_allclose(found.gradient, [2.0, 1.0], atol=0.05)  # gains[0] has no noise
+    rows = bench.examine(
+        lambda x: x @ x, [1.0, 2.0], grad=lambda x: 2 * x, sigma=np.array([[0.1, 0.2], [0.2, 0.4]]), **QUICK
+    )
+    assert [one.sigma for one in rows.smoothed] == [0.2, 0.4]
+    with pytest.raises(UserError, match="unknown input 'mas'; did you mean 'mass'"):
+        bench.examine(cost, theta, sigma={"mas": 0.1}, **QUICK)
+
+
+@pytest.mark.parametrize("batch", ["columns:64", 64])
+def test_a_batch_of_a_fixed_width(batch):
+    def cost(x):
+        assert x.shape == (2, 64)
+        return (x**3).sum(axis=0)
+
+    report = bench.examine(cost, [1.0, 2.0], grad=lambda x: 3 * x**2, batch=batch, **QUICK)
+    assert (report.status, report.batch) == (0, "columns:64")
+    with pytest.raises(UserError, match="unknown batch 'loop:4'"):
+        bench.examine(cost, [1.0, 2.0], batch="loop:4", **QUICK)
+
+
+def test_numbers_with_float_only_are_numbers():
+    value = decimal.Decimal
+    report = bench.examine(
+        lambda x: value(float(x[0]) ** 2), [value("1.5"), value(2)], grad=lambda x: [2 * x[0], 0.0], **QUICK
+    )
+    assert report.status == 0, str(report)
+
+
+def test_what_the_cost_prints_is_kept_and_counted(capsys):
+    def cost(x):
+        print("step done")
+        return swing(x)
+
+    report = bench.examine(cost, START, grad=slope, progress=False, calls=20)
+    assert capsys.readouterr().out == ""
+    assert report.printed.count == report.costs
+    assert "printed" in str(report)
+
+
+# ------------------------------------------------------------------------------------- remarks
+
+
+def test_a_linear_cost_has_no_jumps_and_no_missed_integral():
+    report = bench.examine(lambda x: 1e6 + 3e-4 * x[0] - 1e-9 * x[1], START, grad=lambda x: [3e-4, -1e-9], **QUICK)
+    assert not report.breaks.size
+    assert not any("integral" in text for text in report.warnings)
+
+
+@pytest.mark.parametrize(
+    "cost", [lambda t: np.tanh(300 * t), lambda t: np.exp(-((t * 100) ** 2)), lambda t: np.sqrt(t * t + 1e-6)]
+)
+def test_steep_smooth_lines_have_no_breaks(cost):
+    assert not lines.scan(lambda x: cost(x[0] - 0.113), np.zeros(1), np.ones(1), 1e-16).breaks
+
+
+def test_roughness_has_no_breaks():
+    """Noise that is a function of theta, as from a loose solver, has second differences of every size."""
+
+    def rough(x):
+        return np.sin(x[0]) + 1e-6 * np.sin(1e7 * x[0]) * np.cos(3.1e7 * x[0])
+
+    assert not lines.scan(rough, np.zeros(1), np.ones(1), 1e-16).breaks
+
+
+def test_breaks_have_their_place_in_theta():
+    report = bench.examine(lambda x: x[0] + (x[0] > 0.701), START, grad=lambda x: [1.0, 0.0], **QUICK)
+    np.testing.assert_allclose(report.breaks["theta[0]"], 0.701, atol=1e-6)
+    assert "theta = 0.701" in str(report)
+
+
+def test_the_table_and_the_text_recommend_the_same_method():
+    report = bench.examine(swing, START, grad=lambda x: 2 * slope(x), sigma=0.01, **QUICK)
+    assert report.status == 1
+    best = report.sigmas.query("best")["method"].tolist()
+    assert best == ["smoothing"]
+    assert "use the gradient" not in str(report)
+
+
+def test_a_narrow_bias_interval_has_no_remark_on_heavy_tails():
+    report = bench.examine(
+        lambda x: x[0] ** 2 * x[1], [2.0, 3.0], grad=lambda x: [2 * x[0] * x[1], x[0] ** 2], sigma=0.01, **QUICK
+    )
+    assert report.smoothed[0].remark == ""
+
+
+# ------------------------------------------------------------------------------------- large theta
+
+
+Planted = collections.namedtuple("Planted", "name change said")
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        Planted("right", lambda g: g, None),
+        Planted("array", lambda g: g | {"bias": 0 * g["bias"]}, "bias"),
+        Planted("number", lambda g: g | {"weights": g["weights"] + (np.arange(20_000) == 12_345)}, "weights[12345]"),
+    ],
+    ids=lambda planted: planted.name,
+)
+def test_the_wrong_part_of_a_large_theta_is_named(planted):
+    random = np.random.default_rng(0)
+    theta = {"weights": random.standard_normal(20_000), "bias": random.standard_normal(300), "gain": 0.7}
+    mix = random.standard_normal(20_000) / 100
+
+    def cost(p):
+        return np.tanh(mix @ p["weights"]) * p["gain"] + 0.01 * np.sin(p["bias"]).sum()
+
+    def grad(p):
+        y = np.tanh(mix @ p["weights"])
+        right = {"weights": (1 - y * y) * p["gain"] * mix, "bias": 0.01 * np.cos(p["bias"]), "gain": y}
+        return planted.change(right)
+
+    report = bench.examine(cost, theta, grad=grad, progress=False, calls=2500)
+    assert report.status == (planted.said is not None), str(report)[:500]
+    assert "16 of 20301 components" in str(report)
+    if planted.said:
+        assert f"{planted.said}" in report.conclusion
+
+
+def test_groups_cover_every_number_once():
+    for theta in (np.ones(1000), {"a": np.ones(50), "b": [np.ones(3), 2.0]}, {f"x{i}": np.ones(7) for i in range(100)}):
+        layout = ParameterTree(theta)
+        groups = groups_of(layout, layout.scales(), 0)
+        assert [i for g in groups for i in range(g.first, g.last)] == list(range(layout.vector.size))
+        assert len(groups) <= 16

@@ -1,0 +1,166 @@
+"""The budget: what decides comes first, every finished stage is kept, and calls as a budget give the same report anywhere."""
+
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import numpy as np
+import pytest
+
+import bench
+from bench.errors import UserError
+from bench.model.simulator.clock import Clock, OutOfTime
+
+THETA = [0.4, 0.3, 0.5]
+
+
+def cost(x):
+    return float(np.sin(x[0]) * x[1] + x[1] ** 3 * x[2])
+
+
+def grad(x):
+    return np.array([np.cos(x[0]) * x[1], np.sin(x[0]) + 3 * x[1] ** 2 * x[2], x[1] ** 3])
+
+
+@pytest.mark.parametrize("calls", [8, 15, 29, 79, 243, 700])
+def test_a_gradient_10_percent_off_never_reads_like_a_right_one(calls):
+    """8 calls: one cost, one gradient, and two costs per component."""
+    right = bench.examine(cost, THETA, grad=grad, progress=False, calls=calls)
+    wrong = bench.examine(cost, THETA, grad=lambda x: 1.1 * grad(x), progress=False, calls=calls)
+    assert (right.status, right.derivative) == (0, "right")
+    assert (wrong.status, wrong.derivative) == (1, "wrong")
+    for report in (right, wrong):
+        assert report.costs + report.gradients <= calls
+        assert "3 of 3 components" in str(report)
+
+
+def test_fewer_calls_than_components_decide_nothing():
+    for calls in range(1, 8):
+        report = bench.examine(cost, THETA, grad=grad, progress=False, calls=calls)
+        assert (report.status, report.cause) == (3, "undecided"), calls
+        assert re.search(r"[0-2] of 3 components", str(report))
+    assert "calls=14" in report.advice
+
+
+def test_more_calls_only_add_to_what_was_checked():
+    steps = [
+        max(
+            part.sample.step.size for part in bench.examine(cost, THETA, grad=grad, progress=False, calls=n).check.parts
+        )
+        for n in (8, 200, 900)
+    ]
+    assert steps == [1, 9, 17]
+
+
+def test_calls_give_the_same_report_whatever_the_time():
+    def texts(pause):
+        def slow(x):
+            time.sleep(pause)
+            return cost(x)
+
+        report = bench.examine(slow, THETA, grad=grad, progress=False, calls=40)
+        return report.status, report.cause, report.costs, report.gradients, report.left_out, report.conclusion
+
+    assert texts(0.0) == texts(0.005)
+
+
+def test_sigma_that_was_not_measured_is_not_decided():
+    report = bench.examine(cost, THETA, grad=grad, sigma=0.1, progress=False, calls=60)
+    assert (report.status, report.cause, report.derivative) == (3, "unmeasured", "right")
+    assert "sigma 0.10: not measured" in report.noise_answer
+    assert "no sigma" not in str(report)
+
+
+def test_first_calls_have_a_budget_of_their_own():
+    """0.4 s of compilation within a budget of 0.3 s: nothing is omitted, and nothing is compiled twice."""
+    compiled = []
+
+    def compiling(function, name):
+        def call(x):
+            if name not in compiled:
+                compiled.append(name)
+                time.sleep(0.4)
+            return function(x)
+
+        return call
+
+    report = bench.examine(compiling(cost, "cost"), THETA, grad=compiling(grad, "grad"), progress=False, budget=2)
+    assert report.status == 0
+    assert compiled == ["cost", "grad"]
+    assert 0.8 <= report.compile_s < 2.0
+    assert report.seconds < 2.5
+
+
+def test_a_gradient_that_compiles_too_long_is_tried_once():
+    tried = []
+
+    def hangs(x):
+        tried.append(1)
+        time.sleep(60)
+
+    report = bench.examine(cost, THETA, grad=hangs, progress=False, budget=5, compile_budget=0.2)
+    assert (report.status, report.cause) == (3, "undecided")
+    assert len(tried) == 1
+
+
+def test_jax_compiles_the_cost_twice_and_the_gradient_once_for_a_check():
+    jax = pytest.importorskip("jax")
+    traced = []
+
+    def traced_cost(x):
+        traced.append(1)
+        return jax.numpy.sum(x**3)
+
+    report = bench.examine(traced_cost, np.array([1.0, 2.0]), grad="jax", progress=False, calls=600)
+    assert report.status == 0, str(report)
+    assert len(traced) == 3  # alone, in a batch, and the gradient
+
+
+def test_the_report_is_printed_on_sigterm(tmp_path):
+    path, marker = tmp_path / "slow.py", tmp_path / "called"
+    path.write_text(
+        textwrap.dedent(f"""
+            import pathlib, time
+            theta, calls = [0.4, 0.3], []
+            def cost(x):
+                calls.append(1)
+                time.sleep(0.02)
+                if len(calls) == 20: pathlib.Path({str(marker)!r}).touch()
+                return x[0] ** 2 * x[1]
+            def grad(x): return [2 * x[0] * x[1], x[0] ** 2]
+        """)
+    )
+    words = [sys.executable, "-m", "bench", "examine", f"{path}:cost", "grad=grad", "budget=300"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    started = time.perf_counter()
+    while not marker.exists() and process.poll() is None and time.perf_counter() - started < 60:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    out, _ = process.communicate(timeout=30)
+    assert "everything after SIGTERM" in out
+    assert "Derivative: right. 2 of 2 components" in out
+    assert process.returncode == 0
+
+
+def test_time_lost_to_other_programs_is_not_charged(monkeypatch):
+    lost = {"seconds": 0.0}
+    monkeypatch.setattr("bench.model.simulator.clock._run_delay", lambda: lost["seconds"])
+    monkeypatch.setattr("bench.model.simulator.clock.READ_INTERVAL_S", 0.0)
+    clock = Clock(10.0)
+    lost["seconds"] = 4.0
+    assert clock.waited == pytest.approx(4.0)
+    assert clock.spent < 0.5
+    lost["seconds"] = 40.0  # at most as much as the budget
+    clock.start -= 25.0
+    assert clock.spent == pytest.approx(15.0, abs=0.5)
+    with pytest.raises(OutOfTime):
+        clock.check()
+
+
+@pytest.mark.parametrize("calls", [0, -1, 2.5])
+def test_calls_is_a_whole_number(calls):
+    with pytest.raises(UserError, match="is not a number of calls"):
+        bench.examine(cost, THETA, progress=False, calls=calls)
