@@ -49,7 +49,7 @@ class InProcessLauncher:
         return self
 
     def __exit__(self, *_: object) -> None:
-        return
+        self._handle.close()
 
     def run(self, groups: Iterable[Iterable[Task]]) -> Iterator[list[Answer]]:
         """Yield an empty list before each task, and answers after it; the answers of quick tasks are yielded together."""
