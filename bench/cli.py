@@ -227,7 +227,7 @@ def _execute(experiment: Experiment, words: Sequence[str]) -> Finished | int:
         keys = {cell.key for cell in cells(experiment)}
         stored = int(store.load()["key"].isin(keys).sum())
         is_interrupt = isinstance(end, KeyboardInterrupt)
-        why = "stopped" if is_interrupt else f"stopped after a failed cell ({printable(end)})"
+        why = "stopped" if is_interrupt else f"stopped {printable(end)}"
         again = shlex.join(["python", "-m", "bench", *words])
         print(
             f"\nbench: {why}; {stored} of {len(keys)} cells are stored in '{store.directory}'. Continue with: {again}",

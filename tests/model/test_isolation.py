@@ -14,7 +14,6 @@ from bench.model import registry
 from bench.model.isolation import State
 from bench.run.execute import execute
 
-
 LIBRARIES = (
     "jax.numpy", "scipy.fft", "scipy.linalg", "scipy.optimize", "scipy.special", "torch", "bench.measure.statistics",
     "bench.plugins.estimators.fobg", "bench.plugins.estimators.reinforce",
