@@ -203,7 +203,7 @@ def _load(words: Sequence[str], notes: bool = True) -> Experiment:
     experiment = config.load(overrides, folders)
     for note in [
         *config.explain_names(overrides, folders),
-        *(config.explain_sweep(overrides, folders) if notes else ()),
+        *(config.notes(experiment, overrides, folders) if notes else ()),
     ]:
         print(f"bench: {printable(note)}", file=sys.stderr)
     return experiment

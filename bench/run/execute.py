@@ -16,7 +16,6 @@ from bench.run.files import remove_stale
 from bench.run.plan import Planned, plan
 from bench.run.store import Store
 
-
 MAX_REPAIRS = 2
 """Number of times that cells whose rows are gone at the end of a run are run again."""
 

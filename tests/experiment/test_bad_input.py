@@ -69,6 +69,87 @@ def test_compare_of_files_with_missing_columns_is_one_line(tmp_path, capsys, mon
     assert len(said.splitlines()) == 1
 
 
+FILES = {
+    b"scenes: [heaviside\nbackends: [numpy]\n": "line 3: expected ',' or ']'",
+    b"scenes: [heaviside]\n\tbackends: [numpy]\n": "line 3: found character '\\t' that cannot start any token: indent with spaces",
+    b"samples: 4\nsamples: 5\n": "line 3: found duplicate key samples: give each setting once",
+    b"samples: !!python/object/apply:os.system ['true']\n": "line 2: could not determine a constructor",
+    b"samples: 4\nquestion: \xff\xfe\n": "line 3: not UTF-8",
+    b"- a\n- b\n": "must be a table of settings",
+    b"sweep: [1, 2]\n": "line 2: sweep must be a table, and is [1, 2]: write sweep: {name: value}",
+    b"samples: 4\x00\n": "special characters are not allowed",
+    b"samples: *b\n": "line 2: found undefined alias 'b'",
+    b"samples: 4\n---\nsamples: 5\n": "line 3: but found another document: remove the line ---",
+    b"1: 4\n": "line 2: 1 is not a setting",
+    b"~: 4\n": "Incompatible key type",
+    b"scenes: !!set {heaviside}\n": "not a supported primitive type",
+    b"sweep: " + b"[" * 5000 + b"\n": "is nested too deeply",
+    b"smaples: 4\n": "did you mean 'samples'?",
+    b"samples: ${seed}\n": "must be a whole number",
+}
+
+
+@pytest.mark.parametrize("text", FILES, ids=lambda text: text[:20].decode(errors="replace").strip())
+def test_an_experiment_file_that_cannot_be_read_is_named_with_its_line(tmp_path, monkeypatch, capsys, text):
+    (tmp_path / "experiment").mkdir()
+    path = tmp_path / "experiment" / "mine.yaml"
+    path.write_bytes(b"# @package _global_\n" + text)
+    assert main(["plan", "+experiment=mine", "--config-dir", str(tmp_path)]) == 2
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1
+    assert FILES[text] in said
+    if "did you mean" not in said and "whole number" not in said:
+        assert said.startswith(f"bench: '{path}'")
+
+
+def test_an_experiment_file_without_its_first_line_says_so(tmp_path, capsys):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text("samples: 4\n")
+    assert main(["plan", "+experiment=mine", "--config-dir", str(tmp_path)]) == 2
+    assert "must start with the line # @package _global_" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("word", ["sweep={sigma:[%]}", "sweep={a:*b}", "sweep=[1,2]", "sweep={%:[1]}", "sweep.seed=range(1,2,0)", "sweep.seed=range(0.5,2)", "sweep.seed=range(0,99999999)"])  # fmt: skip
+def test_an_odd_sweep_is_refused_in_one_line_with_its_cause(capsys, word):
+    assert main(["plan", "+experiment=quick", word]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert said[-1].startswith("bench: ")
+    assert len(said) <= 2
+    assert "sweep" in said[-1] or "sigma" in said[-1]
+
+
+def test_of_a_setting_given_twice_it_is_said_which_counts(capsys):
+    assert main(["plan", *BASE, "samples=5"]) == 0
+    assert "samples is given twice: samples=5 counts, samples=4 does not" in capsys.readouterr().err
+
+
+def test_a_folder_with_an_accent_needs_no_quotes():
+    assert load(["results_dir=résultats/é"]).results_dir.name == "é"
+    assert load(["results_dir='résultats/é'"]).results_dir.name == "é"
+
+
+@pytest.mark.parametrize(
+    ("word", "values"),
+    [
+        ("sweep.seed=range(3,40)", list(range(3, 40))), ("sweep.seed=range(40,3,-2)", list(range(40, 3, -2))),
+        ("sweep.seed=range(0,2)", [0, 1]), (f"sweep.seed=[{','.join(map(str, range(50)))}]", list(range(50))),
+        ("sweep={seed:range(0,3)}", [0, 1, 2]), ("sweep.seed=[" + "1e2, " * 20 + "-3.5]", [100.0] * 20 + [-3.5]),
+    ],
+)  # fmt: skip
+def test_ranges_and_long_lists_have_the_values_that_short_lists_have(word, values):
+    read = load([word]).sweep["seed"]
+    assert read == values
+    assert [type(value) for value in read] == [type(value) for value in values]
+
+
+def test_a_list_of_twenty_thousand_values_is_read_in_a_second():
+    words = [f"sweep.seed=[{','.join(map(str, range(20_000)))}]", *BASE[:-1]]
+    load(BASE[:-1])
+    started = time.process_time()
+    assert len(load(words).sweep["seed"]) == 20_000
+    assert time.process_time() - started < 1.5
+
+
 # -------------------------------------------------------------------------------------------------------------- rows
 
 
