@@ -188,10 +188,14 @@ class State:
 
     Imports of installed libraries are not changes: the state after such an import becomes part of this one. With
     ``double_precision``, JAX computes in float64 from its import on, so that its type does not depend on earlier cells.
+    With ``single_thread``, libraries of linear algebra use one thread until :meth:`close`, also those imported later: the
+    number of threads changes the order of sums.
     """
 
-    def __init__(self, double_precision: bool = False) -> None:
-        self._double_precision = double_precision
+    def __init__(self, double_precision: bool = False, single_thread: bool = False) -> None:
+        self._double_precision, self._single_thread = double_precision, single_thread
+        self._limited: dict[str, tuple[Any, int]] = {}
+        """The limited libraries by file, each with its earlier number of threads."""
         self._settings: dict[Setting, Any] = {}
         self._tables: dict[Any, dict[str, Any]] = {}
         """The names and values of each checked module and class."""
@@ -205,14 +209,15 @@ class State:
         _ImportWatch.states.append(self)
 
     def close(self) -> None:
-        """Stop following imports."""
+        """Stop following imports, and restore the numbers of threads."""
+        for library, count in self._limited.values():
+            library.set_num_threads(count)
         if self in _ImportWatch.states:
             _ImportWatch.states.remove(self)
 
     def adopt(self) -> None:
         """Take the present state as the one to compare with."""
-        self._libraries = ThreadpoolController().lib_controllers
-        self._threads = self._n_threads()
+        self._find_libraries()
         self._settings, self._tables, self._earlier = {}, {}, []
         self._add_new()
 
@@ -224,8 +229,7 @@ class State:
 
     def after_import(self) -> None:
         """Adopt the settings as an import has left them, and add new modules."""
-        self._libraries = ThreadpoolController().lib_controllers
-        self._threads = self._n_threads()
+        self._find_libraries()
         self._settings = {}
         self._tables = {owner: before for owner, before in self._tables.items() if _is_equal(vars(owner), before)}
         self._add_new()
@@ -274,6 +278,13 @@ class State:
         for owner in _owners():
             if owner not in self._tables:
                 self._tables[owner] = dict(vars(owner))
+
+    def _find_libraries(self) -> None:
+        self._libraries = ThreadpoolController().lib_controllers
+        for library in self._libraries if self._single_thread else ():
+            self._limited.setdefault(library.filepath, (library, library.get_num_threads()))
+            library.set_num_threads(1)
+        self._threads = self._n_threads()
 
     def _n_threads(self) -> list[int]:
         return [library.get_num_threads() for library in self._libraries]

@@ -46,11 +46,11 @@ class Task:
 class TaskHandler:
     """Handles the tasks of one experiment, in a worker or in this process."""
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: Experiment, single_thread: bool = False) -> None:
         self._experiment = experiment
         self._session = Session(experiment)
         self._study = study_of(experiment)
-        self._state = State(double_precision=True)
+        self._state = State(double_precision=True, single_thread=single_thread)
         self._ran_foreign_code = False
         self.is_tainted = False
         """Whether a plugin has changed the process, so that later items need a new one."""

@@ -8,10 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from changes import CHANGES, plugin
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from bench.experiment.config import load
 from bench.model import registry
 from bench.model.isolation import State
+from bench.run import tasks
 from bench.run.execute import execute
 
 LIBRARIES = (
@@ -136,3 +138,30 @@ def test_an_import_of_an_installed_library_is_no_change(tmp_path, monkeypatch):
         assert state.changes() == ["NumPy's error state (over)"]  # what a plugin changed before the import is known
         importlib.import_module("own_things")
         assert "environment variables (OWN_THINGS)" in state.changes()
+
+
+def test_cells_in_this_process_use_one_thread_and_its_own_number_comes_back():
+    def counts():
+        return [library.num_threads for library in ThreadpoolController().lib_controllers]
+
+    with threadpool_limits(2):
+        before = counts()
+        state = State(single_thread=True)
+        assert set(counts()) == {1}
+        assert state.changes() == []
+        state.close()
+        assert counts() == before
+
+
+def test_a_run_in_this_process_has_one_thread_in_its_cells(tmp_path, monkeypatch):
+    seen = []
+    read = tasks.measure_cell
+
+    def measure(*given):
+        seen.append({library.num_threads for library in ThreadpoolController().lib_controllers})
+        return read(*given)
+
+    monkeypatch.setattr(tasks, "measure_cell", measure)
+    with threadpool_limits(2):
+        rows_of_run(tmp_path, "numpy", [], 0)
+    assert seen == [{1}] * 2
