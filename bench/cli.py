@@ -272,6 +272,11 @@ def _plan(words: list[str]) -> int:
     experiment = _load(words)
     store = store_of(experiment)
     progress.print_plan(experiment, plan.plan(experiment, store), store.load())
+    if experiment.execution.launcher == "ray":
+        from bench.run.launchers import launcher_of
+
+        with launcher_of(experiment):  # raises an error if the cluster does not answer, or cannot run the jobs
+            pass
     if experiment.execution.launcher == "slurm":
         from bench.run.launchers.slurm import script
 

@@ -373,7 +373,7 @@ def _execution(config: Mapping[str, Any]) -> Execution:
 
 CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
     "local": {},
-    "ray": {"address": (str, True), "cells": (int, False), "cpus": (float, False)},
+    "ray": {"address": (str, True), "cells": (int, False), "cpus": (float, False), "wait": (float, False)},
     "slurm": {
         "cluster": (str, False), **dict.fromkeys(("cells", "minutes", "cpus", "parallel"), (int, False)),
         **dict.fromkeys(("partition", "constraint", "account", "qos"), (str, True)),
@@ -395,6 +395,12 @@ def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
             settings[name][key] = None if value is None and may_be_null else coerce(kind, value, f"{name}.{key}")
             if kind is not str and not settings[name][key] >= 1:
                 raise UserError(f"{name}.{key}={value} must be at least 1")
+    n_cores, ray = os.cpu_count() or 1, settings["ray"]
+    if launcher == "ray" and not (ray["address"] or os.environ.get("RAY_ADDRESS")) and ray["cpus"] > n_cores:
+        raise UserError(
+            f"ray.cpus={ray['cpus']:g} is more than the {n_cores} cores of this machine, on which a cluster is started without "
+            "ray.address"
+        )
     _one_of("slurm.cluster", settings["slurm"]["cluster"], ("slurm", "local"))
     return settings[launcher]
 

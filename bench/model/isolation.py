@@ -418,7 +418,7 @@ class _ImportWatch(importlib.abc.MetaPathFinder):
                 execute(module)
             finally:
                 _ImportWatch.is_active = False
-                spec._initializing = False  # the module is complete, and its settings can be read
+                spec._initializing = False  # type: ignore[attr-defined]  # the module is complete, and its settings can be read
                 for state in self.states:
                     state.after_import()
 
