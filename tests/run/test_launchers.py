@@ -1,6 +1,7 @@
 """The same tasks, the same rows: on this machine, on a Ray cluster that loses a node, and as jobs of Slurm."""
 
 import ast
+import importlib
 import importlib.util
 import os
 import subprocess
@@ -92,9 +93,10 @@ def test_settings_of_launchers_are_checked(capsys, word, said):
 def test_a_wait_says_what_for_and_ends(capsys, monkeypatch):
     monkeypatch.setattr(waiting, "SILENT_S", 0.0)
     patience = waiting.Patience(0.05, "ray.wait")
+    patience.wait("nothing moves", "push")
+    time.sleep(0.06)
     with pytest.raises(UserError, match=r"nothing moves; gave up after 0.05 s \(ray.wait\); push"):
-        while True:
-            patience.wait("nothing moves", "push")
+        patience.wait("nothing moves", "push")
     assert capsys.readouterr().err == "bench: nothing moves: waiting, for at most 0.05 s (ray.wait)\n"
 
 
@@ -113,15 +115,15 @@ def test_a_cluster_that_does_not_answer_is_not_waited_for_long(monkeypatch, addr
 
 
 def test_more_cores_than_a_cluster_has_are_not_waited_for_long(monkeypatch):
-    from bench.run.launchers.ray import RayLauncher
+    ray_launcher = importlib.import_module("bench.run.launchers.ray")
 
     class Cluster:
         def nodes(self):
             return [{"Alive": True, "Resources": {"CPU": 2.0}}, {"Alive": False, "Resources": {"CPU": 64.0}}]
 
-    launcher = RayLauncher.__new__(RayLauncher)
+    launcher = ray_launcher.RayLauncher.__new__(ray_launcher.RayLauncher)
     launcher._ray, launcher._settings = Cluster(), {"cpus": 4.0, "wait": 0.1}
-    monkeypatch.setattr("bench.run.launchers.ray.PAUSE_S", 0.02)
+    monkeypatch.setattr(ray_launcher, "PAUSE_S", 0.02)
     with pytest.raises(UserError, match=r"ray.cpus=4 cores, and the largest node of the cluster has 2; gave up"):
         launcher._wait_for_cores()
 
