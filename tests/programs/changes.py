@@ -31,7 +31,7 @@ CHANGES = {
     "root": ("import scipy.optimize; scipy.optimize.root = None", "scipy.optimize.root"),
     "ndtr": ("import scipy.special; scipy.special.ndtr = None", "scipy.special.ndtr"),
     "special_errors": ("import scipy.special; scipy.special.seterr(all='raise')", "SciPy's error state"),
-    "fft_workers": ("import scipy.fft; scipy.fft.set_workers(2).__enter__()", "the threads of scipy.fft"),
+    "fft_workers": ("import scipy.fft; scipy.fft.kept = scipy.fft.set_workers(2); scipy.fft.kept.__enter__()", "the threads of scipy.fft"),
     "dtype": ("import torch; torch.set_default_dtype(torch.float16)", "torch's default type"),
     "torch_threads": ("import torch; torch.set_num_threads(3)", "torch's threads"),
     "torch_seed": ("import torch; torch.manual_seed(1)", "the seed of torch"),
