@@ -12,12 +12,12 @@ from typing import Any
 from bench import deprecated
 from bench.errors import STATUSES, UserError, printable, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
-from bench.experiment.grid import parameter_name, refuse_too_many, swept
+from bench.experiment.grid import COUNTS, applies, is_theta_axis, parameter_name, refuse_too_many, swept
 from bench.experiment.overrides import LISTS_AS, Values, check_file, quoted, repeated
 from bench.experiment.study import Study
-from bench.model import Decision, guard, registry
+from bench.model import Decision, MechanicalScene, Plugin, guard, registry
 from bench.model.identity import parse_identity
-from bench.model.parameters import build, coerce, remember, singular
+from bench.model.parameters import build, coerce, parameters, remember, singular
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -165,7 +165,51 @@ def explain_names(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) ->
 
 def notes(experiment: Experiment, overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
     """Return sentences on settings whose effect may surprise: given twice, without effect, or combined with a file's."""
-    return [*repeated(overrides), *explain_sweep(overrides, config_dirs)]
+    return [*repeated(overrides), *_without_effect(experiment, overrides), *explain_sweep(overrides, config_dirs)]
+
+
+def _without_effect(experiment: Experiment, overrides: Sequence[str]) -> list[str]:
+    """Return a sentence for each setting of the command line that changes no cell of the experiment."""
+    kinds = {kind: singular(kind) for kind in registry.kinds() if kind != "studies"}
+    chosen = {axis: [choice.entry.name for choice in some] for axis, some in experiment.choices.items()}
+    plugins = _effective_plugins(experiment)
+    axes = swept(experiment.sweep)
+    sentences = []
+    for override in overrides:
+        key = override.lstrip("+").partition("=")[0]
+        axis, _, rest = key.partition(".")
+        if kinds.get(axis, axis) in kinds.values() and kinds.get(axis, axis) not in chosen:
+            reason = f"study {experiment.study.name} has no {kinds.get(axis, axis)}"
+        elif axis in chosen and rest and rest.partition(".")[0] not in chosen[axis]:
+            reason = f"{rest.partition('.')[0]} is not among the {registry.kind_of(axis)}"
+        elif (
+            axis == "sweep"
+            and rest in axes
+            and rest not in COUNTS
+            and not is_theta_axis(rest)
+            and not any(applies(rest, plugin.kind, plugin.name, parameters(plugin)) for plugin in plugins)
+        ):
+            reason = "no scene of the sweep uses a plugin with that parameter"
+        elif axis == "marks" and (unswept := _unswept_marks(experiment, axes)):
+            reason = f"{', '.join(unswept)} is not swept"
+        else:
+            continue
+        sentences.append(f"{override[:200]} has no effect: {reason}")
+    return sentences
+
+
+def _effective_plugins(experiment: Experiment) -> list[type[Plugin]]:
+    """Return the chosen plugins, without contact laws and integrators that no chosen scene uses."""
+    plugins = [choice.entry.plugin for some in experiment.choices.values() for choice in some if choice.entry.plugin]
+    mechanical = [plugin for plugin in plugins if issubclass(plugin, MechanicalScene)]
+    unused = {"contacts"} if not any(plugin.n_contacts != 0 for plugin in mechanical) else set()
+    unused |= set() if mechanical else {"contacts", "integrators"}
+    return [plugin for plugin in plugins if plugin.kind not in unused]
+
+
+def _unswept_marks(experiment: Experiment, axes: Sequence[str]) -> list[str]:
+    names = {part for axis in axes for part in (axis, parameter_name(axis))}
+    return [name for name in experiment.marks if name not in names]
 
 
 def explain_sweep(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:

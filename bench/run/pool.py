@@ -28,7 +28,7 @@ import psutil
 
 from bench.errors import STATUSES, StorageError, UserError, failure
 from bench.run.reaper import MARK, Reaper, kill_marked_processes
-from bench.run.worker import Channel, ConnectionLost, Handler, MalformedMessage, command, first_message
+from bench.run.worker import END_OF_OUTPUT, Channel, ConnectionLost, Handler, MalformedMessage, command, first_message
 
 TICK = 0.05
 """Seconds between checks of the items' time and memory."""
@@ -144,8 +144,9 @@ class _Worker:
 
     def take_output(self) -> str:
         """Return the last lines printed since the last call, or the first lines of Python's crash dump, joined by ``|``."""
-        _, crash, dump = self.printed.decode(errors="replace").rpartition("(most recent call first):")
-        self.printed = b""
+        output, end, rest = self.printed.partition(END_OF_OUTPUT)
+        self.printed = rest if end else b""
+        _, crash, dump = output.decode(errors="replace").rpartition("(most recent call first):")
         printable = ("".join(c for c in line if c.isprintable()).strip() for line in dump.split("\n"))
         lines = [line for line in printable if line]
         return " | ".join(lines[:3] if crash else lines[-4:])[-600:]
@@ -183,7 +184,7 @@ class _Worker:
         except (ValueError, LookupError, TypeError, RecursionError) as error:
             raise MalformedMessage from error
         self.read_output()
-        answer = Answer(item, result, seconds, self.take_output())
+        answer = Answer(item, result, seconds, self.take_output() if END_OF_OUTPUT in self.printed else "")
         self.is_done = content.get("is_last") is True
         self.pace, self.since, self.is_prepared = seconds, time.monotonic(), False
         self.n_answered += 1

@@ -30,6 +30,8 @@ PROGRAM = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench
 """The program of a worker. It has the import path of its run, and does not import the run's main script."""
 ENCODER = json.JSONEncoder()
 """The encoder of messages, created before a plugin can replace it."""
+END_OF_OUTPUT = b"\x1ebench-end-of-output\x1e\n"
+"""What a worker prints after each item, so that its output is not taken for the next item's."""
 DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of prctl(2)."""
 
@@ -177,6 +179,8 @@ def _serve(channel: Channel) -> None:
         guard.kill_children()
         with suppress(Exception):
             sys.stdout.flush()
+        with suppress(OSError):  # a plugin may have closed it
+            os.write(1, END_OF_OUTPUT)
         channel.send(answer)
         if getattr(handle, "is_tainted", False):
             return  # the run continues in a new worker

@@ -65,8 +65,9 @@ def test_compare_of_files_with_missing_columns_is_one_line(tmp_path, capsys, mon
         (tmp_path / side / "x").mkdir(parents=True)
         pd.DataFrame([dict.fromkeys(columns, "bias_variance")]).to_parquet(tmp_path / side / "x" / "rows.parquet")
     assert main(["compare", "a", "b"]) == 2
-    said = capsys.readouterr().err.strip()
-    assert len(said.splitlines()) == 1
+    said = capsys.readouterr().err.strip().splitlines()
+    assert all(line.startswith("bench: ") for line in said)
+    assert len(said) == 1 + ("rows are left out" in said[0])
 
 
 FILES = {
@@ -123,6 +124,22 @@ def test_of_a_setting_given_twice_it_is_said_which_counts(capsys):
     assert "samples is given twice: samples=5 counts, samples=4 does not" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("scene.pushing.mass=5", "has no effect: pushing is not among the scenes"),
+        ("sweep.stiffness=[1,2]", "has no effect: no scene of the sweep uses a plugin with that parameter"),
+        ("optimizers=[nosuch]", "has no effect: study bias_variance has no optimizer"),
+        ("optimizer.adam.rate=-5", "has no effect: study bias_variance has no optimizer"),
+        ("marks={nosuch:{a:1}}", "has no effect: nosuch is not swept"),
+        ("scene.heaviside.sigma=0.3", ""), ("sweep.sigma=[0.1]", ""), ("sweep.heaviside.sigma=[0.1]", ""),
+    ],
+)  # fmt: skip
+def test_a_setting_without_effect_is_named(capsys, word, said):
+    assert main(["plan", *BASE, word]) == 0
+    assert capsys.readouterr().err == (f"bench: {word} {said}\n" if said else "")
+
+
 def test_a_folder_with_an_accent_needs_no_quotes():
     assert load(["results_dir=résultats/é"]).results_dir.name == "é"
     assert load(["results_dir='résultats/é'"]).results_dir.name == "é"
@@ -166,7 +183,7 @@ def test_a_reason_is_one_line_of_a_length_that_can_be_read():
     assert row["reason"].endswith("characters)")
 
 
-@pytest.mark.parametrize("start", "=+-@")
+@pytest.mark.parametrize("start", ["=", "+", "-", "@", "\t=", " \r="])
 def test_a_table_holds_no_formulas(start):
     made, cell = one()
     rows = made.columns.typed(pd.DataFrame([tasks.row_of(made, cell, {"status": "error", "reason": f"{start}1+1"})]))

@@ -231,6 +231,8 @@ class Handler:
             os.write(descriptor, MALFORMED[item[1]])
         elif what == "slow":
             time.sleep(0.4)
+        elif what == "prints":
+            print(item[1], flush=True)
         elif what == "taints":
             self.is_tainted = True
         return {"status": "ok", "pid": os.getpid()}
@@ -290,6 +292,11 @@ def test_a_worker_that_a_plugin_has_changed_is_replaced_and_nothing_is_blamed():
     assert {result["status"] for result in results.values()} == {"ok"}
     places = [answer.result["pid"] for answer in found]
     assert [places.index(place) for place in places] == [0, 0, 2, 2, 2, 5]
+
+
+def test_output_belongs_to_the_item_that_printed_it():
+    _, found = answers([("prints", f"output {i}") for i in range(40)] + [("sound",)])
+    assert [answer.output for answer in found] == [f"output {i}" for i in range(40)] + [""]
 
 
 def test_messages_before_a_malformed_one_still_count():
