@@ -11,7 +11,7 @@ from bench.errors import UserError, printable
 from bench.experiment.grid import MAX_CELLS
 
 GLOBAL = "# @package _global_"
-"""The first line of an experiment file, which tells Hydra that its settings are not nested."""
+"""The first line of an experiment file, so that Hydra does not nest its settings."""
 NUMBER = r"[+-]?(?:0|[1-9]\d*)(?:\.\d+)?(?:[eE][+-]?\d+)?"
 LONG_LIST = re.compile(rf"\[\s*{NUMBER}(?:\s*,\s*{NUMBER}){{15,}}\s*\]")
 """A list of at least 16 numbers, which Hydra's parser would read slowly."""

@@ -288,7 +288,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def recorded_sweep(folder: Path) -> dict[str, Any]:
-    """Return the sweep in ``run.json``, or an empty one if there is no record of a valid sweep."""
+    """Return the sweep in ``run.json``, or an empty one if the record is missing or invalid."""
     config = read_record(folder).get("config")
     sweep = config.get("sweep") if isinstance(config, dict) else None
     try:

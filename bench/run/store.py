@@ -169,7 +169,7 @@ class Store:
         raise StorageError(f"'{self.directory}' changes faster than it can be read: too many runs write to it")
 
     def _read(self, paths: Iterable[Path]) -> list[pd.DataFrame]:
-        """Return the valid rows as typed tables, those of all small files as one; notes the files with other rows."""
+        """Return the valid rows as typed tables, one for all small files; notes the files with other rows."""
         import pandas as pd
 
         frames: list[pd.DataFrame] = []

@@ -104,7 +104,7 @@ def test_a_wait_says_what_for_and_ends(capsys, monkeypatch):
     ("address", "said"),
     [
         ("127.0.0.1:1", r"no Ray cluster answers at 127.0.0.1:1 \(Connection refused\); gave up after 0.1 s"),
-        ("no.such.host.invalid:6379", "there is no host of that name"), ("somewhere", "must be HOST:PORT"),
+        ("no.such.host.invalid:6379", "no host has that name"), ("somewhere", "must be HOST:PORT"),
         ("127.0.0.1:70000", "must be HOST:PORT"),
     ],
 )  # fmt: skip

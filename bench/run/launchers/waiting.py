@@ -47,7 +47,7 @@ def reach(address: str, patience: Patience) -> None:
             with socket.create_connection((host.strip("[]"), int(port)), timeout=1.0):
                 return
         except (socket.gaierror, UnicodeError):
-            raise UserError(f"ray.address={printable(address)}: there is no host of that name") from None
+            raise UserError(f"ray.address={printable(address)}: no host has that name") from None
         except OSError as error:
             cause = error.strerror or "no answer"
             patience.wait(f"no Ray cluster answers at {printable(address)} ({cause})", "start one: ray start --head")
