@@ -5,7 +5,6 @@ Names and settings are the same as on the command line.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -148,6 +147,7 @@ def load(directory: str | Path) -> pd.DataFrame:
     from bench.experiment.defaults import completed_rows
     from bench.experiment.study import Study
     from bench.report.views import newest_rows
+    from bench.run.rows import recorded_sweep
     from bench.run.store import Store
 
     directory = Path(directory).expanduser()
@@ -157,11 +157,7 @@ def load(directory: str | Path) -> pd.DataFrame:
     study = registry.entries()["studies"].get(str(rows["study"].iloc[0]))
     columns = study.plugin.columns if study and study.plugin and issubclass(study.plugin, Study) else Columns.of()
     rows = completed_rows(newest_rows(columns.typed(rows)))
-    try:
-        sweep = json.loads((directory / "run.json").read_text())["config"]["sweep"]
-    except (OSError, ValueError, KeyError, TypeError):
-        sweep = {}
-    swept_axes = axes.axes(sweep, rows)
+    swept_axes = axes.axes(recorded_sweep(directory), rows)
     return rows.assign(**{axis.column: axes.values_of(axis, rows) for axis in swept_axes if axis.column not in rows})
 
 

@@ -214,7 +214,7 @@ def _load(words: Sequence[str], notes: bool = True) -> Experiment:
     experiment = config.load(overrides, folders)
     for note in [
         *config.explain_names(overrides, folders),
-        *(config.explain_sweep(overrides, folders) if notes else ()),
+        *(config.notes(experiment, overrides, folders) if notes else ()),
     ]:
         print(f"bench: {printable(note)}", file=sys.stderr)
     return experiment
@@ -238,7 +238,7 @@ def _execute(experiment: Experiment, words: Sequence[str]) -> Finished | int:
         keys = {cell.key for cell in cells(experiment)}
         stored = int(store.load()["key"].isin(keys).sum())
         is_interrupt = isinstance(end, KeyboardInterrupt)
-        why = "stopped" if is_interrupt else f"stopped after a failed cell ({printable(end)})"
+        why = "stopped" if is_interrupt else f"stopped {printable(end)}"
         again = shlex.join(["python", "-m", "bench", *words])
         print(
             f"\nbench: {why}; {stored} of {len(keys)} cells are stored in '{store.directory}'. Continue with: {again}",
@@ -283,6 +283,11 @@ def _plan(words: list[str]) -> int:
     experiment = _load(words)
     store = store_of(experiment)
     progress.print_plan(experiment, plan.plan(experiment, store), store.load())
+    if experiment.execution.launcher == "ray":
+        from bench.run.launchers import launcher_of
+
+        with launcher_of(experiment):  # raises an error if the cluster does not answer, or cannot run the jobs
+            pass
     if experiment.execution.launcher == "slurm":
         from bench.run.launchers.slurm import script
 

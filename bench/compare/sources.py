@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import subprocess
 import tarfile
 import tempfile
@@ -18,6 +17,7 @@ from bench.errors import UserError
 from bench.experiment.columns import IDENTITY, Columns
 from bench.experiment.study import Study
 from bench.model import registry
+from bench.run.rows import read_parquet, read_record, valid_rows
 
 STANDARD = "standard"
 """The folder of committed results inside the results folder."""
@@ -154,9 +154,13 @@ def _read_rows(folder: Path) -> pd.DataFrame | None:
     stored = folder / "rows.parquet"
     if stored.exists():
         try:
-            rows = pd.read_parquet(stored)
+            rows = read_parquet(stored)
         except Exception as error:
             raise UserError(f"'{stored}' cannot be read as Parquet ({error})") from None
+        name = str(rows["study"].iloc[0]) if len(rows) and "study" in rows else ""
+        entry = registry.entries()["studies"].get(name)
+        is_study = entry is not None and entry.plugin is not None and issubclass(entry.plugin, Study)
+        rows = valid_rows(rows, columns_of(name) if is_study else Columns.of(), stored)
         return rows if len(rows) else None
     older = None
     for path in sorted(folder.glob("*.csv")):
@@ -174,7 +178,7 @@ def _read_rows(folder: Path) -> pd.DataFrame | None:
 def _read_machine(folder: Path) -> tuple[str, str]:
     """Return processor, cores and system from ``run.json``, and the load if the machine was busy. Empty if unknown."""
     try:
-        machine = json.loads((folder / "run.json").read_text())["machine"]
+        machine = read_record(folder)["machine"]
         name = f"{machine['processor']}, {machine['cores']} cores, {machine['system']}"
         load = (machine["load_average"] or [0.0])[0]
         return name, f"load {load:.1f}" if load > BUSY * machine["cores"] else ""

@@ -191,7 +191,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
 
 def _escape_formula(text: Any) -> Any:
     """Return text with an apostrophe before a formula's sign, so that a spreadsheet shows it instead of evaluating it."""
-    return f"'{text}" if isinstance(text, str) and text[:1] in ("=", "+", "-", "@") else text
+    return f"'{text}" if isinstance(text, str) and text.lstrip()[:1] in ("=", "+", "-", "@") else text
 
 
 def build_plugins(given: Mapping[str, Any]) -> dict[str, Plugin | None]:

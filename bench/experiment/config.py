@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from bench import deprecated
-from bench.errors import STATUSES, UserError, unknown
+from bench.errors import STATUSES, UserError, printable, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
-from bench.experiment.grid import parameter_name, refuse_too_many, swept
+from bench.experiment.grid import COUNTS, applies, is_theta_axis, parameter_name, refuse_too_many, swept
+from bench.experiment.overrides import LISTS_AS, Values, check_file, quoted, repeated
 from bench.experiment.study import Study
-from bench.model import Decision, guard, registry
+from bench.model import Decision, MechanicalScene, Plugin, guard, registry
 from bench.model.identity import parse_identity
-from bench.model.parameters import build, coerce, remember, singular
+from bench.model.parameters import build, coerce, parameters, remember, singular
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -50,7 +51,6 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
 
     for override in overrides:
         key, _, value = override.lstrip("+").partition("=")
@@ -62,17 +62,18 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
             raise UserError(
                 f"'{folder}' has no experiments: put them into its folder experiment, as experiment/NAME.yaml"
             )
-    parser = OverridesParser.create()
+    parser, values = OverridesParser.create(), Values()
     prepared = []
     for override in overrides:
-        hydra_override = _to_hydra(override, config_dirs)
+        hydra_override = _to_hydra(override, config_dirs, values)
         try:
             parser.parse_override(hydra_override)
         except (HydraException, ValueError, RecursionError):  # ValueError: a number of 5000 digits
-            raise UserError(
-                f"'{override[:200]}' cannot be read: write key=value with lists as [a,b] and strings in quotes"
-            ) from None
+            raise UserError(f"'{override[:200]}' cannot be read: {LISTS_AS}") from None
         prepared.append(hydra_override)
+    for key, _, name in (override.lstrip("+").partition("=") for override in overrides):
+        if key == "experiment":
+            check_file(_file_of(name, config_dirs))
     if config_dirs:
         search_path = ",".join(f"'file://{folder.expanduser().absolute()}'" for folder in config_dirs)
         prepared.insert(0, f"hydra.searchpath=[{search_path}]")
@@ -80,10 +81,18 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
             config = compose("config", overrides=prepared)
         plain = OmegaConf.to_container(config, resolve=False, throw_on_missing=True)
-    except (HydraException, OmegaConfBaseException, ValueError) as error:  # ValueError: a name as the index of a list
-        raise UserError(str(error).strip().splitlines()[0]) from None
+    except Exception as error:  # Hydra raises errors of many types, and only Hydra's code runs here
+        lines = [str(part).strip().partition("\n")[0] for part in (error, error.__cause__) if part is not None]
+        raise UserError(printable(": ".join(lines)).replace("override ++", "")[:1000]) from None
     assert isinstance(plain, dict)
-    return experiment({str(k): v for k, v in plain.items()})
+    return experiment({str(k): values.restore(v) for k, v in plain.items()})
+
+
+def _file_of(name: str, config_dirs: Sequence[Path]) -> Path:
+    """Return the file of an experiment, of the user's or of this package."""
+    folders = [folder / "experiment" for folder in (*config_dirs, config_dir())]
+    paths = [folder / f"{stem}.yaml" for stem in (name, deprecated.EXPERIMENTS.get(name, name)) for folder in folders]
+    return next(path for path in paths if path.exists())
 
 
 def _known_keys() -> frozenset[str]:
@@ -102,7 +111,7 @@ def _settings() -> frozenset[str]:
     return frozenset(yaml.safe_load((config_dir() / "config.yaml").read_text())) - {"defaults"}
 
 
-def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
+def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str:
     """Return an override in Hydra's syntax; experiments and plugin parameters need no ``+``."""
     if "=" not in override:
         raise UserError(f"'{override}' is not an override: write key=value (commands come first: see --help)")
@@ -110,6 +119,7 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
         raise UserError(f"'{override}': interpolations are not supported, give the value itself")
     key, _, value = override.partition("=")
     bare = key.lstrip("+~")
+    value = quoted(values.replace_in(bare, value))
     if bare in LAYOUT:
         bare = f"table.{bare}"
     head = bare.partition(".")[0]
@@ -153,22 +163,74 @@ def explain_names(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) ->
     return [deprecated.sentence(f"experiment={name}", f"experiment={deprecated.EXPERIMENTS[name]}") for name in old]
 
 
+def notes(experiment: Experiment, overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
+    """Return sentences on settings whose effect may surprise: given twice, without effect, or combined with a file's."""
+    return [*repeated(overrides), *_without_effect(experiment, overrides), *explain_sweep(overrides, config_dirs)]
+
+
+def _without_effect(experiment: Experiment, overrides: Sequence[str]) -> list[str]:
+    """Return a sentence for each setting of the command line that changes no cell of the experiment."""
+    kinds = {kind: singular(kind) for kind in registry.kinds() if kind != "studies"}
+    chosen = {axis: [choice.entry.name for choice in some] for axis, some in experiment.choices.items()}
+    plugins = _effective_plugins(experiment)
+    axes = swept(experiment.sweep)
+    sentences = []
+    for override in overrides:
+        key = override.lstrip("+").partition("=")[0]
+        axis, _, rest = key.partition(".")
+        if kinds.get(axis, axis) in kinds.values() and kinds.get(axis, axis) not in chosen:
+            reason = f"study {experiment.study.name} has no {kinds.get(axis, axis)}"
+        elif axis in chosen and rest and rest.partition(".")[0] not in chosen[axis]:
+            reason = f"{rest.partition('.')[0]} is not among the {registry.kind_of(axis)}"
+        elif (
+            axis == "sweep"
+            and rest in axes
+            and rest not in COUNTS
+            and not is_theta_axis(rest)
+            and not any(applies(rest, plugin.kind, plugin.name, parameters(plugin)) for plugin in plugins)
+        ):
+            reason = "no scene of the sweep uses a plugin with that parameter"
+        elif axis == "marks" and (unswept := _unswept_marks(experiment, axes)):
+            reason = f"{', '.join(unswept)} is not swept"
+        else:
+            continue
+        sentences.append(f"{override[:200]} has no effect: {reason}")
+    return sentences
+
+
+def _effective_plugins(experiment: Experiment) -> list[type[Plugin]]:
+    """Return the chosen plugins, without contact laws and integrators that no chosen scene uses."""
+    plugins = [choice.entry.plugin for some in experiment.choices.values() for choice in some if choice.entry.plugin]
+    mechanical = [plugin for plugin in plugins if issubclass(plugin, MechanicalScene)]
+    unused = {"contacts"} if not any(plugin.n_contacts != 0 for plugin in mechanical) else set()
+    unused |= set() if mechanical else {"contacts", "integrators"}
+    return [plugin for plugin in plugins if plugin.kind not in unused]
+
+
+def _unswept_marks(experiment: Experiment, axes: Sequence[str]) -> list[str]:
+    names = {part for axis in axes for part in (axis, parameter_name(axis))}
+    return [name for name in experiment.marks if name not in names]
+
+
 def explain_sweep(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
     """Return one sentence on how the sweeps of file and command line combine; empty unless both have a sweep."""
-    import yaml
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from omegaconf import OmegaConf
 
     split = [(key.lstrip("+"), value) for key, _, value in (word.partition("=") for word in overrides)]
     chosen = [value for key, value in split if key == "experiment"]
     axes: list[str] = []
     for key, value in split:
         head, _, axis = key.partition(".")
-        if head == "sweep":
-            axes.extend([axis] if axis else (yaml.safe_load(value.replace(":", ": ")) or {}))
+        if head == "sweep" and axis:
+            axes.append(axis)
+        elif head == "sweep":
+            whole: Any = OverridesParser.create().parse_override(f"sweep={Values().replace_in(head, value)}").value()
+            axes.extend(map(str, whole or ()))
     if not chosen or not axes:
         return []
-    paths = (folder / "experiment" / f"{chosen[-1]}.yaml" for folder in (*config_dirs, config_dir()))
-    path = next((path for path in paths if path.exists()), None)  # None: an old name
-    own = (path and yaml.safe_load(path.read_text()).get("sweep")) or {}
+    file: Any = OmegaConf.load(_file_of(chosen[-1], config_dirs))
+    own = file.get("sweep") or {}
     replaced = [f"{axis} of the command line replaces that of {chosen[-1]}" for axis in axes if axis in own]
     kept = [f"{axis} of {chosen[-1]} stays" for axis in own if axis not in axes]
     added = [f"{axis} of the command line is multiplied with it" for axis in axes if axis not in own]
@@ -355,7 +417,7 @@ def _execution(config: Mapping[str, Any]) -> Execution:
 
 CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
     "local": {},
-    "ray": {"address": (str, True), "cells": (int, False), "cpus": (float, False)},
+    "ray": {"address": (str, True), "cells": (int, False), "cpus": (float, False), "wait": (float, False)},
     "slurm": {
         "cluster": (str, False), **dict.fromkeys(("cells", "minutes", "cpus", "parallel"), (int, False)),
         **dict.fromkeys(("partition", "constraint", "account", "qos"), (str, True)),
@@ -377,6 +439,12 @@ def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
             settings[name][key] = None if value is None and may_be_null else coerce(kind, value, f"{name}.{key}")
             if kind is not str and not settings[name][key] >= 1:
                 raise UserError(f"{name}.{key}={value} must be at least 1")
+    n_cores, ray = os.cpu_count() or 1, settings["ray"]
+    if launcher == "ray" and not (ray["address"] or os.environ.get("RAY_ADDRESS")) and ray["cpus"] > n_cores:
+        raise UserError(
+            f"ray.cpus={ray['cpus']:g} is more than the {n_cores} cores of this machine, on which a cluster is started without "
+            "ray.address"
+        )
     _one_of("slurm.cluster", settings["slurm"]["cluster"], ("slurm", "local"))
     return settings[launcher]
 

@@ -23,6 +23,7 @@ HARMLESS = {
     "bench.errors": "statuses and the wording of messages",
     "bench.experiment": "describes cells and rows; all that it passes on to plugins is in the key",
     "bench.model.guard": "protects the process from plugins, and sees none of their numbers",
+    "bench.model.isolation": "detects and undoes changes of the process",
     "bench.model.identity": "plugins as text",
     "bench.model.parameters": "declares and checks parameters, whose values are in the key",
     "bench.model.registry": "finds plugins, whose code is in the key",

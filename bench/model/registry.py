@@ -19,6 +19,7 @@ import sys
 import types
 import typing
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
@@ -27,7 +28,7 @@ from types import ModuleType
 from typing import Any
 
 from bench.errors import UserError, printable, unknown
-from bench.model import guard, trial
+from bench.model import guard, isolation, trial
 from bench.model.parameters import Plugin, build, parameters, remember, singular
 
 CORE = "bench.studies"
@@ -96,13 +97,13 @@ def entries() -> Table:
     hashes |= {point.module: point.dist.version if point.dist else "" for point in points}
     fatal = trial.find_fatal_modules(hashes, {_package(path): path for path in _folders})
     for kind, module in modules:
-        with guard.capture_output(f"{module}, while it was imported,"), guard.protect_process():
+        with _protected(module):
             _load_module(table, kind, module, fatal.get(module, ""))
     for point in points:
         try:
             if point.module in fatal:
                 raise ImportError(fatal[point.module])
-            with guard.capture_output(f"{point.module}, while it was imported,"), guard.protect_process():
+            with _protected(point.module):
                 plugin = point.load()
             if not (isinstance(plugin, type) and issubclass(plugin, Plugin) and plugin.kind):
                 raise TypeError(f"{point.value} is not a plugin class")
@@ -113,6 +114,18 @@ def entries() -> Table:
         else:
             _add(table, plugin)
     return table
+
+
+@contextmanager
+def _protected(module: str) -> Iterator[None]:
+    """Undo what the import of a module changes in this process, and quote what it prints."""
+    source = f"{module}, while it was imported,"
+    with ExitStack() as stack:
+        if not module.startswith("bench."):
+            stack.enter_context(isolation.undo_changes(source))
+        stack.enter_context(guard.capture_output(source))
+        stack.enter_context(guard.protect_process())
+        yield
 
 
 def entries_with(kind: str, package: str) -> dict[str, Entry]:

@@ -31,6 +31,8 @@ TIMEOUT_S = 60.0
 """Time limit of each stage of a module's trial, in seconds."""
 STAGES = {b".": "when it was imported", b",": "when it was built with its defaults and called as for a plan"}
 """Stage of a module's trial, by the byte that the trial process writes at its start."""
+MARK = "BENCH_TRIAL"
+"""Environment variable of a trial process and all processes that it starts."""
 CHILD_CODE = (
     "import json, sys; job = json.load(sys.stdin); sys.path[:] = job['path']; "
     "import bench.model.trial as trial; trial.run_child(job)"
@@ -47,6 +49,8 @@ def find_fatal_modules(
     ``modules`` maps module names to the hashes of their files (:func:`file_hash`). ``packages`` maps package names of
     plugin folders to the folders. A module that only raises an exception is not fatal.
     """
+    if MARK in os.environ:  # a module of a plugin folder that adds folders itself would start trials without end
+        return {}
     passed = _load_digests()
     remaining = [name for name, text in modules.items() if _digest(name, text) not in passed]
     fatal: dict[str, str] = {}
@@ -73,6 +77,7 @@ def file_hash(module: str) -> str:
 
 def run_child(job: Mapping[str, Any]) -> None:
     """Run the trial process: import and call modules one by one, writing a byte to the pipe before each stage."""
+    os.environ[MARK] = "1"
     pid = os.getpid()
     pipe = os.dup(1)
     null = os.open(os.devnull, os.O_RDWR)

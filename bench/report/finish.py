@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ from bench.report import averages, generic, web, writer
 from bench.report.cores import run_tasks
 from bench.report.views import newest_rows
 from bench.run.execute import Finished, store_of
+from bench.run.plan import requested_rows
 from bench.run.record import record
 from bench.run.store import sort_rows
 
@@ -34,8 +36,13 @@ def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, list
 
 
 def report(experiment: Experiment) -> tuple[pd.DataFrame, list[Path]]:
-    """Rewrite an experiment's files from its newest stored rows, without simulation; return rows and paths."""
-    rows = newest_rows(store_of(experiment).load())
+    """Rewrite an experiment's files from the newest stored rows of its cells, without simulation; return rows and paths.
+
+    If none of its cells is stored, all stored rows are used. Any difference from the requested cells is printed.
+    """
+    rows, difference = requested_rows(experiment, newest_rows(store_of(experiment).load()))
+    if difference:
+        print(f"bench: {difference}", file=sys.stderr)
     return rows, write(experiment, rows)
 
 

@@ -20,6 +20,9 @@ TICKS = (
 )  # fmt: skip
 """Choices of ticks on a logarithmic axis, finest first: a stride in decades, and the positions within a decade."""
 
+SMALLEST, LARGEST = 1e-290, 1e290
+"""Limits of logarithmic axes: the margins that matplotlib adds must not overflow."""
+
 
 def shifts(values: np.ndarray, count: int, columns: int) -> list[Affine2D]:
     """Return sideways shifts for ``count`` lines, smaller than the least distance of values, so that points do not overlap.
@@ -78,6 +81,7 @@ def log_axis(
     values. ``text`` formats the labels.
     """
     axis = panel.xaxis if which == "x" else panel.yaxis
+    low, high = max(low, SMALLEST), min(high, LARGEST)
     getattr(panel, f"set_{which}scale")("log")
     getattr(panel, f"set_{which}lim")(low, high)
     ticks = list(wanted)

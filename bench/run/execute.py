@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bench.errors import StorageError, Unsupported, UserError
 from bench.experiment.experiment import Experiment
@@ -15,6 +15,9 @@ from bench.run import progress, runner
 from bench.run.files import remove_stale
 from bench.run.plan import Planned, plan
 from bench.run.store import Store
+
+MAX_REPAIRS = 2
+"""Number of times that cells whose rows are gone at the end of a run are run again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +43,10 @@ def store_of(experiment: Experiment) -> Store:
 def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     """Run the missing cells of an experiment and merge their rows into ``rows.parquet``.
 
-    Raises :class:`runner.Stopped` after a failed cell in an experiment with ``on_error=stop``, KeyboardInterrupt if
-    interrupted (every cell finished by then is stored), and :class:`UserError` if the study supports no cell.
+    Cells whose rows are gone at the end, for example since the results folder was renamed or removed, are run again.
+    Raises :class:`runner.Stopped` after a failed cell in an experiment with ``on_error=stop`` and if rows are missing
+    even so, KeyboardInterrupt if interrupted (every cell finished by then is stored), and :class:`UserError` if the study
+    supports no cell.
     """
     started = time.time()
     # measured before the run itself loads the machine
@@ -54,12 +59,30 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     store.prepare()
     for folder in (experiment.directory, experiment.directory / "pending", experiment.results_dir / "references"):
         remove_stale(folder)
+    _run(experiment, planned, store, quiet)
+    for is_last in (*[False] * MAX_REPAIRS, True):
+        stored = set(store.load()["key"])
+        rest = [replace(item, stored=item.cell.key in stored) for item in planned]
+        if all(item.stored for item in rest):
+            break
+        missing = sum(not item.stored for item in rest)
+        if is_last:
+            raise runner.Stopped(f"since {missing} cells were run and have no row")
+        print(
+            f"bench: {missing} of {len(planned)} cells were run and have no row in '{store.directory}': was it renamed or "
+            "removed? They are run again",
+            file=sys.stderr,
+        )
+        _run(experiment, rest, store, quiet)
+    return Finished(experiment, store, planned, time.time() - started)
+
+
+def _run(experiment: Experiment, planned: list[Planned], store: Store, quiet: bool) -> None:
     with progress.show_progress(experiment.name, planned, quiet) as shown:
         try:
             runner.run(experiment, planned, store, shown.finished, shown.working)
         finally:
             _compact(store, planned)
-    return Finished(experiment, store, planned, time.time() - started)
 
 
 def _refuse_without_supported_cells(experiment: Experiment, planned: Sequence[Planned]) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
+from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.defaults import completed_json, missing_parameters
 from bench.experiment.experiment import Experiment
@@ -93,6 +94,34 @@ def _rows_of_older_code(experiment: Experiment, rows: pd.DataFrame, keys: set[st
         rows["parameters"].map(completed_json), rows["samples"], rows["repeats"], rows["seed"], strict=True
     )
     return dict(zip(identities, rows["parameters"], strict=True))
+
+
+def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataFrame, str]:
+    """Return the stored rows of the experiment's cells, also of older code, and a sentence on how they differ from all rows.
+
+    If none of its cells is stored, all rows are returned. The sentence is empty if the rows are exactly the cells.
+    """
+    try:
+        with guard.capture_output("a plugin"), guard.protect_process():
+            every = cells(experiment)
+            keys, identities = {cell.key for cell in every}, {_identity_of(cell) for cell in every}
+    except UserError:
+        return rows, ""  # a plugin of the rows may not be installed any more
+    facts = zip(
+        rows["key"], rows["parameters"].map(completed_json), rows["samples"], rows["repeats"], rows["seed"], strict=True
+    )
+    is_requested = [key in keys or identity in identities for key, *rest in facts for identity in [tuple(rest)]]
+    n_requested, n_others = sum(is_requested), len(rows) - sum(is_requested)
+    if not n_requested:
+        return (
+            rows,
+            f"none of the {len(every)} requested cells is stored; the {len(rows)} rows shown have other settings",
+        )
+    missing = (
+        f"{len(every) - n_requested} of {len(every)} requested cells have no row" if n_requested < len(every) else ""
+    )
+    others = f"{n_others} stored rows of other settings are not shown" if n_others else ""
+    return rows[is_requested].reset_index(drop=True), "; ".join(part for part in (missing, others) if part)
 
 
 def _identity_of(cell: Cell) -> Identity:

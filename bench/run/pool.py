@@ -8,6 +8,7 @@ worker sends is executed here. (Pools of the standard library lose all their ite
 from __future__ import annotations
 
 import json
+import math
 import os
 import pickle
 import select
@@ -17,7 +18,7 @@ import subprocess
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,9 +26,9 @@ from typing import Any, Literal
 
 import psutil
 
-from bench.errors import StorageError, UserError, failure
+from bench.errors import STATUSES, StorageError, UserError, failure
 from bench.run.reaper import MARK, Reaper, kill_marked_processes
-from bench.run.worker import Channel, ConnectionLost, Handler, MalformedMessage, command, first_message
+from bench.run.worker import END_OF_OUTPUT, Channel, ConnectionLost, Handler, MalformedMessage, command, first_message
 
 TICK = 0.05
 """Seconds between checks of the items' time and memory."""
@@ -107,6 +108,8 @@ class _Worker:
     """Seconds that the last item took."""
     printed: bytes = b""
     n_answered: int = 0
+    is_done: bool = False
+    """Whether it handles no more items, since a plugin has changed its process."""
     fault: ConnectionLost | MalformedMessage | None = None
     """Fault that ended the connection to the worker."""
 
@@ -141,8 +144,9 @@ class _Worker:
 
     def take_output(self) -> str:
         """Return the last lines printed since the last call, or the first lines of Python's crash dump, joined by ``|``."""
-        _, crash, dump = self.printed.decode(errors="replace").rpartition("(most recent call first):")
-        self.printed = b""
+        output, end, rest = self.printed.partition(END_OF_OUTPUT)
+        self.printed = rest if end else b""
+        _, crash, dump = output.decode(errors="replace").rpartition("(most recent call first):")
         printable = ("".join(c for c in line if c.isprintable()).strip() for line in dump.split("\n"))
         lines = [line for line in printable if line]
         return " | ".join(lines[:3] if crash else lines[-4:])[-600:]
@@ -173,14 +177,15 @@ class _Worker:
                 case "storage":
                     raise StorageError(content["reason"])
                 case "answer":
-                    result, seconds = dict(content["result"]), float(content["seconds"])
+                    result, seconds = _result_in(content)
                     item = self.sent.popleft()
                 case _:
                     raise MalformedMessage
-        except (ValueError, LookupError, TypeError) as error:
+        except (ValueError, LookupError, TypeError, RecursionError) as error:
             raise MalformedMessage from error
         self.read_output()
-        answer = Answer(item, result, seconds, self.take_output())
+        answer = Answer(item, result, seconds, self.take_output() if END_OF_OUTPUT in self.printed else "")
+        self.is_done = content.get("is_last") is True
         self.pace, self.since, self.is_prepared = seconds, time.monotonic(), False
         self.n_answered += 1
         return [answer]
@@ -317,13 +322,14 @@ class Pool:
         kind, reason = end
         was_killed = kind == "stopped" or (worker.process.returncode or 0) < 0
         worker.kill()
-        answers += worker.receive()  # answers sent before it died still count
+        if kind != "done":
+            answers += worker.receive()  # answers sent before it died still count
         worker.close()
         self._workers.remove(worker)
         self._n_failed_starts = 0 if worker.is_ready else self._n_failed_starts + 1
         if not worker.is_ready and (self._n_failed_starts == MAX_FAILED_STARTS or not was_killed):
             raise UserError(f"a worker cannot start: {reason}; last output: {worker.take_output() or 'none'}")
-        if worker.sent and worker.is_ready:
+        if worker.sent and worker.is_ready and kind != "done":
             item, seconds = worker.sent.popleft(), time.monotonic() - worker.since
             if self._may_retry(worker, item, kind):
                 self._crashed.add(id(item))
@@ -347,8 +353,10 @@ class Pool:
             return False
         return kind != "memory" or worker.n_answered > 0
 
-    def _check(self, worker: _Worker) -> tuple[Literal["crashed", "stopped", "timeout", "memory"], str] | None:
+    def _check(self, worker: _Worker) -> tuple[Literal["crashed", "stopped", "timeout", "memory", "done"], str] | None:
         """Return why a worker has to be replaced, as a kind and a reason; None if it can continue."""
+        if worker.is_done:
+            return "done", "a plugin has changed its process"
         code = worker.process.poll()
         if code is None and isinstance(worker.fault, ConnectionLost):
             with suppress(subprocess.TimeoutExpired):
@@ -369,6 +377,14 @@ class Pool:
             if worker.usage.status() == psutil.STATUS_STOPPED:
                 return "stopped", "stopped by a signal"
         return None
+
+
+def _result_in(content: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
+    """Return the result in an answer and its seconds; raises ValueError, TypeError or LookupError if it is malformed."""
+    result, seconds = dict(content["result"]), float(content["seconds"])
+    if result["status"] not in STATUSES or not isinstance(result.get("reason", ""), str) or not 0 <= seconds < math.inf:
+        raise ValueError("an answer has a status, a reason and a time")
+    return result, seconds
 
 
 def describe_exit(code: int) -> str:

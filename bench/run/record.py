@@ -17,6 +17,7 @@ from bench.experiment.experiment import Experiment
 from bench.measure import timing
 from bench.model.parameters import remember
 from bench.run.files import write_whole
+from bench.run.rows import read_record
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,10 +56,7 @@ def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds
 
 def _configuration(path: Path) -> Any:
     """Return the configuration in a record, or None if the record is missing or unreadable."""
-    try:
-        return json.loads(path.read_text())["config"]
-    except (OSError, ValueError, TypeError, KeyError):
-        return None
+    return read_record(path.parent).get("config")
 
 
 def _version(name: str) -> str | None:

@@ -119,15 +119,16 @@ class _Run:
         if self._experiment.execution.stop:
             for row in rows:
                 if row["status"] in FAILED:
-                    raise Stopped(row)
+                    raise _stopped_by(row)
 
 
 class Stopped(Exception):
-    """Raised when a cell failed in a run with ``on_error=stop``."""
+    """Raised when a run ends before its last cell: a cell failed in a run with ``on_error=stop``, or rows are missing."""
 
-    def __init__(self, row: dict[str, Any]) -> None:
-        names = " ".join(str(row[name]) for name in ("scene", "backend", "estimator") if row.get(name))
-        super().__init__(f"{names}: {row['status']}, {row['reason']}")
+
+def _stopped_by(row: dict[str, Any]) -> Stopped:
+    names = " ".join(str(row[name]) for name in ("scene", "backend", "estimator") if row.get(name))
+    return Stopped(f"after a failed cell ({names}: {row['status']}, {row['reason']})")
 
 
 def _has_closed_form(cell: Cell) -> bool:

@@ -14,6 +14,7 @@ import io
 import json
 import os
 import random
+import sys
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 from bench.errors import StorageError, UserError, printable
 from bench.experiment.columns import Columns
 from bench.run.files import link_exclusively, remove_stale, replace_file, sync_directory, temporary
+from bench.run.rows import read_parquet, valid_rows, valid_small_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,6 +52,8 @@ class Store:
         self._study = study
         self._sequence: int | None = None
         self._files_read: dict[Path, FileId] = {}
+        self._spoilt: set[Path] = set()
+        """Files with rows that are left out."""
         self._table = directory / "rows.parquet"
         self._pending = directory / "pending"
         self._claim = self._pending / ".study"
@@ -156,13 +160,36 @@ class Store:
         for _ in _attempts():
             files = self._list_files()
             try:
-                frames = [_with_types(self._columns, frame, path) for path, frame in _read_files(files)]
+                frames = self._read(files)
             except FileNotFoundError:
                 continue
             if _is_complete(files, self._list_files()):
                 self._files_read = dict(files)
                 return self._merge(frames), files
         raise StorageError(f"'{self.directory}' changes faster than it can be read: too many runs write to it")
+
+    def _read(self, paths: Iterable[Path]) -> list[pd.DataFrame]:
+        """Return the valid rows as typed tables, one for all small files; notes the files with other rows."""
+        import pandas as pd
+
+        frames: list[pd.DataFrame] = []
+        rows: list[dict[str, Any]] = []
+        for path in paths:
+            content = _content_of(path)
+            if isinstance(content, list):
+                small = valid_small_rows(content, self._columns, path)
+                rows.extend(small)
+                is_whole = len(small) == len(content)
+            elif content.empty:
+                continue
+            else:
+                frames.append(_with_types(self._columns, valid_rows(content, self._columns, path), path))
+                is_whole = len(frames[-1]) == len(content)
+            if not is_whole:
+                self._spoilt.add(path)
+        if rows:
+            frames.append(_with_types(self._columns, pd.DataFrame(rows), self._pending))
+        return [frame for frame in frames if not frame.empty]
 
     def _merge(self, frames: list[pd.DataFrame]) -> pd.DataFrame:
         """Return the newest row of each key, and store the largest ``sequence`` for :meth:`append`."""
@@ -208,7 +235,7 @@ class Store:
         # the rows are in one new file before the old files are deleted, so a kill at any moment loses none
         part = self._write_pending("parquet", buffer.getvalue())
         for path in read:
-            path.unlink(missing_ok=True)
+            self._discard(path, path)
         aside = self._pending / f"{uuid.uuid4().hex}.parquet"
         try:
             with suppress(FileNotFoundError):
@@ -225,8 +252,19 @@ class Store:
                 f"'{self._table}' cannot be written: {error.strerror}; its rows are in '{part}'"
             ) from None
         part.unlink(missing_ok=True)
-        aside.unlink(missing_ok=True)
+        self._discard(self._table, aside)
         return True
+
+    def _discard(self, path: Path, place: Path) -> None:
+        """Delete a merged file, which is at ``place`` now. If some of its rows were left out, it is kept under another name."""
+        if path not in self._spoilt:
+            place.unlink(missing_ok=True)
+            return
+        other = self.directory / f"left_out-{uuid.uuid4().hex[:8]}{path.suffix}"
+        with suppress(FileNotFoundError):
+            os.rename(place, other)
+            print(f"bench: '{path}' is kept as '{other}', since some of its rows are left out", file=sys.stderr)
+        self._spoilt.discard(path)
 
 
 def sort_rows(table: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:
@@ -286,28 +324,17 @@ def _with_types(columns: Columns, frame: pd.DataFrame, path: Path) -> pd.DataFra
     return typed
 
 
-def _read_files(paths: Iterable[Path]) -> Iterator[tuple[Path, pd.DataFrame]]:
-    """Yield each table with its path; the rows of all small files come last, as one table."""
-    import pandas as pd
-
-    rows: list[dict[str, Any]] = []
-    for path in paths:
-        try:
-            if path.suffix == ".parquet":
-                # read once: pandas opens a path twice, and the file may be replaced in between
-                yield path, pd.read_parquet(io.BytesIO(path.read_bytes()))
-            else:
-                rows.extend(_rows_in(json.loads(path.read_text())))
-                small = path
-        except FileNotFoundError:
-            raise
-        except Exception as error:
-            kind = "Parquet" if path.suffix == ".parquet" else "JSON rows"
-            raise StorageError(
-                f"'{path}' cannot be read as {kind} ({printable(error)[:300]}); move it away to start afresh"
-            ) from None
-    if rows:
-        yield small, pd.DataFrame(rows)
+def _content_of(path: Path) -> pd.DataFrame | list[dict[str, Any]]:
+    """Return the table of a Parquet file or the rows of a small file; raises :class:`StorageError` if it has none."""
+    try:
+        return read_parquet(path) if path.suffix == ".parquet" else _rows_in(json.loads(path.read_text()))
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        kind = "Parquet" if path.suffix == ".parquet" else "JSON rows"
+        raise StorageError(
+            f"'{path}' cannot be read as {kind} ({printable(error)[:300]}); move it away to start afresh"
+        ) from None
 
 
 def _rows_in(content: Any) -> list[dict[str, Any]]:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 
-from bench.errors import StorageError, failure, printable
+from bench.errors import STATUSES, StorageError, failure, printable
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint
 from bench.experiment.study import Study, study_of
 from bench.measure import noise
-from bench.model import Backend, guard
+from bench.model import Backend, CallableScene, Plugin, guard
+from bench.model.isolation import State, reduced_precision
 from bench.run.plan import versions
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
@@ -47,9 +49,18 @@ class Task:
 class TaskHandler:
     """Handles the tasks of one experiment, in a worker or in this process."""
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: Experiment, single_thread: bool = False) -> None:
+        self._experiment = experiment
         self._session = Session(experiment)
         self._study = study_of(experiment)
+        self._state = State(double_precision=True, single_thread=single_thread)
+        self._ran_foreign_code = False
+        self.is_tainted = False
+        """Whether a plugin has changed the process, so that later items need a new one."""
+
+    def close(self) -> None:
+        """Stop following the state of the process."""
+        self._state.close()
 
     def prepare(self, item: Task) -> None:
         """Compile the program, so that the backend imports its libraries."""
@@ -62,7 +73,29 @@ class TaskHandler:
                 return
 
     def __call__(self, item: Task) -> dict[str, Any]:
-        """Return the results of the cell, or the status and reason of its failure."""
+        """Return the results of the cell, or the status and reason of its failure.
+
+        A change of the process that would change other cells' numbers is undone and added to the reason.
+        """
+        result = self._handle(item)
+        self._ran_foreign_code |= _is_foreign(item.cell)
+        changes = self._state.changes(functions=self._ran_foreign_code)
+        if not changes:
+            return result
+        if (
+            result.get("dtype", item.cell.backend.dtype) == "float64"
+            and reduced_precision()
+            and _uses_jax(item.backend)
+        ):
+            result["dtype"] = "float32"
+        self._state.restore()
+        self._state.adopt()
+        self._session = Session(self._experiment)
+        self.is_tainted = True
+        remark = f"a plugin of this cell changed {printable('; '.join(changes))}, which was undone before the next cell"
+        return result | {"reason": "; ".join(part for part in (result.get("reason", ""), remark) if part)}
+
+    def _handle(self, item: Task) -> dict[str, Any]:
         with guard.protect_process():
             if not item.reference:
                 return measure_cell(item.cell, self._session, self._study)
@@ -75,12 +108,27 @@ class TaskHandler:
             return {"status": "ok"}
 
 
+def _is_foreign(cell: Cell) -> bool:
+    """Return whether a cell runs code from outside this package."""
+    parts: list[Plugin | None] = [*cell.parts.values(), cell.study]
+    return any(
+        part is not None and (not type(part).__module__.startswith("bench.") or isinstance(part, CallableScene))
+        for part in parts
+    )
+
+
+def _uses_jax(backend: Backend) -> bool:
+    return any(requirement.partition("=")[0] == "jax" for requirement in backend.requires)
+
+
 def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
     """Return the results of a cell, or the status and reason of its failure; never raises for a plugin's error."""
     try:
         result = study.measure(cell, session)
         if not isinstance(result, dict) or not isinstance(result.get("status"), str):
             raise TypeError(f"measure() of study {study.name} must return a dictionary with a status")
+        if fault := _fault_of(result, study):
+            raise TypeError(f"measure() of study {study.name} returned {fault}")
     except (StorageError, KeyboardInterrupt):
         raise
     except BaseException as error:  # a plugin that exits must not end a run in this process
@@ -107,6 +155,24 @@ def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict
         return {"solver_residual": residual}
     remark = f"the constraint solver has not converged (relative residual {residual:.1e}): more iterations give another gradient"
     return {"solver_residual": residual, "reason": "; ".join(filter(None, (result.get("reason", ""), remark)))}
+
+
+def _fault_of(result: dict[str, Any], study: Study) -> str:
+    """Return the first value of a result that its column cannot hold, in words; empty if there is none."""
+    if result["status"] not in STATUSES:
+        return f"the status {printable(result['status'])[:100]!r}, which is not one of {', '.join(STATUSES)}"
+    types = {"number": (int, float, type(None)), "text": (str,), "list": (list, tuple)}
+    for name, value in result.items():
+        column = study.columns.by_name.get(name)
+        if column is None:
+            return f"{name!r}, which is not one of its columns"
+        if not isinstance(value, types[column.kind]):
+            return f"{name}={printable(repr(value))[:100]}, and that column holds a {column.kind}"
+    try:
+        json.dumps(result)
+    except (TypeError, ValueError) as error:
+        return f"values that cannot be stored: {printable(error)}"
+    return ""
 
 
 def group_by_program(tasks: list[Task]) -> list[list[Task]]:

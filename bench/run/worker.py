@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bench.errors import StorageError, failure
-from bench.model import guard, registry
+from bench.model import guard, isolation, registry
 
 LENGTH = struct.Struct(">Q")
 """The length of a message in bytes, which precedes the message."""
@@ -28,6 +28,10 @@ MAX_MESSAGE = 1 << 30
 """Bytes of the longest valid message."""
 PROGRAM = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.worker import main; main()"
 """The program of a worker. It has the import path of its run, and does not import the run's main script."""
+ENCODER = json.JSONEncoder()
+"""The encoder of messages, created before a plugin can replace it."""
+END_OF_OUTPUT = b"\x1ebench-end-of-output\x1e\n"
+"""What a worker prints after each item, so that its output is not taken for the next item's."""
 DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of prctl(2)."""
 
@@ -120,7 +124,10 @@ class Handler(Protocol):
         """Import the libraries that the item needs; this time does not count as the item's."""
 
     def __call__(self, item: Any) -> dict[str, Any]:
-        """Return the item's result, to be sent as JSON."""
+        """Return the item's result, to be sent as JSON.
+
+        If the attribute ``is_tainted`` is true afterwards, later items are handled in a new worker.
+        """
 
 
 def command(descriptor: int) -> list[str]:
@@ -160,7 +167,10 @@ def _serve(channel: Channel) -> None:
     folders, make, argument = pickle.loads(messages.pop(0))
     for folder in folders:
         registry.add_folder(folder)
-    pid, handle = os.getpid(), make(pickle.loads(argument))
+    pid = os.getpid()
+    with isolation.undo_changes("a plugin, while it was imported,"):
+        content = pickle.loads(argument)
+    handle = make(content)
     channel.send(_encode("ready"))
     while True:
         messages = messages or channel.receive()
@@ -169,12 +179,16 @@ def _serve(channel: Channel) -> None:
         guard.kill_children()
         with suppress(Exception):
             sys.stdout.flush()
+        with suppress(OSError):  # a plugin may have closed it
+            os.write(1, END_OF_OUTPUT)
         channel.send(answer)
+        if getattr(handle, "is_tainted", False):
+            return  # the run continues in a new worker
 
 
 def _encode(event: str, **content: Any) -> bytes:
     """Return a message to the run as JSON; its event is ``ready``, ``started``, ``answer`` or ``storage``."""
-    return json.dumps({"event": event, **content}).encode()
+    return ENCODER.encode({"event": event, **content}).encode()
 
 
 def _answer(channel: Channel, handle: Handler, message: bytes) -> bytes:
@@ -186,7 +200,9 @@ def _answer(channel: Channel, handle: Handler, message: bytes) -> bytes:
         # the imports are done, and the item's own time begins
         channel.send(_encode("started"))
         started = time.perf_counter()
-        return _encode("answer", result=handle(item), seconds=time.perf_counter() - started)
+        result = handle(item)
+        seconds, is_last = time.perf_counter() - started, bool(getattr(handle, "is_tainted", False))
+        return _encode("answer", result=result, seconds=seconds, is_last=is_last)
     except ConnectionLost:
         raise
     except StorageError as error:

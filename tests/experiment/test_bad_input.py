@@ -65,8 +65,106 @@ def test_compare_of_files_with_missing_columns_is_one_line(tmp_path, capsys, mon
         (tmp_path / side / "x").mkdir(parents=True)
         pd.DataFrame([dict.fromkeys(columns, "bias_variance")]).to_parquet(tmp_path / side / "x" / "rows.parquet")
     assert main(["compare", "a", "b"]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert all(line.startswith("bench: ") for line in said)
+    assert len(said) == 1 + ("rows are left out" in said[0])
+
+
+FILES = {
+    b"scenes: [heaviside\nbackends: [numpy]\n": "line 3: expected ',' or ']'",
+    b"scenes: [heaviside]\n\tbackends: [numpy]\n": "line 3: found character '\\t' that cannot start any token: indent with spaces",
+    b"samples: 4\nsamples: 5\n": "line 3: found duplicate key samples: give each setting once",
+    b"samples: !!python/object/apply:os.system ['true']\n": "line 2: could not determine a constructor",
+    b"samples: 4\nquestion: \xff\xfe\n": "line 3: not UTF-8",
+    b"- a\n- b\n": "must be a table of settings",
+    b"sweep: [1, 2]\n": "line 2: sweep must be a table, and is [1, 2]: write sweep: {name: value}",
+    b"samples: 4\x00\n": "special characters are not allowed",
+    b"samples: *b\n": "line 2: found undefined alias 'b'",
+    b"samples: 4\n---\nsamples: 5\n": "line 3: but found another document: remove the line ---",
+    b"1: 4\n": "line 2: 1 is not a setting",
+    b"~: 4\n": "Incompatible key type",
+    b"scenes: !!set {heaviside}\n": "not a supported primitive type",
+    b"sweep: " + b"[" * 5000 + b"\n": "is nested too deeply",
+    b"smaples: 4\n": "did you mean 'samples'?",
+    b"samples: ${seed}\n": "must be a whole number",
+}
+
+
+@pytest.mark.parametrize("text", FILES, ids=lambda text: text[:20].decode(errors="replace").strip())
+def test_an_experiment_file_that_cannot_be_read_is_named_with_its_line(tmp_path, monkeypatch, capsys, text):
+    (tmp_path / "experiment").mkdir()
+    path = tmp_path / "experiment" / "mine.yaml"
+    path.write_bytes(b"# @package _global_\n" + text)
+    assert main(["plan", "+experiment=mine", "--config-dir", str(tmp_path)]) == 2
     said = capsys.readouterr().err.strip()
     assert len(said.splitlines()) == 1
+    assert FILES[text] in said
+    if "did you mean" not in said and "whole number" not in said:
+        assert said.startswith(f"bench: '{path}'")
+
+
+def test_an_experiment_file_without_its_first_line_says_so(tmp_path, capsys):
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "mine.yaml").write_text("samples: 4\n")
+    assert main(["plan", "+experiment=mine", "--config-dir", str(tmp_path)]) == 2
+    assert "must start with the line # @package _global_" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("word", ["sweep={sigma:[%]}", "sweep={a:*b}", "sweep=[1,2]", "sweep={%:[1]}", "sweep.seed=range(1,2,0)", "sweep.seed=range(0.5,2)", "sweep.seed=range(0,99999999)"])  # fmt: skip
+def test_an_odd_sweep_is_refused_in_one_line_with_its_cause(capsys, word):
+    assert main(["plan", "+experiment=quick", word]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert said[-1].startswith("bench: ")
+    assert len(said) <= 2
+    assert "sweep" in said[-1] or "sigma" in said[-1]
+
+
+def test_of_a_setting_given_twice_it_is_said_which_counts(capsys):
+    assert main(["plan", *BASE, "samples=5"]) == 0
+    assert "samples is given twice: samples=5 counts, samples=4 does not" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("scene.pushing.mass=5", "has no effect: pushing is not among the scenes"),
+        ("sweep.stiffness=[1,2]", "has no effect: no scene of the sweep uses a plugin with that parameter"),
+        ("optimizers=[nosuch]", "has no effect: study bias_variance has no optimizer"),
+        ("optimizer.adam.rate=-5", "has no effect: study bias_variance has no optimizer"),
+        ("marks={nosuch:{a:1}}", "has no effect: nosuch is not swept"),
+        ("scene.heaviside.sigma=0.3", ""), ("sweep.sigma=[0.1]", ""), ("sweep.heaviside.sigma=[0.1]", ""),
+    ],
+)  # fmt: skip
+def test_a_setting_without_effect_is_named(capsys, word, said):
+    assert main(["plan", *BASE, word]) == 0
+    assert capsys.readouterr().err == (f"bench: {word} {said}\n" if said else "")
+
+
+def test_a_folder_with_an_accent_needs_no_quotes():
+    assert load(["results_dir=résultats/é"]).results_dir.name == "é"
+    assert load(["results_dir='résultats/é'"]).results_dir.name == "é"
+
+
+@pytest.mark.parametrize(
+    ("word", "values"),
+    [
+        ("sweep.seed=range(3,40)", list(range(3, 40))), ("sweep.seed=range(40,3,-2)", list(range(40, 3, -2))),
+        ("sweep.seed=range(0,2)", [0, 1]), (f"sweep.seed=[{','.join(map(str, range(50)))}]", list(range(50))),
+        ("sweep={seed:range(0,3)}", [0, 1, 2]), ("sweep.seed=[" + "1e2, " * 20 + "-3.5]", [100.0] * 20 + [-3.5]),
+    ],
+)  # fmt: skip
+def test_ranges_and_long_lists_have_the_values_that_short_lists_have(word, values):
+    read = load([word]).sweep["seed"]
+    assert read == values
+    assert [type(value) for value in read] == [type(value) for value in values]
+
+
+def test_a_list_of_twenty_thousand_values_is_read_in_a_second():
+    words = [f"sweep.seed=[{','.join(map(str, range(20_000)))}]", *BASE[:-1]]
+    load(BASE[:-1])
+    started = time.process_time()
+    assert len(load(words).sweep["seed"]) == 20_000
+    assert time.process_time() - started < 1.5
 
 
 # -------------------------------------------------------------------------------------------------------------- rows
@@ -85,10 +183,11 @@ def test_a_reason_is_one_line_of_a_length_that_can_be_read():
     assert row["reason"].endswith("characters)")
 
 
-@pytest.mark.parametrize("start", "=+-@")
+@pytest.mark.parametrize("start", ["=", "+", "-", "@", "\t=", " \r="])
 def test_a_table_holds_no_formulas(start):
     made, cell = one()
-    rows = made.columns.typed(pd.DataFrame([tasks.row_of(made, cell, {"status": "error", "reason": f"{start}1+1"})]))
+    rows = made.columns.typed(pd.DataFrame([tasks.row_of(made, cell, {"status": "error"})]))
+    rows = rows.assign(reason=f"{start}1+1")
     assert table(made, rows)["reason"].iloc[0] == f"'{start}1+1"
 
 

@@ -1,6 +1,7 @@
 """The same tasks, the same rows: on this machine, on a Ray cluster that loses a node, and as jobs of Slurm."""
 
 import ast
+import importlib
 import importlib.util
 import os
 import subprocess
@@ -16,7 +17,7 @@ from bench.errors import UserError
 from bench.experiment import config
 from bench.run import record
 from bench.run.execute import execute, store_of
-from bench.run.launchers import jobs
+from bench.run.launchers import jobs, waiting
 from bench.run.tasks import Task
 
 WORDS = ["scenes=[heaviside]", "backends=[numpy]", "samples=16", "repeats=4", "workers=1", "--quiet"]
@@ -87,6 +88,50 @@ def test_settings_of_launchers_are_checked(capsys, word, said):
     words = [] if launcher == "launcher" else [f"launcher={launcher}"]
     assert main(["plan", *WORDS, "estimators=[fobg]", *words, word]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_wait_says_what_for_and_ends(capsys, monkeypatch):
+    monkeypatch.setattr(waiting, "SILENT_S", 0.0)
+    patience = waiting.Patience(0.05, "ray.wait")
+    patience.wait("nothing moves", "push")
+    time.sleep(0.06)
+    with pytest.raises(UserError, match=r"nothing moves; gave up after 0.05 s \(ray.wait\); push"):
+        patience.wait("nothing moves", "push")
+    assert capsys.readouterr().err == "bench: nothing moves: waiting, for at most 0.05 s (ray.wait)\n"
+
+
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("127.0.0.1:1", r"no Ray cluster answers at 127.0.0.1:1 \(Connection refused\); gave up after 0.1 s"),
+        ("no.such.host.invalid:6379", "no host has that name"), ("somewhere", "must be HOST:PORT"),
+        ("127.0.0.1:70000", "must be HOST:PORT"),
+    ],
+)  # fmt: skip
+def test_a_cluster_that_does_not_answer_is_not_waited_for_long(monkeypatch, address, said):
+    monkeypatch.setattr(waiting, "PAUSE_S", 0.05)
+    with pytest.raises(UserError, match=said):
+        waiting.reach(address, waiting.Patience(0.1, "ray.wait"))
+
+
+def test_more_cores_than_a_cluster_has_are_not_waited_for_long(monkeypatch):
+    ray_launcher = importlib.import_module("bench.run.launchers.ray")
+
+    class Cluster:
+        def nodes(self):
+            return [{"Alive": True, "Resources": {"CPU": 2.0}}, {"Alive": False, "Resources": {"CPU": 64.0}}]
+
+    launcher = ray_launcher.RayLauncher.__new__(ray_launcher.RayLauncher)
+    launcher._ray, launcher._settings = Cluster(), {"cpus": 4.0, "wait": 0.1}
+    monkeypatch.setattr(ray_launcher, "PAUSE_S", 0.02)
+    with pytest.raises(UserError, match=r"ray.cpus=4 cores, and the largest node of the cluster has 2; gave up"):
+        launcher._wait_for_cores()
+
+
+def test_more_cores_than_this_machine_has_are_refused_when_planned(capsys, monkeypatch):
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    assert main(["plan", *WORDS, "estimators=[fobg]", "launcher=ray", "ray.cpus=4096"]) == 2
+    assert "ray.cpus=4096 is more than the" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("launcher", ["ray", "slurm"])

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
 
 import pandas as pd
 import psutil
@@ -16,9 +17,9 @@ from bench.cli import main
 from bench.errors import StorageError, UserError
 from bench.run import files
 from bench.run.files import TEMPORARY, remove_stale, temporary
-from bench.run.pool import Pool, ResourceLimits
+from bench.run.pool import Pool, ResourceLimits, _Worker
 from bench.run.store import Store
-from bench.run.worker import Channel, ConnectionLost, MalformedMessage
+from bench.run.worker import LENGTH, Channel, ConnectionLost, MalformedMessage
 from bench.studies.bias_variance.columns import COLUMNS
 
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "samples=8", "repeats=4", "timing=false", "workers=0", "--quiet"]
@@ -188,6 +189,12 @@ MALFORMED = {
     "json": framed(b"{"),
     "event": framed(b'{"event": "of no kind"}'),
     "result": framed(b'{"event": "answer", "result": 7, "seconds": "x"}'),
+    "seconds": framed(b'{"event": "answer", "result": {"status": "ok"}}'),
+    "time": framed(b'{"event": "answer", "result": {"status": "ok"}, "seconds": NaN}'),
+    "status": framed(b'{"event": "answer", "result": {}, "seconds": 1.0}'),
+    "state": framed(b'{"event": "answer", "result": {"status": "fine"}, "seconds": 1.0}'),
+    "reason": framed(b'{"event": "answer", "result": {"status": "error", "reason": 7}, "seconds": 1.0}'),
+    "deep": framed(b'{"event": ' + b"[" * 100_000),
 }
 
 
@@ -224,7 +231,11 @@ class Handler:
             os.write(descriptor, MALFORMED[item[1]])
         elif what == "slow":
             time.sleep(0.4)
-        return {"status": "ok"}
+        elif what == "prints":
+            print(item[1], flush=True)
+        elif what == "taints":
+            self.is_tainted = True
+        return {"status": "ok", "pid": os.getpid()}
 
 
 def answers(items, limits=None, **more):
@@ -257,12 +268,35 @@ def test_large_items_behind_a_hanging_one_do_not_hold_up_the_clock():
     assert len(found) == 8
 
 
-@pytest.mark.parametrize("content", ["noise", "length", "json", "event", "result"])
+@pytest.mark.parametrize("content", ["noise", "length"])
 def test_a_malformed_message_counts_as_a_crash_of_its_cell(content):
     results, _ = answers([("sound",), ("malformed", content), ("other",)])
     assert results["malformed"]["status"] == "crashed"
     assert "malformed message, in two workers" in results["malformed"]["reason"]
     assert results["sound"]["status"] == results["other"]["status"] == "ok"
+
+
+@pytest.mark.parametrize("content", sorted(MALFORMED.keys() - {"noise", "length"}))
+def test_a_message_that_is_no_answer_is_malformed(content):
+    (length,) = LENGTH.unpack_from(MALFORMED[content])
+    worker = _Worker(None, None, -1, None, "", sent=deque(["item"]))
+    with pytest.raises(MalformedMessage):
+        worker._read(MALFORMED[content][LENGTH.size :])
+    assert list(worker.sent) == ["item"]
+    assert length == len(MALFORMED[content]) - LENGTH.size
+
+
+def test_a_worker_that_a_plugin_has_changed_is_replaced_and_nothing_is_blamed():
+    results, found = answers([("sound",), ("taints",), ("other",), ("more",), ("taints", 2), ("last",)])
+    assert len(found) == 6
+    assert {result["status"] for result in results.values()} == {"ok"}
+    places = [answer.result["pid"] for answer in found]
+    assert [places.index(place) for place in places] == [0, 0, 2, 2, 2, 5]
+
+
+def test_output_belongs_to_the_item_that_printed_it():
+    _, found = answers([("prints", f"output {i}") for i in range(40)] + [("sound",)])
+    assert [answer.output for answer in found] == [f"output {i}" for i in range(40)] + [""]
 
 
 def test_messages_before_a_malformed_one_still_count():
@@ -292,7 +326,7 @@ def test_an_open_connection_without_messages_is_not_a_fault():
 
 HELD = """
 import ctypes, os, subprocess, sys
-from bench.run.pool import Pool, ResourceLimits
+from bench.run.pool import _Worker, Pool, ResourceLimits
 
 class Holds:
     def __init__(self, argument):

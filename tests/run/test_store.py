@@ -519,3 +519,28 @@ def test_killed_at_twenty_moments(tmp_path):
     pd.testing.assert_frame_equal(table(tmp_path / "cut"), table(tmp_path / "whole"), check_exact=True)
     names = [tmp_path / run / "sweep" / "bias_variance.csv" for run in ("cut", "whole")]
     assert names[0].read_bytes() == names[1].read_bytes()
+
+
+@pytest.mark.parametrize("change", ["rename", "remove"])
+def test_a_folder_that_goes_during_a_run_costs_no_row(tmp_path, capsys, monkeypatch, change):
+    append, calls = Store.append, []
+
+    def append_and_lose(self, *rows):
+        append(self, *rows)
+        calls.append(len(rows))
+        if len(calls) == 2:
+            self.directory.rename(tmp_path / "elsewhere") if change == "rename" else shutil.rmtree(self.directory)
+
+    monkeypatch.setattr(Store, "append", append_and_lose)
+    monkeypatch.setattr(launcher, "BATCH_S", 0.0)
+    words = [*TINY, "workers=0", "sweep.seed=[0,1,2,3]", f"results_dir={tmp_path}", "--quiet"]
+    assert main(words) == 0
+    assert calls == [1] * 6
+    assert "2 of 4 cells were run and have no row" in capsys.readouterr().err
+    assert len(pd.read_parquet(tmp_path / "custom" / "rows.parquet")) == 4
+
+
+def test_a_run_whose_rows_go_again_and_again_ends_with_their_number(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(Store, "append", lambda *_: None)
+    assert main([*TINY, "workers=0", "sweep.seed=[0,1,2]", f"results_dir={tmp_path}", "--quiet"]) == 1
+    assert "3 cells were run and have no row; 0 of 3 cells are stored" in capsys.readouterr().err

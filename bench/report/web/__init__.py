@@ -5,7 +5,6 @@ The experiment's study returns the content. If it returns None, the page has the
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from bench.report.web import from_views
 from bench.report.web.content import Content
 from bench.report.web.document import assemble
 from bench.run.files import write_whole
+from bench.run.rows import read_record
 
 
 def write(experiment: Experiment, rows: pd.DataFrame, views: Views | None = None) -> Path:
@@ -59,8 +59,4 @@ def _old_content(experiment: Experiment, rows: pd.DataFrame) -> Content:
 
 
 def _record(page: Path) -> dict[str, Any]:
-    try:
-        record: dict[str, Any] = json.loads(page.with_name("run.json").read_text())
-    except (OSError, ValueError):
-        return {}
-    return record
+    return read_record(page.parent)

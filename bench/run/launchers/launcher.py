@@ -49,7 +49,7 @@ class InProcessLauncher:
         return self
 
     def __exit__(self, *_: object) -> None:
-        return
+        self._handle.close()
 
     def run(self, groups: Iterable[Iterable[Task]]) -> Iterator[list[Answer]]:
         """Yield an empty list before each task, and answers after it; the answers of quick tasks are yielded together."""
@@ -80,7 +80,7 @@ def local_launcher(experiment: Experiment, timed: bool = False, n_workers: int |
     workers = rules.workers if n_workers is None else n_workers
     workers = (os.cpu_count() or 1) if workers is None else workers
     if not workers:
-        return InProcessLauncher(TaskHandler(experiment))
+        return InProcessLauncher(TaskHandler(experiment, single_thread=not timed))
     limits = ResourceLimits(rules.timeout, rules.memory)
     return Pool(
         1 if timed else workers, TaskHandler, without_grid(experiment), limits,

@@ -15,6 +15,7 @@ from typing import Any
 from bench.errors import UserError, printable
 from bench.experiment.experiment import Experiment
 from bench.run.launchers.jobs import Job, Losses, import_path, pack, read_message, run_job, split, unavailable
+from bench.run.launchers.waiting import PAUSE_S, Patience, reach
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
 from bench.run.tasks import Task
@@ -58,6 +59,8 @@ class RayLauncher:
     def __enter__(self) -> RayLauncher:
         if not self._ray.is_initialized():
             address = self._settings["address"] or os.environ.get("RAY_ADDRESS")
+            if address and address not in ("auto", "local"):
+                reach(address, self._patience())
             try:
                 self._ray.init(
                     address=address, log_to_driver=False, logging_level=logging.ERROR,
@@ -68,6 +71,11 @@ class RayLauncher:
                     f"no Ray cluster at {address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head"
                 ) from None
             self._has_started_ray = True
+        try:
+            self._wait_for_cores()
+        except BaseException:
+            self.__exit__()
+            raise
         self._packed = self._ray.put(pack(self._experiment))
         return self
 
@@ -79,6 +87,20 @@ class RayLauncher:
         if self._has_started_ray:
             self._ray.shutdown()
 
+    def _patience(self) -> Patience:
+        return Patience(self._settings["wait"], "ray.wait")
+
+    def _wait_for_cores(self) -> None:
+        """Wait until a node has the cores of a job; raises :class:`UserError` after the limit."""
+        patience, cpus = self._patience(), self._settings["cpus"]
+        while (most := self._most_cores()) < cpus:
+            patience.wait(f"a job reserves ray.cpus={cpus:g} cores, and the largest node of the cluster has {most:g}")
+            time.sleep(PAUSE_S)
+
+    def _most_cores(self) -> float:
+        """Return the number of cores of the largest node."""
+        return max((float(node["Resources"].get("CPU", 0)) for node in self._ray.nodes() if node["Alive"]), default=0.0)
+
     @property
     def current(self) -> list[Task]:
         """The first unanswered task of each of the first four jobs."""
@@ -89,6 +111,7 @@ class RayLauncher:
         nodes = self._nodes_of_one_kind() if self._timed else {}
         n_slots = len(nodes) if self._timed else int(self._ray.cluster_resources().get("CPU", 1))
         waiting = deque(split(groups, self._settings["cells"], JOBS_PER_CORE * n_slots))
+        patience: Patience | None = Patience(None)
         while waiting or self._jobs:
             if self._timed:
                 alive = {node["NodeID"] for node in self._ray.nodes() if node["Alive"]}
@@ -104,7 +127,12 @@ class RayLauncher:
                 n_cores = int(self._ray.cluster_resources().get("CPU", 1))
                 while waiting and len(self._jobs) < JOBS_PER_CORE * n_cores:
                     self._send(waiting.popleft(), self._settings["cpus"], "")
-            yield self._collect(waiting)
+            answers = self._collect(waiting)
+            if answers:
+                patience = None
+            elif patience is not None and self._ray.available_resources().get("CPU", 0) < self._settings["cpus"]:
+                patience.wait("all cores of the Ray cluster are in use")
+            yield answers
 
     def _send(self, tasks: list[Task], cores: float, node: str) -> None:
         options: dict[str, Any] = {"num_cpus": cores, "num_returns": "streaming", "max_retries": 0}

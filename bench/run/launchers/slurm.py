@@ -19,12 +19,15 @@ from typing import Any
 from bench.errors import UserError, printable
 from bench.experiment.experiment import Experiment
 from bench.run.launchers.jobs import Job, Losses, import_path, pack, read_message, run_job, split, unavailable
+from bench.run.launchers.waiting import Patience
 from bench.run.pool import Answer
 from bench.run.store import Store
 from bench.run.tasks import Task
 
 TICK = 1.0
 """Seconds between checks of the jobs."""
+PENDING = ("PENDING", "CONFIGURING", "UNKNOWN", "REQUEUED")
+"""States of jobs that have not started."""
 MAX_LOSSES = 2
 """Number of losses of a job after which its first unanswered task counts as crashed."""
 
@@ -81,9 +84,13 @@ class SlurmLauncher:
         """Yield answers when a job has ended, one per task, and empty lists while the caller has to wait."""
         n_jobs = 1 if self._timed else self._settings["parallel"]
         waiting = deque(split(groups, self._settings["cells"], n_jobs))
+        patience = Patience(None)
         while waiting or self._jobs:
             self._submit([waiting.popleft() for _ in range(min(len(waiting), n_jobs - len(self._jobs)))])
-            yield [answer for job, tasks in list(self._jobs) for answer in self._collect(job, tasks, waiting)]
+            answers = [answer for job, tasks in list(self._jobs) for answer in self._collect(job, tasks, waiting)]
+            if not answers and self._jobs and all(job.state in PENDING for job, _ in self._jobs):
+                patience.wait(f"none of {len(self._jobs)} jobs has started (job {self._jobs[0][0].job_id} is pending)")
+            yield answers
 
     def _submit(self, chunks: list[list[Task]]) -> None:
         if not chunks:

@@ -1,0 +1,142 @@
+"""Prepares command-line words for Hydra, and checks experiment files; errors name the word, or the file and its line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.errors import UserError, printable
+from bench.experiment.grid import MAX_CELLS
+
+GLOBAL = "# @package _global_"
+"""The first line of an experiment file, so that Hydra does not nest its settings."""
+NUMBER = r"[+-]?(?:0|[1-9]\d*)(?:\.\d+)?(?:[eE][+-]?\d+)?"
+LONG_LIST = re.compile(rf"\[\s*{NUMBER}(?:\s*,\s*{NUMBER}){{15,}}\s*\]")
+"""A list of at least 16 numbers, which Hydra's parser would read slowly."""
+RANGE = re.compile(r"range\(([^()]*)\)")
+PLACEHOLDER = "bench_values_"
+TABLES = ("sweep", "marks", "reference", "table", "ray", "slurm")
+"""Settings that are tables; the parameters of plugins are too."""
+LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
+
+
+def repeated(overrides: Sequence[str]) -> list[str]:
+    """Return a sentence for each setting that is given more than once, since only its last value counts."""
+    given: dict[str, str] = {}
+    sentences = []
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+")
+        if key in given:
+            sentences.append(f"{key} is given twice: {override[:200]} counts, {given[key][:200]} does not")
+        given[key] = override
+    return sentences
+
+
+def quoted(value: str) -> str:
+    """Return a value in quotes if it has characters that Hydra reads in quotes only, such as é; else unchanged.
+
+    >>> quoted("results"), quoted("résultats"), quoted("'résultats'"), quoted("[é]")
+    ('results', "'résultats'", "'résultats'", '[é]')
+    """
+    if value.isascii() or not value.isprintable() or any(character in value for character in "'\"[]{}"):
+        return value
+    return "'" + value + ("\\" if value.endswith("\\") else "") + "'"
+
+
+class Values:
+    """Long lists and ranges of a sweep, which pass Hydra as placeholders."""
+
+    def __init__(self) -> None:
+        self._lists: dict[str, list[Any]] = {}
+
+    def replace_in(self, key: str, value: str) -> str:
+        """Return the value of a setting with long lists of numbers and ranges replaced by placeholders."""
+        if key.partition(".")[0] not in ("sweep", "theta0") or "'" in value or '"' in value:
+            return value
+        value = RANGE.sub(lambda match: self._placeholder(_range(key, match)), value)
+        return LONG_LIST.sub(lambda match: self._placeholder(_numbers(match[0])), value)
+
+    def restore(self, value: Any) -> Any:
+        """Return a configuration with the lists in place of their placeholders."""
+        if isinstance(value, Mapping):
+            return {name: self.restore(item) for name, item in value.items()}
+        if isinstance(value, list):
+            if len(value) == 1 and isinstance(value[0], str) and value[0] in self._lists:
+                return list(self._lists[value[0]])
+            return [self.restore(item) for item in value]
+        return value
+
+    def _placeholder(self, items: list[Any]) -> str:
+        name = f"{PLACEHOLDER}{len(self._lists)}"
+        self._lists[name] = items
+        return f"[{name}]"
+
+
+def _range(key: str, match: re.Match[str]) -> list[Any]:
+    try:
+        numbers = range(*(int(part) for part in match[1].split(",")))
+    except (ValueError, TypeError):
+        raise UserError(
+            f"{key}={match[0]} is not a range: write range(start,stop) or range(start,stop,step) with whole numbers; "
+            "stop itself is left out"
+        ) from None
+    if len(numbers) > MAX_CELLS:
+        raise UserError(f"{key}={match[0]} has {len(numbers)} values, and more than {MAX_CELLS} are not allowed")
+    return list(numbers)
+
+
+def _numbers(text: str) -> list[Any]:
+    return [float(part) if set(part) & set(".eE") else int(part) for part in text[1:-1].split(",")]
+
+
+def check_file(path: Path) -> None:
+    """Raise :class:`UserError` with file, line and the nearest fix if an experiment file cannot be read."""
+    import yaml
+    from omegaconf import OmegaConf
+
+    try:
+        text = path.read_bytes().decode()
+        content = OmegaConf.to_container(OmegaConf.load(path), resolve=False) if text.strip() else {}
+    except OSError as error:
+        raise UserError(f"'{path}' cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        line = path.read_bytes()[: error.start].count(b"\n") + 1
+        raise UserError(f"'{path}', line {line}: not UTF-8; save the file as UTF-8") from None
+    except yaml.YAMLError as error:
+        raise UserError(f"'{path}'{_explained(error)}") from None
+    except RecursionError:
+        raise UserError(f"'{path}' is nested too deeply") from None
+    except Exception as error:  # OmegaConf's own errors, such as a key that is a list
+        raise UserError(f"'{path}': {printable(error).split('.')[0][:300]}") from None
+    _check_content(path, text, content)
+
+
+def _check_content(path: Path, text: str, content: Any) -> None:
+    if not isinstance(content, dict):
+        raise UserError(f"'{path}' must be a table of settings, key: value, and is {type(content).__name__}")
+    first = next((line for line in text.lstrip("\ufeff").splitlines() if line.strip()), "")
+    if first.split() != GLOBAL.split():
+        raise UserError(f"'{path}' must start with the line {GLOBAL}")
+    for key, value in content.items():
+        line = next((n for n, row in enumerate(text.splitlines(), 1) if row.startswith(f"{key}:")), 0)
+        where = f"'{path}'" + (f", line {line}" if line else "")
+        if not isinstance(key, str):
+            raise UserError(f"{where}: {key!r} is not a setting: settings are names")
+        if key in TABLES and value is not None and not isinstance(value, dict):
+            raise UserError(f"{where}: {key} must be a table, and is {repr(value)[:100]}: write {key}: {{name: value}}")
+
+
+def _explained(error: Any) -> str:
+    """Return line, problem and fix of a YAML error."""
+    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+    problem = printable(getattr(error, "problem", None) or getattr(error, "reason", None) or error)
+    fixes = {
+        "\\t": "indent with spaces", "constructor for the tag": "tags are not supported, write the value itself",
+        "duplicate key": "give each setting once", 
+        "undefined alias": "put strings that begin with * in quotes", "cannot start any token": "put the string in quotes",
+        "expected ',' or": "close the bracket", "another document": "remove the line ---", "mapping values": "put strings with a colon in quotes",
+    }  # fmt: skip
+    fix = next((f": {fix}" for part, fix in fixes.items() if part in problem), "")
+    return f"{f', line {mark.line + 1}' if mark else ''}: {problem}{fix}"

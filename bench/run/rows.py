@@ -1,0 +1,301 @@
+"""Reads stored rows, and leaves out rows that no run has written: stored files may be damaged or foreign.
+
+A file that is not a table, or claims more rows than a sweep can have, is an error that names the file. Of other files,
+rows with values of a wrong type or out of range are left out, and one line on stderr names the file, the first such row
+and the number of rows left out.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from bench.errors import STATUSES, UserError, printable
+from bench.experiment.columns import Columns
+from bench.experiment.grid import expand, refuse_too_many
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pandas as pd
+
+MAX_ROWS = 5_000_000
+"""Largest number of rows of a file: five times the largest sweep."""
+MAX_BYTES = 1 << 33
+"""Largest size of a table in memory, as its file states it."""
+MAX_TEXT = 1_000_000
+"""Length of the longest string, in characters."""
+COUNTS = {"samples": 1, "repeats": 1, "seed": 0, "horizon": 0}
+"""Columns of whole numbers, each with its smallest value."""
+NOT_NEGATIVE = (
+    "variance",
+    "rmse",
+    "grad_norm",
+    "reference_norm",
+    "reference_se",
+    "bias",
+    "wall_s",
+    "time_s",
+    "compile_s",
+)
+"""Columns whose numbers are at least 0."""
+LARGEST = 2.0**53
+"""Larger counts are not exact as float64, so no run has written them."""
+
+_reported: set[str] = set()
+"""Sentences that were printed, since a command reads its files more than once."""
+
+
+def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFrame:
+    """Return the table in a Parquet file, or some of its columns; raises ValueError if it claims more rows or bytes than a run writes."""
+    import pandas as pd
+    import pyarrow.parquet
+
+    # read once: pandas opens a path twice, and the file may be replaced in between
+    content = io.BytesIO(path.read_bytes())
+    metadata = pyarrow.parquet.ParquetFile(content).metadata
+    size = sum(metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups))
+    if metadata.num_rows > MAX_ROWS or size > MAX_BYTES:
+        raise ValueError(f"{metadata.num_rows} rows and {size} bytes are more than a run writes")
+    content.seek(0)
+    return pd.read_parquet(content, columns=columns and list(columns))
+
+
+def valid_rows(table: pd.DataFrame, columns: Columns, path: Path) -> pd.DataFrame:
+    """Return the rows whose values are of the right types and in range, and print how many others are left out."""
+    import numpy as np
+
+    reasons: dict[int, str] = {}
+    for name, check in _checks(columns, table).items():
+        for place in np.flatnonzero(~check(table[name])):
+            value = printable(repr(table[name].iloc[place]))[:60]
+            reasons.setdefault(int(place), f"{name}={value} {_rule(name, columns)}")
+    if "parameters" in table:
+        for name in ("samples", "repeats", "seed"):
+            if name in table and table[name].dtype.kind == "f":
+                missing = table[name].isna() & table["parameters"].map(lambda text: text not in ("", "{}", None))
+                for place in np.flatnonzero(missing):
+                    reasons.setdefault(int(place), f"{name} is missing")
+    if not reasons:
+        return table
+    _report(path, reasons, len(table))
+    keep = np.ones(len(table), dtype=bool)
+    keep[list(reasons)] = False
+    return table[keep]
+
+
+def valid_small_rows(rows: list[dict[str, Any]], columns: Columns, path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a small file whose values are right, and print how many others are left out."""
+    reasons = {place: reason for place, row in enumerate(rows) if (reason := _fault(row, columns))}
+    if reasons:
+        _report(path, reasons, len(rows))
+    return [row for place, row in enumerate(rows) if place not in reasons]
+
+
+def _report(path: Path, reasons: Mapping[int, str], n_rows: int) -> None:
+    first = min(reasons)
+    rest = f"{len(reasons)} of {n_rows} rows are left out"
+    sentence = printable(f"bench: '{path}', row {first + 1}: {reasons[first]}; {rest}")
+    if sentence not in _reported:
+        _reported.add(sentence)
+        print(sentence, file=sys.stderr)
+
+
+def _fault(row: dict[str, Any], columns: Columns) -> str:
+    """Return why a row of a small file is not a row, or an empty string."""
+    for name, value in row.items():
+        column = columns.by_name.get(name)
+        if column is None:
+            fault = "" if _is_scalar(value) or _is_list(value) else "is neither a number nor a string nor a list"
+        elif column.kind == "number":
+            fault = (
+                "is not a number" if not _is_missing(value) and not _is_number(value) else _fault_of_number(name, value)
+            )
+        elif name == "status":
+            fault = "" if value in ("", *STATUSES) else _rule(name, columns)
+        else:
+            check = _is_parameters if name == "parameters" else _is_text if column.kind == "text" else _is_list
+            check = _is_vector if name in _vectors(columns) else check
+            fault = "" if check(value) else _rule(name, columns)
+        if fault:
+            return f"{printable(name)[:60]}={printable(repr(value))[:60]} {fault}"
+    return ""
+
+
+def _fault_of_number(name: str, value: float | None) -> str:
+    if value is None or value != value:
+        return ""
+    if name in COUNTS and not (COUNTS[name] <= value <= LARGEST and value % 1 == 0):
+        return f"is not a whole number of at least {COUNTS[name]}"
+    return "is negative" if name in NOT_NEGATIVE and value < 0 else ""
+
+
+def _checks(columns: Columns, table: pd.DataFrame) -> dict[str, Callable[[pd.Series], np.ndarray]]:
+    """Return a check of each column of the table, which returns whether each of its values is right."""
+    checks: dict[str, Callable[[pd.Series], np.ndarray]] = {}
+    vectors = _vectors(columns)
+    for column in columns.all:
+        if column.name not in table:
+            continue
+        values = table[column.name]
+        if column.name == "status":
+            checks["status"] = lambda values: _each(values, lambda value: value in ("", *STATUSES))
+        elif column.name == "parameters":
+            checks["parameters"] = lambda values: _each(values, _is_parameters)
+        elif column.kind == "text" and str(values.dtype) == "str":
+            checks[column.name] = lambda values: ~(values.str.len() > MAX_TEXT).to_numpy(dtype=bool, na_value=False)
+        elif column.kind == "text":
+            checks[column.name] = lambda values: _each(values, _is_text)
+        elif column.kind == "list":
+            is_list = _is_vector if column.name in vectors else _is_list
+            checks[column.name] = lambda values, is_list=is_list: _each(values, is_list)  # type: ignore[misc]
+        elif column.kind == "number" and values.dtype.kind in "fiu":
+            if column.name in COUNTS:
+                checks[column.name] = lambda values, low=COUNTS[column.name]: _is_count(values, low)  # type: ignore[misc]
+            elif column.name in NOT_NEGATIVE:
+                checks[column.name] = lambda values: ~(values.to_numpy() < 0)
+    return checks
+
+
+def _rule(name: str, columns: Columns) -> str:
+    if name == "status":
+        return f"is not one of {', '.join(STATUSES)}"
+    if name == "parameters":
+        return "is not an object of plugins and their values"
+    if name in COUNTS:
+        return f"is not a whole number of at least {COUNTS[name]}"
+    kind = columns.by_name[name].kind
+    return {"number": "is negative", "text": "is not a string", "list": "is not a list of numbers or strings"}[kind]
+
+
+def _each(values: Iterable[Any], check: Callable[[Any], bool]) -> np.ndarray:
+    import numpy as np
+
+    return np.fromiter((check(value) for value in values), dtype=bool)
+
+
+def _is_count(values: pd.Series, low: int) -> np.ndarray:
+    """Return whether values are whole numbers of at least ``low``; a missing count is valid."""
+    import numpy as np
+
+    numbers = values.to_numpy(dtype=float)
+    with np.errstate(invalid="ignore"):
+        valid: np.ndarray = np.isnan(numbers) | ((numbers >= low) & (numbers <= LARGEST) & (numbers % 1 == 0))
+    return valid
+
+
+def _is_text(value: Any) -> bool:
+    """Return whether a value is a string that can be written, or missing."""
+    if _is_missing(value):
+        return True
+    if not isinstance(value, str) or len(value) > MAX_TEXT:
+        return False
+    try:
+        value.encode()
+    except UnicodeEncodeError:  # a lone surrogate
+        return False
+    return True
+
+
+def _is_list(value: Any) -> bool:
+    """Return whether a value is a flat list of numbers or strings, or missing."""
+    import numpy as np
+
+    if isinstance(value, np.ndarray):
+        return value.ndim == 1 and (value.dtype.kind in "fiub" or all(_is_scalar(item) for item in value))
+    return _is_missing(value) or (isinstance(value, list | tuple) and all(map(_is_scalar, value)))
+
+
+def _is_vector(value: Any) -> bool:
+    """Return whether a value is a list of numbers, or missing."""
+    import numpy as np
+
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
+        return value.ndim == 1
+    items = value if isinstance(value, list | tuple | np.ndarray) else ()
+    return _is_list(value) and not any(isinstance(item, str) for item in items)
+
+
+def _vectors(columns: Columns) -> set[str]:
+    """Return the columns of vectors that ``compare`` computes with."""
+    rules = [column.comparison for column in columns.compared if column.comparison is not None]
+    return {name for rule in rules for name in (rule.mean, rule.reference) if name}
+
+
+def _is_scalar(value: Any) -> bool:
+    return value is None or isinstance(value, int | float) or (isinstance(value, str) and _is_text(value))
+
+
+def _is_parameters(text: Any) -> bool:
+    return isinstance(text, str) and len(text) <= MAX_TEXT and _parses(text)
+
+
+@lru_cache(maxsize=50_000)
+def _parses(text: str) -> bool:
+    """Return whether a string is empty or the parameters of a cell."""
+    if not text:
+        return True
+    try:
+        content = json.loads(text, parse_constant=_refuse)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(content, dict) and all(_is_part(axis, part) for axis, part in content.items())
+
+
+def _is_part(axis: str, part: Any) -> bool:
+    """Return whether an entry of a row's parameters is a plugin with its values, theta, the reference's budget, or null."""
+    if part is None:
+        return True
+    if not isinstance(part, dict) or not all(_is_value(value) for value in part.values()):
+        return False
+    if axis == "theta":
+        at = part.get("at")
+        return isinstance(part.get("names"), list) and (
+            at is None or (isinstance(at, list) and all(map(_is_number, at)))
+        )
+    return axis == "reference" or isinstance(part.get("name"), str)
+
+
+def _is_value(value: Any) -> bool:
+    return _is_scalar(value) or (isinstance(value, list) and all(map(_is_scalar, value)))
+
+
+def _is_number(value: Any) -> bool:
+    """Return whether a value is a number that float64 can hold."""
+    return isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**1024)
+
+
+def _is_missing(value: Any) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))
+
+
+def _refuse(name: str) -> Any:
+    raise ValueError(f"{name} is not JSON")
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Return the content of ``run.json``, or an empty dictionary if it is missing or not the record of a run."""
+    try:
+        record = json.loads((folder / "run.json").read_text())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def recorded_sweep(folder: Path) -> dict[str, Any]:
+    """Return the sweep in ``run.json``, or an empty one if the record is missing or invalid."""
+    config = read_record(folder).get("config")
+    sweep = config.get("sweep") if isinstance(config, dict) else None
+    try:
+        if isinstance(sweep, dict):
+            refuse_too_many(sweep)
+            expand(sweep)
+            return sweep
+    except (UserError, TypeError, AttributeError, RecursionError):
+        pass
+    return {}

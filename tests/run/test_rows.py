@@ -1,0 +1,125 @@
+"""Stored files may be damaged or foreign: rows that no run has written are left out and named, the rest is shown."""
+
+import json
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from helpers import row, table
+
+from bench.cli import main
+from bench.errors import StorageError
+from bench.report import index
+from bench.run import rows
+from bench.run.store import Store
+from bench.studies.bias_variance.columns import COLUMNS
+
+DEEP = 1000
+PARTS = {
+    "not_json": "{nope", "list": "[1,2]", "deep_list": "[" * DEEP + "]" * DEEP,
+    "deep": '{"a":' * DEEP + "1" + "}" * DEEP, "number": "7", "null": "null", "part": '{"scene":[1]}',
+    "no_name": '{"scene":{"sigma":1}}', "odd_name": '{"scene":{"name":[1]}}', "nan": '{"scene":{"name":"a","x":NaN}}',
+    "object": '{"scene":{"name":"a","x":{"b":[1]}}}', "theta": '{"theta":{"names":3,"at":"x"}}',
+}  # fmt: skip
+SPOILT = {
+    **{f"parameters_{name}": ("parameters", text, "is not an object of plugins") for name, text in PARTS.items()},
+    "status": ("status", "fine", "is not one of ok, nonfinite"),
+    "variance": ("variance", -1.0, "is negative"), "rmse": ("rmse", -1.0, "is negative"),
+    "seed_missing": ("seed", math.nan, "seed is missing"), "seed_negative": ("seed", -1.0, "is not a whole number"),
+    "seed_fraction": ("seed", 0.5, "is not a whole number"), "seed_infinite": ("seed", math.inf, "is not a whole number"),
+    "samples": ("samples", 0.0, "is not a whole number of at least 1"),
+    "samples_missing": ("samples", math.nan, "samples is missing"),
+    "bytes": ("scene", b"\xff", "is not a string"), "number": ("scene", 3, "is not a string"),
+    "long": ("reason", "x" * 2_000_000, "is not a string"),
+    "strings": ("mean_estimate", ["a"], "is not a list of numbers"), "nested": ("mean_estimate", [[1.0]], "is not a list"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_a_spoilt_row_is_left_out_and_named(tmp_path, capsys, name):
+    column, value, said = SPOILT[name]
+    good = table([row(seed=i) for i in range(3)])
+    values = good[column].tolist()
+    values[1] = value
+    spoilt = good.assign(**{column: pd.Series(values, dtype=object if not isinstance(value, float) else float)})
+    if name in ("bytes", "number", "strings", "nested"):  # a column of Parquet has one type
+        spoilt = spoilt.assign(**{column: pd.Series([value] * 3, dtype=object)})
+    n_left = 0 if name in ("bytes", "number", "strings", "nested") else 2
+    spoilt.to_parquet(tmp_path / "rows.parquet")
+    assert len(Store(tmp_path, COLUMNS).load()) == n_left
+    line = capsys.readouterr().err
+    assert line.startswith(f"bench: '{tmp_path / 'rows.parquet'}', row {1 if n_left == 0 else 2}: ")
+    assert said in line
+    assert f"{3 - n_left} of 3 rows are left out" in line
+
+
+SMALL = {
+    "surrogate": {"reason": "\ud800"}, "status": {"status": 5}, "text": {"scene": ["a"]}, "number": {"bias": "abc"},
+    "true": {"seed": True}, "list": {"mean_estimate": "x"}, "nested": {"mean_estimate": [[1]]}, "big": {"bias": 10**400},
+    "extra": {"extra": {"a": [1]}}, "date": {"stored_at": "x"}, "parameters": {"parameters": {"a": 1}},
+    "deep": {"parameters": "[" * DEEP + "]" * DEEP}, "variance": {"variance": -1.0}, "seed": {"seed": 0.5},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_spoilt_small_row_is_left_out_and_its_file_is_kept(tmp_path, capsys, name):
+    (tmp_path / "pending").mkdir()
+    good = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in row(seed=1).items()}
+    text = json.dumps([good, {**good, "key": "other", **SMALL[name]}])
+    (tmp_path / "pending" / "a.json").write_text(text)
+    store = Store(tmp_path, COLUMNS)
+    assert list(store.load()["key"]) == [good["key"]]
+    assert "row 2: " in capsys.readouterr().err
+    store.compact()
+    assert list(pd.read_parquet(tmp_path / "rows.parquet")["key"]) == [good["key"]]
+    (kept,) = tmp_path.glob("left_out-*.json")
+    assert kept.read_text() == text
+
+
+def test_a_table_with_rows_that_are_left_out_is_kept_when_it_is_replaced(tmp_path, capsys):
+    table([row(seed=0), row(seed=1) | {"status": "fine"}]).to_parquet(tmp_path / "rows.parquet")
+    before = (tmp_path / "rows.parquet").read_bytes()
+    store = Store(tmp_path, COLUMNS)
+    store.append(row(seed=2))
+    store.compact()
+    assert sorted(pd.read_parquet(tmp_path / "rows.parquet")["seed"]) == [0, 2]
+    (kept,) = tmp_path.glob("left_out-*.parquet")
+    assert kept.read_bytes() == before
+    assert "is kept as" in capsys.readouterr().err
+
+
+def test_a_table_without_rows_is_empty(tmp_path):
+    table([row()]).iloc[:0].to_parquet(tmp_path / "rows.parquet")
+    assert Store(tmp_path, COLUMNS).load().empty
+
+
+def test_a_file_that_claims_more_rows_than_a_run_writes_is_refused_quickly(tmp_path, monkeypatch):
+    table([row(seed=i) for i in range(20)]).to_parquet(tmp_path / "rows.parquet")
+    monkeypatch.setattr(rows, "MAX_ROWS", 10)
+    with pytest.raises(StorageError, match=r"20 rows and .* bytes are more than a run writes"):
+        Store(tmp_path, COLUMNS).load()
+
+
+RECORDS = {
+    "list": [], "counts": {"counts": "x"}, "counts_list": {"counts": [1]}, "counts_text": {"counts": {"ok": "x"}},
+    "config": {"config": [1]}, "sweep": {"config": {"sweep": [1]}}, "zip": {"config": {"sweep": {"zip": 3}}},
+    "question": {"question": ["a"]}, "finished": {"finished": 5}, "experiment": {"experiment": {"a": 1}},
+    "machine": {"machine": "x"}, "versions": {"versions": 3},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_an_odd_record_of_a_run_hides_no_experiment(tmp_path, name):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "run.json").write_text(json.dumps(RECORDS[name]))
+    assert "1 experiment" in index.write(tmp_path).read_text()
+    assert rows.recorded_sweep(tmp_path / "a") == {}
+
+
+@pytest.mark.parametrize("stored_at", [["yesterday"], [1e308], pd.date_range("2020", periods=1), [None]])
+def test_an_odd_date_of_a_row_does_not_end_the_index(tmp_path, stored_at):
+    (tmp_path / "a").mkdir()
+    table([row()]).assign(stored_at=stored_at).to_parquet(tmp_path / "a" / "rows.parquet")
+    assert main(["index", str(tmp_path)]) == 0
+    assert "<span>1 ok</span>" in (tmp_path / "index.html").read_text()
