@@ -47,7 +47,7 @@ PANELS = 4
 POOLED = ("horizon", "stiffness", "sigma", "smoothing")
 """Columns that change the cost of an estimate: each value has a panel of its own."""
 DISTINCT = 1.2
-"""Median factor between the errors of two estimators from which their lines can be told apart."""
+"""Median factor between the errors of two estimators from which a reader distinguishes their lines."""
 RMSE = Column(
     "rmse_rel", label="relative RMSE of one estimate", low="rmse_low", high="rmse_high", log=True,
     above_one="worse than the zero estimate",
@@ -264,9 +264,9 @@ def _unstable(shown: Arranged, axis: Axis, frame: pd.DataFrame, names: Sequence[
 
 
 def choose_problems(problems: Sequence[ProblemRows], room: int) -> tuple[list[ProblemRows], list[str]]:
-    """Return the problems to print, at most ``room``, and notes on what is left out.
+    """Return the problems to print, at most ``room``, and notes on the problems omitted.
 
-    Problems that differ only in numbers are represented by the first of them; what is left are the first problems.
+    Of problems that differ only in numbers, the first stands for all.
     """
     if len(problems) <= 2:
         return list(problems), []

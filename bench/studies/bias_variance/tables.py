@@ -65,16 +65,16 @@ def tables(
     experiment: Experiment, rows: pd.DataFrame, shown: Arranged, methods: pd.DataFrame, comparisons: pd.DataFrame
 ) -> list[Table]:
     """Return all tables but those of the cost to reach an error."""
-    made = [*pivots(experiment, shown), every_cell(experiment, rows)]
-    made[0] = replace(made[0], data=axes.table(experiment, rows))
+    result = [*pivots(experiment, shown), every_cell(experiment, rows)]
+    result[0] = replace(result[0], data=axes.table(experiment, rows))
     columns = [COLUMNS.by_name[name] for name in ("scene", "contact", "backend", "estimator", "rmse_rel", "time_s")]
-    made.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
+    result.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
     if methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1:
-        made.append(ranking(methods))
-    made.append(recommendations(methods, comparisons[comparisons["basis"] == EQUAL_SAMPLES]))
+        result.append(ranking(methods))
+    result.append(recommendations(methods, comparisons[comparisons["basis"] == EQUAL_SAMPLES]))
     joined = comparisons.assign(tied=[", ".join(names) for names in comparisons["tied"]])
-    made.append(Table("comparisons", joined, COMPARED, "the first and the next at each setting", COMPARISON_NOTES))
-    return made
+    result.append(Table("comparisons", joined, COMPARED, "the first and the next at each setting", COMPARISON_NOTES))
+    return result
 
 
 COMPARISON_NOTES = (
@@ -97,9 +97,9 @@ def pivots(experiment: Experiment, shown: Arranged) -> list[Table]:
         axis = _axis(experiment.table.columns, shown)
         parts = [(axis, problem) for problem in split_by_problem(shown, axis, ("scene", "contact"))]
     apart = "backend" in experiment.table.rows
-    made = [_pivot(axis, problem, apart) for axis, problem in parts]
-    notes = _notes(made)
-    return [replace(table, notes=notes if table is made[-1] else ()) for table in made]
+    result = [_pivot(axis, problem, apart) for axis, problem in parts]
+    notes = _notes(result)
+    return [replace(table, notes=notes if table is result[-1] else ()) for table in result]
 
 
 def _axis(name: str, shown: Arranged) -> Axis:
@@ -148,9 +148,9 @@ def _pivot_cell(row: Mapping[str, Any] | None, others: Sequence[Mapping[str, Any
     return {"": float(row["rmse_rel"]), "_low": low, "_high": high, "_best": best, "_note": mark}
 
 
-def _notes(made: Sequence[Table]) -> list[str]:
+def _notes(result: Sequence[Table]) -> list[str]:
     """Return the notes below the tables: numbers, intervals, bold type and the signs that occur."""
-    seen = {str(v) for table in made for name in table.frame if name.endswith("_note") for v in table.frame[name]}
+    seen = {str(v) for table in result for name in table.frame if name.endswith("_note") for v in table.frame[name]}
     notes = [
         "Relative RMSE of one estimate [95% interval], in units of the reference gradient's norm: above 1 the zero estimate "
         "is better. Bold: below 1, with an interval apart from that of every other estimator."

@@ -34,11 +34,11 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     comparisons = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
     texts = findings(methods, errors, shown.marks(longest) if longest else {})
     texts = texts if best.empty else [time_to_accuracy.finding(best), *texts][:3]
-    made = tables.tables(experiment, rows, shown, methods, comparisons)
-    made += [] if best.empty else [time_to_accuracy.accuracy_table(best)]
+    all_tables = tables.tables(experiment, rows, shown, methods, comparisons)
+    all_tables += [] if best.empty else [time_to_accuracy.accuracy_table(best)]
     return Views(
         texts,
-        made,
+        all_tables,
         charts.charts(shown, methods, errors, best, texts),
         rows=charts.with_plotted_columns(with_gradient_cost(rows)),
         columns=[
