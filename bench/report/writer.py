@@ -99,13 +99,22 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
         if table.terminal:
             right = {column.heading for column in table.columns if column.kind == "number"}
             for place, (heading, part) in enumerate(parts(table)):
-                columns = [column for column in table.columns if column.name not in table.details]
-                texts = readable(replace(table, frame=part, columns=columns))
+                texts = _terminal_text(replace(table, frame=part), console.width)
                 print_table(console, texts, right=right, title=heading or (table.title if place == 0 else ""))
             for note in table.notes:
                 console.print(note)
     for text in (*views.remarks, *views.findings):
         console.print(text)
+
+
+def _terminal_text(table: Table, width: int) -> pd.DataFrame:
+    """Return a table as strings without its details, and without intervals where these make it wider than ``width``."""
+    columns = [column for column in table.columns if column.name not in table.details]
+    texts = readable(replace(table, columns=columns))
+    natural = sum(max([*map(len, texts[name]), *map(len, name.split())], default=0) + 2 for name in texts)
+    if natural - 2 <= width:
+        return texts
+    return readable(replace(table, columns=[replace(column, low="", high="") for column in columns]))
 
 
 def reasons(rows: pd.DataFrame) -> Sequence[str]:
