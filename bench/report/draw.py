@@ -57,9 +57,10 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     titles = [_panel_title(chart, name, 0.9 * width / across) for name, _ in panels]
     title_height = LINE * max(title.count("\n") + 1 for title in titles) if any(titles) else 0.0
     head = _Head(chart, width)
-    legend = [] if chart.labels == "ends" else _legend(chart, styles)
+    legend = [] if chart.labels == "ends" else _legend(chart, styles, width - 0.6)
     columns = _legend_columns([str(handle.get_label()) for handle in legend], width)
-    below = 0.05 + LINE * 1.12 * math.ceil(len(legend) / columns) if legend else 0.0
+    tall = max((str(handle.get_label()).count("\n") + 1 for handle in legend), default=0)
+    below = 0.05 + LINE * 1.12 * tall * math.ceil(len(legend) / columns) if legend else 0.0
     body = sum(max(heights[i * across : (i + 1) * across]) + title_height for i in range(down)) + 0.45
     if chart.kind == "grid":
         names = _categories(chart.x[0], chart.frame)
@@ -184,12 +185,13 @@ def _height(chart: Chart, part: pd.DataFrame) -> float:
     return float(chart.height * part[chart.y[0].name].nunique() + 0.1)
 
 
-def _legend(chart: Chart, styles: dict[str, Style]) -> list[Any]:
+def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
+    labels = {name: plain_lines(_fill(style.meaning or name, width)) for name, style in styles.items()}
     if chart.kind == "grid":
         if not chart.level:
             return []
         return [
-            Patch(facecolor=style.colour, edgecolor="#808080", linewidth=0.4, label=plain(style.meaning or name))
+            Patch(facecolor=style.colour, edgecolor="#808080", linewidth=0.4, label=labels[name])
             for name, style in styles.items()
         ]
     if not chart.series:
@@ -215,7 +217,7 @@ def _shapes(chart: Chart) -> dict[str, str]:
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
-    lengths = np.array([0.5 + width_in_inches(label) for label in labels])
+    lengths = np.array([0.5 + max(map(width_in_inches, label.split("\n"))) for label in labels])
     for count in range(min(len(lengths), 8), 1, -1):
         if sum(part.max() for part in np.array_split(lengths, count)) <= width:
             return count
@@ -304,9 +306,10 @@ def _label_axes(chart: Chart, panel: Axes, first: bool) -> None:
 def _scale(chart: Chart, axes: Sequence[Axes], panels: Sequence[tuple[str, pd.DataFrame]]) -> None:
     """Set the scales of all panels: x per panel, y for all together unless the chart has scales per panel."""
     x, y = chart.x[0], chart.y[0]
+    few = all(part[x.name].nunique() <= 6 for _, part in panels)
     for panel, (_, part) in zip(axes, panels, strict=True):
         rows = part if chart.own_scales else chart.frame
-        _scale_x(panel, x, part[x.name].to_numpy(float))
+        _scale_x(panel, x, part[x.name].to_numpy(float), few)
         if _is_log(y, chart.frame[y.name]):
             low, high = _log_range(y, rows, [mark for mark in chart.marks if mark.axis == "y"])
             log_axis(panel, "y", low, high, text=_values_text(y))
@@ -331,18 +334,19 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -
     return low / margin, high * margin
 
 
-def _scale_x(panel: Axes, column: Column, values: np.ndarray) -> None:
+def _scale_x(panel: Axes, column: Column, values: np.ndarray, few: bool) -> None:
+    """Set the scale of x, with a label at each of the ``values`` if all panels have ``few``."""
     values = np.unique(values[np.isfinite(values)])
     if not values.size:
         return
     text = _values_text(column)
     if _is_log(column, values) and values[0] > 0:
         margin = max((values[-1] / values[0]) ** 0.05, 1.08)
-        log_axis(panel, "x", values[0] / margin, values[-1] * margin, values if len(values) <= 6 else (), text)
+        log_axis(panel, "x", values[0] / margin, values[-1] * margin, values if few else (), text)
         return
     spread = float(np.ptp(values)) or abs(float(values[0])) or 1.0
     panel.set_xlim(values[0] - 0.05 * spread, values[-1] + 0.05 * spread)
-    if len(values) <= 6:
+    if few:
         panel.xaxis.set_major_locator(FixedLocator(list(values)))
     if text:
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))

@@ -27,7 +27,7 @@ from bench.report.web.document import data
 from bench.run.files import make_directory
 from bench.studies.gradient_check import matrix
 from bench.studies.gradient_check import report as gradient_check
-from bench.studies.growth import report as growth
+from bench.studies.growth import views as growth
 from bench.studies.stability import page as stability_page
 from bench.studies.stability import report as stability
 from bench.studies.three_errors import page as three_errors_page
@@ -285,9 +285,11 @@ def test_growth_keeps_noises_apart_and_joins_what_steps_with_the_horizon():
     words = ["study=growth", "scenes=[double_integrator]", "estimators=[fobg]", "sweep.sigma=[0.1,0.2]"]
     given, rows = made(*words, "sweep.zip.horizon=[10,20]", "sweep.zip.dt=[0.1,0.05]")
     rows = rows.assign(gradient_median=1.0, time_horizon=rows["horizon"] * rows["dt"])
-    names = growth.problem_of(arrange(given, rows))
-    assert dict(names.value_counts()) == {"double_integrator, sigma=0.1": 2, "double_integrator, sigma=0.2": 2}
-    assert list(growth.readable(arrange(given, rows))["sigma"]) == ["0.1", "0.1", "0.2", "0.2"]
+    shown = growth.views(given, rows)
+    assert dict(shown.rows["problem"].value_counts()) == {
+        "double_integrator, sigma=0.1": 2, "double_integrator, sigma=0.2": 2
+    }  # fmt: skip
+    assert list(readable(shown.tables[1])["sigma"]) == ["0.1", "0.1", "0.2", "0.2"]
 
 
 def test_twins_of_a_swept_scene_are_panels_of_their_own():
