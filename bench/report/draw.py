@@ -54,13 +54,14 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
         chart.kind, _draw_lines
     )
     heights = [_height(chart, part) for _, part in panels]
-    titles = [_panel_title(chart, name, 0.9 * width / across) for name, _ in panels]
+    room = 0.9 * width / across - _label_width(chart)
+    titles = [_panel_title(chart, name, room) for name, _ in panels]
     title_height = LINE * max(title.count("\n") + 1 for title in titles) if any(titles) else 0.0
     head = _Head(chart, width)
     legend = [] if chart.labels == "ends" else _legend(chart, styles, width - 0.6)
     columns = _legend_columns([str(handle.get_label()) for handle in legend], width)
-    tall = max((str(handle.get_label()).count("\n") + 1 for handle in legend), default=0)
-    below = 0.05 + LINE * 1.12 * tall * math.ceil(len(legend) / columns) if legend else 0.0
+    lines = [str(handle.get_label()).count("\n") + 1 for handle in legend]  # one column if any label is broken
+    below = 0.05 + LINE * 1.12 * (math.ceil(len(legend) / columns) + sum(lines) - len(lines)) if legend else 0.0
     body = sum(max(heights[i * across : (i + 1) * across]) + title_height for i in range(down)) + 0.45
     if chart.kind == "grid":
         names = _categories(chart.x[0], chart.frame)
@@ -97,6 +98,9 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
             _draw_marks(chart, panel, name, part)
             if chart.labels == "ends":
                 _label_ends(chart, panel, part, styles, width / across)
+    if chart.kind == "dots" and shared:
+        for panel in axes[:-across]:
+            panel.set_xlabel("")
     if legend:
         figure.legend(
             handles=legend, loc="lower center", bbox_to_anchor=(0.5, 0), ncols=columns, frameon=False,
@@ -171,6 +175,13 @@ def _panels(chart: Chart) -> list[tuple[str, pd.DataFrame]]:
 def _panel_title(chart: Chart, name: str, width: float) -> str:
     parts = [_fill(_clipped(text, 3 * width), width) for text in (name, chart.panel_notes.get(name, "")) if text]
     return "\n".join(map(plain_lines, parts))
+
+
+def _label_width(chart: Chart) -> float:
+    """Return the width in inches of the labels left of a panel of dots; the titles begin right of them."""
+    if chart.kind != "dots":
+        return 0.0
+    return max(map(width_in_inches, map(plain, map(str, chart.frame[chart.y[0].name].unique()))), default=0.0)
 
 
 def _across(chart: Chart, count: int, width: float) -> int:
@@ -441,7 +452,10 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
             ends = points[x.name].to_numpy(float)
             ends = ends[np.isfinite(ends) & ((ends > 0) | (not log))]
             if len(ends) > 1:
-                panel.hlines(place[str(category)], ends.min(), ends.max(), color="#a0a0a0", linewidth=1.6, zorder=1)
+                shade = styles[str(points[chart.series].iloc[-1])].colour if chart.series else "#000000"
+                panel.hlines(
+                    place[str(category)], ends.min(), ends.max(), color=shade, alpha=0.45, linewidth=1.8, zorder=1
+                )
     for number, (series, style) in enumerate(styles.items()):
         points = part[part[chart.series].astype(str) == series] if chart.series else part
         if points.empty:

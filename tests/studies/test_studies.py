@@ -30,8 +30,7 @@ from bench.studies.gradient_check import report as gradient_check
 from bench.studies.growth import views as growth
 from bench.studies.stability import page as stability_page
 from bench.studies.stability import report as stability
-from bench.studies.three_errors import page as three_errors_page
-from bench.studies.three_errors import report as three_errors
+from bench.studies.three_errors import views as three_errors
 from bench.studies.twins import views as twins
 
 SPRUNG = '''
@@ -164,8 +163,8 @@ def erring(*words):
 
 
 def lines_of(given, rows):
-    shown = arrange(given, rows)
-    return {part.heading: three_errors.readable(shown, part) for part in three_errors.sections(shown)}
+    """The readable parts of the table of three errors, by heading."""
+    return dict(parts(three_errors.views(given, rows).tables[0]))
 
 
 def test_three_errors_of_two_integrators_are_twice_as_many_lines():
@@ -175,20 +174,23 @@ def test_three_errors_of_two_integrators_are_twice_as_many_lines():
     assert heading == "Along dt [s]"
     assert len(found) == 2 * 2 * 3
     assert found.groupby(["contact", "integrator"], sort=False).ngroups == 4
-    shown = arrange(given, rows)
-    assert three_errors.figure(shown).axes[0].get_legend() is None
-    labels = {text.get_text() for text in three_errors.figure(shown).legends[0].get_texts()}
-    assert {"impulse, semi_implicit_euler", "impulse, event_driven", "penalty, event_driven"} <= labels
+    drawn = three_errors.views(given, rows).charts[0].plotted()
+    assert list(dict.fromkeys(drawn["law"])) == [
+        f"{law}, {step}" for law in ("impulse", "penalty") for step in ("semi_implicit_euler", "event_driven")
+    ]
+    assert len(drawn) == 2 * 4, "both errors at the smallest step"
 
 
-def test_three_errors_without_a_swept_axis_have_a_table(tmp_path):
-    given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,penalty]", f"results_dir={tmp_path}")
+def test_three_errors_without_a_swept_axis_have_a_table_and_a_chart(tmp_path):
+    given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,penalty]", f"results_dir={tmp_path}", "formats=[]")
     found = lines_of(given, rows)
     assert list(found) == ["Not along a swept axis"]
     assert list(found["Not along a swept axis"]["contact"]) == ["impulse", "penalty"]
     make_directory(given.directory)
-    study_of(given).write(given, rows)
+    write(given, three_errors.views(given, rows))
     assert "| bounce_once | penalty | 0.50 |" in (given.directory / "three_errors.md").read_text()
+    assert list(pd.read_csv(given.directory / "three_errors.csv")["estimator"]) == ["fobg", "reinforce"] * 2
+    assert list(three_errors.views(given, rows).charts[0].frame["law"]) == ["impulse"] * 2 + ["penalty"] * 2
 
 
 def test_a_law_that_no_axis_moves_is_in_a_table_of_its_own():
@@ -196,6 +198,8 @@ def test_a_law_that_no_axis_moves_is_in_a_table_of_its_own():
     found = lines_of(given, rows)
     assert set(found["Along beta [1/m]"]["contact"]) == {"softplus"}
     assert set(found["Not along a swept axis"]["contact"]) == {"impulse"}
+    drawn = three_errors.views(given, rows).charts[0].frame
+    assert list(dict.fromkeys(drawn["law"])) == ["softplus, beta=100", "softplus, beta=1000"]
 
 
 def test_along_one_axis_the_others_have_one_value():
@@ -211,15 +215,15 @@ def test_along_one_axis_the_others_have_one_value():
     found = lines_of(given, rows)
     assert list(found) == ["Along dt [s], with horizon", "Along stiffness [N/m]", "Along beta [1/m]"]
     steps = found["Along dt [s], with horizon"]
-    assert [list(part["dt [s]"]) for _, part in steps.groupby("contact")] == [["0.025", "0.05", "0.1"]] * 2
+    assert [list(part["value"]) for _, part in steps.groupby("contact")] == [["0.025", "0.05", "0.1"]] * 2
     assert set(found["Along stiffness [N/m]"]["contact"]) == {"penalty"}
-    assert list(found["Along stiffness [N/m]"]["stiffness [N/m]"]) == ["50", "1000", "1e4"]
+    assert list(found["Along stiffness [N/m]"]["value"]) == ["50", "1000", "1e4"]
 
 
 def test_the_page_of_three_errors_draws_along_every_swept_parameter():
     given, rows = erring("scenes=[bounce_once]", "contacts=[softplus]", "sweep.beta=[100,1000]", "sweep.dt=[0.1,0.05]")
-    chart = web.content(given, rows).charts[0]
-    assert [axis.label for axis in chart.x] == ["beta [1/m]", "dt [s]"]
+    chart = three_errors.views(given, rows).charts[1]
+    assert [column.heading for column in chart.x] == ["beta [1/m]", "dt [s]"]
 
 
 # ------------------------------------------------------------------------------------------------------- stability
@@ -402,7 +406,7 @@ def test_reports_name_no_plugin():
 
 def test_findings_count_in_plain_english():
     given, rows = erring("scenes=[bounce_once]", "contacts=[penalty]", "estimators=[fobg]")
-    text = three_errors_page.finding(rows.assign(program_error_rel=1e-9))
+    text = three_errors.views(given, rows.assign(program_error_rel=1e-9)).findings[1]
     assert text.startswith("Of 1 gradient confirmed by differences of the program's cost, 1 is off by over 10%")
     given, rows = checked("scenes=[pendulum]", "backends=[jax]")
     assert web.content(given, rows).finding.startswith("No wrong gradient at 1 checked point")
