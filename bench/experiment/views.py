@@ -81,6 +81,8 @@ class Chart:
     """The column that separates lines of the same series, such as backends; by default ``series``."""
     panel: str = ""
     """The column with a panel per value."""
+    panel_row: str = ""
+    """The column with a row of panels per value; each value of ``panel`` is then a column of panels."""
     level: str = ""
     value: str = ""
     cell: str = ""

@@ -37,6 +37,8 @@ LINE = 0.155
 """Height of a line of text in inches."""
 BOLD = 1.3
 """Width of a bold title relative to the same text elsewhere."""
+UPRIGHT = 1.15
+"""Height in inches of the titles of panels too narrow for them; these titles read upwards."""
 MANY = 12
 """Most points of a line that are drawn with markers; longer lines are drawn without."""
 
@@ -54,9 +56,16 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
         chart.kind, _draw_lines
     )
     heights = [_height(chart, part) for _, part in panels]
-    room = 0.9 * width / across - _label_width(chart)
-    titles = [_panel_title(chart, name, room) for name, _ in panels]
-    title_height = LINE * max(title.count("\n") + 1 for title in titles) if any(titles) else 0.0
+    room = 0.9 * (width - _label_width(chart, row_names, across)) / across
+    titles = [_panel_title(chart, name, room) for name, _ in panels[: across if row_names else None]]
+    upright = bool(row_names) and max(map(_text_width, titles)) > room * 1.1
+    if upright:
+        titles = [_panel_title(chart, name, UPRIGHT) for name, _ in panels[:across]]
+    titles += [""] * (len(panels) - len(titles))  # of rows of panels, the first one alone has titles
+    title_heights = [
+        UPRIGHT if upright and i == 0 else LINE * max(title.count("\n") + 1 if title else 0 for title in part)
+        for i, part in enumerate(titles[i * across : (i + 1) * across] for i in range(down))
+    ]
     head = _Head(chart, width)
     legend = [] if chart.labels == "ends" else _legend(chart, styles, width - 0.6)
     columns = _legend_columns([str(handle.get_label()) for handle in legend], width)
@@ -74,7 +83,6 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     head.write(figure)
-    ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
     shared = not chart.own_scales
     grid = figure.subplots(
         down, across, squeeze=False, sharey=shared and chart.kind in ("lines", "points"),
@@ -85,7 +93,7 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     axes = list(grid[: len(panels)])
     for place, (panel, (name, part), title) in enumerate(zip(axes, panels, titles, strict=True)):
         if title:
-            panel.set_title(title, loc="left", fontsize=SIZE)
+            panel.set_title(title, loc="center" if upright else "left", fontsize=SIZE, rotation=90 if upright else 0)
         draw_kind(chart, panel, name, part, styles)
         if chart.kind == "grid" and place + across < len(panels) and not chart.own_scales:
             panel.set_xlabel("")
@@ -98,15 +106,35 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
             _draw_marks(chart, panel, name, part)
             if chart.labels == "ends":
                 _label_ends(chart, panel, part, styles, width / across)
-    if chart.kind == "dots" and shared:
-        for panel in axes[:-across]:
-            panel.set_xlabel("")
+    if shared and chart.kind in ("dots", "grid"):
+        _label_outer(chart, axes, across, row_names, upright)
     if legend:
         figure.legend(
             handles=legend, loc="lower center", bbox_to_anchor=(0.5, 0), ncols=columns, frameon=False,
             fontsize=SIZE, columnspacing=1.2, handletextpad=0.5, labelspacing=0.25, borderaxespad=0.1,
         )  # fmt: skip
     return figure
+
+
+def _label_outer(chart: Chart, axes: Sequence[Axes], across: int, row_names: Sequence[str], upright: bool) -> None:
+    """Label the axes of panels with common scales at the left and lower edge only, and name the rows of panels."""
+    for place, panel in enumerate(axes):
+        if place + across < len(axes):
+            panel.set_xlabel("")
+        if chart.kind == "grid":
+            panel.tick_params(labelbottom=place + across >= len(axes), labelleft=place % across == 0)
+            if place % across:
+                panel.set_ylabel("")
+    if row_names:
+        for panel, name in zip(axes[::across], row_names, strict=True):
+            panel.set_ylabel(plain(name), rotation=0, ha="right", va="center")
+        for place, panel in enumerate(axes):
+            if place != len(axes) - 1 - across // 2:
+                panel.set_xlabel("")
+            if upright:
+                panel.tick_params(axis="x", rotation=90)
+        figure = axes[0].figure.figure
+        figure.supylabel(axis_text(chart.y[0]), fontsize=SIZE)
 
 
 def series_styles(chart: Chart) -> dict[str, Style]:
@@ -167,6 +195,10 @@ def _fill(text: str, width: float) -> str:
 
 
 def _panels(chart: Chart) -> list[tuple[str, pd.DataFrame]]:
+    if chart.panel_row:
+        names = [list(dict.fromkeys(chart.frame[column])) for column in (chart.panel_row, chart.panel)]
+        rows = {row: part for row, part in chart.frame.groupby(chart.panel_row, sort=False)}
+        return [(str(name), rows[row][rows[row][chart.panel] == name]) for row in names[0] for name in names[1]]
     if not chart.panel:
         return [("", chart.frame)]
     return [(str(name), part) for name, part in chart.frame.groupby(chart.panel, sort=False)]
@@ -177,11 +209,17 @@ def _panel_title(chart: Chart, name: str, width: float) -> str:
     return "\n".join(map(plain_lines, parts))
 
 
-def _label_width(chart: Chart) -> float:
-    """Return the width in inches of the labels left of a panel of dots; the titles begin right of them."""
+def _label_width(chart: Chart, row_names: Sequence[str], across: int) -> float:
+    """Return the width in inches of all labels left of panels of dots, or of rows of panels: titles are right of them."""
+    if row_names:
+        return max(map(width_in_inches, map(plain, row_names))) + 0.6
     if chart.kind != "dots":
         return 0.0
-    return max(map(width_in_inches, map(plain, map(str, chart.frame[chart.y[0].name].unique()))), default=0.0)
+    return across * max(map(width_in_inches, map(plain, map(str, chart.frame[chart.y[0].name].unique()))), default=0.0)
+
+
+def _text_width(text: str) -> float:
+    return max(map(width_in_inches, text.split("\n")))
 
 
 def _across(chart: Chart, count: int, width: float) -> int:
@@ -193,7 +231,8 @@ def _height(chart: Chart, part: pd.DataFrame) -> float:
     """Return the height of a panel in inches."""
     if chart.height >= 1 or chart.kind in ("lines", "points"):
         return chart.height
-    return float(chart.height * part[chart.y[0].name].nunique() + 0.1)
+    rows = chart.frame if chart.panel_row else part
+    return float(chart.height * rows[chart.y[0].name].nunique() + 0.1)
 
 
 def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
@@ -228,7 +267,7 @@ def _shapes(chart: Chart) -> dict[str, str]:
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
-    lengths = np.array([0.5 + max(map(width_in_inches, label.split("\n"))) for label in labels])
+    lengths = np.array([0.5 + _text_width(label) for label in labels])
     for count in range(min(len(lengths), 8), 1, -1):
         if sum(part.max() for part in np.array_split(lengths, count)) <= width:
             return count
@@ -508,6 +547,8 @@ def _draw_grid(
     x, y = chart.x[0], chart.y[0]
     across, down = _categories(x, part if chart.own_scales else chart.frame), _categories(y, part, downwards=True)
     norm = _norm(chart)
+    cell_width = 72 * panel.get_position().width * panel.figure.figure.get_size_inches()[0] / max(len(across), 1)
+    size = min(SIZE - 1, 0.8 * cell_width)
     for line in part.to_dict("records"):
         place = across.index(_category(line[x.name])), len(down) - 1 - down.index(_category(line[y.name]))
         if chart.level:
@@ -521,7 +562,7 @@ def _draw_grid(
             Rectangle((place[0] - 0.5, place[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8)
         )
         if text:
-            panel.text(*place, plain(str(text)), ha="center", va="center", color=ink_on(face), fontsize=SIZE - 1)
+            panel.text(*place, plain(str(text)), ha="center", va="center", color=ink_on(face), fontsize=size)
     panel.set_xlim(-0.5, len(across) - 0.5)
     panel.set_ylim(-0.5, len(down) - 0.5)
     for which, column, names in (("x", x, across), ("y", y, down[::-1])):

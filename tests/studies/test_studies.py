@@ -28,8 +28,8 @@ from bench.run.files import make_directory
 from bench.studies.gradient_check import matrix
 from bench.studies.gradient_check import report as gradient_check
 from bench.studies.growth import views as growth
-from bench.studies.stability import page as stability_page
-from bench.studies.stability import report as stability
+from bench.studies.stability import maps
+from bench.studies.stability import views as stability
 from bench.studies.three_errors import views as three_errors
 from bench.studies.twins import views as twins
 
@@ -239,46 +239,42 @@ def test_maps_are_apart_by_parameters_and_their_titles_say_defaults():
         "scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]",
         "sweep.mass_spring.damping=[0,1,10]",
     )  # fmt: skip
-    panels = stability.panels(stability.arrange_maps(given, rows))
+    panels = maps.panels(maps.arrange_maps(given, rows))
     assert [panel.title for panel in panels] == [f"mass_spring, damping={d}" for d in (0, 1, 10)]
     assert [len(panel.rows) for panel in panels] == [4, 4, 4]
     assert panels[0].kind == ("semi_implicit_euler", "mass_spring", "none")
-    assert list(table_of(stability.markdown(stability.arrange_maps(given, rows), panels))["damping"]) == [
-        "0",
-        "1",
-        "10",
-    ]
+    shown = stability.views(given, rows)
+    assert list(readable(shown.tables[1])["damping"]) == ["0", "1", "10"]
+    first, every, _ = shown.charts
+    assert len(first.frame) == 4
+    assert "At damping=0. The other values are on the page." in first.subtitle
+    assert every.frame["panel"].nunique() == 3
 
 
 def test_maps_of_scenes_that_no_label_tells_apart_are_apart():
     """sigma has a column of its own, and so is in no identity string."""
     given, rows = mapped("scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']", "sweep.stiffness=[10,100]")
     assert rows["scene"].nunique() == 1
-    panels = stability.panels(stability.arrange_maps(given, rows))
+    panels = maps.panels(maps.arrange_maps(given, rows))
     assert [panel.title for panel in panels] == ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]
 
 
 def test_a_stiffness_that_equals_another_swept_number_stays_on_its_map():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[10,100]")
-    for panel in stability.panels(stability.arrange_maps(given, rows)):
+    for panel in maps.panels(maps.arrange_maps(given, rows)):
         assert list(panel.rows["stiffness"]) == [10.0, 100.0]
 
 
 def test_limits_in_texts_are_those_of_the_rows():
     given, rows = mapped("study=stability[inaccurate=0.25]", "scenes=[mass_spring]", "sweep.stiffness=[10,100]")
-    shown = stability.arrange_maps(given, rows)
-    panels = stability.panels(shown)
-    assert "25%" in stability.markdown(shown, panels)
-    legend = stability.heat_map("semi_implicit_euler", panels).legends[0]
-    assert legend.get_texts()[0].get_text().count("25%") == 1
-    content = web.content(given, rows)
-    assert "25%" in content.charts[0].text
-    assert content.looks["inaccurate"]["meaning"].count("25%") == 1
+    shown = stability.views(given, rows)
+    assert "25%" in shown.tables[1].notes[0]
+    assert web.content(given, rows).looks["right"]["meaning"].count("25%") == 1
 
 
 def test_a_share_is_not_named_after_a_parameter_that_varies_in_it():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[0,1]")
-    (line,) = stability_page.shares(stability.arrange_maps(given, rows)).to_dict("records")
+    (line,) = stability.views(given, rows).tables[0].frame.to_dict("records")
     assert (line["scene"], line["step"]) == ("mass_spring", "semi_implicit_euler")
 
 
@@ -342,7 +338,7 @@ def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     assert axis.unit == "N/m"
     assert rows["stiffness"].nunique() == 1  # that of the law
     given, rows = mapped(*words, "sweep.sprung.stiffness=[1,10,100]", "sweep.penalty.stiffness=[1,10]")
-    panels = stability.panels(stability.arrange_maps(given, rows))
+    panels = maps.panels(maps.arrange_maps(given, rows))
     assert [list(panel.rows["stiffness"]) for panel in panels] == [[1.0, 10.0]] * 3
     assert len({panel.title for panel in panels}) == 3
 

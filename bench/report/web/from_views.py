@@ -74,7 +74,7 @@ def _chart(chart: Chart) -> page.Chart:
         y=[_axis(column, chart) for column in chart.y],
         table=chart.name,
         series=chart.series or "one_",
-        facet=chart.panel,
+        facet="facet_" if chart.panel_row else chart.panel,
         line="line_" if chart.kind == "lines" else "",
         front=chart.front,
         level=chart.level,
