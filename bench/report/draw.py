@@ -547,8 +547,8 @@ def _draw_grid(
     x, y = chart.x[0], chart.y[0]
     across, down = _categories(x, part if chart.own_scales else chart.frame), _categories(y, part, downwards=True)
     norm = _norm(chart)
-    cell_width = 72 * panel.get_position().width * panel.figure.figure.get_size_inches()[0] / max(len(across), 1)
-    size = min(SIZE - 1, 0.8 * cell_width)
+    panel_width = _inner_width(panel, down)
+    size = min(SIZE - 1, 0.8 * 72 * panel_width / max(len(across), 1))
     for line in part.to_dict("records"):
         place = across.index(_category(line[x.name])), len(down) - 1 - down.index(_category(line[y.name]))
         if chart.level:

@@ -105,7 +105,7 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
             for note in table.notes:
                 console.print(note)
     for text in (*views.remarks, *views.findings):
-        console.print(text)
+        console.print(text, soft_wrap=True)  # a command stays one line, so that it can be copied
 
 
 def reasons(rows: pd.DataFrame) -> Sequence[str]:

@@ -15,8 +15,7 @@ import bench.report
 from bench.experiment import config
 from bench.experiment.axes import axes, table
 from bench.experiment.grid import cells
-from bench.experiment.study import study_of
-from bench.measure.gradcheck import EPS
+from bench.measure.gradcheck import EPS, TRUSTED, VERDICTS
 from bench.model import registry
 from bench.report import reproduce, web
 from bench.report.cells import readable
@@ -25,14 +24,16 @@ from bench.report.views import arrange, rows_along
 from bench.report.web.content import Content, looks
 from bench.report.web.document import data
 from bench.run.files import make_directory
-from bench.studies.gradient_check import matrix
-from bench.studies.gradient_check import report as gradient_check
+from bench.run.store import Store
+from bench.studies.gradient_check import views as gradient_check
+from bench.studies.gradient_check.lines import PER_COMPONENT
 from bench.studies.growth import views as growth
 from bench.studies.stability import maps
 from bench.studies.stability import views as stability
 from bench.studies.three_errors import views as three_errors
 from bench.studies.twins import views as twins
 
+STANDARD = Path(bench.report.__file__).parents[2] / "results" / "standard"
 SPRUNG = '''
 from dataclasses import dataclass
 
@@ -92,13 +93,6 @@ def made(*words):
     return given, given.columns.typed(pd.DataFrame(lines))
 
 
-def table_of(markdown):
-    """The lines of the first table in Markdown, by heading."""
-    lines = [line.strip("|").split(" | ") for line in markdown.splitlines() if line.startswith("|")]
-    heads, _, *body = [[cell.strip() for cell in line] for line in lines]
-    return pd.DataFrame(body, columns=heads)
-
-
 # -------------------------------------------------------------------------------------------------- gradient_check
 
 
@@ -109,36 +103,36 @@ def checked(*words):
         "point": ["start"], "sample": [0], "direction": [0], "derivative_program": [1.0], "check_verdict": ["smooth"],
         "check_error": [1e-9], "check_eps": [1e-4], "eps": list(eps), "derivative_differences": [1.0, 1.0],
         "relative_error": [1e-9, 1e-8], "mode_minus": ["", ""], "mode_plus": ["", ""],
-    } | {name: [0] for name in gradient_check.PER_COMPONENT}  # fmt: skip
+    } | {name: [0] for name in PER_COMPONENT}  # fmt: skip
     return given, rows.assign(verdict="smooth", **{name: [value] * len(rows) for name, value in values.items()})
 
 
 def test_two_integrators_are_two_lines_of_the_gradient_check():
     given, rows = checked("scenes=[pendulum]", "integrators=[semi_implicit_euler,rk4]", "sweep.horizon=[1,10]")
-    found = table_of(gradient_check.markdown(arrange(given, rows)))
+    found = readable(gradient_check.views(given, rows).tables[1])
     assert list(found["integrator"]) == ["semi_implicit_euler", "rk4"] * 2
-    assert list(found["horizon"]) == ["1", "1", "10", "10"]
+    assert list(found["horizon [steps]"]) == ["1", "1", "10", "10"]
     assert set(found["backends"]) == {"jax, torch"}
 
 
 def test_a_swept_parameter_keeps_lines_of_the_gradient_check_apart():
     given, rows = checked("scenes=[mass_spring]", "sweep.mass_spring.damping=[0,1,10]", "sweep.horizon=[2]")
-    shown = arrange(given, rows)
-    found = table_of(gradient_check.markdown(shown))
+    shown = gradient_check.views(given, rows)
+    found = readable(shown.tables[1])
     assert list(found["damping"]) == ["0", "1", "10"]
     assert set(found["scene"]) == {"mass_spring"}
-    (panel,) = matrix.figure(shown).axes
-    lines = [label.get_text() for label in reversed(panel.get_yticklabels())]
-    assert lines == ["mass_spring, damping=0", "mass_spring, damping=1", "mass_spring, damping=10"]
-    assert [text.get_text() for text in panel.texts] == ["ok"] * 3 + ["2 steps"]
-    assert web.content(given, rows).tables["checks"]["problem"].nunique() == 6
+    grid, errors = shown.charts
+    assert list(grid.frame["name"]) == ["mass_spring, damping=0", "mass_spring, damping=1", "mass_spring, damping=10"]
+    assert list(grid.frame["letter"]) == ["ok"] * 3
+    assert set(grid.frame["steps"]) == {"2 steps"}
+    assert errors.frame["problem"].nunique() == 6
 
 
 def test_the_gradient_check_says_how_far_from_a_switch_it_looked():
     given, rows = checked("scenes=[pendulum]", "study=gradient_check[aside=0.002]")
-    assert "2e-3" in gradient_check.markdown(arrange(given, rows))
+    assert "2e-3" in gradient_check.views(given, rows).tables[1].notes[0]
     given, rows = checked("scenes=[pendulum]")
-    assert "1e-4" in gradient_check.markdown(arrange(given, rows))
+    assert "1e-4" in gradient_check.views(given, rows).tables[1].notes[0]
 
 
 def test_the_long_table_keeps_its_columns_and_adds_swept_ones(tmp_path):
@@ -146,11 +140,58 @@ def test_the_long_table_keeps_its_columns_and_adds_swept_ones(tmp_path):
         "scenes=[mass_spring]", "sweep.mass_spring.damping=[0,1]", f"results_dir={tmp_path}", "formats=[]"
     )
     make_directory(given.directory)
-    study_of(given).write(given, rows)
+    write(given, gradient_check.views(given, rows))
     found = pd.read_csv(given.directory / "gradient_check.csv")
     assert list(found)[-4:] == ["verdict", "key", "damping", "study"]
     assert len(found) == 2 * len(rows)
     assert set(found["damping"]) == {0.0, 1.0}
+
+
+def test_findings_of_the_standard_gradient_check_computed_from_its_rows():
+    given = config.load(["+experiment=gradient_check", f"results_dir={STANDARD}"])
+    rows = Store(given.directory, given.columns).load()
+    shown = gradient_check.views(given, rows)
+    checks = rows[["scene", "contact", "key", "point", "check_verdict", "check_error"]].explode(
+        ["point", "check_verdict", "check_error"]
+    )
+    checks = checks[checks["point"].notna()]
+    worst = checks.assign(rank=checks["check_verdict"].map(VERDICTS.index)).groupby(["key", "point"])["rank"].min()
+    assert shown.findings[0] == f"No wrong gradient at {len(worst)} checked points."
+    assert worst[worst < VERDICTS.index("saturated")].index.get_level_values("point").unique() == ["at"]
+    errors = checks.set_index(["key", "point"])
+    errors = errors[errors["check_verdict"].isin(TRUSTED)]["check_error"].astype(float)
+    largest = errors[~errors.index.isin(worst[worst < VERDICTS.index("saturated")].index)].max()
+    assert f" {largest:.1e} ".replace("e-0", "e-") in shown.findings[1]
+    broken = worst.isin([VERDICTS.index(name) for name in ("jump", "kink")])
+    assert shown.findings[2].startswith(f"{broken.sum()} points on a contact switch have a kink or a jump")
+    grid = shown.charts[0].frame
+    assert len(grid) == len(grid[["name", "horizon", "point"]].drop_duplicates())
+    assert set(grid["letter"]) == {"ok", "K", "J"}
+    assert set(grid.loc[grid["letter"] != "ok", "point"]) == {"at"}
+    [verdicts] = [table for table in shown.tables if table.page]
+    assert verdicts.frame["points"].sum() == len(worst)
+
+
+def test_untrusted_undecided_and_missing_gradients_come_first_and_are_never_right():
+    given, rows = checked("scenes=[pendulum]", "sweep.horizon=[1,2]")
+    rows["command"] = [f"python -m bench gradcheck {i}" for i in range(len(rows))]
+    rows.at[0, "check_verdict"], rows.at[0, "check_error"] = ["wrong_factor"], [0.5]
+    rows.at[1, "check_verdict"], rows.at[1, "check_error"] = ["nonfinite"], [np.nan]
+    shown = gradient_check.views(given, rows)
+    assert shown.findings[0].startswith(
+        "2 of 4 checked points have a gradient that cannot be trusted (wrong_factor, nonfinite)"
+    )
+    assert shown.findings[1] == "The largest error of a right gradient is 1.0e-9 (pendulum)."
+    assert shown.charts[0].title.startswith("Wrong gradients: pendulum, and kinks, jumps or undecided checks")
+    assert list(shown.charts[0].frame["letter"]) == ["X", "ok"], "the worse verdict of the backends"
+    assert "      python -m bench gradcheck 0" in shown.tables[1].notes
+    assert any(text == "\nwrong_factor (start); repeat with\n  python -m bench gradcheck 0" for text in shown.remarks)
+    for name in ("check_verdict", "point", "check_error", "check_eps"):
+        rows[name] = [[]] * len(rows)
+    rows["status"], rows["reason"] = "unsupported", "no root finder"
+    nothing = gradient_check.views(given, rows)
+    assert nothing.findings == ["No gradient could be checked: the table has the reason of each cell."]
+    assert nothing.remarks == ["\n4 cells: unsupported: no root finder"]
 
 
 # ---------------------------------------------------------------------------------------------------- three_errors
@@ -495,10 +536,12 @@ def test_the_command_of_a_gradient_check_without_time_steps_has_no_horizon():
     assert reproduce.check_of(cell) == "python -m bench gradcheck quadratic 'backends=[jax]' seed=0"
 
 
-def test_the_matrix_of_gradient_checks_leads_with_what_is_wrong():
-    table = pd.DataFrame({"name": ["a", "b"], "point": ["start", "before"], "verdict": ["wrong_factor", "kink"]})
-    assert matrix.headline(table) == "Wrong gradients: a; kinks, jumps or undecided checks in 1 of 2 problems"
-    assert matrix.headline(table[1:]).startswith("No gradient is wrong for its program; kinks, jumps")
-    assert matrix.headline(table.assign(verdict="smooth")).startswith(
+def test_the_grid_of_gradient_checks_leads_with_what_is_wrong():
+    points = pd.DataFrame({"name": ["a", "b"], "point": ["start", "before"], "verdict": ["wrong_factor", "kink"]})
+    doubtful = "kinks, jumps or undecided checks away from contact switches in 1 of"
+    assert gradient_check.headline(points) == f"Wrong gradients: a, and {doubtful} 2 problems"
+    assert gradient_check.headline(points[1:]) == f"No gradient is wrong for its program, and {doubtful} 1 problem"
+    assert gradient_check.headline(points.assign(verdict="smooth")).startswith(
         "Away from contact switches, every gradient is the derivative"
     )
+    assert gradient_check.headline(points[1:].assign(point="at")).startswith("Away from contact switches, every")
