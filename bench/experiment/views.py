@@ -122,7 +122,7 @@ class Chart:
     def __post_init__(self) -> None:
         wanted = (self.series, self.line, self.panel, self.shape, self.level, self.value, self.cell, self.failed)
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        missing = sorted({name for name in (*wanted, *axes) if name and name not in self.frame})
+        missing = sorted({name for name in (*columns, *axes) if name and name not in self.frame})
         if missing:
             raise ValueError(f"chart {self.name}: its table has no column {', '.join(missing)}")
 

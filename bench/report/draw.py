@@ -1,6 +1,6 @@
 """Draws charts, given as data, with Matplotlib.
 
-A chart is drawn at any width: the panels are laid out anew, and the text keeps its size.
+A chart is drawn at any width: the panels are laid out again, and the text keeps its size.
 """
 
 from __future__ import annotations
@@ -448,16 +448,16 @@ def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> Non
 def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], width: float) -> None:
     """Name each series beside the last point of its line, in its colour, moved apart where names would overlap."""
     x, y = chart.x[0].name, chart.y[0].name
-    wanted = []
+    labels = []
     for series, points in part.groupby(chart.series, sort=False):
         points = points[np.isfinite(points[y]) & ((points[y] > 0) | (panel.get_yscale() != "log"))]
         if len(points):
             last = points.sort_values(x, kind="stable").iloc[-1]
             at = panel.transAxes.inverted().transform(panel.transData.transform((last[x], last[y])))[1]
-            wanted.append((float(np.clip(at, 0.02, 0.98)), str(series)))
-    wanted.sort()
+            labels.append((float(np.clip(at, 0.02, 0.98)), str(series)))
+    labels.sort()
     gap = 1.15 * LINE / chart.height
-    places = [at for at, _ in wanted]
+    places = [at for at, _ in labels]
     for _ in range(200):  # move neighbours apart until no two overlap
         moved = False
         for i in range(len(places) - 1):
@@ -466,7 +466,7 @@ def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
                 places[i], places[i + 1], moved = places[i] - lack / 2, places[i + 1] + lack / 2, True
         if not moved:
             break
-    for place, (_, series) in zip(places, wanted, strict=True):
+    for place, (_, series) in zip(places, labels, strict=True):
         style = styles[series]
         panel.annotate(
             plain(_clipped(style.meaning or series, 0.42 * width)), (1.015, place), xycoords="axes fraction",

@@ -114,6 +114,6 @@ def _column(column: Column, cells: pd.DataFrame) -> page.TableColumn:
 def _look(style: Style) -> dict[str, object]:
     dashes = {str(line): name for line, name in zip(VARIANTS, ("solid", "dash", "dot"), strict=True)}
     return page.look(
-        style.colour, page.SYMBOLS.get(style.marker, "circle"), dashes.get(str(style.line), "dash"), style.letter,
+        style.colour, page.SYMBOLS.get(style.marker, "circle") if style.marker else "line", dashes.get(str(style.line), "dash"), style.letter,
         style.meaning,
     )  # fmt: skip

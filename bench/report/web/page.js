@@ -11,7 +11,7 @@ const SMALL = 12; // size of the smallest text in a chart [px]
 const PANELS = 4; // most panels of a chart that are drawn at once
 const FIRST = 60, MORE = 240; // rows of the table at first, and with every "Show more"
 const GLYPHS = {
-  circle: "●", square: "■", diamond: "◆", "triangle-up": "▲", "triangle-down": "▼", cross: "✚", x: "✖", star: "★",
+  circle: "●", square: "■", diamond: "◆", "triangle-up": "▲", "triangle-down": "▼", cross: "✚", x: "✖", star: "★", line: "━",
 };
 const GONE = "The experiment, as configured when this page was written, has no such cell any more.";
 const state = { chosen: {}, find: "", sort: null, limit: FIRST, selected: -1, theme: "auto" };

@@ -31,7 +31,7 @@ KINDS: dict[str, tuple[tuple[str, ...], Style]] = {
 }
 """Verdicts and look of each letter in a cell, the worst first."""
 LOOKS = {
-    point: Style(PALETTE[place], marker) for point, place, marker in zip(POINTS, (0, 5, 2, 3), "osD^", strict=True)
+    point: Style(PALETTE[place], marker) for point, place, marker in zip(POINTS, (0, 5, 2, 3, 4), "osD^X", strict=True)
 }
 """Look of each point at which gradients are checked."""
 ERROR = Column("error", label="best error")

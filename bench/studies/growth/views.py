@@ -105,10 +105,10 @@ def verdicts(good: pd.DataFrame) -> pd.DataFrame:
         # standard error of a normal median: 1.2533 sigma / sqrt(n), and sigma is the interquartile range / 1.349
         errors = (1.2533 / 1.349 * spread / np.sqrt(counts)).fillna(0.0).to_numpy(float)
         horizons, norms = (part[name].to_numpy(float) for name in ("time_horizon", "gradient_median"))
-        found = fit(horizons, norms, errors, bounded=part["growth"].iloc[-1] in ("neutral", "vanishing"))
+        fitted = fit(horizons, norms, errors, bounded=part["growth"].iloc[-1] in ("neutral", "vanishing"))
         lines.append({
-            "problem": problem, "verdict": found.verdict, "odds": found.odds, **_slope("order", found.power),
-            **_slope("rate", found.exponential), **_variances(part), "fit": found,
+            "problem": problem, "verdict": fitted.verdict, "odds": fitted.odds, **_slope("order", fitted.power),
+            **_slope("rate", fitted.exponential), **_variances(part), "fit": fitted,
         })  # fmt: skip
     return pd.DataFrame(lines)
 

@@ -167,9 +167,9 @@ def findings(shares: pd.DataFrame, cells: pd.DataFrame) -> list[str]:
     n_wrong, n_lost = (int((cells["level"] == name).sum()) for name in ("wrong", "diverged"))
     causes = cells.loc[cells["level"] == "wrong", "cause"]
     nouns = {"step": "the step or its derivative", "law": "the law", "both": "both"}
-    told = [f"{nouns[cause]} in {(causes == cause).sum()}" for cause in nouns if (causes == cause).any()]
+    causes_of = [f"{nouns[cause]} in {(causes == cause).sum()}" for cause in nouns if (causes == cause).any()]
     rest = int((~causes.isin(list(nouns))).sum())
-    told += [f"not resolved in {rest}"] if rest else []
+    causes_of += [f"not resolved in {rest}"] if rest else []
     use = (
         f"Use {listed(best)}."
         if best
@@ -178,7 +178,7 @@ def findings(shares: pd.DataFrame, cells: pd.DataFrame) -> list[str]:
     return [
         use,
         f"Of {counted(len(cells), 'cell')}, {n_wrong} have a finite but wrong gradient and {n_lost} a state that diverges.",
-        *([f"The cause of the wrong gradients is {', '.join(told)}."] if n_wrong else []),
+        *([f"The cause of the wrong gradients is {', '.join(causes_of)}."] if n_wrong else []),
     ]
 
 

@@ -155,9 +155,9 @@ def _lines(shown: Arranged, parts: Sequence[Section]) -> tuple[pd.DataFrame, lis
         labels = problem_names(shown, ["estimator"], shown.axes, ["estimator"], rows)
         rows = rows.assign(program=problem_numbers(rows, PROGRAM, without), label=labels, place=pd.factorize(laws)[0])
         for _, group in rows.sort_values("place", kind="stable").groupby(["place", "program", "x"], sort=False):
-            found = {f"bias {row['label']}": _bias(row) for _, row in group.drop_duplicates("label").iterrows()}
-            biases |= dict.fromkeys(found)
-            lines.append(group.iloc[0].to_dict() | found | {"section": part.heading})
+            estimates = {f"bias {row['label']}": _bias(row) for _, row in group.drop_duplicates("label").iterrows()}
+            biases |= dict.fromkeys(estimates)
+            lines.append(group.iloc[0].to_dict() | estimates | {"section": part.heading})
     own = COLUMNS.by_name
     columns = [*(COMMON.get(name, Column(name, format="setting")) for name in names), *(own[name] for name in RESULTS)]
     value = [Column("x", label="value", format="setting")] if any(part.axis is not None for part in parts) else []
