@@ -138,7 +138,14 @@ def _verdicts(points: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
         for verdict in VERDICTS if len(part := points[points["verdict"] == verdict])
     ]  # fmt: skip
     largest = Column("error", label="largest error")
-    columns = [text("verdict"), text("meaning"), text("trusted"), Column("points"), largest, text("scenes")]
+    columns = [
+        text("verdict"),
+        text("meaning"),
+        text("trusted"),
+        Column("points", format="setting"),
+        largest,
+        text("scenes"),
+    ]
     return pd.DataFrame(lines, columns=[column.name for column in columns]), columns
 
 
@@ -237,7 +244,7 @@ def _errors(shown: Arranged) -> Chart:
     frame = frame.astype({"eps": float, "relative_error": float})
     return Chart(
         "gradient_errors", "The error of a right gradient falls with eps^2 until rounding dominates", frame,
-        [Column("eps", label="eps, in units of the natural scale")],
-        [Column("relative_error", above_one="larger than the gradient")], series="point", line="check", panel="problem",
+        [Column("eps", label="eps, in units of the natural scale", log=True)],
+        [Column("relative_error", log=True, above_one="larger than the gradient")], series="point", line="check", panel="problem",
         styles=LOOKS, printed=False, text="That of a wrong gradient stays constant.",
     )  # fmt: skip

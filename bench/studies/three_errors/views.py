@@ -183,7 +183,11 @@ def _wrong(named: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
     counts = wrong.groupby("law", sort=False).size().rename("cells")
     worst = wrong.groupby("law", sort=False)["model_error_rel"].max().sort_values(ascending=False).index
     frame = ranges.join(counts).loc[worst].reset_index()
-    return frame, [text("law", label="problem"), Column("cells"), *(COLUMNS.by_name[name] for name in ERRORS)]
+    return frame, [
+        text("law", label="problem"),
+        Column("cells", format="setting"),
+        *(COLUMNS.by_name[name] for name in ERRORS),
+    ]
 
 
 # ------------------------------------------------------------------------------------------------------- charts
