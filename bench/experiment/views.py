@@ -120,7 +120,8 @@ class Chart:
     on_page: bool = True
 
     def __post_init__(self) -> None:
-        wanted = (self.series, self.line, self.panel, self.shape, self.level, self.value, self.cell, self.failed)
+        columns = (self.series, self.line, self.panel, self.panel_row, self.shape, self.level, self.value, self.cell,
+                   self.failed)  # fmt: skip
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
         missing = sorted({name for name in (*columns, *axes) if name and name not in self.frame})
         if missing:
@@ -137,7 +138,8 @@ class Chart:
     def plotted(self) -> pd.DataFrame:
         """Return the drawn lines and columns: panel, series, levels, and all quantities with their intervals."""
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        names = [self.panel, self.series, self.line, self.shape, self.level, self.value, self.cell, self.failed, *axes]
+        names = [self.panel, self.panel_row, self.series, self.line, self.shape, self.level, self.value, self.cell,
+                 self.failed, *axes]  # fmt: skip
         return self.drawn()[[name for name in dict.fromkeys(names) if name]]
 
 

@@ -50,7 +50,8 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     if width is None:
         width = NARROW if len(panels) == 1 and chart.kind in ("lines", "points") and chart.labels == "legend" else WIDTH
     styles = series_styles(chart)
-    across = _across(chart, len(panels), width)
+    row_names = list(dict.fromkeys(chart.frame[chart.panel_row].astype(str))) if chart.panel_row else []
+    across = len(panels) // len(row_names) if row_names else _across(chart, len(panels), width)
     down = math.ceil(len(panels) / across)
     draw_kind: Any = {"dots": _draw_dots, "grid": partial(_draw_grid, width=width / across)}.get(
         chart.kind, _draw_lines
@@ -61,7 +62,7 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     upright = bool(row_names) and max(map(_text_width, titles)) > room * 1.1
     if upright:
         titles = [_panel_title(chart, name, UPRIGHT) for name, _ in panels[:across]]
-    titles += [""] * (len(panels) - len(titles))  # of rows of panels, the first one alone has titles
+    titles += [""] * (len(panels) - len(titles))  # of rows of panels, only the first has titles
     title_heights = [
         UPRIGHT if upright and i == 0 else LINE * max(title.count("\n") + 1 if title else 0 for title in part)
         for i, part in enumerate(titles[i * across : (i + 1) * across] for i in range(down))
@@ -71,7 +72,8 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     columns = _legend_columns([str(handle.get_label()) for handle in legend], width)
     lines = [str(handle.get_label()).count("\n") + 1 for handle in legend]  # one column if any label is broken
     below = 0.05 + LINE * 1.12 * (math.ceil(len(legend) / columns) + sum(lines) - len(lines)) if legend else 0.0
-    body = sum(max(heights[i * across : (i + 1) * across]) + title_height for i in range(down)) + 0.45
+    ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
+    body = sum(ratios) + sum(title_heights) + 0.45
     if chart.kind == "grid":
         names = _categories(chart.x[0], chart.frame)
         labels = _grid_labels(chart, chart.x[0], names, width / across)
@@ -95,9 +97,6 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
         if title:
             panel.set_title(title, loc="center" if upright else "left", fontsize=SIZE, rotation=90 if upright else 0)
         draw_kind(chart, panel, name, part, styles)
-        if chart.kind == "grid" and place + across < len(panels) and not chart.own_scales:
-            panel.set_xlabel("")
-            panel.tick_params(labelbottom=False)
         if chart.kind in ("lines", "points"):
             _label_axes(chart, panel, first=place % across == 0 or chart.own_scales)
     if chart.kind in ("lines", "points"):
@@ -118,11 +117,13 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
 
 def _label_outer(chart: Chart, axes: Sequence[Axes], across: int, row_names: Sequence[str], upright: bool) -> None:
     """Label the axes of panels with common scales at the left and lower edge only, and name the rows of panels."""
+    labels = [[text.get_text() for text in panel.get_yticklabels()] for panel in axes]
+    equal_rows = all(texts == labels[0] for texts in labels)
     for place, panel in enumerate(axes):
         if place + across < len(axes):
             panel.set_xlabel("")
         if chart.kind == "grid":
-            panel.tick_params(labelbottom=place + across >= len(axes), labelleft=place % across == 0)
+            panel.tick_params(labelbottom=place + across >= len(axes), labelleft=place % across == 0 or not equal_rows)
             if place % across:
                 panel.set_ylabel("")
     if row_names:
@@ -250,7 +251,7 @@ def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
     colours = [
         Line2D(
             [], [], color=style.colour, marker="s" if chart.shape else style.marker, linestyle=style.line if line else "none",
-            linewidth=style.width, label=plain(_clipped(style.meaning or name, 3.0)),
+            linewidth=style.width, label=labels[name],
         )
         for name, style in styles.items()
     ]  # fmt: skip
@@ -545,7 +546,10 @@ def _draw_grid(
 ) -> None:
     """Draw a cell per pair of x and y, coloured by level or value, with its text."""
     x, y = chart.x[0], chart.y[0]
-    across, down = _categories(x, part if chart.own_scales else chart.frame), _categories(y, part, downwards=True)
+    across, down = (
+        _categories(x, part if chart.own_scales else chart.frame),
+        _categories(y, chart.frame if chart.panel_row else part, downwards=True),
+    )
     norm = _norm(chart)
     panel_width = _inner_width(panel, down)
     size = min(SIZE - 1, 0.8 * 72 * panel_width / max(len(across), 1))
@@ -567,7 +571,10 @@ def _draw_grid(
     panel.set_ylim(-0.5, len(down) - 0.5)
     for which, column, names in (("x", x, across), ("y", y, down[::-1])):
         labels = _grid_labels(chart, column, names, width)
-        few = _thinned(labels) if which == "x" else list(range(len(labels)))
+        if which == "x" and any("…" in label for label in labels) and max(map(width_in_inches, names)) < 1:
+            labels = [plain(name) for name in names]  # short names read upwards rather than shortened
+            panel.tick_params(axis="x", rotation=90)
+        few = _thinned(labels, which, panel, panel_width)
         getattr(panel, f"set_{which}ticks")(few, [labels[i] for i in few])
         if column.label or column.kind == "number":
             getattr(panel, f"set_{which}label")(axis_text(column))
@@ -577,11 +584,14 @@ def _draw_grid(
 
 
 def _grid_labels(chart: Chart, column: Column, names: Sequence[str], width: float) -> list[str]:
-    """Return the labels of an axis of a grid: those of x in at most three lines of the width of a cell."""
+    """Return the labels of an axis of a grid, x labels in at most three lines of the width of a cell."""
     if column is chart.y[0] or column.kind != "text":
         return [plain(_clipped(name, 3.0)) for name in names]
     beside = min(3.0, max(map(width_in_inches, map(plain, _categories(chart.y[0], chart.frame))), default=0.0))
-    room = max(0.3, 0.95 * (width - beside - 0.3) / len(names))
+    if chart.panel and not chart.own_scales:  # the labels beside the first panel serve all
+        across = max(1, round(WIDTH / width))
+        beside /= across
+    room = max(0.3, (width - beside - 0.15) / len(names))
     return ["\n".join(plain(_clipped(line, room)) for line in _broken(name, room).split("\n", 2)[:3]) for name in names]
 
 
@@ -604,10 +614,21 @@ def _clipped(text: str, width: float) -> str:
     return f"{text[: (kept + 1) // 2]}…{text[len(text) - kept // 2 :]}"
 
 
-def _thinned(labels: Sequence[str]) -> list[int]:
-    """Return the positions of the labels that are shown: all, or every second or more of many numbers."""
-    step = math.ceil(len(labels) / 8) if len(labels) > 8 and all(map(_is_number, labels)) else 1
-    return list(range(0, len(labels), step))
+def _inner_width(panel: Axes, labels: Sequence[str]) -> float:
+    """Return about the width of a panel in inches, before the layout, from the labels left of the first one."""
+    place, width = panel.get_subplotspec(), panel.figure.figure.get_size_inches()[0]
+    across = place.get_gridspec().ncols if place is not None else 1
+    return max(0.9 * (float(width) - max(map(width_in_inches, labels), default=0.0)) / across, 0.2)
+
+
+def _thinned(labels: Sequence[str], which: str, panel: Axes, panel_width: float) -> list[int]:
+    """Return the positions of the labels that are shown: all, or each second or more of numbers that would overlap."""
+    if not all(_is_number(label) for label in labels):
+        return list(range(len(labels)))
+    panel_height = panel.get_position().height * panel.figure.figure.get_size_inches()[1]
+    needed = sum(width_in_inches(label) + 0.08 for label in labels) if which == "x" else 0.8 * LINE * len(labels)
+    step = math.ceil(needed / (panel_width if which == "x" else panel_height))
+    return list(range(0, len(labels), max(step, 1)))
 
 
 def _is_number(text: str) -> bool:

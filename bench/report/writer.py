@@ -78,7 +78,7 @@ def markdown(tables: Sequence[Table], experiment: str) -> str:
                 for row in part.to_dict("records")
             ]
             blocks.append("\n".join([head, rule, *lines]))
-        blocks += map(e, table.notes)
+        blocks += [note if note.startswith("    ") else e(note) for note in table.notes]  # a command is a block of code
     return "\n\n".join(blocks) + "\n"
 
 

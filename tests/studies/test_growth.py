@@ -17,7 +17,7 @@ from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import Jacobians, compose
-from bench.report.writer import readable
+from bench.report.cells import readable
 from bench.run.store import Store
 from bench.studies.growth import views
 from bench.studies.growth.columns import COLUMNS

@@ -16,8 +16,8 @@ from bench.experiment.cell import Cell
 from bench.experiment.grid import cells
 from bench.model import MechanicalScene, State, compose, registry
 from bench.model.parameters import build
+from bench.report.cells import readable
 from bench.report.draw import draw
-from bench.report.writer import readable
 from bench.run import runner, tasks
 from bench.run.plan import plan
 from bench.run.session import Session

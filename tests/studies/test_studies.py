@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +19,12 @@ from bench.experiment.grid import cells
 from bench.measure.gradcheck import EPS, TRUSTED, VERDICTS
 from bench.model import registry
 from bench.report import reproduce, web
-from bench.report.cells import readable
+from bench.report.cells import parts, readable
 from bench.report.problems import problem_names, problem_numbers, split_by_problem
 from bench.report.views import arrange, rows_along
 from bench.report.web.content import Content, looks
 from bench.report.web.document import data
+from bench.report.writer import write
 from bench.run.files import make_directory
 from bench.run.store import Store
 from bench.studies.gradient_check import views as gradient_check
@@ -205,7 +207,8 @@ def erring(*words):
 
 def lines_of(given, rows):
     """The readable parts of the table of three errors, by heading."""
-    return dict(parts(three_errors.views(given, rows).tables[0]))
+    table_ = three_errors.views(given, rows).tables[0]
+    return {name: readable(replace(table_, frame=part)) for name, part in parts(table_)}
 
 
 def test_three_errors_of_two_integrators_are_twice_as_many_lines():

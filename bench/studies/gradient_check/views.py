@@ -16,7 +16,6 @@ from bench.measure.gradcheck import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED,
 from bench.report.problems import axes_of, problem_names, titled
 from bench.report.study_tables import label_columns
 from bench.report.style import PALETTE
-from bench.report.tables import escape_markdown
 from bench.report.text import counted, listed, number
 from bench.report.views import Arranged, arrange
 from bench.studies.gradient_check.lines import PROBLEM, by_point, component_table, long_table, untrusted
@@ -45,8 +44,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     names = problem_names(shown, PROBLEM, axes_of(shown, "horizon"), ("scene", "contact"))
     points = points.assign(name=names.to_numpy()[points["row"].astype(int)])
     tables = [
-        Table("gradient_check", *_lines(shown, points), long_table(with_axes(experiment, rows)),
-              "gradients against differences of the cost", _notes(rows, untrusted(points))),
+        Table("gradient_check", *_lines(shown, points), data=long_table(with_axes(experiment, rows)),
+              title="gradients against differences of the cost", notes=_notes(rows, untrusted(points))),
         Table("gradient_components", component_table(rows), [], files=["csv"]),
     ]  # fmt: skip
     charts = [] if points.empty else [_grid(points), _errors(shown)]
@@ -154,21 +153,19 @@ def _notes(rows: pd.DataFrame, faults: pd.DataFrame) -> list[str]:
     distances = dict.fromkeys(given["study"]["aside"] for given in parse(rows) if given)
     notes = [
         "- best error: |a - b| / max(1, |a|, |b|) between derivative and central difference, the smallest over all eps. "
-        "Each line has the largest of its directions, samples and backends. eps is relative to max(1, |theta|).\n"
-        f"- verdict: the worst of a line's checks. `before` and `after` are {' or '.join(map(_power, distances))} from a "
-        "switch of contact mode, `at` is on it."
+        "Each line has the largest of its directions, samples and backends. eps is relative to max(1, |theta|).",
+        f"- verdict: the worst of a line's checks. before and after are {' or '.join(map(_power, distances))} from a "
+        "switch of contact mode, at is on it.",
     ]
     unchecked = rows[rows["status"] != "ok"].groupby("reason", sort=False)
-    lines = [f"- {len(part)} {part['status'].iloc[0]}: {escape_markdown(str(reason))}" for reason, part in unchecked]
-    notes += ["Not checked:", "\n".join(lines)] if lines else []
+    lines = [f"- {len(part)} {part['status'].iloc[0]}: {reason}" for reason, part in unchecked]
+    notes += ["Not checked:", *lines] if lines else []
     if len(faults):
         notes.append("Gradients that cannot be trusted, and the command that repeats each:")
         for command, part in faults.groupby("command", sort=False):
             notes += [f"- {', '.join(dict.fromkeys(part['verdict']))}", f"      {command}"]
-    remarks = [
-        f"- {escape_markdown(reason)} ({counted(count, 'cell')})" for reason, count in _count_reasons(rows, True)
-    ]
-    return [*notes, *(["Remarks:", "\n".join(remarks)] if remarks else [])]
+    remarks = [f"- {reason} ({counted(count, 'cell')})" for reason, count in _count_reasons(rows, True)]
+    return [*notes, *(["Remarks:", *remarks] if remarks else [])]
 
 
 def _power(value: float) -> str:

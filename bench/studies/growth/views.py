@@ -67,7 +67,13 @@ NOTE = (
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the findings, a table with a line per problem and one with a line per cell, and the charts."""
     shown = arrange(experiment, rows)
-    cells = Table("growth", *_cells(shown), table(experiment, rows), "growth of gradients with the horizon", [NOTE])
+    cells = Table(
+        "growth",
+        *_cells(shown),
+        data=table(experiment, rows),
+        title="growth of gradients with the horizon",
+        notes=[NOTE],
+    )
     named = shown.rows.assign(problem=problem_of(shown))
     good = attempted(named)
     good = good[np.isfinite(good["gradient_median"]) & (good["gradient_median"] > 0)]
@@ -78,6 +84,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         "growth_verdicts",
         lines,
         VERDICT,
+        data=lines.drop(columns="fit"),
         title="Growth of the gradient",
         notes=[VERDICT_NOTE],
         terminal=True,

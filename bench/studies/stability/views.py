@@ -54,8 +54,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     shown = arrange_maps(experiment, rows)
     maps = panels(shown)
     whole = Table(
-        "stability_map", *_maps(maps, label_columns_of(shown, axes_of(shown, *PLACES))), table(experiment, rows),
-        "shares of verdicts and stability limits", notes(shown.rows),
+        "stability_map", *_maps(maps, label_columns_of(shown, axes_of(shown, *PLACES))), data=table(experiment, rows),
+        title="shares of verdicts and stability limits", notes=notes(shown.rows),
     )  # fmt: skip
     remarks = [
         f"{count} {status}: {reason}"

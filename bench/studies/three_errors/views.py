@@ -56,8 +56,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     parts = sections(shown)
     trapped = traps(shown, parts)
     lines = Table(
-        "three_errors", *_lines(shown, parts), table(experiment, rows), "program, model and estimator error",
-        [*map(str, trapped), NOTE], terminal=True, split="section",
+        "three_errors", *_lines(shown, parts), data=table(experiment, rows), title="program, model and estimator error",
+        notes=[*map(str, trapped), NOTE], terminal=True, split="section",
     )  # fmt: skip
     if not (attempted(rows)["status"] == "ok").any():
         return Views(["No cell gave a result: the table has the reason of each."], [lines], remarks=reasons(rows))
