@@ -81,10 +81,12 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   stiffness above which the spectral radius of the step exceeds 1, and `growth_factor` is the measured growth per step of a
   state without contact. `cause` explains a finite but wrong gradient by comparison with the law's own gradient, from
   differences of its cost at a far finer step: `step` (the law's own gradient is right, the step or its derivative is wrong),
-  `law` (as wrong at any step size), `both`, or `unknown` where the law's gradient has not converged. `stability_summary.png`
-  shows the share of cells by verdict and cause, with a bar per integrator and law.
+  `law` (as wrong at any step size), `both`, or `unknown` where the law's gradient has not converged. `stability_map.png`
+  shows where the gradient is right, wrong or lost, and `stability_shares.csv` the share of each by integrator and law.
 - `three_errors.csv`: forward, program, model and estimator error, absolute and relative.
-- `growth.csv`: gradient norms, singular values and growth rates with their intervals.
+- `growth.csv`: gradient norms, singular values and growth rates with their intervals. `growth_verdicts.csv`: per problem the
+  order of the best power law, the rate of the best exponential, both with their intervals, and the verdict. `exploding` needs
+  at least five horizons, an exponential that is 20 times as likely as the power law, and a rate above 0.
 - `gradient_check.csv`: one line per check and step size. `gradient_components.csv`: one line per component of theta.
 - `twins.csv`: differences between an engine's model of a scene and the scene's own program, and their times.
 - `optimise.csv`: one line per search. `summary.csv`: per method the score with its interval, the probability of beating the

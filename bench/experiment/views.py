@@ -81,6 +81,8 @@ class Chart:
     """The column that separates lines of the same series, such as backends; by default ``series``."""
     panel: str = ""
     """The column with a panel per value."""
+    panel_row: str = ""
+    """The column with a row of panels per value; each value of ``panel`` is then a column of panels."""
     level: str = ""
     value: str = ""
     cell: str = ""
@@ -118,9 +120,10 @@ class Chart:
     on_page: bool = True
 
     def __post_init__(self) -> None:
-        roles = (self.series, self.line, self.panel, self.shape, self.level, self.value, self.cell, self.failed)
+        columns = (self.series, self.line, self.panel, self.panel_row, self.shape, self.level, self.value, self.cell,
+                   self.failed)  # fmt: skip
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        missing = sorted({name for name in (*roles, *axes) if name and name not in self.frame})
+        missing = sorted({name for name in (*columns, *axes) if name and name not in self.frame})
         if missing:
             raise ValueError(f"chart {self.name}: its table has no column {', '.join(missing)}")
 
@@ -135,7 +138,8 @@ class Chart:
     def plotted(self) -> pd.DataFrame:
         """Return the drawn lines and columns: panel, series, levels, and all quantities with their intervals."""
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        names = [self.panel, self.series, self.line, self.shape, self.level, self.value, self.cell, self.failed, *axes]
+        names = [self.panel, self.panel_row, self.series, self.line, self.shape, self.level, self.value, self.cell,
+                 self.failed, *axes]  # fmt: skip
         return self.drawn()[[name for name in dict.fromkeys(names) if name]]
 
 

@@ -1,6 +1,6 @@
 """Draws charts, given as data, with Matplotlib.
 
-A chart is drawn at any width: the panels are rearranged, and the text keeps its size.
+A chart is drawn at any width: the panels are laid out again, and the text keeps its size.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ LINE = 0.155
 """Height of a line of text in inches."""
 BOLD = 1.3
 """Width of a bold title relative to the same text elsewhere."""
+UPRIGHT = 1.15
+"""Height in inches of the titles of panels too narrow for them; these titles read upwards."""
 MANY = 12
 """Most points of a line that are drawn with markers; longer lines are drawn without."""
 
@@ -48,19 +50,30 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     if width is None:
         width = NARROW if len(panels) == 1 and chart.kind in ("lines", "points") and chart.labels == "legend" else WIDTH
     styles = series_styles(chart)
-    across = _across(chart, len(panels), width)
+    row_names = list(dict.fromkeys(chart.frame[chart.panel_row].astype(str))) if chart.panel_row else []
+    across = len(panels) // len(row_names) if row_names else _across(chart, len(panels), width)
     down = math.ceil(len(panels) / across)
     draw_kind: Any = {"dots": _draw_dots, "grid": partial(_draw_grid, width=width / across)}.get(
         chart.kind, _draw_lines
     )
     heights = [_height(chart, part) for _, part in panels]
-    titles = [_panel_title(chart, name, 0.9 * width / across) for name, _ in panels]
-    title_height = LINE * max(title.count("\n") + 1 for title in titles) if any(titles) else 0.0
+    room = 0.9 * (width - _label_width(chart, row_names, across)) / across
+    titles = [_panel_title(chart, name, room) for name, _ in panels[: across if row_names else None]]
+    upright = bool(row_names) and max(map(_text_width, titles)) > room * 1.1
+    if upright:
+        titles = [_panel_title(chart, name, UPRIGHT) for name, _ in panels[:across]]
+    titles += [""] * (len(panels) - len(titles))  # of rows of panels, only the first has titles
+    title_heights = [
+        UPRIGHT if upright and i == 0 else LINE * max(title.count("\n") + 1 if title else 0 for title in part)
+        for i, part in enumerate(titles[i * across : (i + 1) * across] for i in range(down))
+    ]
     head = _Head(chart, width)
-    legend = [] if chart.labels == "ends" else _legend(chart, styles)
+    legend = [] if chart.labels == "ends" else _legend(chart, styles, width - 0.6)
     columns = _legend_columns([str(handle.get_label()) for handle in legend], width)
-    below = 0.05 + LINE * 1.12 * math.ceil(len(legend) / columns) if legend else 0.0
-    body = sum(max(heights[i * across : (i + 1) * across]) + title_height for i in range(down)) + 0.45
+    lines = [str(handle.get_label()).count("\n") + 1 for handle in legend]  # one column if any label is broken
+    below = 0.05 + LINE * 1.12 * (math.ceil(len(legend) / columns) + sum(lines) - len(lines)) if legend else 0.0
+    ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
+    body = sum(ratios) + sum(title_heights) + 0.45
     if chart.kind == "grid":
         names = _categories(chart.x[0], chart.frame)
         labels = _grid_labels(chart, chart.x[0], names, width / across)
@@ -72,7 +85,6 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     head.write(figure)
-    ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
     shared = not chart.own_scales
     grid = figure.subplots(
         down, across, squeeze=False, sharey=shared and chart.kind in ("lines", "points"),
@@ -83,11 +95,8 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     axes = list(grid[: len(panels)])
     for place, (panel, (name, part), title) in enumerate(zip(axes, panels, titles, strict=True)):
         if title:
-            panel.set_title(title, loc="left", fontsize=SIZE)
+            panel.set_title(title, loc="center" if upright else "left", fontsize=SIZE, rotation=90 if upright else 0)
         draw_kind(chart, panel, name, part, styles)
-        if chart.kind == "grid" and place + across < len(panels) and not chart.own_scales:
-            panel.set_xlabel("")
-            panel.tick_params(labelbottom=False)
         if chart.kind in ("lines", "points"):
             _label_axes(chart, panel, first=place % across == 0 or chart.own_scales)
     if chart.kind in ("lines", "points"):
@@ -96,12 +105,37 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
             _draw_marks(chart, panel, name, part)
             if chart.labels == "ends":
                 _label_ends(chart, panel, part, styles, width / across)
+    if shared and chart.kind in ("dots", "grid"):
+        _label_outer(chart, axes, across, row_names, upright)
     if legend:
         figure.legend(
             handles=legend, loc="lower center", bbox_to_anchor=(0.5, 0), ncols=columns, frameon=False,
             fontsize=SIZE, columnspacing=1.2, handletextpad=0.5, labelspacing=0.25, borderaxespad=0.1,
         )  # fmt: skip
     return figure
+
+
+def _label_outer(chart: Chart, axes: Sequence[Axes], across: int, row_names: Sequence[str], upright: bool) -> None:
+    """Label the axes of panels with common scales at the left and lower edge only, and name the rows of panels."""
+    labels = [[text.get_text() for text in panel.get_yticklabels()] for panel in axes]
+    equal_rows = all(texts == labels[0] for texts in labels)
+    for place, panel in enumerate(axes):
+        if place + across < len(axes):
+            panel.set_xlabel("")
+        if chart.kind == "grid":
+            panel.tick_params(labelbottom=place + across >= len(axes), labelleft=place % across == 0 or not equal_rows)
+            if place % across:
+                panel.set_ylabel("")
+    if row_names:
+        for panel, name in zip(axes[::across], row_names, strict=True):
+            panel.set_ylabel(plain(name), rotation=0, ha="right", va="center")
+        for place, panel in enumerate(axes):
+            if place != len(axes) - 1 - across // 2:
+                panel.set_xlabel("")
+            if upright:
+                panel.tick_params(axis="x", rotation=90)
+        figure = axes[0].figure.figure
+        figure.supylabel(axis_text(chart.y[0]), fontsize=SIZE)
 
 
 def series_styles(chart: Chart) -> dict[str, Style]:
@@ -162,6 +196,10 @@ def _fill(text: str, width: float) -> str:
 
 
 def _panels(chart: Chart) -> list[tuple[str, pd.DataFrame]]:
+    if chart.panel_row:
+        names = [list(dict.fromkeys(chart.frame[column])) for column in (chart.panel_row, chart.panel)]
+        rows = {row: part for row, part in chart.frame.groupby(chart.panel_row, sort=False)}
+        return [(str(name), rows[row][rows[row][chart.panel] == name]) for row in names[0] for name in names[1]]
     if not chart.panel:
         return [("", chart.frame)]
     return [(str(name), part) for name, part in chart.frame.groupby(chart.panel, sort=False)]
@@ -170,6 +208,19 @@ def _panels(chart: Chart) -> list[tuple[str, pd.DataFrame]]:
 def _panel_title(chart: Chart, name: str, width: float) -> str:
     parts = [_fill(_clipped(text, 3 * width), width) for text in (name, chart.panel_notes.get(name, "")) if text]
     return "\n".join(map(plain_lines, parts))
+
+
+def _label_width(chart: Chart, row_names: Sequence[str], across: int) -> float:
+    """Return the width in inches of all labels left of panels of dots, or of rows of panels: titles are right of them."""
+    if row_names:
+        return max(map(width_in_inches, map(plain, row_names))) + 0.6
+    if chart.kind != "dots":
+        return 0.0
+    return across * max(map(width_in_inches, map(plain, map(str, chart.frame[chart.y[0].name].unique()))), default=0.0)
+
+
+def _text_width(text: str) -> float:
+    return max(map(width_in_inches, text.split("\n")))
 
 
 def _across(chart: Chart, count: int, width: float) -> int:
@@ -181,15 +232,17 @@ def _height(chart: Chart, part: pd.DataFrame) -> float:
     """Return the height of a panel in inches."""
     if chart.height >= 1 or chart.kind in ("lines", "points"):
         return chart.height
-    return float(chart.height * part[chart.y[0].name].nunique() + 0.1)
+    rows = chart.frame if chart.panel_row else part
+    return float(chart.height * rows[chart.y[0].name].nunique() + 0.1)
 
 
-def _legend(chart: Chart, styles: dict[str, Style]) -> list[Any]:
+def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
+    labels = {name: plain_lines(_fill(style.meaning or name, width)) for name, style in styles.items()}
     if chart.kind == "grid":
         if not chart.level:
             return []
         return [
-            Patch(facecolor=style.colour, edgecolor="#808080", linewidth=0.4, label=plain(style.meaning or name))
+            Patch(facecolor=style.colour, edgecolor="#808080", linewidth=0.4, label=labels[name])
             for name, style in styles.items()
         ]
     if not chart.series:
@@ -198,7 +251,7 @@ def _legend(chart: Chart, styles: dict[str, Style]) -> list[Any]:
     colours = [
         Line2D(
             [], [], color=style.colour, marker="s" if chart.shape else style.marker, linestyle=style.line if line else "none",
-            linewidth=style.width, label=plain(_clipped(style.meaning or name, 3.0)),
+            linewidth=style.width, label=labels[name],
         )
         for name, style in styles.items()
     ]  # fmt: skip
@@ -215,7 +268,7 @@ def _shapes(chart: Chart) -> dict[str, str]:
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
-    lengths = np.array([0.5 + width_in_inches(label) for label in labels])
+    lengths = np.array([0.5 + _text_width(label) for label in labels])
     for count in range(min(len(lengths), 8), 1, -1):
         if sum(part.max() for part in np.array_split(lengths, count)) <= width:
             return count
@@ -304,9 +357,10 @@ def _label_axes(chart: Chart, panel: Axes, first: bool) -> None:
 def _scale(chart: Chart, axes: Sequence[Axes], panels: Sequence[tuple[str, pd.DataFrame]]) -> None:
     """Set the scales of all panels: x per panel, y for all together unless the chart has scales per panel."""
     x, y = chart.x[0], chart.y[0]
+    few = all(part[x.name].nunique() <= 6 for _, part in panels)
     for panel, (_, part) in zip(axes, panels, strict=True):
         rows = part if chart.own_scales else chart.frame
-        _scale_x(panel, x, part[x.name].to_numpy(float))
+        _scale_x(panel, x, part[x.name].to_numpy(float), few)
         if _is_log(y, chart.frame[y.name]):
             low, high = _log_range(y, rows, [mark for mark in chart.marks if mark.axis == "y"])
             log_axis(panel, "y", low, high, text=_values_text(y))
@@ -331,18 +385,19 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -
     return low / margin, high * margin
 
 
-def _scale_x(panel: Axes, column: Column, values: np.ndarray) -> None:
+def _scale_x(panel: Axes, column: Column, values: np.ndarray, few: bool) -> None:
+    """Set the scale of x, with a label at each of the ``values`` if all panels have ``few``."""
     values = np.unique(values[np.isfinite(values)])
     if not values.size:
         return
     text = _values_text(column)
     if _is_log(column, values) and values[0] > 0:
         margin = max((values[-1] / values[0]) ** 0.05, 1.08)
-        log_axis(panel, "x", values[0] / margin, values[-1] * margin, values if len(values) <= 6 else (), text)
+        log_axis(panel, "x", values[0] / margin, values[-1] * margin, values if few else (), text)
         return
     spread = float(np.ptp(values)) or abs(float(values[0])) or 1.0
     panel.set_xlim(values[0] - 0.05 * spread, values[-1] + 0.05 * spread)
-    if len(values) <= 6:
+    if few:
         panel.xaxis.set_major_locator(FixedLocator(list(values)))
     if text:
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
@@ -394,16 +449,16 @@ def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> Non
 def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], width: float) -> None:
     """Name each series beside the last point of its line, in its colour, moved apart where names would overlap."""
     x, y = chart.x[0].name, chart.y[0].name
-    ends = []
+    labels = []
     for series, points in part.groupby(chart.series, sort=False):
         points = points[np.isfinite(points[y]) & ((points[y] > 0) | (panel.get_yscale() != "log"))]
         if len(points):
             last = points.sort_values(x, kind="stable").iloc[-1]
             at = panel.transAxes.inverted().transform(panel.transData.transform((last[x], last[y])))[1]
-            ends.append((float(np.clip(at, 0.02, 0.98)), str(series)))
-    ends.sort()
+            labels.append((float(np.clip(at, 0.02, 0.98)), str(series)))
+    labels.sort()
     gap = 1.15 * LINE / chart.height
-    places = [at for at, _ in ends]
+    places = [at for at, _ in labels]
     for _ in range(200):  # move neighbours apart until no two overlap
         moved = False
         for i in range(len(places) - 1):
@@ -412,7 +467,7 @@ def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
                 places[i], places[i + 1], moved = places[i] - lack / 2, places[i + 1] + lack / 2, True
         if not moved:
             break
-    for place, (_, series) in zip(places, ends, strict=True):
+    for place, (_, series) in zip(places, labels, strict=True):
         style = styles[series]
         panel.annotate(
             plain(_clipped(style.meaning or series, 0.42 * width)), (1.015, place), xycoords="axes fraction",
@@ -437,7 +492,10 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
             ends = points[x.name].to_numpy(float)
             ends = ends[np.isfinite(ends) & ((ends > 0) | (not log))]
             if len(ends) > 1:
-                panel.hlines(place[str(category)], ends.min(), ends.max(), color="#a0a0a0", linewidth=1.6, zorder=1)
+                shade = styles[str(points[chart.series].iloc[-1])].colour if chart.series else "#000000"
+                panel.hlines(
+                    place[str(category)], ends.min(), ends.max(), color=shade, alpha=0.45, linewidth=1.8, zorder=1
+                )
     for number, (series, style) in enumerate(styles.items()):
         points = part[part[chart.series].astype(str) == series] if chart.series else part
         if points.empty:
@@ -488,8 +546,13 @@ def _draw_grid(
 ) -> None:
     """Draw a cell per pair of x and y, coloured by level or value, with its text."""
     x, y = chart.x[0], chart.y[0]
-    across, down = _categories(x, part if chart.own_scales else chart.frame), _categories(y, part, downwards=True)
+    across, down = (
+        _categories(x, part if chart.own_scales else chart.frame),
+        _categories(y, chart.frame if chart.panel_row else part, downwards=True),
+    )
     norm = _norm(chart)
+    panel_width = _inner_width(panel, down)
+    size = min(SIZE - 1, 0.8 * 72 * panel_width / max(len(across), 1))
     for line in part.to_dict("records"):
         place = across.index(_category(line[x.name])), len(down) - 1 - down.index(_category(line[y.name]))
         if chart.level:
@@ -503,12 +566,15 @@ def _draw_grid(
             Rectangle((place[0] - 0.5, place[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8)
         )
         if text:
-            panel.text(*place, plain(str(text)), ha="center", va="center", color=ink_on(face), fontsize=SIZE - 1)
+            panel.text(*place, plain(str(text)), ha="center", va="center", color=ink_on(face), fontsize=size)
     panel.set_xlim(-0.5, len(across) - 0.5)
     panel.set_ylim(-0.5, len(down) - 0.5)
     for which, column, names in (("x", x, across), ("y", y, down[::-1])):
         labels = _grid_labels(chart, column, names, width)
-        few = _thinned(labels) if which == "x" else list(range(len(labels)))
+        if which == "x" and any("…" in label for label in labels) and max(map(width_in_inches, names)) < 1:
+            labels = [plain(name) for name in names]  # short names read upwards rather than shortened
+            panel.tick_params(axis="x", rotation=90)
+        few = _thinned(labels, which, panel, panel_width)
         getattr(panel, f"set_{which}ticks")(few, [labels[i] for i in few])
         if column.label or column.kind == "number":
             getattr(panel, f"set_{which}label")(axis_text(column))
@@ -518,11 +584,14 @@ def _draw_grid(
 
 
 def _grid_labels(chart: Chart, column: Column, names: Sequence[str], width: float) -> list[str]:
-    """Return the labels of an axis of a grid: those of x in at most three lines of the width of a cell."""
+    """Return the labels of an axis of a grid, x labels in at most three lines of the width of a cell."""
     if column is chart.y[0] or column.kind != "text":
         return [plain(_clipped(name, 3.0)) for name in names]
     beside = min(3.0, max(map(width_in_inches, map(plain, _categories(chart.y[0], chart.frame))), default=0.0))
-    room = max(0.3, 0.95 * (width - beside - 0.3) / len(names))
+    if chart.panel and not chart.own_scales:  # the labels beside the first panel serve all
+        across = max(1, round(WIDTH / width))
+        beside /= across
+    room = max(0.3, (width - beside - 0.15) / len(names))
     return ["\n".join(plain(_clipped(line, room)) for line in _broken(name, room).split("\n", 2)[:3]) for name in names]
 
 
@@ -545,10 +614,21 @@ def _clipped(text: str, width: float) -> str:
     return f"{text[: (kept + 1) // 2]}…{text[len(text) - kept // 2 :]}"
 
 
-def _thinned(labels: Sequence[str]) -> list[int]:
-    """Return the positions of the labels that are shown: all, or every second or more of many numbers."""
-    step = math.ceil(len(labels) / 8) if len(labels) > 8 and all(map(_is_number, labels)) else 1
-    return list(range(0, len(labels), step))
+def _inner_width(panel: Axes, labels: Sequence[str]) -> float:
+    """Return about the width of a panel in inches, before the layout, from the labels left of the first one."""
+    place, width = panel.get_subplotspec(), panel.figure.figure.get_size_inches()[0]
+    across = place.get_gridspec().ncols if place is not None else 1
+    return max(0.9 * (float(width) - max(map(width_in_inches, labels), default=0.0)) / across, 0.2)
+
+
+def _thinned(labels: Sequence[str], which: str, panel: Axes, panel_width: float) -> list[int]:
+    """Return the positions of the labels that are shown: all, or each second or more of numbers that would overlap."""
+    if not all(_is_number(label) for label in labels):
+        return list(range(len(labels)))
+    panel_height = panel.get_position().height * panel.figure.figure.get_size_inches()[1]
+    needed = sum(width_in_inches(label) + 0.08 for label in labels) if which == "x" else 0.8 * LINE * len(labels)
+    step = math.ceil(needed / (panel_width if which == "x" else panel_height))
+    return list(range(0, len(labels), max(step, 1)))
 
 
 def _is_number(text: str) -> bool:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 from bench.errors import printable as one_line
 
-__all__ = ["axis_value", "counted", "duration", "number", "one_line"]
+__all__ = ["axis_value", "counted", "duration", "listed", "number", "one_line"]
 
 
 def number(value: float, digits: int = 2) -> str:
@@ -61,3 +62,13 @@ def counted(count: int, one: str, many: str = "") -> str:
     ('1 cell', '3 cells')
     """
     return f"{count} {one if count == 1 else many or one + 's'}"
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return names as an enumeration.
+
+    >>> listed(["a"]), listed(["a", "b", "c"])
+    ('a', 'a, b and c')
+    """
+    *rest, last = names
+    return f"{', '.join(rest)} and {last}" if rest else last

@@ -78,7 +78,7 @@ def markdown(tables: Sequence[Table], experiment: str) -> str:
                 for row in part.to_dict("records")
             ]
             blocks.append("\n".join([head, rule, *lines]))
-        blocks += map(e, table.notes)
+        blocks += [note if note.startswith("    ") else e(note) for note in table.notes]  # a command is a block of code
     return "\n\n".join(blocks) + "\n"
 
 
@@ -104,7 +104,7 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
             for note in table.notes:
                 console.print(note)
     for text in (*views.remarks, *views.findings):
-        console.print(text)
+        console.print(text, soft_wrap=True)  # a command stays one line, so that it can be copied
 
 
 def _terminal_text(table: Table, width: int) -> pd.DataFrame:

@@ -13,7 +13,8 @@ from bench.experiment.columns import IDENTITY
 from bench.measure import noise
 from bench.measure.gradcheck import EPS, FAULTS, VERDICTS, Sample, diagnose
 from bench.model import Problem, compose, registry
-from bench.studies.gradient_check import GradientCheck, measure, report
+from bench.studies.gradient_check import GradientCheck, measure
+from bench.studies.gradient_check.lines import by_point
 from bench.studies.gradient_check.points import is_trusted
 
 FLOAT64, FLOAT32 = (float(np.finfo(dtype).eps) for dtype in (np.float64, np.float32))
@@ -375,7 +376,7 @@ def test_worst_check_decides_the_line_of_a_point():
         "point": ["start", "start"], "check_verdict": ["smooth", "wrong_adjoint"], "check_error": [1e-9, 0.5],
         "check_eps": [1e-5, 1e-6], "key": "k",
     }])  # fmt: skip
-    (line,) = report.by_point(rows).to_dict("records")
+    (line,) = by_point(rows).to_dict("records")
     assert (line["verdict"], line["error"]) == ("wrong_adjoint", 0.5)
 
 

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 
 from bench.model import registry
 from bench.report.style import MARKERS, PALETTE, colour
-from bench.studies.growth import report as growth
+from bench.studies.growth import views as growth
 from bench.studies.optimise import findings
 from bench.studies.optimise import report as searches
 
@@ -76,7 +76,7 @@ def test_an_estimator_keeps_its_colour_in_searches_and_in_errors_and_what_sees_c
     context = found["cem[elites=8,population=40]"]
     assert len(set(to_rgb(context["color"]))) == 1
     assert context["linestyle"] != "-"
-    assert growth.variances()["first_order"][1]["color"] == found["fobg, adam"]["color"]
+    assert growth.looks()["first_order"].colour == found["fobg, adam"]["color"]
 
 
 def test_titles_of_searches_say_what_was_found():

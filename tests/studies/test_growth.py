@@ -1,6 +1,7 @@
 """Products of step Jacobians against closed forms, and the growth study end to end."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,15 +12,19 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.double_integrator import DoubleIntegrator
 from bench.plugins.scenes.double_pendulum import DoublePendulum
 
+import bench
 from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import Jacobians, compose
-from bench.report.views import arrange
+from bench.report.cells import readable
 from bench.run.store import Store
-from bench.studies.growth import report
+from bench.studies.growth import views
 from bench.studies.growth.columns import COLUMNS
+from bench.studies.growth.fits import fit
 from bench.studies.growth.measure import classify, products, rate
+
+STANDARD = Path(bench.__file__).parent.parent / "results" / "standard"
 
 
 def constant(matrix, horizon, batch=3):
@@ -89,7 +94,7 @@ def test_from_the_command_line(tmp_path, capsys):
     assert main(words) == 0
     for name in ("csv", "md", "png"):
         assert (tmp_path / "small" / f"growth.{name}").stat().st_size > 0
-    assert "spectral" in capsys.readouterr().out
+    assert "follow no curve beyond doubt on double_integrator and double_pendulum" in capsys.readouterr().out
     rows = Store(tmp_path / "small", COLUMNS).load().set_index(["scene", "horizon"])
     assert rows.loc[("double_integrator", 50.0), "growth"] == "neutral"
     chaotic = rows.loc[("double_pendulum", 50.0)]
@@ -98,26 +103,141 @@ def test_from_the_command_line(tmp_path, capsys):
     assert len(chaotic["lags"]) == len(chaotic["gain"])
 
 
-def test_every_singular_value_and_the_gain_are_drawn():
-    """Two scenes of 2 and 3 states, four rows of panels; what is below rounding is left out and said to be."""
-    words = ["study=growth", "scenes=[bouncing_ball,hopper]", "integrators=[rk4]", "estimators=[fobg]"]
-    given = config.load([*words, "sweep.horizon=[10,20]"])
+TIMES = np.array([0.5, 1.0, 2.5, 5.0, 10.0])
+QUIET = np.full(5, 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("norms", "verdict"),
+    [
+        (TIMES**3, "polynomial"),
+        (np.sqrt(TIMES), "polynomial"),
+        (np.exp(1.2 * TIMES), "exploding"),
+        (TIMES * np.exp(2.0 * TIMES), "exploding"),
+        (np.exp(-TIMES), "vanishing"),
+        (TIMES**-2, "vanishing"),
+        (np.ones(5), "open"),
+        (np.array([1.0, 100.0, 1.0, 100.0, 1.0]), "open"),
+    ],
+)
+def test_verdicts_of_planted_norms(norms, verdict):
+    found = fit(TIMES, norms, QUIET)
+    assert found.verdict == verdict
+    if verdict == "open":
+        assert np.isnan(found.at(TIMES)).all()
+    elif norms[1] != math.exp(2.0):  # all but the one that is neither
+        assert found.at(TIMES) == pytest.approx(norms, rel=1e-6)
+
+
+def test_few_horizons_and_uncertain_norms_are_open():
+    assert fit(TIMES[:4], np.exp(TIMES[:4]), QUIET[:4]).verdict == "open"
+    assert fit(TIMES[:1], np.ones(1), QUIET[:1]).verdict == "open"
+    assert fit(np.ones(5), np.exp(TIMES), QUIET).verdict == "open", "equal horizons, such as seeds"
+    assert fit(TIMES, np.exp(0.3 * TIMES), 1e3 * QUIET).verdict == "open", "norms known within a factor of e"
+
+
+@pytest.mark.parametrize("count", [5, 8])
+def test_at_most_one_power_law_in_twenty_counts_as_exploding(count):
+    rng, horizons = np.random.default_rng(0), np.geomspace(0.5, 10.0, count)
+    for order, spread in ((0.5, 0.3), (1.0, 0.6), (3.0, 2.0)):
+        noise = spread * rng.standard_normal((500, count))
+        found = [fit(horizons, horizons**order * np.exp(n), np.zeros(count)).verdict for n in noise]
+        assert found.count("exploding") <= 500 * 0.05 + 3 * math.sqrt(500 * 0.05 * 0.95)
+
+
+def grown(*words):
+    """Two scenes of 2 and 3 states over five horizons: norms of one rise like t^2, of the other like e^t."""
+    given = config.load(
+        ["study=growth", "scenes=[bouncing_ball,hopper]", "integrators=[rk4]", "estimators=[fobg]",
+         "sweep.horizon=[10,20,50,100,200]", *words]
+    )  # fmt: skip
     values = {"bouncing_ball": [10.0, 0.1], "hopper": [1e3, 1.0, 1e-15]}
     lines = []
     for cell in cells(given):
-        row, t = cell.columns(), float(cell.scene.horizon)
+        row, t = cell.columns(), 0.1 * cell.scene.horizon
+        norm = t**2 if row["scene"] == "bouncing_ball" else math.exp(t)
         lines.append(COLUMNS.blank() | row | {
-            "status": "ok", "dt": 0.1, "time_horizon": t, "gradient_median": t, "gradient_low": t / 2,
-            "gradient_high": 2 * t, "growth": "exploding", "spectral_rate": 0.1, "lags": [1, 10], "gain": [1.0, 5.0],
-            "gain_low": [0.5, 2.0], "gain_high": [2.0, 9.0], "gain_of": "states", "singular_values": values[row["scene"]],
-            **{f"{order}_order_variance{end}": t for order in ("first", "zeroth") for end in ("", "_low", "_high")},
+            "status": "ok", "dt": 0.1, "time_horizon": t, "gradient_median": norm, "gradient_low": norm / 2,
+            "gradient_quarter": norm / 1.1, "gradient_three_quarters": norm * 1.1, "gradient_high": 2 * norm,
+            "finite_fraction": 1.0, "growth": "exploding", "spectral_rate": 0.1, "spectral_low": 0.05, "spectral_high": 0.2,
+            "lags": [1, 10], "gain": [1.0, 5.0], "gain_low": [0.5, 2.0], "gain_high": [2.0, 9.0], "gain_of": "states",
+            "singular_values": values[row["scene"]],
+            **{f"first_order_variance{end}": t for end in ("", "_low", "_high")},
+            **{f"zeroth_order_variance{end}": 3.0 for end in ("", "_low", "_high")},
         })  # fmt: skip
-    drawn = report.figure(arrange(given, pd.DataFrame(lines)))
-    assert drawn is not None
-    panels = np.array(drawn.axes).reshape(4, 2)
-    shown = [{float(line.get_ydata()[0]) for line in panel.lines} for panel in panels[1]]
-    assert shown[0] == {10.0, 0.1, 1.0}  # and the 1 at which nothing grows
-    assert {value for value in shown[1] if math.isfinite(value)} == {1e3, 1.0}
-    assert 5.0 in panels[2, 0].lines[0].get_ydata()
-    assert report._ends([1e3, 1.0, 1e-15]) == "1000 to < 2.2e-13"
-    assert report._ends([10.0, 0.1]) == "10 to 0.10"
+    return given, given.columns.typed(pd.DataFrame(lines))
+
+
+def test_findings_charts_and_tables_of_planted_rows():
+    given, rows = grown()
+    shown = views.views(given, rows)
+    assert shown.findings == [
+        "Use the zeroth order on bouncing_ball from 5 s and hopper from 5 s: it varies less there.",
+        "Gradients explode on hopper (rate 1.0 [1.0, 1.0] per second).",
+        "They grow like a power of the horizon on bouncing_ball (order 2.0 [2.0, 2.0]).",
+    ]
+    norms, variances, _, gains = shown.charts
+    drawn = norms.plotted()
+    assert set(zip(drawn["problem"], drawn["series"], strict=True)) == {
+        ("bouncing_ball", views.NORM), ("bouncing_ball", "power law"), ("hopper", views.NORM), ("hopper", "exponential")
+    }  # fmt: skip
+    curve = drawn[drawn["series"] == "exponential"]
+    assert curve["gradient_median"].to_numpy() == pytest.approx(np.exp(curve["time_horizon"].to_numpy()), rel=1e-3)
+    assert list(norms.frame.loc[norms.frame["series"] == views.NORM, "row"]) == list(range(10))
+    assert len(variances.frame) == 2 * len(rows)
+    assert list(gains.frame["gain"]) == [1.0, 5.0] * 2
+    assert list(rows["horizon"][gains.frame["row"]]) == [200.0] * 4, "gains are of the longest horizon"
+    answers, table = map(readable, shown.tables)
+    assert list(answers["verdict"]) == ["polynomial", "exploding"]
+    assert list(table["singular values"]) == ["10 to 0.10"] * 5 + ["1000 to < 2.2e-13"] * 5
+    assert table["spectral [1/s]"][0] == "1.0 [0.50, 2.0]", "per second, at steps of 0.1 s"
+
+
+def test_ranges_of_variances_that_overlap_and_lost_horizons_are_open():
+    given, rows = grown()
+    rows["first_order_variance_low"], rows["first_order_variance_high"] = 0.0, 1e9
+    lost = rows["horizon"] > 50
+    rows.loc[lost, ["gradient_median", "gradient_quarter"]] = math.nan
+    rows.loc[lost, "status"] = "nonfinite"
+    shown = views.views(given, rows)
+    assert shown.findings == [
+        "Which order has the lower variance is open at the longest horizon.",
+        "Gradients explode on no problem.",
+        "They follow no curve beyond doubt on bouncing_ball and hopper.",
+    ]
+    assert len(shown.tables[1].frame) == len(rows)
+    rows["status"], rows["gradient_median"], rows["reason"] = "nonfinite", math.nan, "not finite"
+    shown = views.views(given, rows)
+    assert shown.findings == ["No cell gave a result: the table has the reason of each."]
+    assert shown.remarks == ["not finite"]
+
+
+def test_findings_of_the_standard_experiment_computed_from_its_table():
+    given = config.load(["+experiment=horizon_growth", f"results_dir={STANDARD}"])
+    rows = Store(given.directory, COLUMNS).load()
+    shown = views.views(given, rows)
+    table = pd.read_csv(given.directory / "growth.csv")
+    classes = {}
+    for scene, part in table.groupby("scene", sort=False):
+        t, y = part["time_horizon"], np.log(part["gradient_median"])
+        left = {name: np.polyfit(x, y, 1, full=True)[1][0] for name, x in (("t", t), ("log", np.log(t)))}
+        odds = (left["log"] / left["t"]) ** (len(part) / 2)
+        classes[scene] = "exploding" if odds > 20 else "polynomial" if odds < 1 else "open"
+    assert classes == {
+        "double_integrator": "polynomial", "pendulum": "polynomial", "bouncing_ball": "exploding",
+        "hopper": "polynomial", "double_pendulum": "exploding",
+    }  # fmt: skip
+    slope, _ = np.polyfit(np.log(t := table[table["scene"] == "hopper"]["time_horizon"]), np.log(
+        table[table["scene"] == "hopper"]["gradient_median"]), 1)  # fmt: skip
+    assert 0 < slope < 1
+    assert len(t) == 5
+    verdicts = dict(zip(shown.tables[0].frame["problem"], shown.tables[0].frame["verdict"], strict=True))
+    assert verdicts == classes | {"hopper": "open"}, "the norms of hopper rise, then fall: the order's interval has 0"
+    lower = table["zeroth_order_variance_high"] < table["first_order_variance_low"]
+    assert set(table.loc[lower, "scene"]) == {"bouncing_ball", "double_pendulum"}
+    for scene, start in (("bouncing_ball", 1.0), ("double_pendulum", 2.5)):
+        own = table[table["scene"] == scene]
+        assert list(own["time_horizon"] >= start) == list(lower[own.index])
+        assert f"{scene} from {start:g} s" in shown.findings[0]
+    assert "the first order on double_integrator and pendulum at every horizon" in shown.findings[0]
+    assert shown.findings[1].startswith("Gradients explode on bouncing_ball (")

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+import bench
 from bench.experiment import config
 from bench.experiment.cell import Cell
 from bench.experiment.grid import cells
 from bench.model import MechanicalScene, State, compose, registry
 from bench.model.parameters import build
+from bench.report.cells import readable
+from bench.report.draw import draw
 from bench.run import runner, tasks
 from bench.run.plan import plan
 from bench.run.session import Session
 from bench.run.store import Store
-from bench.studies.stability import Stability, report, summary
+from bench.studies.stability import Stability, maps, views
 from bench.studies.stability import measure as stability
 
+STANDARD = Path(bench.__file__).parent.parent / "results" / "standard"
 STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
 HORIZON, DT = 40, 0.05
 
@@ -87,7 +92,7 @@ def test_semi_implicit_euler_diverges_within_a_cell_of_its_limit(tmp_path, facto
     assert lost[first:].all()
     assert 0 < first < len(STIFFNESS) - 1
     assert STIFFNESS[first - 2] < limit < STIFFNESS[first + 1]
-    (panel,) = report.panels(report.arrange_maps(given, rows))
+    (panel,) = maps.panels(maps.arrange_maps(given, rows))
     assert panel.boundary["agrees"].all()
 
 
@@ -106,7 +111,7 @@ def test_implicit_steps_never_diverge(tmp_path, integrator):
 def test_measured_boundary_is_within_a_cell_of_the_theoretical_one(tmp_path, integrator, damping):
     """For every integrator, those too that grow too slowly to diverge within the rollout."""
     given, rows = swept(tmp_path, integrator, f"scene.mass_spring.damping={damping}")
-    (panel,) = report.panels(report.arrange_maps(given, rows))
+    (panel,) = maps.panels(maps.arrange_maps(given, rows))
     assert panel.boundary["agrees"].all()
     assert rows["growth_factor"].to_numpy() == pytest.approx(rows["spectral_radius"].to_numpy(), rel=1e-6)
 
@@ -249,50 +254,101 @@ def test_limits_hold_what_is_known():
     assert limit("implicit_euler") == limit("implicit_midpoint") == math.inf
 
 
-def test_files_and_the_printed_table(tmp_path, capsys):
+def test_tables_and_charts_of_two_step_sizes(tmp_path):
     given, rows = swept(tmp_path, "semi_implicit_euler")
     coarse = rows.assign(dt=2 * DT, horizon=HORIZON / 2, stiffness_limit=rows["stiffness_limit"] / 4)
     coarse["parameters"] = coarse["parameters"].str.replace(f'"dt":{DT}', f'"dt":{2 * DT}')
     both = pd.concat([rows, coarse], ignore_index=True)
     given = replace(given, sweep={**given.sweep, "dt": [DT, 2 * DT]})
-    capsys.readouterr()
-    paths = Stability().write(given, both)
-    assert capsys.readouterr().out == ""
-    names = {path.name for path in paths}
-    assert names == {
-        "stability_map.csv", "stability_map.md", "stability_map_semi_implicit_euler.png",
-        "stability_map_semi_implicit_euler.plotted.csv", "stability_summary.png", "stability_summary.plotted.csv",
-    }  # fmt: skip
-    counted = pd.read_csv(given.directory / "stability_summary.plotted.csv")
-    assert counted["cells"].sum() == len(both)
-    expected = both["verdict"].where(~both["verdict"].isin(report.WRONG), "by step").value_counts().to_dict()
-    assert dict(zip(counted["look"], counted["cells"], strict=True)) == expected
-    Stability().show(given, both)
-    printed = capsys.readouterr().out
-    assert "semi_implicit_euler" in printed
-    assert "1 of 2" in printed  # the verdicts at twice the dt are copies, and its limit is a quarter
-    (panel,) = report.panels(report.arrange_maps(given, both))
-    (axes,) = report.heat_map("semi_implicit_euler", [panel]).axes
-    (line,) = axes.get_lines()
-    drawn = dict(zip(np.round(line.get_xdata(), 9), line.get_ydata(), strict=True))
-    assert drawn[DT] == pytest.approx(2 / DT**2, rel=1e-6)
-    assert {text.get_text() for text in axes.texts} >= {"D"}
+    shown = views.views(given, both)
+    answers, whole = shown.tables
+    (line,) = answers.frame.to_dict("records")
+    wrong = both["verdict"].isin(maps.WRONG)
+    assert line["cells"] == len(both)
+    assert line["by step"] == pytest.approx(wrong.mean())
+    assert line["right"] + line["wrong"] + line["diverged"] == pytest.approx(1.0)
+    (drawn,) = readable(whole).to_dict("records")
+    assert drawn["agree"] == "1 of 2", "the verdicts at twice the dt are copies, and its limit is a quarter"
+    chart = shown.charts[0].frame
+    assert len(chart) == len(both)
+    beyond = chart["stiffness"] > chart["dt"].map({DT: 2 / DT**2, 2 * DT: 2 / DT**2 / 4})
+    assert list(chart["mark"] == views.BEYOND) == list(beyond)
+    assert set(chart.loc[chart["verdict"] == "diverged", "level"]) == {"diverged"}
+    assert list(both["verdict"][chart["row"]]) == list(chart["verdict"])
 
 
-def test_the_summary_leads_with_what_is_right_where_and_how_often_it_is_never():
-    made = pd.DataFrame(
-        [
-            ("spring", "one", "ok", 3),
-            ("spring", "one", "diverged", 1),
-            ("ball", "one", "by law", 3),
-            ("ball", "one", "by step", 1),
-        ],
-        columns=["problem", "integrator", "look", "cells"],
+def classed(*entries):
+    """Cells of maps as views has them: scene, law and integrator, class, cause, and how many."""
+    return pd.DataFrame(
+        [entry[:4] for entry in entries for _ in range(entry[4])], columns=["scene_name", "step", "level", "cause"]
     )
-    assert summary.headline(made) == (
-        "The gradient is right in 38% of the cells, wrong by the step in 12%, by the law in 38%; "
-        "right most often (75%) with one on spring, never in 1 of 2 combinations"
+
+
+def test_findings_lead_with_what_to_use_and_say_why_the_rest_is_wrong():
+    cells = classed(
+        ("spring", "one", "right", "", 3), ("spring", "one", "diverged", "", 1), ("spring", "two", "right", "", 3),
+        ("spring", "two", "wrong", "step", 1), ("ball", "one", "wrong", "law", 3), ("ball", "one", "wrong", "", 1),
+    )  # fmt: skip
+    assert views.findings(views.shares_of(cells), cells) == [
+        "Use one and two on spring (right in 75% of 4 cells).",
+        "Of 12 cells, 5 have a finite but wrong gradient and 1 a state that diverges.",
+        "The cause of the wrong gradients is the step or its derivative in 1, the law in 3, not resolved in 1.",
+    ]
+    assert list(views.shares_of(cells)["by unknown"]) == [0.0, 0.0, 0.25]
+    lost = classed(("ball", "one", "diverged", "", 2), ("ball", "one", "open", "", 1))
+    assert views.findings(views.shares_of(lost), lost) == [
+        "No law and integrator gives a right gradient at any step size and stiffness.",
+        "Of 3 cells, 0 have a finite but wrong gradient and 1 a state that diverges.".replace(" 1 a", " 2 a"),
+    ]
+
+
+def test_findings_of_the_standard_experiment_computed_from_its_rows():
+    given = config.load(["+experiment=stability_map", f"results_dir={STANDARD}"])
+    rows = Store(given.directory, given.columns).load()
+    shown = views.views(given, rows)
+    ran = rows[rows["verdict"] != ""]
+    counts = ran["verdict"].value_counts()
+    n_wrong, n_lost = (counts.reindex(names).sum() for names in (maps.WRONG, maps.LOST))
+    assert shown.findings[1] == (
+        f"Of {len(ran)} cells, {n_wrong:.0f} have a finite but wrong gradient and {n_lost:.0f} a state that diverges."
     )
+    law = ran["contact"].str.partition("[")[0]
+    right = (
+        (ran["verdict"] == "ok")
+        .groupby([ran["scene"].str.partition("[")[0], law, ran["integrator"]])
+        .agg(["mean", "size"])
+    )
+    spring, ball = (right.loc[scene].sort_values("mean").iloc[-1] for scene in ("mass_spring", "bouncing_ball"))
+    assert (spring.name, ball.name) == (("none", "rk4"), ("impulse", "event_driven"))
+    assert shown.findings[0] == (
+        f"Use rk4 on mass_spring (right in {spring['mean']:.0%} of {spring['size']:.0f} cells) and impulse, event_driven on "
+        f"bouncing_ball (right in {ball['mean']:.0%} of {ball['size']:.0f} cells)."
+    )
+    causes = ran["cause"].value_counts()
+    for cause, noun in (("step", "the step or its derivative"), ("law", "the law"), ("both", "both")):
+        assert f"{noun} in {causes[cause]}" in shown.findings[2]
+    assert f"not resolved in {causes['unknown']}" in shown.findings[2]
+    printed = shown.charts[0]
+    assert f"{(ran['verdict'] == 'ok').mean():.0%} of the cells" in printed.title
+    assert len(draw(printed, 3.5).axes) == len(draw(printed).axes) == 8 * 5, "a panel per integrator and problem"
+    assert [chart.name for chart in shown.charts if chart.printed] == ["stability_map"]
+    whole = shown.charts[1].frame
+    assert whole.groupby(["panel", "dt", "stiffness"]).size().max() == 1
+    assert set(whole["row"]) == set(rows.index[rows["verdict"] != ""])
+
+
+def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_finding(tmp_path):
+    given = experiment(tmp_path, "scenes=[mass_spring]", "backends=[jax,numpy]", "sweep.stiffness=[10,100]")
+    lines = [given.columns.blank() | cell.columns() | {"status": "ok", "verdict": "ok"} for cell in cells(given)]
+    rows = given.columns.typed(pd.DataFrame(lines))
+    rows.loc[(rows["backend"] == "numpy") & (rows["stiffness"] == 100), "verdict"] = "wrong_sign"
+    chart = views.views(given, rows).charts[0].frame.set_index("stiffness")
+    assert dict(chart["level"]) == {10.0: "right", 100.0: "wrong"}
+    assert rows["backend"][chart.loc[100.0, "row"]] == "numpy"
+    rows["verdict"], rows["status"], rows["reason"] = "", "unsupported", "no step"
+    nothing = views.views(given, rows)
+    assert nothing.findings == ["No cell has a verdict: the table has the reason of each."]
+    assert nothing.remarks == ["4 unsupported: no step"]
 
 
 @pytest.mark.parametrize(

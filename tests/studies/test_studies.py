@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,25 +16,26 @@ import bench.report
 from bench.experiment import config
 from bench.experiment.axes import axes, table
 from bench.experiment.grid import cells
-from bench.experiment.study import study_of
-from bench.measure.gradcheck import EPS
+from bench.measure.gradcheck import EPS, TRUSTED, VERDICTS
 from bench.model import registry
 from bench.report import reproduce, web
-from bench.report.cells import readable
+from bench.report.cells import parts, readable
 from bench.report.problems import problem_names, problem_numbers, split_by_problem
 from bench.report.views import arrange, rows_along
 from bench.report.web.content import Content, looks
 from bench.report.web.document import data
+from bench.report.writer import write
 from bench.run.files import make_directory
-from bench.studies.gradient_check import matrix
-from bench.studies.gradient_check import report as gradient_check
-from bench.studies.growth import report as growth
-from bench.studies.stability import page as stability_page
-from bench.studies.stability import report as stability
-from bench.studies.three_errors import page as three_errors_page
-from bench.studies.three_errors import report as three_errors
+from bench.run.store import Store
+from bench.studies.gradient_check import views as gradient_check
+from bench.studies.gradient_check.lines import PER_COMPONENT
+from bench.studies.growth import views as growth
+from bench.studies.stability import maps
+from bench.studies.stability import views as stability
+from bench.studies.three_errors import views as three_errors
 from bench.studies.twins import views as twins
 
+STANDARD = Path(bench.report.__file__).parents[2] / "results" / "standard"
 SPRUNG = '''
 from dataclasses import dataclass
 
@@ -93,13 +95,6 @@ def made(*words):
     return given, given.columns.typed(pd.DataFrame(lines))
 
 
-def table_of(markdown):
-    """The lines of the first table in Markdown, by heading."""
-    lines = [line.strip("|").split(" | ") for line in markdown.splitlines() if line.startswith("|")]
-    heads, _, *body = [[cell.strip() for cell in line] for line in lines]
-    return pd.DataFrame(body, columns=heads)
-
-
 # -------------------------------------------------------------------------------------------------- gradient_check
 
 
@@ -110,36 +105,36 @@ def checked(*words):
         "point": ["start"], "sample": [0], "direction": [0], "derivative_program": [1.0], "check_verdict": ["smooth"],
         "check_error": [1e-9], "check_eps": [1e-4], "eps": list(eps), "derivative_differences": [1.0, 1.0],
         "relative_error": [1e-9, 1e-8], "mode_minus": ["", ""], "mode_plus": ["", ""],
-    } | {name: [0] for name in gradient_check.PER_COMPONENT}  # fmt: skip
+    } | {name: [0] for name in PER_COMPONENT}  # fmt: skip
     return given, rows.assign(verdict="smooth", **{name: [value] * len(rows) for name, value in values.items()})
 
 
 def test_two_integrators_are_two_lines_of_the_gradient_check():
     given, rows = checked("scenes=[pendulum]", "integrators=[semi_implicit_euler,rk4]", "sweep.horizon=[1,10]")
-    found = table_of(gradient_check.markdown(arrange(given, rows)))
+    found = readable(gradient_check.views(given, rows).tables[1])
     assert list(found["integrator"]) == ["semi_implicit_euler", "rk4"] * 2
-    assert list(found["horizon"]) == ["1", "1", "10", "10"]
+    assert list(found["horizon [steps]"]) == ["1", "1", "10", "10"]
     assert set(found["backends"]) == {"jax, torch"}
 
 
 def test_a_swept_parameter_keeps_lines_of_the_gradient_check_apart():
     given, rows = checked("scenes=[mass_spring]", "sweep.mass_spring.damping=[0,1,10]", "sweep.horizon=[2]")
-    shown = arrange(given, rows)
-    found = table_of(gradient_check.markdown(shown))
+    shown = gradient_check.views(given, rows)
+    found = readable(shown.tables[1])
     assert list(found["damping"]) == ["0", "1", "10"]
     assert set(found["scene"]) == {"mass_spring"}
-    (panel,) = matrix.figure(shown).axes
-    lines = [label.get_text() for label in reversed(panel.get_yticklabels())]
-    assert lines == ["mass_spring, damping=0", "mass_spring, damping=1", "mass_spring, damping=10"]
-    assert [text.get_text() for text in panel.texts] == ["ok"] * 3 + ["2 steps"]
-    assert web.content(given, rows).tables["checks"]["problem"].nunique() == 6
+    grid, errors = shown.charts
+    assert list(grid.frame["name"]) == ["mass_spring, damping=0", "mass_spring, damping=1", "mass_spring, damping=10"]
+    assert list(grid.frame["letter"]) == ["ok"] * 3
+    assert set(grid.frame["steps"]) == {"2 steps"}
+    assert errors.frame["problem"].nunique() == 6
 
 
 def test_the_gradient_check_says_how_far_from_a_switch_it_looked():
     given, rows = checked("scenes=[pendulum]", "study=gradient_check[aside=0.002]")
-    assert "2e-3" in gradient_check.markdown(arrange(given, rows))
+    assert "2e-3" in " ".join(gradient_check.views(given, rows).tables[1].notes)
     given, rows = checked("scenes=[pendulum]")
-    assert "1e-4" in gradient_check.markdown(arrange(given, rows))
+    assert "1e-4" in " ".join(gradient_check.views(given, rows).tables[1].notes)
 
 
 def test_the_long_table_keeps_its_columns_and_adds_swept_ones(tmp_path):
@@ -147,11 +142,58 @@ def test_the_long_table_keeps_its_columns_and_adds_swept_ones(tmp_path):
         "scenes=[mass_spring]", "sweep.mass_spring.damping=[0,1]", f"results_dir={tmp_path}", "formats=[]"
     )
     make_directory(given.directory)
-    study_of(given).write(given, rows)
+    write(given, gradient_check.views(given, rows))
     found = pd.read_csv(given.directory / "gradient_check.csv")
     assert list(found)[-4:] == ["verdict", "key", "damping", "study"]
     assert len(found) == 2 * len(rows)
     assert set(found["damping"]) == {0.0, 1.0}
+
+
+def test_findings_of_the_standard_gradient_check_computed_from_its_rows():
+    given = config.load(["+experiment=gradient_check", f"results_dir={STANDARD}"])
+    rows = Store(given.directory, given.columns).load()
+    shown = gradient_check.views(given, rows)
+    checks = rows[["scene", "contact", "key", "point", "check_verdict", "check_error"]].explode(
+        ["point", "check_verdict", "check_error"]
+    )
+    checks = checks[checks["point"].notna()]
+    worst = checks.assign(rank=checks["check_verdict"].map(VERDICTS.index)).groupby(["key", "point"])["rank"].min()
+    assert shown.findings[0] == f"No wrong gradient at {len(worst)} checked points."
+    assert worst[worst < VERDICTS.index("saturated")].index.get_level_values("point").unique() == ["at"]
+    errors = checks.set_index(["key", "point"])
+    errors = errors[errors["check_verdict"].isin(TRUSTED)]["check_error"].astype(float)
+    largest = errors[~errors.index.isin(worst[worst < VERDICTS.index("saturated")].index)].max()
+    assert f" {largest:.1e} ".replace("e-0", "e-") in shown.findings[1]
+    broken = worst.isin([VERDICTS.index(name) for name in ("jump", "kink")])
+    assert shown.findings[2].startswith(f"{broken.sum()} points on a contact switch have a kink or a jump")
+    grid = shown.charts[0].frame
+    assert len(grid) == len(grid[["name", "horizon", "point"]].drop_duplicates())
+    assert set(grid["letter"]) == {"ok", "K", "J"}
+    assert set(grid.loc[grid["letter"] != "ok", "point"]) == {"at"}
+    [verdicts] = [table for table in shown.tables if table.page]
+    assert verdicts.frame["points"].sum() == len(worst)
+
+
+def test_untrusted_undecided_and_missing_gradients_come_first_and_are_never_right():
+    given, rows = checked("scenes=[pendulum]", "sweep.horizon=[1,2]")
+    rows["command"] = [f"python -m bench gradcheck {i}" for i in range(len(rows))]
+    rows.at[0, "check_verdict"], rows.at[0, "check_error"] = ["wrong_factor"], [0.5]
+    rows.at[1, "check_verdict"], rows.at[1, "check_error"] = ["nonfinite"], [np.nan]
+    shown = gradient_check.views(given, rows)
+    assert shown.findings[0].startswith(
+        "2 of 4 checked points have a gradient that cannot be trusted (wrong_factor, nonfinite)"
+    )
+    assert shown.findings[1] == "The largest error of a right gradient is 1.0e-9 (pendulum)."
+    assert shown.charts[0].title.startswith("Wrong gradients: pendulum, and kinks, jumps or undecided checks")
+    assert list(shown.charts[0].frame["letter"]) == ["X", "ok"], "the worse verdict of the backends"
+    assert "      python -m bench gradcheck 0" in shown.tables[1].notes
+    assert any(text == "\nwrong_factor (start); repeat with\n  python -m bench gradcheck 0" for text in shown.remarks)
+    for name in ("check_verdict", "point", "check_error", "check_eps"):
+        rows[name] = [[]] * len(rows)
+    rows["status"], rows["reason"] = "unsupported", "no root finder"
+    nothing = gradient_check.views(given, rows)
+    assert nothing.findings == ["No gradient could be checked: the table has the reason of each cell."]
+    assert nothing.remarks == ["\n4 cells: unsupported: no root finder"]
 
 
 # ---------------------------------------------------------------------------------------------------- three_errors
@@ -164,8 +206,9 @@ def erring(*words):
 
 
 def lines_of(given, rows):
-    shown = arrange(given, rows)
-    return {part.heading: three_errors.readable(shown, part) for part in three_errors.sections(shown)}
+    """The readable parts of the table of three errors, by heading."""
+    table_ = three_errors.views(given, rows).tables[0]
+    return {name: readable(replace(table_, frame=part)) for name, part in parts(table_)}
 
 
 def test_three_errors_of_two_integrators_are_twice_as_many_lines():
@@ -175,20 +218,23 @@ def test_three_errors_of_two_integrators_are_twice_as_many_lines():
     assert heading == "Along dt [s]"
     assert len(found) == 2 * 2 * 3
     assert found.groupby(["contact", "integrator"], sort=False).ngroups == 4
-    shown = arrange(given, rows)
-    assert three_errors.figure(shown).axes[0].get_legend() is None
-    labels = {text.get_text() for text in three_errors.figure(shown).legends[0].get_texts()}
-    assert {"impulse, semi_implicit_euler", "impulse, event_driven", "penalty, event_driven"} <= labels
+    drawn = three_errors.views(given, rows).charts[0].plotted()
+    assert list(dict.fromkeys(drawn["law"])) == [
+        f"{law}, {step}" for law in ("impulse", "penalty") for step in ("semi_implicit_euler", "event_driven")
+    ]
+    assert len(drawn) == 2 * 4, "both errors at the smallest step"
 
 
-def test_three_errors_without_a_swept_axis_have_a_table(tmp_path):
-    given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,penalty]", f"results_dir={tmp_path}")
+def test_three_errors_without_a_swept_axis_have_a_table_and_a_chart(tmp_path):
+    given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,penalty]", f"results_dir={tmp_path}", "formats=[]")
     found = lines_of(given, rows)
     assert list(found) == ["Not along a swept axis"]
     assert list(found["Not along a swept axis"]["contact"]) == ["impulse", "penalty"]
     make_directory(given.directory)
-    study_of(given).write(given, rows)
+    write(given, three_errors.views(given, rows))
     assert "| bounce_once | penalty | 0.50 |" in (given.directory / "three_errors.md").read_text()
+    assert list(pd.read_csv(given.directory / "three_errors.csv")["estimator"]) == ["fobg", "reinforce"] * 2
+    assert list(three_errors.views(given, rows).charts[0].frame["law"]) == ["impulse"] * 2 + ["penalty"] * 2
 
 
 def test_a_law_that_no_axis_moves_is_in_a_table_of_its_own():
@@ -196,6 +242,8 @@ def test_a_law_that_no_axis_moves_is_in_a_table_of_its_own():
     found = lines_of(given, rows)
     assert set(found["Along beta [1/m]"]["contact"]) == {"softplus"}
     assert set(found["Not along a swept axis"]["contact"]) == {"impulse"}
+    drawn = three_errors.views(given, rows).charts[0].frame
+    assert list(dict.fromkeys(drawn["law"])) == ["softplus, beta=100", "softplus, beta=1000"]
 
 
 def test_along_one_axis_the_others_have_one_value():
@@ -211,15 +259,15 @@ def test_along_one_axis_the_others_have_one_value():
     found = lines_of(given, rows)
     assert list(found) == ["Along dt [s], with horizon", "Along stiffness [N/m]", "Along beta [1/m]"]
     steps = found["Along dt [s], with horizon"]
-    assert [list(part["dt [s]"]) for _, part in steps.groupby("contact")] == [["0.025", "0.05", "0.1"]] * 2
+    assert [list(part["value"]) for _, part in steps.groupby("contact")] == [["0.025", "0.05", "0.1"]] * 2
     assert set(found["Along stiffness [N/m]"]["contact"]) == {"penalty"}
-    assert list(found["Along stiffness [N/m]"]["stiffness [N/m]"]) == ["50", "1000", "1e4"]
+    assert list(found["Along stiffness [N/m]"]["value"]) == ["50", "1000", "1e4"]
 
 
 def test_the_page_of_three_errors_draws_along_every_swept_parameter():
     given, rows = erring("scenes=[bounce_once]", "contacts=[softplus]", "sweep.beta=[100,1000]", "sweep.dt=[0.1,0.05]")
-    chart = web.content(given, rows).charts[0]
-    assert [axis.label for axis in chart.x] == ["beta [1/m]", "dt [s]"]
+    chart = three_errors.views(given, rows).charts[1]
+    assert [column.heading for column in chart.x] == ["beta [1/m]", "dt [s]"]
 
 
 # ------------------------------------------------------------------------------------------------------- stability
@@ -235,46 +283,42 @@ def test_maps_are_apart_by_parameters_and_their_titles_say_defaults():
         "scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]",
         "sweep.mass_spring.damping=[0,1,10]",
     )  # fmt: skip
-    panels = stability.panels(stability.arrange_maps(given, rows))
+    panels = maps.panels(maps.arrange_maps(given, rows))
     assert [panel.title for panel in panels] == [f"mass_spring, damping={d}" for d in (0, 1, 10)]
     assert [len(panel.rows) for panel in panels] == [4, 4, 4]
     assert panels[0].kind == ("semi_implicit_euler", "mass_spring", "none")
-    assert list(table_of(stability.markdown(stability.arrange_maps(given, rows), panels))["damping"]) == [
-        "0",
-        "1",
-        "10",
-    ]
+    shown = stability.views(given, rows)
+    assert list(readable(shown.tables[1])["damping"]) == ["0", "1", "10"]
+    first, every, _ = shown.charts
+    assert len(first.frame) == 4
+    assert "At damping=0. The other values are on the page." in first.subtitle
+    assert every.frame["panel"].nunique() == 3
 
 
 def test_maps_of_scenes_that_no_label_tells_apart_are_apart():
     """sigma has a column of its own, and so is in no identity string."""
     given, rows = mapped("scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']", "sweep.stiffness=[10,100]")
     assert rows["scene"].nunique() == 1
-    panels = stability.panels(stability.arrange_maps(given, rows))
+    panels = maps.panels(maps.arrange_maps(given, rows))
     assert [panel.title for panel in panels] == ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]
 
 
 def test_a_stiffness_that_equals_another_swept_number_stays_on_its_map():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[10,100]")
-    for panel in stability.panels(stability.arrange_maps(given, rows)):
+    for panel in maps.panels(maps.arrange_maps(given, rows)):
         assert list(panel.rows["stiffness"]) == [10.0, 100.0]
 
 
 def test_limits_in_texts_are_those_of_the_rows():
     given, rows = mapped("study=stability[inaccurate=0.25]", "scenes=[mass_spring]", "sweep.stiffness=[10,100]")
-    shown = stability.arrange_maps(given, rows)
-    panels = stability.panels(shown)
-    assert "25%" in stability.markdown(shown, panels)
-    legend = stability.heat_map("semi_implicit_euler", panels).legends[0]
-    assert legend.get_texts()[0].get_text().count("25%") == 1
-    content = web.content(given, rows)
-    assert "25%" in content.charts[0].text
-    assert content.looks["inaccurate"]["meaning"].count("25%") == 1
+    shown = stability.views(given, rows)
+    assert "25%" in shown.tables[1].notes[0]
+    assert web.content(given, rows).looks["right"]["meaning"].count("25%") == 1
 
 
 def test_a_share_is_not_named_after_a_parameter_that_varies_in_it():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[0,1]")
-    (line,) = stability_page.shares(stability.arrange_maps(given, rows)).to_dict("records")
+    (line,) = stability.views(given, rows).tables[0].frame.to_dict("records")
     assert (line["scene"], line["step"]) == ("mass_spring", "semi_implicit_euler")
 
 
@@ -285,9 +329,11 @@ def test_growth_keeps_noises_apart_and_joins_what_steps_with_the_horizon():
     words = ["study=growth", "scenes=[double_integrator]", "estimators=[fobg]", "sweep.sigma=[0.1,0.2]"]
     given, rows = made(*words, "sweep.zip.horizon=[10,20]", "sweep.zip.dt=[0.1,0.05]")
     rows = rows.assign(gradient_median=1.0, time_horizon=rows["horizon"] * rows["dt"])
-    names = growth.problem_of(arrange(given, rows))
-    assert dict(names.value_counts()) == {"double_integrator, sigma=0.1": 2, "double_integrator, sigma=0.2": 2}
-    assert list(growth.readable(arrange(given, rows))["sigma"]) == ["0.1", "0.1", "0.2", "0.2"]
+    shown = growth.views(given, rows)
+    assert dict(shown.rows["problem"].value_counts()) == {
+        "double_integrator, sigma=0.1": 2, "double_integrator, sigma=0.2": 2
+    }  # fmt: skip
+    assert list(readable(shown.tables[1])["sigma"]) == ["0.1", "0.1", "0.2", "0.2"]
 
 
 def test_twins_of_a_swept_scene_are_panels_of_their_own():
@@ -336,7 +382,7 @@ def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     assert axis.unit == "N/m"
     assert rows["stiffness"].nunique() == 1  # that of the law
     given, rows = mapped(*words, "sweep.sprung.stiffness=[1,10,100]", "sweep.penalty.stiffness=[1,10]")
-    panels = stability.panels(stability.arrange_maps(given, rows))
+    panels = maps.panels(maps.arrange_maps(given, rows))
     assert [list(panel.rows["stiffness"]) for panel in panels] == [[1.0, 10.0]] * 3
     assert len({panel.title for panel in panels}) == 3
 
@@ -400,7 +446,7 @@ def test_reports_name_no_plugin():
 
 def test_findings_count_in_plain_english():
     given, rows = erring("scenes=[bounce_once]", "contacts=[penalty]", "estimators=[fobg]")
-    text = three_errors_page.finding(rows.assign(program_error_rel=1e-9))
+    text = three_errors.views(given, rows.assign(program_error_rel=1e-9)).findings[1]
     assert text.startswith("Of 1 gradient confirmed by differences of the program's cost, 1 is off by over 10%")
     given, rows = checked("scenes=[pendulum]", "backends=[jax]")
     assert web.content(given, rows).finding.startswith("No wrong gradient at 1 checked point")
@@ -493,10 +539,12 @@ def test_the_command_of_a_gradient_check_without_time_steps_has_no_horizon():
     assert reproduce.check_of(cell) == "python -m bench gradcheck quadratic 'backends=[jax]' seed=0"
 
 
-def test_the_matrix_of_gradient_checks_leads_with_what_is_wrong():
-    table = pd.DataFrame({"name": ["a", "b"], "point": ["start", "before"], "verdict": ["wrong_factor", "kink"]})
-    assert matrix.headline(table) == "Wrong gradients: a; kinks, jumps or undecided checks in 1 of 2 problems"
-    assert matrix.headline(table[1:]).startswith("No gradient is wrong for its program; kinks, jumps")
-    assert matrix.headline(table.assign(verdict="smooth")).startswith(
+def test_the_grid_of_gradient_checks_leads_with_what_is_wrong():
+    points = pd.DataFrame({"name": ["a", "b"], "point": ["start", "before"], "verdict": ["wrong_factor", "kink"]})
+    doubtful = "kinks, jumps or undecided checks away from contact switches in 1 of"
+    assert gradient_check.headline(points) == f"Wrong gradients: a, and {doubtful} 2 problems"
+    assert gradient_check.headline(points[1:]) == f"No gradient is wrong for its program, and {doubtful} 1 problem"
+    assert gradient_check.headline(points.assign(verdict="smooth")).startswith(
         "Away from contact switches, every gradient is the derivative"
     )
+    assert gradient_check.headline(points[1:].assign(point="at")).startswith("Away from contact switches, every")

@@ -1,6 +1,7 @@
 """Program, model and estimator error kept apart: the impulse without time of impact, which only the model error betrays."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.bouncing_ball import BouncingBall
 from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
 
+import bench
 from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
@@ -21,9 +23,11 @@ from bench.run.store import Store
 from bench.studies.three_errors import measure
 from bench.studies.three_errors.columns import COLUMNS
 from bench.studies.three_errors.measure import difference_check
-from bench.studies.three_errors.report import traps
+from bench.studies.three_errors.sections import sections, traps
+from bench.studies.three_errors.views import FLOOR, OWN, TRAP, views
 
-TRAP = Impulse(time_of_impact=False)
+STANDARD = Path(bench.__file__).parent.parent / "results" / "standard"
+NO_IMPACT = Impulse(time_of_impact=False)
 
 
 def check(scene, law):
@@ -35,7 +39,7 @@ def test_the_trap_is_exact_for_its_program_and_wrong_for_the_physics_at_every_st
     forward = []
     for horizon in horizons:
         scene = BounceOnce(horizon=horizon, dt=1.0 / horizon)
-        found, physical = check(scene, TRAP), scene.physical_gradient()
+        found, physical = check(scene, NO_IMPACT), scene.physical_gradient()
         assert np.linalg.norm(found.gradient - found.difference) < 1e-9  # rounding over the best step size
         assert found.gradient[0] == pytest.approx(1.0, abs=1e-12)  # rounding; the physics says -1
         assert physical[0] == -1.0
@@ -49,7 +53,7 @@ def test_the_trap_is_exact_for_its_program_and_wrong_for_the_physics_at_every_st
 def test_in_one_dimension_the_cosine_is_minus_one():
     for horizon in (32, 128, 512):
         scene = WallPenalty1d(start=0.15, horizon=horizon, dt=2.0 / horizon)
-        assert check(scene, TRAP).gradient == pytest.approx([1.0])
+        assert check(scene, NO_IMPACT).gradient == pytest.approx([1.0])
         assert scene.physical_gradient()[0] < 0
 
 
@@ -123,9 +127,12 @@ def test_from_the_command_line(tmp_path, capsys):
         ({"model_cosine": [0.9, 0.99], "model_error_rel": [0.74, 0.2]}, False),
         ({"model_cosine": [0.99, 0.99], "model_error_rel": [0.02, 0.02]}, False),
         ({"forward_error_rel": [0.4, 0.3]}, False),
+        ({"forward_error_rel": [0.4, np.nan]}, False),
+        ({"program_error_rel": [1e-12, np.nan]}, False),
+        ({"model_cosine": [np.nan, np.nan], "model_error_rel": [np.nan, np.nan]}, False),
     ],
 )
-def test_a_trap_is_exact_convergent_and_turned_away_or_no_nearer_at_every_step(tmp_path, change, trapped):
+def test_a_trap_is_exact_convergent_and_turned_away_or_no_nearer_at_every_step(change, trapped):
     words = [
         "study=three_errors",
         "scenes=[bounce_once]",
@@ -133,11 +140,97 @@ def test_a_trap_is_exact_convergent_and_turned_away_or_no_nearer_at_every_step(t
         "backends=[jax]",
         "sweep.dt=[0.1,0.05]",
     ]
-    given = config.load([*words, "estimators=[fobg]", f"results_dir={tmp_path}"])
-    rows = pd.DataFrame([cell.columns() for cell in cells(given)]).assign(status="ok", reason="")
+    given = config.load([*words, "estimators=[fobg]"])
+    rows = pd.DataFrame([COLUMNS.blank() | cell.columns() for cell in cells(given)]).assign(status="ok", reason="")
     values = {"program_error_rel": [1e-12, 1e-13], "model_cosine": [-0.5, -0.4], "forward_error_rel": [0.4, 0.1]}
     values |= {"model_error_rel": [1.5, 0.5]}
-    assert len(traps(arrange(given, rows.assign(**(values | change))))) == trapped
+    shown = arrange(given, COLUMNS.typed(rows.assign(**(values | change))))
+    assert len(traps(shown, sections(shown))) == trapped
+    found = views(given, shown.rows)
+    assert ("1 of 1 program is a trap" in " ".join(found.findings)) == trapped
+    assert (set(found.charts[0].frame["series"]) == {OWN, TRAP}) == trapped
+
+
+def laws(model, program=(1e-12, 1e-12, 1e-12)):
+    """Three laws on two scenes with planted errors: ``model`` has the errors of a scene's laws."""
+    words = ["study=three_errors", "scenes=[bounce_once,bouncing_ball]", "contacts=[impulse,penalty,softplus]"]
+    given = config.load([*words, "backends=[jax]", "estimators=[fobg,reinforce]"])
+    rows = pd.DataFrame([COLUMNS.blank() | cell.columns() for cell in cells(given)]).assign(
+        status="ok", reason="", bias=0.1, bias_rel=0.1, bias_low=0.0, bias_high=0.2, reference_norm=1.0
+    )
+    rows["model_error_rel"] = np.repeat(np.ravel(model), 2)
+    rows["program_error_rel"] = np.repeat([*program, *program], 2)
+    return given, COLUMNS.typed(rows)
+
+
+@pytest.mark.parametrize(
+    ("model", "first"),
+    [
+        ([[0.0, 1.0, 1.0], [0.05, 1.0, 1.0]], "impulse is within 10% of the gradient of the physics on 2 scenes of 2."),
+        (
+            [[0.0, 0.1, 1.0], [0.5, 1.0, 1.0]],
+            "No contact law is right on every scene: impulse and penalty are within 10% of the gradient of the physics on 1 "
+            "of 2 scenes, the most.",
+        ),
+        ([[0.2, 0.2, 0.2]] * 2, "No contact law is within 10% of the gradient of the physics on any scene."),
+        (
+            [[np.nan, 0.05, 1.0]] * 2,
+            "penalty is within 10% of the gradient of the physics on 2 scenes of 2.",
+        ),
+    ],
+)
+def test_the_law_nearest_to_the_physics_comes_first_ties_together_and_nan_never(model, first):
+    assert views(*laws(model)).findings[0] == first
+
+
+def test_gradients_are_counted_once_whatever_estimates_them_and_only_where_confirmed_and_compared():
+    model = [[0.0, 3.0, np.nan], [0.5, 0.2, 0.05]]
+    found = views(*laws(model, (1e-12, 1e-12, np.nan)))
+    assert found.findings[1] == (
+        "Of 4 gradients confirmed by differences of the program's cost, 3 are off by over 10% from the gradient of the "
+        "physics, the worst by 3.0 times its norm (bounce_once, penalty, semi_implicit_euler)."
+    )
+    assert len(found.findings) == 2, "no trap without a sweep of the time step"
+    drawn = found.charts[0].plotted()
+    zero = drawn[drawn["error"] == FLOOR]
+    assert list(zero["law"]) == ["impulse"]
+    assert zero["limit"].all()
+    assert drawn["error"].notna().all()
+    nothing = laws([[np.nan] * 3] * 2)
+    assert views(*nothing).findings[0].startswith("Of 0 gradients confirmed")
+    given, rows = laws(model)
+    rows["status"], rows["reason"] = "unsupported", "no physics"
+    assert views(given, rows).findings == ["No cell gave a result: the table has the reason of each."]
+
+
+def test_findings_of_the_standard_experiment_computed_from_its_table():
+    given = config.load(["+experiment=three_errors", f"results_dir={STANDARD}"])
+    found = views(given, Store(given.directory, COLUMNS).load())
+    data = pd.read_csv(given.directory / "three_errors.csv")
+    fobg = data[data["estimator"] == "fobg"]
+    right = fobg[fobg["program_error_rel"] <= 1e-3]
+    wrong = right[right["model_error_rel"] > 0.1]
+    assert f"Of {len(right)} gradients" in found.findings[1]
+    assert f", {len(wrong)} are off by over 10%" in found.findings[1]
+    assert f"by {wrong['model_error_rel'].max():.2g} times".replace("7.2e+02", "720") in found.findings[1]
+    smallest = fobg[fobg["dt"] == fobg.groupby("scene")["dt"].transform("min")]
+    near = (smallest["model_error_rel"] <= 0.1).groupby(smallest["contact"]).sum()
+    assert (
+        f"{near.idxmax()} is within 10% of the gradient of the physics on {near.max()} of 4 scenes" in found.findings[0]
+    )
+    assert sorted(near)[-2] < near.max()
+    main = found.charts[0]
+    drawn = main.frame[main.frame["series"] != OWN].set_index(["scene", "contact"])["error"]
+    known = smallest.set_index(["scene", "contact"])["model_error_rel"]
+    pd.testing.assert_series_equal(
+        drawn.sort_index(), known.clip(lower=FLOOR).sort_index(), check_names=False, check_index=True
+    )
+    assert (
+        main.title
+        == f"Right for the program, wrong for the physics: {(known > 0.1).sum()} of 20 gradients, 5 of them traps"
+    )
+    assert "5 of 20 programs are traps" in found.findings[2]
+    assert (main.frame["series"] == TRAP).sum() == 5
 
 
 def test_rounding_has_no_sign():

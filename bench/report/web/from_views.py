@@ -63,6 +63,8 @@ def _table(chart: Chart) -> pd.DataFrame:
     frame = frame if "row" in frame else frame.assign(row=-1)
     key = [name for name in (chart.series, chart.line) if name]
     frame = frame.assign(line_=frame[key].astype(str).agg(" ".join, axis=1) if key else "", one_="")
+    if chart.panel_row:
+        frame = frame.assign(facet_=frame[chart.panel] + ", " + frame[chart.panel_row])
     return frame.assign(fill_=draw.cell_colours(chart)) if chart.kind == "grid" and chart.value else frame
 
 
@@ -74,7 +76,7 @@ def _chart(chart: Chart) -> page.Chart:
         y=[_axis(column, chart) for column in chart.y],
         table=chart.name,
         series=chart.series or "one_",
-        facet=chart.panel,
+        facet="facet_" if chart.panel_row else chart.panel,
         line="line_" if chart.kind == "lines" else "",
         front=chart.front,
         level=chart.level,
@@ -114,6 +116,6 @@ def _column(column: Column, cells: pd.DataFrame) -> page.TableColumn:
 def _look(style: Style) -> dict[str, object]:
     dashes = {str(line): name for line, name in zip(VARIANTS, ("solid", "dash", "dot"), strict=True)}
     return page.look(
-        style.colour, page.SYMBOLS.get(style.marker, "circle"), dashes.get(str(style.line), "dash"), style.letter,
-        style.meaning,
+        style.colour, page.SYMBOLS.get(style.marker, "circle") if style.marker else "line",
+        dashes.get(str(style.line), "dash"), style.letter, style.meaning,
     )  # fmt: skip

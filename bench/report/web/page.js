@@ -11,7 +11,7 @@ const SMALL = 12; // size of the smallest text in a chart [px]
 const PANELS = 4; // most panels of a chart that are drawn at once
 const FIRST = 60, MORE = 240; // rows of the table at first, and with every "Show more"
 const GLYPHS = {
-  circle: "●", square: "■", diamond: "◆", "triangle-up": "▲", "triangle-down": "▼", cross: "✚", x: "✖", star: "★",
+  circle: "●", square: "■", diamond: "◆", "triangle-up": "▲", "triangle-down": "▼", cross: "✚", x: "✖", star: "★", line: "━",
 };
 const GONE = "The experiment, as configured when this page was written, has no such cell any more.";
 const state = { chosen: {}, find: "", sort: null, limit: FIRST, selected: -1, theme: "auto" };
@@ -371,7 +371,7 @@ function drawLegend(chart, panels) {
   const ordered = Object.keys(page.looks).filter((name) => names.has(name));
   chart.legend.replaceChildren(...(chart.share ? [] : ordered).map((name) => {
     const look = looks(name);
-    const mark = element("b", { textContent: chart.level ? look.letter || " " : GLYPHS[look.symbol] });
+    const mark = element("b", { textContent: chart.level ? look.letter || "\u2003" : GLYPHS[look.symbol] });
     if (chart.level) { mark.className = "level"; mark.style.background = filling(name); mark.style.color = inkOn(filling(name)); }
     else mark.style.color = colour(name);
     return element("li", {}, mark, " " + (look.meaning || name));
@@ -500,7 +500,7 @@ function trace(chart, points, joined) {
   const symbol = points.some((p) => p.limit || p.leftLimit)
     ? points.map((p) => look.symbol + (p.limit || p.leftLimit ? "-open" : "")) : look.symbol;
   const made = {
-    type: "scatter", mode: joined ? "lines+markers" : "markers", x: points.map((p) => coordinate(p.x)), y: points.map((p) => coordinate(p.y)),
+    type: "scatter", mode: look.symbol === "line" ? "lines" : joined ? "lines+markers" : "markers", x: points.map((p) => coordinate(p.x)), y: points.map((p) => coordinate(p.y)),
     customdata: points.map((p) => (p.row < 0 ? null : p.row)), text: points.map((p) => hover(chart, p)), hovertemplate: "%{text}<extra></extra>",
     marker: { color: own, symbol, size: points.length > 500 ? 6 : 8,
       ...(joined ? {} : { line: { color: ground(), width: 1 } }) }, // an outline separates points that overlap

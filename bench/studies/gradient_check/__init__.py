@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.experiment.cell import Cell
@@ -11,6 +10,7 @@ from bench.experiment.columns import Columns
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
+from bench.experiment.views import Views
 from bench.model import param
 from bench.studies.gradient_check.columns import COLUMNS
 
@@ -44,23 +44,11 @@ class GradientCheck(Study):
         search = SwitchSearch(self.directions, self.drawn, self.reach, self.aside, self.around)
         return measure(cell, session, search) | {"command": check_of(cell)}
 
-    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the tables and the matrix of verdicts."""
-        from bench.studies.gradient_check import matrix, report
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return which gradients can be trusted, the tables of checks, the grid of verdicts, and how to repeat faults."""
+        from bench.studies.gradient_check.views import views
 
-        return [*report.write(experiment, rows), *matrix.write(experiment, rows)]
-
-    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the counts of verdicts, and the command that repeats each untrusted check."""
-        from bench.studies.gradient_check import report
-
-        report.show(experiment, rows)
-
-    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the page: the finding, the verdicts, and errors against the step of the differences."""
-        from bench.studies.gradient_check.page import content
-
-        return content(experiment, rows)
+        return views(experiment, rows)
 
     def faults(self, rows: pd.DataFrame) -> int:
         """Return the number of rows with a gradient that cannot be trusted, or without a finite cost."""

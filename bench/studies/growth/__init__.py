@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.experiment.cell import Cell
@@ -11,6 +10,7 @@ from bench.experiment.columns import Columns
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
+from bench.experiment.views import Views
 from bench.model import param
 from bench.studies.growth.columns import COLUMNS
 
@@ -36,20 +36,8 @@ class Growth(Study):
 
         return measure(cell, session, self.rollouts, self.lags)
 
-    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the tables and charts."""
-        from bench.studies.growth import report
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return how the norm grows on each problem, where the zeroth order varies less, the tables and the charts."""
+        from bench.studies.growth.views import views
 
-        return report.write(experiment, rows)
-
-    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the table of growth, and the reasons of cells without numbers."""
-        from bench.studies.growth import report
-
-        report.show(experiment, rows)
-
-    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the page: the finding, the growth by problem, and charts of norms, variances and gains."""
-        from bench.studies.growth.page import content
-
-        return content(experiment, rows)
+        return views(experiment, rows)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.experiment.cell import Cell
@@ -11,6 +10,7 @@ from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, t
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
+from bench.experiment.views import Views
 from bench.model import param
 
 if TYPE_CHECKING:
@@ -68,20 +68,8 @@ class Stability(Study):
         limits = StabilityLimits(self.diverged, self.grown, self.inaccurate, self.fine_steps, self.finer)
         return measure(cell, session, limits)
 
-    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the tables, the maps and their summary."""
-        from bench.studies.stability import report, summary
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return where the gradient is right most often and why it is wrong, the tables of shares, and the maps."""
+        from bench.studies.stability.views import views
 
-        return [*report.write(experiment, rows), *summary.write(experiment, rows)]
-
-    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the shares of the verdicts, and the stability limits of the oscillators without contact."""
-        from bench.studies.stability import report
-
-        report.show(experiment, rows)
-
-    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the page: the finding, the shares of right gradients and the maps."""
-        from bench.studies.stability.page import content
-
-        return content(experiment, rows)
+        return views(experiment, rows)

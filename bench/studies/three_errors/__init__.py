@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.experiment.cell import Cell
@@ -11,6 +10,7 @@ from bench.experiment.columns import Columns
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
+from bench.experiment.views import Views
 from bench.studies.three_errors.columns import COLUMNS
 
 if TYPE_CHECKING:
@@ -30,20 +30,8 @@ class ThreeErrors(Study):
 
         return measure(cell, session)
 
-    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the tables and charts."""
-        from bench.studies.three_errors import report
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return the law to use, the misleading gradients and traps, the tables and the charts of the errors."""
+        from bench.studies.three_errors.views import views
 
-        return report.write(experiment, rows)
-
-    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the tables and the traps."""
-        from bench.studies.three_errors import report
-
-        report.show(experiment, rows)
-
-    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the page: the finding, the misleading gradients and charts of the errors."""
-        from bench.studies.three_errors.page import content
-
-        return content(experiment, rows)
+        return views(experiment, rows)

@@ -9,6 +9,7 @@ COLUMNS = Columns.of(
     Column(
         "forward_error_rel",
         "forward_error relative to physical_cost",
+        label="forward error",
         comparison=ComparisonRule("exact", "forward error"),
     ),
     Column("program_norm", "norm of the program's gradient"),
@@ -16,16 +17,22 @@ COLUMNS = Columns.of(
     Column(
         "program_error_rel",
         "program_error relative to the norm of that difference",
+        label="program error",
         comparison=ComparisonRule("exact", "program error"),
     ),
     Column("difference_step", "step of the best central difference, in the units of theta"),
     Column("physical_norm", "norm of the physics' gradient"),
     Column("model_error", "norm of (program's gradient - physics' gradient)"),
     Column(
-        "model_error_rel", "model_error relative to physical_norm", comparison=ComparisonRule("exact", "model error")
+        "model_error_rel",
+        "model_error relative to physical_norm",
+        label="model error",
+        comparison=ComparisonRule("exact", "model error"),
     ),
-    Column("model_cosine", "cosine between the program's gradient and the physics' gradient"),
-    Column("model_signs", "share of coordinates in which both gradients have the same sign"),
+    Column(
+        "model_cosine", "cosine between the program's gradient and the physics' gradient", label="cosine to physics"
+    ),
+    Column("model_signs", "share of coordinates in which both gradients have the same sign", label="right signs"),
     Column("reference_norm", "norm of the reference gradient of the program"),
     Column("reference_se", "standard error of the reference gradient"),
     Column(
@@ -35,7 +42,7 @@ COLUMNS = Columns.of(
     ),
     Column("bias_low", "lower end of its 95% interval"),
     Column("bias_high", "upper end of its 95% interval"),
-    Column("bias_rel", "bias / reference_norm"),
+    Column("bias_rel", "bias / reference_norm", label="estimator error"),
     Column("variance", "trace of the covariance of one estimate", comparison=ComparisonRule("spread", "variance")),
     Column("rmse_rel", "root mean squared error of one estimate / reference_norm"),
     Column("cosine", "mean cosine between one estimate and the reference"),

@@ -1,0 +1,90 @@
+"""Tables of gradient checks for programs: a line per check and step, per component of theta, and per point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.experiment.columns import IDENTITY
+from bench.measure.gradcheck import VERDICTS
+from bench.report.problems import problem_numbers
+from bench.studies.gradient_check.columns import COLUMNS
+from bench.studies.gradient_check.points import is_trusted
+
+PER_CHECK = ["point", "sample", "direction", "derivative_program"]
+PER_STEP = ["derivative_differences", "relative_error", "mode_minus", "mode_plus"]
+PER_COMPONENT = (
+    "component", "component_program", "component_difference", "component_uncertainty", "component_step",
+    "component_ratio", "component_left", "component_right", "component_verdict",
+)  # fmt: skip
+PROBLEM = ("scene", "contact", "integrator")
+"""Parts of the grid that identify a problem."""
+
+
+def checks(rows: pd.DataFrame) -> Iterator[tuple[dict[str, Any], int, str]]:
+    """Yield each check of each row: the row, the number of the check within it, and the verdict."""
+    for row in rows.to_dict("records"):
+        for i, verdict in enumerate(row["check_verdict"]):
+            yield {str(name): value for name, value in row.items()}, i, verdict
+
+
+def long_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one line per cell, check and eps, and one line per cell that could not be checked.
+
+    Columns that are not the study's own, such as swept parameters, are last. The column ``parameters`` is omitted,
+    since it would be repeated on every line: ``rows.parquet`` has it under the same ``key``.
+    """
+    whole = ["experiment", *IDENTITY, "dim", "status", "reason"]
+    added = [name for name in rows if name not in COLUMNS.by_name]
+    last = list(dict.fromkeys(["key", *map(str, added), *(name for name in ("study",) if name in rows)]))
+    lines = []
+    for row, i, verdict in checks(rows):
+        check = {name: row[name] for name in whole} | {name: row[name][i] for name in PER_CHECK}
+        end = {"verdict": verdict} | {name: row[name] for name in last}
+        count = len(row["eps"])
+        for k in range(count):
+            values = {name: row[name][i * count + k] for name in PER_STEP}
+            lines.append(check | {"eps": row["eps"][k]} | values | end)
+    unchecked = rows[[len(verdicts) == 0 for verdicts in rows["check_verdict"]]]
+    lines += unchecked[[*whole, "verdict", *last]].to_dict("records")
+    table = pd.DataFrame(lines, columns=[*whole, *PER_CHECK, "eps", *PER_STEP, "verdict", *last])
+    counts = ["horizon", "samples", "repeats", "dim", "seed", "sample", "direction"]
+    return table.astype(dict.fromkeys(counts, "Int64"))
+
+
+def component_table(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one line per cell and component of theta, with the columns :data:`PER_COMPONENT`."""
+    names = ["experiment", *IDENTITY, "dim"]
+    lines = [
+        {name: row[name] for name in names} | dict(zip(PER_COMPONENT, values, strict=True)) | {"key": row["key"]}
+        for row in rows.to_dict("records")
+        for values in zip(*(row[name] for name in PER_COMPONENT), strict=True)
+    ]
+    return pd.DataFrame(lines, columns=[*names, *PER_COMPONENT, "key"])
+
+
+def by_point(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one line per cell and point: its worst verdict, and the largest error among its checks, with the eps.
+
+    The error of a check is the smallest over all eps. ``row`` is the position of the cell in ``rows``. ``problem`` is a
+    number, the same for cells with equal parameters of scene, contact law and integrator.
+    """
+    lines = []
+    shown = ("scene", "contact", "integrator", "backend", "horizon", "dtype", "key", "command")
+    for row, i, verdict in checks(rows.assign(row=range(len(rows)), problem=problem_numbers(rows, PROBLEM))):
+        cell = {name: row[name] for name in (*shown, "row", "problem")}
+        result = {"verdict": verdict, "error": row["check_error"][i], "eps": row["check_eps"][i]}
+        lines.append(cell | {"point": row["point"][i], "rank": VERDICTS.index(verdict)} | result)
+    names = [*shown, "row", "problem", "point", "verdict", "error", "eps", "rank"]
+    table = pd.DataFrame(lines, columns=names)
+    table = table.sort_values(["rank", "error"], ascending=[True, False], kind="stable")
+    return table.drop_duplicates(["row", "point"]).sort_index()
+
+
+def untrusted(summary: pd.DataFrame) -> pd.DataFrame:
+    """Return the lines of :func:`by_point` whose gradient cannot be trusted."""
+    pairs = zip(summary["point"], summary["verdict"], strict=True)
+    return summary[np.array([not is_trusted(point, verdict) for point, verdict in pairs], dtype=bool)]
