@@ -332,6 +332,7 @@ def test_a_browser_draws_a_panel_for_each_stiffness_and_noise(browser, tmp_path)
     path.write_text(page(rows, sweep={"samples": [16, 64], "stiffness": [10.0, 1000.0], "sigma": [0.1, 0.3]}, marks={}))
     browser.open(path)
     browser.do(SETTLED)
+    browser.do("charts.forEach((chart) => drawChart(chart))")
     drawn = browser.do(
         "charts.filter((c) => !c.fill).map((c) => [...c.panels.querySelectorAll('.plot')].map((p) => p.data.filter((d) => d.text)"
         ".reduce((n, d) => n + d.x.length, 0)))"
