@@ -188,6 +188,7 @@ def _without_effect(experiment: Experiment, overrides: Sequence[str]) -> list[st
             and rest not in COUNTS
             and not is_theta_axis(rest)
             and not any(applies(rest, plugin.kind, plugin.name, parameters(plugin)) for plugin in plugins)
+            and _is_parameter(rest)
         ):
             reason = "no scene of the sweep uses a plugin with that parameter"
         elif axis == "marks" and (unswept := _unswept_marks(experiment, axes)):
@@ -196,6 +197,12 @@ def _without_effect(experiment: Experiment, overrides: Sequence[str]) -> list[st
             continue
         sentences.append(f"{override[:200]} has no effect: {reason}")
     return sentences
+
+
+def _is_parameter(axis: str) -> bool:
+    """Return whether some registered plugin has the parameter that a sweep names; others are errors, not remarks."""
+    plugins = [entry.plugin for entries in registry.entries().values() for entry in entries.values() if entry.plugin]
+    return any(applies(axis, plugin.kind, plugin.name, parameters(plugin)) for plugin in plugins)
 
 
 def _effective_plugins(experiment: Experiment) -> list[type[Plugin]]:

@@ -18,7 +18,9 @@ from helpers import experiment, small_rows
 from bench.compare import judging
 from bench.measure.statistics import UNEXPLAINED, Truth, is_unexplained, summarise, variance_per_sample
 from bench.model import compose
-from bench.studies.bias_variance import tables, terminal
+from bench.report.cells import readable
+from bench.report.writer import markdown, show
+from bench.studies.bias_variance import tables
 from bench.studies.bias_variance.columns import COLUMNS
 
 
@@ -73,20 +75,16 @@ def doubted(rows):
     return changed
 
 
-def test_tables_and_findings_say_so(capsys):
+def test_tables_and_the_terminal_say_so(capsys):
     rows = doubted(small_rows(backends=("jax",), estimators=("fobg", "reinforce")))
-    table = tables.readable(experiment(), rows)
-    column = table.headers.index("bias [95% interval]")
-    marked = [row[column] for row in table.body if row[column].endswith(tables.DOUBTED)]
+    rows = rows[rows["status"] == "ok"]
+    table = tables.every_cell(experiment(), rows)
+    marked = [text for text in readable(table)["bias"] if text.endswith(tables.REMARKED)]
     assert len(marked) == ((rows["estimator"] == "fobg") & (rows["status"] == "ok")).sum() > 0
-    assert UNEXPLAINED in tables.markdown(table)
-    terminal.show(experiment(), rows)
+    assert UNEXPLAINED in markdown([table], "made_up")
+    show(experiment(), rows, experiment().study.views(experiment(), rows))
     shown = " ".join(capsys.readouterr().out.split())
-    assert f"a bias where none is declared, {UNEXPLAINED}: fobg" in shown
-    assert "mostly bias" not in shown
-    plain = rows.assign(reason="")
-    terminal.show(experiment(), plain)
-    assert "mostly bias, more samples do not help: fobg" in " ".join(capsys.readouterr().out.split())
+    assert f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}" in shown
 
 
 def test_comparison_says_so():

@@ -50,7 +50,7 @@ OF_CHECKS = "tests/measure/test_direction.py tests/measure/test_check.py"
 EL, EF, EX, ES, EG, EQ = (
     f"bench/examine/{name}.py" for name in ("lines", "findings", "examination", "smoothing", "gradient", "quick")
 )
-OF_PLAN, OF_MECHANISMS = "tests/examine/test_plan.py", "tests/examine/test_mechanisms.py"
+OF_PLAN, OF_MECHANISMS = "tests/examine/test_budget.py", "tests/examine/test_mechanisms.py"
 OF_EXAMINE = "-m not\\ slow tests/examine/test_examine.py --deselect tests/examine/test_examine.py::test_python_number_from_torch_is_disconnected_in_double_precision"
 OF_ESTIMATORS = "tests/plugins/test_weights.py tests/plugins/test_estimators.py"
 
