@@ -53,9 +53,12 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     row_names = list(dict.fromkeys(chart.frame[chart.panel_row].astype(str))) if chart.panel_row else []
     across = len(panels) // len(row_names) if row_names else _across(chart, len(panels), width)
     down = math.ceil(len(panels) / across)
-    draw_kind: Any = {"dots": _draw_dots, "grid": partial(_draw_grid, width=width / across)}.get(
-        chart.kind, _draw_lines
-    )
+    orders = [list(part[chart.y[0].name].unique()) for _, part in panels]
+    same = all(order == orders[0] for order in orders)
+    draw_kind: Any = {
+        "dots": partial(_draw_dots, room=0.42 * (width if same else width / across)),
+        "grid": partial(_draw_grid, width=width / across),
+    }.get(chart.kind, _draw_lines)
     heights = [_height(chart, part) for _, part in panels]
     room = 0.9 * (width - _label_width(chart, row_names, across)) / across
     titles = [_panel_title(chart, name, room) for name, _ in panels[: across if row_names else None]]
@@ -97,6 +100,8 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
         if title:
             panel.set_title(title, loc="center" if upright else "left", fontsize=SIZE, rotation=90 if upright else 0)
         draw_kind(chart, panel, name, part, styles)
+        if chart.kind == "dots" and same and place % across:
+            panel.tick_params(labelleft=False)
         if chart.kind in ("lines", "points"):
             _label_axes(chart, panel, first=place % across == 0 or chart.own_scales)
     if chart.kind in ("lines", "points"):
@@ -478,8 +483,11 @@ def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
 # ---------------------------------------------------------------------------------------------------- dots
 
 
-def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles: dict[str, Style]) -> None:
-    """Draw a row per category, the first at the top, with a dot and an interval per series."""
+def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles: dict[str, Style], room: float) -> None:
+    """Draw a row per category, the first at the top, with a dot and an interval per series.
+
+    Names have ``room`` inches: wider ones are broken at a comma where the rows are high enough, and shortened.
+    """
     x, y = chart.x[0], chart.y[0]
     categories = list(dict.fromkeys(part[y.name].astype(str)))
     place = {category: len(categories) - 1 - i for i, category in enumerate(categories)}
@@ -518,10 +526,10 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
             at[known & limit], rows[known & limit], linestyle="none", marker=style.marker or "o", markerfacecolor="white",
             **common,
         )  # fmt: skip
-        for row, lost in zip(rows, ~known, strict=True):
-            if lost and chart.failed:
-                panel.plot([0.985], [row], "x", transform=panel.get_yaxis_transform(), color=style.colour, markersize=5)
-    panel.set_yticks(list(place.values()), [plain(_clipped(category, 3.0)) for category in place])
+        for row in rows[points[chart.failed].to_numpy(bool)] if chart.failed else ():
+            panel.plot([0.985], [row], "x", transform=panel.get_yaxis_transform(), color=style.colour, markersize=5)
+    labels = [_in_lines(category, room, int(chart.height / LINE)) for category in place]
+    panel.set_yticks(list(place.values()), labels)
     panel.set_ylim(-0.6, len(categories) - 0.4)
     panel.tick_params(axis="y", length=0)
     panel.grid(axis="y", color="#e4e4e4", linewidth=0.6)
@@ -603,6 +611,13 @@ def _broken(text: str, width: float) -> str:
             lines.append("")
         lines[-1] += piece
     return "\n".join(lines)
+
+
+def _in_lines(text: str, width: float, most: int) -> str:
+    """Break a name at commas into at most ``most`` lines, and shorten those wider than ``width`` inches."""
+    lines = _fill(text, width).split("\n")
+    lines = [*lines[: most - 1], " ".join(lines[most - 1 :])] if most > 1 else [text]
+    return "\n".join(plain(_clipped(line, width)) for line in lines if line)
 
 
 def _clipped(text: str, width: float) -> str:
