@@ -55,12 +55,13 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     down = math.ceil(len(panels) / across)
     orders = [list(part[chart.y[0].name].unique()) for _, part in panels]
     same = all(order == orders[0] for order in orders)
+    label_room = 0.42 * (width if same else width / across)
     draw_kind: Any = {
-        "dots": partial(_draw_dots, room=0.42 * (width if same else width / across)),
+        "dots": partial(_draw_dots, room=label_room),
         "grid": partial(_draw_grid, width=width / across),
     }.get(chart.kind, _draw_lines)
     heights = [_height(chart, part) for _, part in panels]
-    room = 0.9 * (width - _label_width(chart, row_names, across)) / across
+    room = 0.9 * (width - _label_width(chart, row_names, 1 if same else across, label_room)) / across
     titles = [_panel_title(chart, name, room) for name, _ in panels[: across if row_names else None]]
     upright = bool(row_names) and max(map(_text_width, titles)) > room * 1.1
     if upright:
@@ -215,13 +216,17 @@ def _panel_title(chart: Chart, name: str, width: float) -> str:
     return "\n".join(map(plain_lines, parts))
 
 
-def _label_width(chart: Chart, row_names: Sequence[str], across: int) -> float:
-    """Return the width in inches of all labels left of panels of dots, or of rows of panels: titles are right of them."""
+def _label_width(chart: Chart, row_names: Sequence[str], across: int, room: float) -> float:
+    """Return the width in inches of the labels left of panels of dots, or of rows of panels: titles are right of them.
+
+    Labels of dots have at most ``room`` inches each; ``across`` is the number of panels with labels in a row.
+    """
     if row_names:
         return max(map(width_in_inches, map(plain, row_names))) + 0.6
     if chart.kind != "dots":
         return 0.0
-    return across * max(map(width_in_inches, map(plain, map(str, chart.frame[chart.y[0].name].unique()))), default=0.0)
+    names = map(str, chart.frame[chart.y[0].name].unique())
+    return across * min(room, max(map(width_in_inches, map(plain, names)), default=0.0))
 
 
 def _text_width(text: str) -> float:
@@ -250,13 +255,15 @@ def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
             Patch(facecolor=style.colour, edgecolor="#808080", linewidth=0.4, label=labels[name])
             for name, style in styles.items()
         ]
-    if not chart.series:
+    if not chart.series or (chart.kind == "dots" and chart.series == chart.y[0].name):
         return []
     line = chart.kind == "lines"
+    keys = [key for key in dict.fromkeys((chart.panel, chart.series, chart.line)) if key]
+    bare = line and chart.frame.groupby(keys).size().min() > MANY
     colours = [
         Line2D(
-            [], [], color=style.colour, marker="s" if chart.shape else style.marker, linestyle=style.line if line else "none",
-            linewidth=style.width, label=labels[name],
+            [], [], color=style.colour, marker="s" if chart.shape else "" if bare else style.marker,
+            linestyle=style.line if line else "none", linewidth=style.width, label=labels[name],
         )
         for name, style in styles.items()
     ]  # fmt: skip
@@ -398,6 +405,7 @@ def _scale_x(panel: Axes, column: Column, values: np.ndarray, few: bool) -> None
     text = _values_text(column)
     if _is_log(column, values) and values[0] > 0:
         margin = max((values[-1] / values[0]) ** 0.05, 1.08)
+        few = few and column.format == "setting"
         log_axis(panel, "x", values[0] / margin, values[-1] * margin, values if few else (), text)
         return
     spread = float(np.ptp(values)) or abs(float(values[0])) or 1.0
@@ -509,7 +517,7 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
         if points.empty:
             continue
         shift = 0.0
-        if several and points[y.name].nunique() < len(part):
+        if several and part[y.name].nunique() < len(part):
             shift = -0.5 * (number - (len(names) - 1) / 2) / max(len(names), 2)
         rows = np.array([place[str(v)] for v in points[y.name]]) + shift
         at = points[x.name].to_numpy(float)
