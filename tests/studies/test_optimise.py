@@ -748,7 +748,7 @@ def test_interval_of_the_share_of_targets_covers():
             )
             share, error = aggregate.share_of_targets(found.assign(rate=found["successes"] / 4))
             hits += abs(share - rates.mean()) <= performance.Z * error
-        assert hits / 300 > 0.93
+        assert hits / 300 > 0.91  # discrete: nominal 0.95
 
 
 def correlations(*lines):

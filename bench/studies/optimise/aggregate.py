@@ -247,12 +247,12 @@ def runtimes(runs: RunSet, default: float) -> pd.DataFrame:
 def share_of_targets(reached: pd.DataFrame) -> tuple[float, float]:
     """Return the mean success rate of a method's lines of :func:`times_to_targets`, and a bound of its standard error.
 
-    The error is due to the seeds. The variance of each rate is that of Agresti and Coull (1998), so that few searches that
-    agree are uncertain. The targets of a problem count as fully dependent, the problems as independent.
+    The error is due to the seeds. The variance of each rate is that of the estimate of Agresti and Coull (1998), with two more
+    successes and two more failures, so that few searches that agree are uncertain. The targets of a problem count as fully
+    dependent, the problems as independent.
     """
-    n = reached["searches"] + 4.0
-    p = (reached["successes"] + 2.0) / n
-    by_problem = np.sqrt(p * (1 - p) / n).groupby(reached["problem"]).mean()
+    p = (reached["successes"] + 2.0) / (reached["searches"] + 4.0)
+    by_problem = np.sqrt(p * (1 - p) / reached["searches"]).groupby(reached["problem"]).mean()
     return float(reached["rate"].mean()), float(np.sqrt((by_problem**2).sum()) / len(by_problem))
 
 
