@@ -45,7 +45,7 @@ MANY = 12
 
 def draw(chart: Chart, width: float | None = None) -> Figure:
     """Return the chart as a figure of a width in inches: by default two columns of a paper, or one for a single panel."""
-    chart = replace(chart, frame=chart.drawn(), chosen=())
+    chart, places = _numbered(replace(chart, frame=chart.drawn(), chosen=()))
     panels = _panels(chart)
     if width is None:
         width = NARROW if len(panels) == 1 and chart.kind in ("lines", "points") and chart.labels == "legend" else WIDTH
@@ -107,6 +107,9 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
             _label_axes(chart, panel, first=place % across == 0 or chart.own_scales)
     if chart.kind in ("lines", "points"):
         _scale(chart, axes, panels)
+        for panel in axes if places else ():
+            panel.set_xlim(-0.3, len(places) - 0.7)
+            panel.set_xticks(range(len(places)), list(map(plain, places)), rotation=30, ha="right")
         for panel, (name, part) in zip(axes, panels, strict=True):
             _draw_marks(chart, panel, name, part)
             if chart.labels == "ends":
@@ -154,6 +157,15 @@ def series_styles(chart: Chart) -> dict[str, Style]:
         name: chart.styles[name] if name in chart.styles else Style(colour(i := next(free)), MARKERS[i % len(MARKERS)])
         for name in ordered
     }
+
+
+def _numbered(chart: Chart) -> tuple[Chart, list[str]]:
+    """Return a chart of lines or points with the strings of its x replaced by their places, and the strings."""
+    x = chart.x[0].name
+    if chart.kind not in ("lines", "points") or pd.api.types.is_numeric_dtype(chart.frame[x]):
+        return chart, []
+    codes, names = pd.factorize(chart.frame[x])
+    return replace(chart, frame=chart.frame.assign(**{x: codes.astype(float)})), list(map(str, names))
 
 
 # ------------------------------------------------------------------------------------------------------- layout

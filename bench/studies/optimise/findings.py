@@ -56,6 +56,8 @@ def recommendation(summary: pd.DataFrame, name: Name = str) -> str:
         return "No method reaches any target."
     if len(summary) == 1:
         return f"{name(best['method'])} reaches {_share(best)} of the targets."
+    if len(tied) == len(summary):
+        return f"Which method to use is open: {name(best['method'])} reaches most targets ({_share(best)}), and no other is distinguishable from it."
     others = [name(method) for method in tied["method"][1:]]
     also = f", not distinguishable from {_join(others) if len(others) <= NAMED else counted(len(others), 'other')}"
     text = f"Use {name(best['method'])}: it reaches most targets ({_share(best)}{also if others else ''})"
