@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -113,10 +114,11 @@ def write(history: History, out: Path) -> list[Path]:
 
 def views(history: History) -> Views:
     """Return the finding, the table of all series, and small multiples of the series that changed."""
+    short = _short_names(history.names)
     table = history.table.assign(
         line=[": ".join(filter(None, pair)) for pair in zip(history.table["experiment"], history.table["series"], strict=True)],
         failures=[f"{f} of {n}" for f, n in zip(history.table["failed"], history.table["of"], strict=True)],
-        result=[_shorten(name) for name in history.table["result"]],
+        result=history.table["result"].map(short),
     )  # fmt: skip
     changes = _changes(table)
     moved = changes[changes > 0].sort_values(ascending=False, kind="stable")
@@ -166,6 +168,13 @@ def _changes(table: pd.DataFrame) -> pd.Series:
     return pd.Series(parts, dtype=float)
 
 
-def _shorten(name: str) -> str:
-    name = name.rstrip("/")
-    return name if len(name) <= LONGEST else "..." + name[-LONGEST:]
+def _short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return the part of each name that is not common to the ends of all, such as the revision in ``REV:results/standard``."""
+    parts = [re.split(r"(?=[:/])", name.rstrip("/")) for name in names]
+    while all(len(part) > 1 and part[-1] == parts[0][-1] for part in parts):
+        parts = [part[:-1] for part in parts]
+    short = ["".join(part) for part in parts]
+    return {
+        name: text_ if len(text_) <= LONGEST else "..." + text_[-LONGEST:]
+        for name, text_ in zip(names, short, strict=True)
+    }

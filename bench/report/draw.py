@@ -74,6 +74,7 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     head = _Head(chart, width)
     legend = [] if chart.labels == "ends" else _legend(chart, styles, width - 0.6)
     columns = _legend_columns([str(handle.get_label()) for handle in legend], width)
+    heights = [height + 0.5 * max(map(width_in_inches, map(plain, places)), default=0.0) for height in heights]
     lines = [str(handle.get_label()).count("\n") + 1 for handle in legend]  # one column if any label is broken
     below = 0.05 + LINE * 1.12 * (math.ceil(len(legend) / columns) + sum(lines) - len(lines)) if legend else 0.0
     ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
@@ -110,6 +111,7 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
         for panel in axes if places else ():
             panel.set_xlim(-0.3, len(places) - 0.7)
             panel.set_xticks(range(len(places)), list(map(plain, places)), rotation=30, ha="right")
+            panel.set_xlabel("")
         for panel, (name, part) in zip(axes, panels, strict=True):
             _draw_marks(chart, panel, name, part)
             if chart.labels == "ends":

@@ -600,6 +600,17 @@ def test_history_draws_what_changed():
     ]
 
 
+def test_results_are_named_by_what_differs():
+    """Revisions of one folder by the revision, folders by their names; what would be empty stays."""
+    for names, short in (
+        (["HEAD~1:results/standard", "abc:results/standard/"], ["HEAD~1", "abc"]),
+        (["runs/v1", "runs/v2"], ["runs/v1", "runs/v2"]),
+        (["old/results", "new/results"], ["old", "new"]),
+        (["HEAD:results", "results"], ["HEAD:results", "results"]),
+    ):
+        assert list(history._short_names(names).values()) == short
+
+
 def test_the_page_has_all_cells_and_numbers_of_the_comparison():
     rows = given()
     after = rows.copy()

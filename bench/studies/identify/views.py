@@ -51,9 +51,9 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         ),
         Table(
             "identify", lines.drop_duplicates("problem"),
-            [PROBLEM, text("identifiable"), replace(by_name["bound"], kind="text"), replace(by_name["condition"], digits=3), by_name["step_note"]],
+            [PROBLEM, text("identifiable"), replace(by_name["bound"], kind="text"), replace(by_name["condition"], digits=3), by_name["explained"], by_name["step_note"]],
             "Parameters that a record identifies",
-            ["identifiable: products of powers of the parameters. bound: Cramer-Rao bound of their relative standard deviations."],
+            ["identifiable: products of powers of the parameters. bound: Cramer-Rao bound of their relative standard deviations. explained: records that no test of the residuals contradicts."],
             terminal=True, details=["step_note"],
         ),
     ]  # fmt: skip
@@ -76,10 +76,21 @@ def flatten(shown: Arranged) -> pd.DataFrame:
                 "row": index, "problem": name, "scene": row["scene"], "integrator": row["integrator"], "shooting": shooting,
                 "identifiable": ", ".join(row["invariants"]), "rank": row["rank"], "n_unknowns": len(row["unknowns"]),
                 "bound": ", ".join(number(b) for b in row["bound"]), "condition": row["condition"], "fits": row["fits"],
-                "step_note": row["step_note"], "step_shift": row["step_shift"],
+                "step_note": row["step_note"], "explained": row["explained"], "step_shift": row["step_shift"],
                 **{column: float(row[column][i]) for column in STATISTICS},
             })  # fmt: skip
-    names_ = ["row", "problem", "shooting", "identifiable", "bound", "condition", "fits", "step_note", *STATISTICS]
+    names_ = [
+        "row",
+        "problem",
+        "shooting",
+        "identifiable",
+        "bound",
+        "condition",
+        "fits",
+        "step_note",
+        "explained",
+        *STATISTICS,
+    ]
     found = pd.DataFrame(lines) if lines else pd.DataFrame(columns=names_)
     low, high = error_interval(found["error"], found["converged"] * found["fits"])
     return found.assign(error_low=low, error_high=high)
