@@ -25,7 +25,7 @@ CHANGED = 1.01
 """Smallest factor by which an error counts as changed."""
 PANELS = 16
 """Most series that are drawn."""
-ERROR = Column("error", label="relative error", digits=3, log=True)
+ERROR = Column("error", label="relative error", digits=3)
 ERRORS = ("paired", "interval", "exact")
 """Comparison rules of columns that contain an error. The history uses the first such column of a study."""
 NOT_RUN = ("unsupported", "unavailable")
