@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from bench.model import registry
+from bench.report.colours import estimator_order
 from bench.report.style import MARKERS, PALETTE, colour
 from bench.studies.growth import views as growth
 from bench.studies.optimise import views as searches
@@ -69,7 +69,7 @@ def test_an_estimator_keeps_its_colour_in_searches_and_in_errors_and_what_sees_c
         ("fobg, line_search", "fobg"),
         ("windowed[steps=5], adam", "windowed"),
     ):
-        assert found[method].colour == colour(sorted(registry.entries()["estimators"]).index(estimator))
+        assert found[method].colour == colour(estimator_order().index(estimator))
     assert found["fobg, adam"].line != found["fobg, line_search"].line
     context = found["cem[elites=8,population=40]"]
     assert len(set(to_rgb(context.colour))) == 1
