@@ -109,7 +109,7 @@ def tables(
     return [
         Table(
             "optimise", methods,
-            [text("name", label="method"), REACHED, SCORE, BETTER, PROFILE, Column("tunings"), MEDIAN, text("diverged_of", label="diverged")],
+            [text("name", label="method"), REACHED, SCORE, BETTER, PROFILE, Column("tunings", format="setting"), MEDIAN, text("diverged_of", label="diverged")],
             "methods by the share of targets they reach", [*notes(runs), *([f"{key}."] if key else [])], terminal=True, page=True,
             data=table(experiment, rows),
         ),
