@@ -105,9 +105,9 @@ def write(history: History, out: Path) -> list[Path]:
     from bench.report.writer import table_files
 
     make_directory(out)
-    made = views(history)
-    paths = write_all(out, table_files(made.tables, "History"))
-    (chart,) = made.charts
+    shown = views(history)
+    paths = write_all(out, table_files(shown.tables, "History"))
+    (chart,) = shown.charts
     with styled():
         return [*paths, *save(draw(chart), out / chart.name, data=chart.plotted())]
 

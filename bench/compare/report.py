@@ -183,10 +183,10 @@ def page(comparison: Comparison) -> str:
     experiment = Experiment(
         name=comparison.title, study=study, columns=study.columns, choices={}, question="Did something get worse?"
     )
-    made = page_views(comparison)
-    assert made.rows is not None
-    content = from_views.content(experiment, made.rows, made)
-    return assemble(experiment, content, [[] for _ in range(len(made.rows))], {})
+    shown = page_views(comparison)
+    assert shown.rows is not None
+    content = from_views.content(experiment, shown.rows, shown)
+    return assemble(experiment, content, [[] for _ in range(len(shown.rows))], {})
 
 
 def page_views(comparison: Comparison) -> Views:

@@ -91,9 +91,9 @@ def flatten(shown: Arranged) -> pd.DataFrame:
         "explained",
         *STATISTICS,
     ]
-    found = pd.DataFrame(lines) if lines else pd.DataFrame(columns=names_)
-    low, high = error_interval(found["error"], found["converged"] * found["fits"])
-    return found.assign(error_low=low, error_high=high)
+    table_ = pd.DataFrame(lines) if lines else pd.DataFrame(columns=names_)
+    low, high = error_interval(table_["error"], table_["converged"] * table_["fits"])
+    return table_.assign(error_low=low, error_high=high)
 
 
 def error_interval(error: pd.Series, count: pd.Series) -> tuple[pd.Series, pd.Series]:

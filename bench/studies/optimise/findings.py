@@ -22,12 +22,12 @@ Name = Callable[[str], str]
 def sentences(runs: RunSet, default: float, name: Name = str) -> list[str]:
     """Return the findings; ``name`` shortens the name of a method."""
     summary = aggregate.summarise(runs, default)
-    found = [
+    texts = [
         recommendation(summary, name),
         failures(runs, summary, name),
         effect_of_error(aggregate.effects_of_error(runs, default)),
     ]
-    return [sentence for sentence in found if sentence]
+    return [sentence for sentence in texts if sentence]
 
 
 def uses_gradients(method: str) -> bool:

@@ -159,15 +159,15 @@ def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str
 def charts(runs: RunSet, default: float, name: Callable[[str], str], texts: Sequence[str]) -> list[Chart]:
     """Return the charts, the shares of targets reached first."""
     looks = styles(runs.methods, name)
-    made = [
+    charts_ = [
         _targets(runs, default, texts[0]),
         _progress(runs, default),
         _quality(runs, default),
         *_paths(runs, default),
     ]
-    made += [*_tunings(runs, name), _path_quality(runs)]
+    charts_ += [*_tunings(runs, name), _path_quality(runs)]
     out = []
-    for chart in made:
+    for chart in charts_:
         if chart is not None and len(chart.frame):
             frame = chart.frame.assign(method=chart.frame["method"].map(name))
             out.append(
@@ -258,7 +258,7 @@ def _quality(runs: RunSet, default: float) -> Chart | None:
 def _paths(runs: RunSet, default: float) -> list[Chart]:
     """Return the regret along the paths against rollouts, and for the page against time."""
     ended: Counter[str] = Counter()
-    made = []
+    charts_ = []
     for unit in ("rollouts", "seconds"):
         lines = []
         for problem in runs.problems:
@@ -286,7 +286,7 @@ def _paths(runs: RunSet, default: float) -> list[Chart]:
         frame = pd.DataFrame(lines, columns=["problem", "method", "spent", "regret", "low", "high"]).replace(
             np.inf, np.nan
         )
-        made.append(Chart(
+        charts_.append(Chart(
             "anytime" if unit == "rollouts" else "anytime_seconds", "", frame, [SPENT if unit == "rollouts" else SECONDS], [REGRET],
             panel="problem", band=True, height=1.55, printed=unit == "rollouts",
             marks=[Mark("", 1 / target, axis="y") for target in TARGETS],
@@ -298,7 +298,7 @@ def _paths(runs: RunSet, default: float) -> list[Chart]:
     title = f"No method ends with the lowest median regret on most of the {len(runs.problems)} problems"
     if 2 * count > len(runs.problems):
         title = f"{short_names(runs.methods)(method)} ends with the lowest median regret on {count} of {counted(len(runs.problems), 'problem')}"
-    return [replace(chart, title=title) for chart in made]
+    return [replace(chart, title=title) for chart in charts_]
 
 
 def _tunings(runs: RunSet, name: Callable[[str], str]) -> list[Chart]:
