@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -15,18 +15,17 @@ import pandas as pd
 from bench.compare.cells import rows_by_cell
 from bench.compare.sources import Results, open_results
 from bench.errors import UserError
-from bench.experiment.columns import Column, Columns
+from bench.experiment.columns import Column, Columns, text
+from bench.experiment.views import Chart, Mark, Table, Views
 from bench.experiment.words import parse_words
-from bench.report.colours import estimator_order
-from bench.report.tables import plain_markdown
-from bench.report.text import number
+from bench.report.text import counted
 from bench.run.files import make_directory, write_all
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-WIDTH, HEIGHT = 7.16, 2.4
-"""Size of the chart [inches]."""
+CHANGED = 1.01
+"""Smallest factor by which an error counts as changed."""
+PANELS = 16
+"""Most series that are drawn."""
+ERROR = Column("error", label="relative error", digits=3)
 ERRORS = ("paired", "interval", "exact")
 """Comparison rules of columns that contain an error. The history uses the first such column of a study."""
 NOT_RUN = ("unsupported", "unavailable")
@@ -101,58 +100,81 @@ def _error_column(columns: Columns) -> Column | None:
 
 def write(history: History, out: Path) -> list[Path]:
     """Write ``history`` as .csv, .md and .png into a folder. Raises :class:`StorageError` if that fails."""
+    from bench.report.draw import draw
     from bench.report.figures import save, styled
+    from bench.report.writer import table_files
 
     make_directory(out)
-    readable = history.table.assign(
-        error=[number(e, 3) for e in history.table["error"]],
-        failed=[f"{f} of {n}" for f, n in zip(history.table["failed"], history.table["of"], strict=True)],
-    ).drop(columns="of")
-    text = (
-        "# History\n\n`error` is the geometric mean of the ratios to the errors of the first result, over the cells that are ok "
-        f"in all results. Below 1 is better.\n\n{plain_markdown(readable.astype(str))}\n"
-    )
-    paths = write_all(out, {"history.csv": history.table.to_csv(index=False, lineterminator="\n"), "history.md": text})
+    shown = views(history)
+    paths = write_all(out, table_files(shown.tables, "History"))
+    (chart,) = shown.charts
     with styled():
-        return [*paths, *save(figure(history), out / "history")]
+        return [*paths, *save(draw(chart), out / chart.name, data=chart.plotted())]
 
 
-def figure(history: History) -> Figure:
-    """Draw the errors relative to the first result, and the share of failed cells."""
-    from matplotlib.figure import Figure
+def views(history: History) -> Views:
+    """Return the finding, the table of all series, and small multiples of the series that changed."""
+    short = _short_names(history.names)
+    table = history.table.assign(
+        line=[": ".join(filter(None, pair)) for pair in zip(history.table["experiment"], history.table["series"], strict=True)],
+        failures=[f"{f} of {n}" for f, n in zip(history.table["failed"], history.table["of"], strict=True)],
+        result=history.table["result"].map(short),
+    )  # fmt: skip
+    changes = _changes(table)
+    moved = changes[changes > 0].sort_values(ascending=False, kind="stable")
+    total = counted(len(changes), "series", "series")
+    finding = (
+        f"No error changed by more than {CHANGED - 1:.0%} and no number of failed cells changed in any of {total}."
+    )
+    if len(moved):
+        finding = f"{len(moved)} of {total} changed in error by more than {CHANGED - 1:.0%} or in failed cells"
+        finding += f", most {moved.index[0]}."
+    names = list(moved.index[:PANELS]) or list(changes.index[:PANELS])
+    frame = pd.concat([table[table["line"] == name] for name in names], ignore_index=True)
+    failures = {
+        str(name): f"failed: {', '.join(map(str, part['failed']))} of {part['of'].iloc[0]}"
+        for name, part in frame.groupby("line")
+        if part["failed"].nunique() > 1
+    }
+    subtitle = "geometric mean of the ratios to the errors of the first result"
+    subtitle += f", {len(names)} of {len(moved)} changed series" if len(moved) > len(names) else ""
+    chart = Chart(
+        "history", finding, frame, [text("result", label="")], [ERROR], panel="line", panel_notes=failures, height=1.2,
+        marks=[Mark("", 1.0, axis="y")], subtitle=subtitle,
+    )  # fmt: skip
+    columns = [
+        text("result"),
+        text("experiment"),
+        text("series"),
+        replace(ERROR, label="error"),
+        Column("cells"),
+        text("failures", label="failed"),
+    ]
+    notes = [
+        "error: geometric mean of the ratios to the errors of the first result, over the cells that are ok in all results. Below 1 is better."
+    ]
+    every = Table("history", table, columns, finding.rstrip("."), notes, data=history.table)
+    return Views([finding], [every], [chart])
 
-    from bench.report.scales import log_axis
-    from bench.report.style import MARKERS, colour
 
-    known = estimator_order()
-    drawn = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
-    left, right = drawn.subplots(1, 2)
-    places = np.arange(len(history.names))
-    several = history.table["experiment"].nunique() > 1
-    ratios = history.table["error"].dropna()
-    lines = list(history.table.groupby(["experiment", "series"], sort=False))
-    for turn, ((experiment, series), part) in enumerate(lines):
-        place = known.index(series) if series in known else len(known) + turn
-        label = ": ".join(filter(None, [experiment if several else "", series])) or experiment
-        look = {"color": colour(place), "marker": MARKERS[(place + place // 8) % len(MARKERS)], "label": label}
-        if part["error"].notna().any():
-            left.plot(places, part["error"], **look)
-        right.plot(places, part["failed"] / part["of"] * 100, **look)
-    low, high = (min([0.8, *ratios]) / 1.05, max([1.25, *ratios]) * 1.05)
-    log_axis(left, "y", low, high)
-    left.axhline(1.0, color="#595959", linewidth=0.9, linestyle=(0, (3, 2)), zorder=1)
-    left.set_title("Error, relative to the first result")
-    right.set_title("Failed cells [%]")
-    right.set_ylim(bottom=-2 if history.table["failed"].max() else -0.1)
-    for panel in (left, right):
-        panel.set_xticks(places, [_shorten(name) for name in history.names], rotation=20, ha="right")
-        panel.set_xlim(-0.2, len(places) - 0.8)
-    if len(lines) > 1:
-        handles, labels = right.get_legend_handles_labels()
-        drawn.legend(handles, labels, loc="outside lower center", ncols=4)
-    return drawn
+def _changes(table: pd.DataFrame) -> pd.Series:
+    """Return how far each series moved: the logarithm of its largest factor, 0 below 1%, plus the change in failures."""
+    parts = {}
+    for name, part in table.groupby("line", sort=False):
+        factor = np.abs(np.log(part["error"].to_numpy(float)))
+        factor = factor[np.isfinite(factor)].max(initial=0.0)
+        failures = (part["failed"].max() - part["failed"].min()) / max(part["of"].max(), 1)
+        parts[name] = (factor if factor > math.log(CHANGED) else 0.0) + failures
+    return pd.Series(parts, dtype=float)
 
 
-def _shorten(name: str) -> str:
-    name = name.rstrip("/")
-    return name if len(name) <= LONGEST else "..." + name[-LONGEST:]
+def _short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return the part of each name that is not common to the ends of all, such as the revision in ``REV:results/standard``."""
+    parts = [re.split(r"(?=[:/])", name.rstrip("/")) for name in names]
+    while all(len(part) > 1 and part[-1] == parts[0][-1] for part in parts):
+        parts = [part[:-1] for part in parts]
+    short = ["".join(part) for part in parts]
+    return {
+        name: text_ if len(text_) <= LONGEST else "..." + text_[-LONGEST:]
+        for name, text_ in zip(names, short, strict=True)
+    }

@@ -17,14 +17,16 @@ from bench.compare import timings
 from bench.compare.cells import FIRST, LAST, OUTCOMES, WORSE_IN, both_sides, differing_parameters, flat_parameters
 from bench.compare.exports import as_json, as_junit, count_outcomes
 from bench.compare.judging import NOTES
-from bench.experiment.columns import Column
+from bench.experiment import views
+from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
+from bench.experiment.views import Chart, Style, Views
 from bench.model import registry
 from bench.report import terminal
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted, one_line
-from bench.report.web.content import STATUS, Chart, Content, PlotAxis, identity_columns, look
-from bench.report.web.content import TableColumn as Shown
+from bench.report.web import from_views
+from bench.report.web.content import identity_columns
 from bench.report.web.document import assemble
 from bench.run.files import make_directory, write_all
 
@@ -34,16 +36,9 @@ LISTED = 100
 """Largest number of changes in the Markdown file, which CI servers show above a run."""
 PHRASES = {"gone": "gone", "status": "no longer ok"}
 """Phrases of the summary for changes that are not of one column."""
-LOOKS = dict(
-    zip(
-        OUTCOMES,
-        (
-            look("#D55E00", "triangle-up"), look("#0072B2", "triangle-down"), look("#CC79A7", "square"),
-            look("#7F6000", "circle"),
-        ),
-        strict=True,
-    )
-)  # fmt: skip
+STYLES = dict(
+    zip(OUTCOMES, (Style("#D55E00", "^"), Style("#0072B2", "v"), Style("#CC79A7", "s"), Style("#7F6000")), strict=True)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,48 +179,50 @@ def _name_part(name: str, value: Any) -> str:
 
 def page(comparison: Comparison) -> str:
     """Return the comparison as an HTML page in the layout of an experiment's page."""
-    table = _worst_first(comparison.table).reset_index(drop=True)
-    rows = table.drop(columns=WORSE_IN).assign(
-        series=table["outcome"], status=table["status_after"], reason=table["change"]
-    )
-    numbers = [column for column in comparison.judged if column.kind == "number"]
-    content = Content(
-        finding=summary(table),
-        rows=rows,
-        columns=[
-            Shown("outcome", "outcome", "text"),
-            Shown("experiment", "experiment", "text"),
-            *identity_columns(rows),
-            *(
-                Shown(f"{column.name}_{when}", f"{_called(column)} {when}", _kind(column))
-                for column in comparison.judged
-                for when in ("before", "after")
-            ),
-            *STATUS,
-        ],
-        charts=[_before_after(column) for column in numbers if rows[f"{column.name}_after"].notna().any()],
-        answers=pd.DataFrame({"remark": [*comparison.remarks, *NOTES, timings.NOTE]}),
-        answers_title="How cells are judged",
-        looks=LOOKS,
-    )
     study = registry.make("studies", comparison.study)
-    as_experiment = Experiment(
+    experiment = Experiment(
         name=comparison.title, study=study, columns=study.columns, choices={}, question="Did something get worse?"
     )
-    return assemble(as_experiment, content, [[] for _ in range(len(rows))], {})
+    shown = page_views(comparison)
+    assert shown.rows is not None
+    content = from_views.content(experiment, shown.rows, shown)
+    return assemble(experiment, content, [[] for _ in range(len(shown.rows))], {})
+
+
+def page_views(comparison: Comparison) -> Views:
+    """Return the summary, the rules, all cells before and after, and a chart per number: the worst cells first."""
+    table = _worst_first(comparison.table).reset_index(drop=True)
+    rows = table.drop(columns=WORSE_IN).assign(status=table["status_after"], reason=table["change"])
+    rules = pd.DataFrame({"remark": [*comparison.remarks, *NOTES, timings.NOTE]})
+    columns = [
+        Column(
+            f"{column.name}_{when}", label=f"{_called(column)} {when}", unit=column.unit, kind=column.kind,
+            format="seconds" if column.unit == "s" else "number",
+        )
+        for column in comparison.judged
+        for when in ("before", "after")
+    ]  # fmt: skip
+    return Views(
+        findings=[summary(table)],
+        tables=[views.Table("rules", rules, [text("remark")], "How cells are judged", files=[], page=True)],
+        charts=[
+            _before_after(before, after, rows)
+            for before, after in zip(columns[::2], columns[1::2], strict=True)
+            if before.kind == "number" and rows[after.name].notna().any()
+        ],
+        rows=rows,
+        columns=[text("outcome"), text("experiment"), *columns],
+    )  # fmt: skip
 
 
 def _called(column: Column) -> str:
     return column.comparison.called if column.comparison else column.name
 
 
-def _kind(column: Column) -> str:
-    return "text" if column.kind == "text" else "seconds" if column.unit == "s" else "number"
-
-
-def _before_after(column: Column) -> Chart:
-    unit = f" [{column.unit}]" if column.unit else ""
+def _before_after(before: Column, after: Column, rows: pd.DataFrame) -> Chart:
+    title = after.heading.replace(" after", "").capitalize()
+    frame = rows[["outcome", "experiment", before.name, after.name]].assign(row=range(len(rows)))
     return Chart(
-        f"{_called(column)}{unit}".capitalize(), "Points above the diagonal are larger after.",
-        [PlotAxis(f"{column.name}_before", "before")], [PlotAxis(f"{column.name}_after", "after")], facet="experiment",
+        after.name, title, frame, [before], [after], "points", series="outcome", panel="experiment", styles=STYLES,
+        printed=False, text="Points above the diagonal are larger after.",
     )  # fmt: skip

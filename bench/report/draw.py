@@ -45,7 +45,7 @@ MANY = 12
 
 def draw(chart: Chart, width: float | None = None) -> Figure:
     """Return the chart as a figure of a width in inches: by default two columns of a paper, or one for a single panel."""
-    chart = replace(chart, frame=chart.drawn(), chosen=())
+    chart, places = _numbered(replace(chart, frame=chart.drawn(), chosen=()))
     panels = _panels(chart)
     if width is None:
         width = NARROW if len(panels) == 1 and chart.kind in ("lines", "points") and chart.labels == "legend" else WIDTH
@@ -53,11 +53,15 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     row_names = list(dict.fromkeys(chart.frame[chart.panel_row].astype(str))) if chart.panel_row else []
     across = len(panels) // len(row_names) if row_names else _across(chart, len(panels), width)
     down = math.ceil(len(panels) / across)
-    draw_kind: Any = {"dots": _draw_dots, "grid": partial(_draw_grid, width=width / across)}.get(
-        chart.kind, _draw_lines
-    )
+    orders = [list(part[chart.y[0].name].unique()) for _, part in panels]
+    same = all(order == orders[0] for order in orders)
+    label_room = 0.42 * (width if same else width / across)
+    draw_kind: Any = {
+        "dots": partial(_draw_dots, room=label_room),
+        "grid": partial(_draw_grid, width=width / across),
+    }.get(chart.kind, _draw_lines)
     heights = [_height(chart, part) for _, part in panels]
-    room = 0.9 * (width - _label_width(chart, row_names, across)) / across
+    room = 0.9 * (width - _label_width(chart, row_names, 1 if same else across, label_room)) / across
     titles = [_panel_title(chart, name, room) for name, _ in panels[: across if row_names else None]]
     upright = bool(row_names) and max(map(_text_width, titles)) > room * 1.1
     if upright:
@@ -70,6 +74,7 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     head = _Head(chart, width)
     legend = [] if chart.labels == "ends" else _legend(chart, styles, width - 0.6)
     columns = _legend_columns([str(handle.get_label()) for handle in legend], width)
+    heights = [height + 0.5 * max(map(width_in_inches, map(plain, places)), default=0.0) for height in heights]
     lines = [str(handle.get_label()).count("\n") + 1 for handle in legend]  # one column if any label is broken
     below = 0.05 + LINE * 1.12 * (math.ceil(len(legend) / columns) + sum(lines) - len(lines)) if legend else 0.0
     ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
@@ -97,10 +102,16 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
         if title:
             panel.set_title(title, loc="center" if upright else "left", fontsize=SIZE, rotation=90 if upright else 0)
         draw_kind(chart, panel, name, part, styles)
+        if chart.kind == "dots" and same and place % across:
+            panel.tick_params(labelleft=False)
         if chart.kind in ("lines", "points"):
             _label_axes(chart, panel, first=place % across == 0 or chart.own_scales)
     if chart.kind in ("lines", "points"):
         _scale(chart, axes, panels)
+        for panel in axes if places else ():
+            panel.set_xlim(-0.3, len(places) - 0.7)
+            panel.set_xticks(range(len(places)), list(map(plain, places)), rotation=30, ha="right")
+            panel.set_xlabel("")
         for panel, (name, part) in zip(axes, panels, strict=True):
             _draw_marks(chart, panel, name, part)
             if chart.labels == "ends":
@@ -148,6 +159,15 @@ def series_styles(chart: Chart) -> dict[str, Style]:
         name: chart.styles[name] if name in chart.styles else Style(colour(i := next(free)), MARKERS[i % len(MARKERS)])
         for name in ordered
     }
+
+
+def _numbered(chart: Chart) -> tuple[Chart, list[str]]:
+    """Return a chart of lines or points with the strings of its x replaced by their places, and the strings."""
+    x = chart.x[0].name
+    if chart.kind not in ("lines", "points") or pd.api.types.is_numeric_dtype(chart.frame[x]):
+        return chart, []
+    codes, names = pd.factorize(chart.frame[x])
+    return replace(chart, frame=chart.frame.assign(**{x: codes.astype(float)})), list(map(str, names))
 
 
 # ------------------------------------------------------------------------------------------------------- layout
@@ -210,13 +230,17 @@ def _panel_title(chart: Chart, name: str, width: float) -> str:
     return "\n".join(map(plain_lines, parts))
 
 
-def _label_width(chart: Chart, row_names: Sequence[str], across: int) -> float:
-    """Return the width in inches of all labels left of panels of dots, or of rows of panels: titles are right of them."""
+def _label_width(chart: Chart, row_names: Sequence[str], across: int, room: float) -> float:
+    """Return the width in inches of the labels left of panels of dots, or of rows of panels: titles are right of them.
+
+    Labels of dots have at most ``room`` inches each; ``across`` is the number of panels with labels in a row.
+    """
     if row_names:
         return max(map(width_in_inches, map(plain, row_names))) + 0.6
     if chart.kind != "dots":
         return 0.0
-    return across * max(map(width_in_inches, map(plain, map(str, chart.frame[chart.y[0].name].unique()))), default=0.0)
+    names = map(str, chart.frame[chart.y[0].name].unique())
+    return across * min(room, max(map(width_in_inches, map(plain, names)), default=0.0))
 
 
 def _text_width(text: str) -> float:
@@ -245,13 +269,15 @@ def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
             Patch(facecolor=style.colour, edgecolor="#808080", linewidth=0.4, label=labels[name])
             for name, style in styles.items()
         ]
-    if not chart.series:
+    if not chart.series or (chart.kind == "dots" and chart.series == chart.y[0].name):
         return []
     line = chart.kind == "lines"
+    keys = [key for key in dict.fromkeys((chart.panel, chart.series, chart.line)) if key]
+    bare = line and chart.frame.groupby(keys).size().min() > MANY
     colours = [
         Line2D(
-            [], [], color=style.colour, marker="s" if chart.shape else style.marker, linestyle=style.line if line else "none",
-            linewidth=style.width, label=labels[name],
+            [], [], color=style.colour, marker="s" if chart.shape else "" if bare else style.marker,
+            linestyle=style.line if line else "none", linewidth=style.width, label=labels[name],
         )
         for name, style in styles.items()
     ]  # fmt: skip
@@ -393,6 +419,7 @@ def _scale_x(panel: Axes, column: Column, values: np.ndarray, few: bool) -> None
     text = _values_text(column)
     if _is_log(column, values) and values[0] > 0:
         margin = max((values[-1] / values[0]) ** 0.05, 1.08)
+        few = few and column.format == "setting"
         log_axis(panel, "x", values[0] / margin, values[-1] * margin, values if few else (), text)
         return
     spread = float(np.ptp(values)) or abs(float(values[0])) or 1.0
@@ -478,8 +505,11 @@ def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
 # ---------------------------------------------------------------------------------------------------- dots
 
 
-def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles: dict[str, Style]) -> None:
-    """Draw a row per category, the first at the top, with a dot and an interval per series."""
+def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles: dict[str, Style], room: float) -> None:
+    """Draw a row per category, the first at the top, with a dot and an interval per series.
+
+    Names have ``room`` inches: wider ones are broken at a comma where the rows are high enough, and shortened.
+    """
     x, y = chart.x[0], chart.y[0]
     categories = list(dict.fromkeys(part[y.name].astype(str)))
     place = {category: len(categories) - 1 - i for i, category in enumerate(categories)}
@@ -501,7 +531,7 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
         if points.empty:
             continue
         shift = 0.0
-        if several and points[y.name].nunique() < len(part):
+        if several and part[y.name].nunique() < len(part):
             shift = -0.5 * (number - (len(names) - 1) / 2) / max(len(names), 2)
         rows = np.array([place[str(v)] for v in points[y.name]]) + shift
         at = points[x.name].to_numpy(float)
@@ -518,10 +548,10 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
             at[known & limit], rows[known & limit], linestyle="none", marker=style.marker or "o", markerfacecolor="white",
             **common,
         )  # fmt: skip
-        for row, lost in zip(rows, ~known, strict=True):
-            if lost and chart.failed:
-                panel.plot([0.985], [row], "x", transform=panel.get_yaxis_transform(), color=style.colour, markersize=5)
-    panel.set_yticks(list(place.values()), [plain(_clipped(category, 3.0)) for category in place])
+        for row in rows[points[chart.failed].to_numpy(bool)] if chart.failed else ():
+            panel.plot([0.985], [row], "x", transform=panel.get_yaxis_transform(), color=style.colour, markersize=5)
+    labels = [_in_lines(category, room, int(chart.height / LINE)) for category in place]
+    panel.set_yticks(list(place.values()), labels)
     panel.set_ylim(-0.6, len(categories) - 0.4)
     panel.tick_params(axis="y", length=0)
     panel.grid(axis="y", color="#e4e4e4", linewidth=0.6)
@@ -603,6 +633,13 @@ def _broken(text: str, width: float) -> str:
             lines.append("")
         lines[-1] += piece
     return "\n".join(lines)
+
+
+def _in_lines(text: str, width: float, most: int) -> str:
+    """Break a name at commas into at most ``most`` lines, and shorten those wider than ``width`` inches."""
+    lines = _fill(text, width).split("\n")
+    lines = [*lines[: most - 1], " ".join(lines[most - 1 :])] if most > 1 else [text]
+    return "\n".join(plain(_clipped(line, width)) for line in lines if line)
 
 
 def _clipped(text: str, width: float) -> str:

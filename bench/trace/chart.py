@@ -14,8 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
+from bench.report.draw import WIDTH
 from bench.report.figures import save, styled
-from bench.report.page import WIDTH
 from bench.report.scales import log_axis
 from bench.report.style import GREY, PALETTE, SHADE, STYLE, plain, wrapped
 from bench.run.files import make_directory, write_whole

@@ -19,7 +19,7 @@ import yaml
 from helpers import experiment, loaded, small_rows
 
 from bench import cli
-from bench.compare import cells, command, judging, report, sources, timings
+from bench.compare import cells, command, history, judging, report, sources, timings
 from bench.errors import UserError
 from bench.experiment import axes
 from bench.experiment.columns import Columns
@@ -576,6 +576,53 @@ def test_history_follows_errors_and_failures_in_the_order_given(tmp_path):
     assert list(fobg["failed"] - fobg["failed"].iloc[0]) == [0, 0, 1]
     assert (tmp_path / "out" / "history.png").stat().st_size > 0
     assert "fobg" in (tmp_path / "out" / "history.plotted.csv").read_text()
+
+
+def test_history_draws_what_changed():
+    """A panel per series that moved by more than 1% or failed elsewhere, the largest change first; NaN is no change."""
+    lines = [
+        (result, "some", series, error, 3, failed, 4)
+        for series, errors, failures in (
+            ("same", (1.0, 1.001, 0.999), (0, 0, 0)), ("little", (1.0, 1.0, 1.1), (0, 0, 0)), ("much", (1.0, 3.0, 1.0), (0, 0, 0)),
+            ("lost", (1.0, 1.0, 1.0), (1, 1, 2)), ("unknown", (math.nan,) * 3, (4, 4, 4)),
+        )
+        for result, error, failed in zip("abc", errors, failures, strict=True)
+    ]  # fmt: skip
+    names = ["result", "experiment", "series", "error", "cells", "failed", "of"]
+    made = history.views(history.History(pd.DataFrame(lines, columns=names), ["a", "b", "c"]))
+    assert made.findings == ["3 of 5 series changed in error by more than 1% or in failed cells, most some: much."]
+    (chart,) = made.charts
+    assert list(dict.fromkeys(chart.frame["line"])) == ["some: much", "some: lost", "some: little"]
+    assert chart.panel_notes == {"some: lost": "failed: 1, 1, 2 of 4"}
+    still = history.views(history.History(pd.DataFrame(lines[:3], columns=names), ["a", "b", "c"]))
+    assert still.findings == [
+        "No error changed by more than 1% and no number of failed cells changed in any of 1 series."
+    ]
+
+
+def test_results_are_named_by_what_differs():
+    """Revisions of one folder by the revision, folders by their names; what would be empty stays."""
+    for names, short in (
+        (["HEAD~1:results/standard", "abc:results/standard/"], ["HEAD~1", "abc"]),
+        (["runs/v1", "runs/v2"], ["runs/v1", "runs/v2"]),
+        (["old/results", "new/results"], ["old", "new"]),
+        (["HEAD:results", "results"], ["HEAD:results", "results"]),
+    ):
+        assert list(history._short_names(names).values()) == short
+
+
+def test_the_page_has_all_cells_and_numbers_of_the_comparison():
+    rows = given()
+    after = rows.copy()
+    after.loc[good(rows), ["bias", "bias_low", "bias_high"]] = [9.0, 8.0, 10.0]
+    table = compared(rows, after).assign(experiment="some")
+    made = report.page_views(report.Comparison("t", table, ["a remark"], COLUMNS.compared, "bias_variance"))
+    assert made.findings == [report.summary(table)]
+    assert made.rows["outcome"].iloc[0] == "worse"
+    assert len(made.rows) == len(table)
+    (chart,) = [chart for chart in made.charts if chart.name == "bias_after"]
+    assert chart.frame.loc[0, "bias_after"] == 9.0
+    assert made.tables[0].frame["remark"].iloc[0] == "a remark"
 
 
 @pytest.mark.parametrize(

@@ -5,15 +5,13 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.colors import to_rgb
 
-from bench.model import registry
+from bench.report.colours import estimator_order
 from bench.report.style import MARKERS, PALETTE, colour
 from bench.studies.growth import views as growth
-from bench.studies.optimise import findings
-from bench.studies.optimise import report as searches
+from bench.studies.optimise import views as searches
 
 DEUTERANOPIA = np.array(
     [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
@@ -63,7 +61,7 @@ def test_more_estimators_than_colours_differ_by_colour_or_marker(seen):
 
 def test_an_estimator_keeps_its_colour_in_searches_and_in_errors_and_what_sees_costs_only_is_grey_and_dashed():
     """fobg was blue in one experiment's searches, pink in another's, and orange in growth."""
-    found = searches.looks(
+    found = searches.styles(
         ["cem[elites=8,population=40]", "fobg, adam", "fobg, line_search", "windowed[steps=5], adam"]
     )
     for method, estimator in (
@@ -71,28 +69,9 @@ def test_an_estimator_keeps_its_colour_in_searches_and_in_errors_and_what_sees_c
         ("fobg, line_search", "fobg"),
         ("windowed[steps=5], adam", "windowed"),
     ):
-        assert found[method]["color"] == colour(sorted(registry.entries()["estimators"]).index(estimator))
-    assert found["fobg, adam"]["linestyle"] != found["fobg, line_search"]["linestyle"]
+        assert found[method].colour == colour(estimator_order().index(estimator))
+    assert found["fobg, adam"].line != found["fobg, line_search"].line
     context = found["cem[elites=8,population=40]"]
-    assert len(set(to_rgb(context["color"]))) == 1
-    assert context["linestyle"] != "-"
-    assert growth.looks()["first_order"].colour == found["fobg, adam"]["color"]
-
-
-def test_titles_of_searches_say_what_was_found():
-    rho = pd.DataFrame(
-        [("stiff", 12, 0.9, 0.6, 1.0, 0.02), ("smooth", 12, 0.1, -0.4, 0.7, 0.9), ("chaotic", 3, -1.0, -1.0, -1.0, 0.0)],
-        columns=["scene_class", "points", "rho", "rho_low", "rho_high", "chance"],
-    )  # fmt: skip
-    assert (
-        findings.effect_title(rho)
-        == "The better gradient reaches the target sooner on stiff scenes; not known on smooth, chaotic scenes"
-    )
-    assert findings.effect_title(rho[1:]).startswith(
-        "Whether the better gradient reaches the target sooner is not known on smooth"
-    )
-    assert findings.targets_title({"cem": 0.5, "fobg, adam": 0.4, "reinforce, adam": 0.1}) == (
-        "Most targets reached: cem (50%); with gradients fobg, adam (40%)"
-    )
-    assert findings.targets_title({"fobg, adam": 0.4, "cem": 0.3}) == "Most targets reached: fobg, adam (40%)"
-    assert findings.targets_title({"a, adam": 0.4, "b, adam": 0.4}) == "Most targets reached: a, adam and b, adam (40%)"
+    assert len(set(to_rgb(context.colour))) == 1
+    assert context.line != "-"
+    assert growth.looks()["first_order"].colour == found["fobg, adam"].colour

@@ -38,10 +38,11 @@ from bench.report.draw import draw
 from bench.report.figures import save, styled
 from bench.report.plotted import plotted
 from bench.report.problems import split_by_problem
-from bench.report.style import PALETTE, Styles, axis_name, colour
+from bench.report.style import PALETTE, colour, marker
 from bench.report.text import number
 from bench.run.store import Store
 from bench.studies.bias_variance import tables
+from bench.studies.bias_variance.charts import estimator_styles
 from bench.studies.bias_variance.columns import TABLE
 from bench.studies.bias_variance.comparisons import problems_by_axis
 
@@ -604,7 +605,6 @@ def test_the_axis_of_zipped_parameters_names_all_of_them():
     for name, other in (("stiffness", "dt"), ("dt", "stiffness")):
         assert other in figures[f"bias_variance_{name}"].x[0].heading
     shown = views.arrange(experiment(sweep=sweep), rows)
-    assert axis_name(named(shown, "stiffness")) == "stiffness $k$ [N/m], dt with it"
     assert [axis.title for axis in shown.axes] == ["stiffness [N/m], with dt", "dt [s], with stiffness"]
 
 
@@ -643,14 +643,10 @@ def test_forty_estimators_have_forty_colours_each_told_from_the_one_it_comes_fro
 def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
     def look(*estimators):
         rows = table([row(estimator=name, stiffness=k) for name in estimators for k in (1e2, 1e4)])
-        styles = Styles(rows, NAMES)
-        return {
-            line.label: styles.marked(line)
-            for line in views.estimator_curves(rows.assign(x=rows["stiffness"], lost=0.0))
-        }
+        return estimator_styles(rows)
 
     every = look(*NAMES)
-    assert len({(style["color"], style["marker"]) for style in every.values()}) == len(NAMES)
+    assert len({(style.colour, style.marker) for style in every.values()}) == len(NAMES)
     for name in NAMES:
         assert look(name) == {name: every[name]}
     assert look("of_my_own", *NAMES) == every | look("of_my_own")
@@ -675,9 +671,7 @@ def lab_of(linear):
 def test_twelve_estimators_stay_distinct_for_colour_blind_readers_too(eyes):
     """Colours differ by 8 (just noticeable: 2.3), and by 30 where the marker is the same."""
     seen = np.array(BLIND.get(eyes, np.eye(3)))
-    names = [f"estimator_{i}" for i in range(12)]
-    look = Styles(table([row(estimator=name) for name in names]), names)
-    styles = [look.marked(views.Curve(name, "", {}, pd.DataFrame(), {}, frozenset(), 0)) for name in names]
+    styles = [{"color": colour(i), "marker": marker(i)} for i in range(12)]
     linear = [
         np.array([c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(s["color"])])
         for s in styles

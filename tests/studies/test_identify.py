@@ -1,8 +1,10 @@
 """Fits of parameters: what a record tells in closed form, the Cramer-Rao bound, coverage, basins and time steps."""
 
 import math
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import wrong_models
 from bench.plugins.optimizers.gauss_newton import GaussNewton
@@ -10,12 +12,16 @@ from bench.plugins.optimizers.gauss_newton import GaussNewton
 import bench
 from bench.experiment import config
 from bench.experiment.grid import cells
+from bench.experiment.study import study_of
 from bench.measure.identification import Information, product
 from bench.model import Answer
+from bench.report.views import newest_rows
 from bench.run.execute import store_of
 from bench.run.plan import plan
+from bench.studies.identify import views as shown
 from bench.studies.identify.measure import Fitting, count_windows, information, measure, model_of, run_fits
 
+STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
 SPRING = ("scenes=[mass_spring_damper]", "integrators=[rk4]")
 STEPPED = 1e-4
 """Relative error of rk4 at 0.05 s against the closed form of the motion, in what is compared here."""
@@ -260,3 +266,114 @@ def test_levenberg_marquardt_needs_as_few_evaluations_as_minpack_on_rosenbrock()
         if 0.5 * float((residual**2).sum()) < 1e-20:
             break
     assert evaluations <= 21
+
+
+# ---------------------------------------------------------------------------------------------------- what is shown
+
+
+@pytest.fixture(scope="module")
+def standard():
+    """The standard experiment, its rows and its views."""
+    given = config.load(["experiment=identify", f"results_dir={STANDARD}"])
+    rows = newest_rows(store_of(given).load())
+    return given, rows, study_of(given).views(given, rows)
+
+
+def test_findings_are_those_of_the_stored_table(standard):
+    """Counted again from the CSV's own lists, without the code of the views."""
+    rows = pd.read_csv(STANDARD / "identify" / "identify.csv")
+    listed = {
+        name: [[float(word) for word in cell.strip("[]").split()] for cell in rows[name]]
+        for name in ("converged_high", "coverage", "coverage_high", "error")
+    }
+    lost = sum(high < 0.9 for cell in listed["converged_high"] for high in cell)
+    narrow = sum(high < 0.95 for cell in listed["coverage_high"] for high in cell)
+    lowest = min(c for cell in listed["coverage"] for c in cell if c == c)
+    errors = [cell[0] for cell, name in zip(listed["error"], rows["integrator"], strict=True) if name == "rk4"]
+    use, fails, known = standard[2].findings
+    assert use.startswith("Use rk4 and single shooting: in 5 of 5 cases")
+    assert f"(error {min(errors):.2f} to {max(errors):.1f} times the bound)" in use
+    assert f"in {lost} of 22 cases, all with semi_implicit_euler," in fails
+    assert f"too narrow in {narrow} (they contain the truth in {lowest:.0%} of the fits" in fails
+    assert known == "A record of mass_spring_damper identifies only stiffness/mass and damping/mass."
+    assert not any(";" in text for text in standard[2].findings)
+
+
+def test_chart_and_tables_have_the_rows(standard):
+    _, rows, views = standard
+    fits, parameters = views.tables
+    assert len(fits.frame) == 22
+    assert len(parameters.frame) == len(rows)
+    assert {"step_note", "condition"} <= {column.name for column in parameters.columns}
+    printed = next(chart for chart in views.charts if chart.printed)
+    assert len(printed.frame) == 44
+    assert printed.frame["failed"].sum() == 2 * (fits.frame["converged"] == 0).sum() > 0
+    page = next(chart for chart in views.charts if not chart.printed)
+    for line in page.frame.to_dict("records"):
+        row = rows.iloc[line["row"]]
+        assert line["error"] == pytest.approx(
+            list(row["error"])[list(row["shooting"]).index(line["shooting"])], nan_ok=True
+        )
+
+
+def planted(**columns):
+    """The findings of four cases with rk4 and four with another integrator, some columns replaced."""
+    n = 8
+    lines = pd.DataFrame({
+        "row": range(n), "problem": [f"p{i}" for i in range(n)], "scene": "s", "integrator": ["rk4"] * 4 + ["euler"] * 4,
+        "shooting": "single", "identifiable": "a, b", "rank": 2.0, "n_unknowns": 2, "fits": 64.0, "converged": 1.0,
+        "converged_low": 0.94, "converged_high": 1.0, "error": 1.0, "coverage": 0.95, "coverage_low": 0.87,
+        "coverage_high": 0.98, "hidden": 0.0,
+    } | columns)  # fmt: skip
+    low, high = shown.error_interval(lines["error"], lines["converged"] * lines["fits"])
+    return shown.findings(lines.assign(error_low=low, error_high=high))
+
+
+def test_findings_need_their_intervals():
+    half = [1.0] * 4
+    tied = planted()
+    assert tied[0].startswith("Use rk4 and single shooting: in 4 of 4 cases")
+    assert tied[1] == "Neither fits nor their intervals fail in any of 8 cases."
+    assert len(tied) == 2
+    open_ = planted(coverage=[0.85] * 8, coverage_low=0.7, coverage_high=0.951)
+    assert "fail in any" in open_[1]  # below the stated level, but not by the whole interval
+    few = planted(converged=[0.85] * 8, converged_low=0.7, converged_high=0.93)
+    assert few[0] == "No fit is known to reach the Cramer-Rao bound."
+    assert "do not explain" not in few[1]
+    unknown = planted(error=[math.nan] * 8, coverage=[math.nan] * 8, coverage_high=[math.nan] * 8)
+    assert unknown[0] == "No fit is known to reach the Cramer-Rao bound."
+    far = planted(
+        error=[*half, 3.0, 3.0, 3.0, 3.0], coverage=[0.95] * 4 + [0.3] * 4, coverage_high=[0.98] * 4 + [0.4] * 4
+    )
+    assert far[0].startswith("Use rk4")
+    assert "95% intervals are too narrow in 4 (they contain the truth in 30%" in far[1]
+    assert "report more identifiable directions" in planted(hidden=[3.0] + [0.0] * 7)[2]
+
+
+def test_interval_of_the_error_covers():
+    rng = np.random.default_rng(0)
+    errors = pd.Series(np.sqrt(np.mean(rng.standard_normal((4000, 20)) ** 2, axis=1)))
+    low, high = shown.error_interval(errors, pd.Series(np.full(4000, 20.0)))
+    # 4,000 draws of a share of 0.95: three standard errors
+    assert np.mean((low <= 1.0) & (high >= 1.0)) == pytest.approx(0.95, abs=0.0104)
+
+
+@pytest.mark.parametrize("status", ["nonfinite", "unsupported"])
+def test_rows_without_results_are_said_so(standard, status):
+    given, rows, _ = standard
+    views = study_of(given).views(given, rows.assign(status=status, reason="planted"))
+    assert views.findings == ["No fit gave a result: the table has the reason of each."]
+    assert not views.charts
+    assert list(views.remarks) == ["planted"]
+
+
+def test_own_measurements_have_no_coverage_to_show(standard):
+    """With a record of one's own the truth is unknown: neither error nor coverage is drawn, and no fit counts as lost."""
+    given, rows, _ = standard
+    gone = {
+        name: [[math.nan] * len(v) for v in rows[name]]
+        for name in ("error", "coverage", "coverage_low", "coverage_high")
+    }
+    views = study_of(given).views(given, rows.assign(**gone))
+    assert views.findings[0] == "No fit is known to reach the Cramer-Rao bound."
+    assert [column.name for column in views.charts[0].x] == ["converged", "condition", "step_shift"]

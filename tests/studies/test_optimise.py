@@ -1,7 +1,10 @@
 """The study of searches: known optima, stops, refusals, tables and charts, and the statistics that sum them up."""
 
 import math
+import re
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -25,13 +28,16 @@ from bench.experiment.study import study_of
 from bench.measure import performance
 from bench.measure.solve import solve
 from bench.model import Problem, State, compose
+from bench.report.views import newest_rows
 from bench.run.execute import store_of
 from bench.run.plan import plan
 from bench.run.session import Session
-from bench.studies.optimise import aggregate, report
+from bench.studies.optimise import aggregate, findings
+from bench.studies.optimise import views as shown
 from bench.studies.optimise.batched import run_batched
 from bench.studies.optimise.search import compare_with_reference, scene_class
 
+STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
 CHECKED = 1e-6
 """Relative agreement with the checked optima."""
 
@@ -371,6 +377,8 @@ def test_tables_charts_and_page(finished):
         "targets.csv",
         "summary.csv",
         "quality_runtime.png",
+        "runtimes.png",
+        "findings.json",
         "anytime.png",
         "targets.png",
         "learning_rates.png",
@@ -378,8 +386,10 @@ def test_tables_charts_and_page(finished):
     ):
         assert (folder / name).stat().st_size > 0, name
     text = (folder / "optimise.md").read_text()
-    assert "Best score" in text
-    assert "not known" in text  # two methods on one problem say nothing about gradients in general
+    assert "average runtime" in text
+    assert (
+        "is open on smooth scenes" in (folder / "findings.json").read_text()
+    )  # two methods on one problem say nothing
     found = aggregate.collect_runs(experiment, bench.load(folder))
     assert found.methods == ["fobg, gradient_descent", "cem[elites=5,population=20]", "reinforce, gradient_descent"]
     assert found.best_tunings[found.problems[0], "fobg, gradient_descent"] == "rate=0.1"
@@ -594,7 +604,7 @@ def test_seeds_that_choose_a_tuning_do_not_score_it():
     assert found.best_tunings == {("p", "tuned"): "1", ("p", "plain"): ""}
     assert found.best_runs.groupby("method")["final_cost"].mean().to_dict() == {"tuned": 9, "plain": 5}
     assert sorted(found.best_runs["seed"].unique()) == [2, 3, 4]  # the same for all methods, so that pairs remain
-    assert "seeds 0, 1, which do not score" in " ".join(report.notes(found))
+    assert "seeds 0, 1, which do not score" in " ".join(shown.notes(found))
 
 
 @pytest.mark.parametrize("finals", [{("one", ""): [1, 2, 3, 4, 5]}, {("few", "1"): [1, 2, 3], ("few", "2"): [2, 3, 4]}])
@@ -616,6 +626,166 @@ def test_quality_along_the_path_is_summed_up_over_seeds():
     assert error["iteration"].tolist() == [0, 10, 20]
     assert error["value"].tolist() == pytest.approx([0.1, 0.3, 0.6])
     assert error["low"].iloc[2] == pytest.approx(np.quantile([0.4, 0.8, 0.6], 0.2))
-    assert len(report.path_figure(aggregate.RunSet(rows, ()), 4.0).axes) == 2
+    chart = shown._path_quality(aggregate.RunSet(rows, ()))
+    assert chart.frame["value"].tolist() == pytest.approx([0.1, 0.3, 0.6])
+    assert chart.frame["cosine_value"].tolist() == pytest.approx([1.0, 0.9, 0.5])
+    assert chart.title.endswith("by up to a factor of 6.0")
     alone = rows.assign(path_quality_iteration=[[0]] * 3)
-    assert report.path_figure(aggregate.RunSet(alone, ()), 4.0) is None
+    assert shown._path_quality(aggregate.RunSet(alone, ())) is None
+
+
+# ---------------------------------------------------------------------------------------------------- what is shown
+
+
+@cache
+def views_of(name):
+    """A standard experiment, its rows and its views."""
+    given = config.load([f"experiment={name}", f"results_dir={STANDARD}"])
+    rows = newest_rows(store_of(given).load())
+    return given, rows, study_of(given).views(given, rows)
+
+
+@pytest.fixture(params=["optimise", "learning_rates", "optimise/small"])
+def standard(request):
+    """A standard experiment's name, rows and views."""
+    return request.param, *views_of(request.param)[1:]
+
+
+def test_findings_are_those_of_the_stored_targets(standard):
+    """The share of targets, who is first and the median over tunings again from the CSV files and the rows."""
+    name, rows, views = standard
+
+    def plain(method):
+        return re.sub(r"\[.*?\]", "", method)
+
+    use, fails, effect = views.findings
+    targets, summary = (pd.read_csv(views_of(name)[0].directory / f"{table}.csv") for table in ("targets", "summary"))
+    shares = targets.groupby("method")["rate"].mean().sort_values(ascending=False)
+    assert (
+        f"{plain(shares.index[0])}{' reaches' if 'is open' in use else ': it reaches'} most targets ({shares.iloc[0]:.0%} ["
+        in use
+    )
+    assert ("is open" in use) == (name != "optimise")  # three seeds
+    with_gradients = [method for method in shares.index if ", " in method]
+    assert f"{plain(with_gradients[0])} ({shares[with_gradients[0]]:.0%}" in use.replace(
+        ": it reaches most targets", ""
+    ).replace(" reaches most targets", "")
+    gains = (summary["score"] - summary["median_score"])[summary["tunings"] > 1]
+    worst = summary.loc[gains.idxmax()]
+    assert f"score of {plain(worst['method'])} from {worst['median_score']:.2f}" in fails
+    diverged = int((rows["stopped"] == "diverged").sum())
+    assert (f"{diverged} of {len(rows)} searches diverged" in fails) == (diverged > 0)
+    assert "open on" in effect
+    assert not any(";" in text for text in views.findings)
+    assert all(len(text) < 260 for text in views.findings)
+
+
+def test_error_and_runtime_are_ranked_again_with_scipy():
+    """On stiff scenes of ``optimise``: the pooled ranks within problems, by scipy."""
+    from scipy.stats import rankdata, spearmanr
+
+    chart = next(c for c in views_of("optimise")[2].charts if c.name == "quality_runtime")
+    stiff = chart.frame[chart.frame["scene_class"] == "stiff"]
+    ranks = [
+        np.stack([rankdata(part["rmse_rel"]), rankdata(part["art"].fillna(np.inf))])
+        for _, part in stiff.groupby("problem")
+    ]
+    rho = spearmanr(*np.concatenate(ranks, axis=1)).statistic
+    stated = float(re.search(r"rank correlation (\S+) \[", chart.panel_notes["stiff"])[1])
+    assert stated == pytest.approx(rho, abs=0.0051)
+    assert all(chart.panel_notes[kind].startswith("open: ") for kind in ("smooth", "chaotic", "discontinuous"))
+    assert "rank" not in chart.title
+
+
+def test_charts_have_the_tables_numbers(standard):
+    """The dots are the summary's shares, and the lines of runtimes end at them."""
+    _, rows, views = standard
+    charts = {chart.name: chart for chart in views.charts}
+    assert next(iter(charts)) == "targets"
+    shares = charts["targets"].frame.set_index("method")["reached"]
+    assert list(shares) == sorted(shares, reverse=True)
+    ends = charts["runtimes"].frame.groupby("method")["share"].max()
+    assert ends.to_dict() == pytest.approx(shares.to_dict())
+    regret = charts["anytime"].frame
+    assert regret["regret"].min() >= shown.DEPTH
+    assert set(regret["problem"]) == set(charts["learning_rates"].frame["problem"])
+    assert len(views.rows) == len(rows)
+
+
+def table_of_rates(**rates):
+    """A summary of methods with rates of success on ten problems of six searches, and one tuning."""
+    lines = []
+    for method, share in rates.items():
+        name = method.replace("_", ", ", 1)
+        reached = pd.DataFrame({
+            "problem": np.repeat(np.arange(10), 3), "searches": 6, "successes": round(6 * share), "rate": round(6 * share) / 6,
+        })  # fmt: skip
+        value, error = aggregate.share_of_targets(reached)
+        lines.append({
+            "method": name, "problems": 10, "reached": value, "reached_se": error, "reached_low": max(0, value - 2 * error),
+            "reached_high": min(1, value + 2 * error), "tunings": 1, "score": 0.5, "median_score": 0.5,
+        })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
+def test_who_reaches_most_targets_needs_an_interval():
+    assert findings.recommendation(table_of_rates(a_adam=1.0, b_adam=0.5)).startswith(
+        "Use a, adam: it reaches most targets (100%"
+    )
+    tied = findings.recommendation(table_of_rates(a_adam=4 / 6, b_adam=4 / 6, cem=0.0))
+    assert "not distinguishable from b, adam" in tied
+    assert findings.recommendation(table_of_rates(a_adam=4 / 6, b_adam=4 / 6)).startswith("Which method to use is open")
+    assert "with gradients b, adam" in findings.recommendation(table_of_rates(cem=1.0, b_adam=0.5))
+    assert findings.recommendation(table_of_rates(a_adam=0.0, cem=0.0)) == "No method reaches any target."
+    partial = table_of_rates(a_adam=1.0, b_adam=0.5).assign(problems=[3, 10])  # run on three problems only
+    assert findings.recommendation(partial).startswith("Use b, adam")
+
+
+def test_interval_of_the_share_of_targets_covers():
+    """Seeds drawn anew, the three targets of a problem reached by the same seeds: few searches, rates at both ends."""
+    rng = np.random.default_rng(0)
+    for rates in (np.full(5, 1.0), np.linspace(0.0, 1.0, 8), np.full(3, 0.9)):
+        hits = 0
+        for _ in range(300):
+            successes = rng.binomial(4, rates)
+            found = pd.DataFrame(
+                {"problem": np.repeat(np.arange(len(rates)), 3), "searches": 4, "successes": np.repeat(successes, 3)}
+            )
+            share, error = aggregate.share_of_targets(found.assign(rate=found["successes"] / 4))
+            hits += abs(share - rates.mean()) <= performance.Z * error
+        assert hits / 300 > 0.91  # discrete: nominal 0.95
+
+
+def correlations(*lines):
+    return pd.DataFrame(lines, columns=["scene_class", "points", "rho", "rho_low", "rho_high", "chance"])
+
+
+def test_the_effect_of_errors_needs_five_points_and_an_interval():
+    sure, wide = ("stiff", 12, 0.9, 0.6, 1.0, 0.02), ("smooth", 12, 0.1, -0.4, 0.7, 0.9)
+    text = findings.effect_of_error(correlations(sure, wide, ("chaotic", 3, -1.0, -1.0, -1.0, 0.0)))
+    assert text == (
+        "Gradients with a smaller error reach a tenth of the first regret sooner on stiff scenes (rank correlation 0.90 [0.60, "
+        "1.0], 12 points), and this is open on smooth and chaotic scenes."
+    )
+    assert "later on stiff" in findings.effect_of_error(correlations(("stiff", 12, -0.9, -1.0, -0.6, 0.02)))
+    assert "is open on smooth" in findings.effect_of_error(correlations(wide))
+    assert "is open on odd" in findings.effect_of_error(correlations(("odd", 9, math.nan, math.nan, math.nan, 1.0)))
+    assert "no gradient's quality" in findings.effect_of_error(correlations())
+    points = pd.DataFrame(
+        {"problem": ["p", "p", "q", "q"], "scene_class": "smooth", "rmse_rel": [1.0, 2, 1, 2], "art": [1.0, 2, 1, 2]}
+    )
+    assert aggregate.rank_correlations(points)["rho"].isna().all()  # two pairs in order are four points
+
+
+def test_short_names_stay_unique():
+    name = shown.short_names(["cem[population=40]", "cem[population=20]", "windowed[terminal=learned], adam"])
+    assert name("cem[population=40]") == "cem[population=40]"
+    assert name("windowed[terminal=learned], adam") == "windowed, adam"
+
+
+def test_searches_without_results_are_said_so():
+    given, rows, _ = views_of("optimise/small")
+    none = rows.assign(status="unsupported", reason="planted")
+    views = study_of(given).views(given, none)
+    assert views.findings == ["No search gave a result: the table has the reason of each."]
+    assert list(views.remarks) == ["planted"]

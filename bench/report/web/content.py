@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import pandas as pd
 
-from bench.experiment import axes as sweep
 from bench.experiment.columns import IDENTITY
 from bench.report.problems import distinguishing_columns, titled
-from bench.report.style import MARKERS, VARIANTS, colour, marker
-from bench.report.views import attempted
+from bench.report.style import MARKERS, colour, marker
 
 __all__ = ["distinguishing_columns", "titled"]
 SYMBOLS = dict(
     zip(MARKERS, ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star"), strict=True)
 )
 """Plotly's name of each Matplotlib marker."""
-DASHES = dict(zip(map(str, VARIANTS), ("solid", "dash", "dot"), strict=True))
-"""Plotly's name of each Matplotlib line style."""
 DARK = {"#000000": "#ffffff"}
 """Replacements for colours on a dark page; all other colours are visible on both backgrounds."""
 
@@ -129,19 +124,3 @@ def identity_columns(rows: pd.DataFrame, swept: Sequence[str] = ()) -> list[Tabl
 
 STATUS = [TableColumn("status", "status", "text"), TableColumn("reason", "reason", "text")]
 """The last columns of every main table."""
-
-
-def numeric_axis(axis: sweep.Axis, column: str = "x", log: bool = True) -> PlotAxis:
-    """Return a swept parameter as an axis of a chart, labelled with its unit and the parameters that step with it."""
-    return PlotAxis(column, axis.title, log)
-
-
-def no_result_sentence(rows: pd.DataFrame) -> str:
-    """Return a sentence if no cell has a result, else an empty string."""
-    has_result = bool((attempted(rows)["status"] == "ok").any())
-    return "" if has_result else "No cell gave a result: the table has the reason of each."
-
-
-def finite(value: float) -> bool:
-    """Return whether a value is a finite number."""
-    return isinstance(value, int | float) and math.isfinite(value)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.experiment.cell import Cell
@@ -12,6 +11,7 @@ from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, t
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
+from bench.experiment.views import Views
 from bench.model import Identified, MechanicalScene, Optimizer, param
 
 if TYPE_CHECKING:
@@ -34,7 +34,8 @@ class Identify(Study):
         Column("fits", "records that were fitted"),
         Column("step_shift", "largest relative change of an estimate when the model's step is halved, without noise"),
         text("step_note", "whether the estimate holds for its time step only"),
-        Column("explained", "share of records that no test of the residuals contradicts, at 5% false alarms"),
+        Column("explained", "share of records that no test of the residuals contradicts, at 5% false alarms",
+               label="explained", format="percent"),
         Column("misfit", "share of records of a right model that contradict it as much as the first record"),
         numbers("wide_low", "by unknown, lower end of the 95% interval of the first fit under correlated noise"),
         numbers("wide_high", "by unknown, its upper end"),
@@ -45,11 +46,14 @@ class Identify(Study):
         numbers("bound", "Cramer-Rao bound of the relative standard deviation of each invariant"),
         numbers("fisher", "Fisher information of the logarithms, row by row", table=False),
         numbers("shooting", "the shooting methods: single, multiple, windows"),
-        numbers("converged", "by shooting method, share of fits whose residuals are consistent with the noise"),
+        numbers("converged", "by shooting method, share of fits whose residuals are consistent with the noise",
+                label="share of fits that converge", low="converged_low", high="converged_high"),
         numbers("converged_low", "lower end of its 95% interval"),
         numbers("converged_high", "upper end of its 95% interval"),
-        numbers("error", "by shooting method, root mean square error of converged fits in units of the bound"),
-        numbers("coverage", "by shooting method, share of 95% intervals of converged fits that contain the truth"),
+        numbers("error", "by shooting method, root mean square error of converged fits in units of the bound",
+                label="error / Cramer-Rao bound", low="error_low", high="error_high"),
+        numbers("coverage", "by shooting method, share of 95% intervals of converged fits that contain the truth",
+                label="coverage of 95% intervals", low="coverage_low", high="coverage_high"),
         numbers("coverage_low", "lower end of its 95% interval over records"),
         numbers("coverage_high", "upper end of its 95% interval over records"),
         numbers("hidden", "by shooting method, fits with more identifiable directions than the record has"),
@@ -97,20 +101,8 @@ class Identify(Study):
                 return str(error)
         return None
 
-    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the tables and the chart."""
-        from bench.studies.identify import report
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return the findings, the tables of fits and of identifiable parameters, and the charts of their precision."""
+        from bench.studies.identify.views import views
 
-        return report.write(experiment, rows)
-
-    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the identifiable parameters of each record, and convergence and coverage of the fits."""
-        from bench.studies.identify import report
-
-        report.show(experiment, rows)
-
-    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the page: the failures, the identifiable parameters, a chart of any two numbers, and the table."""
-        from bench.studies.identify.page import content
-
-        return content(experiment, rows)
+        return views(experiment, rows)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.experiment.cell import Cell
@@ -12,6 +11,7 @@ from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, t
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
+from bench.experiment.views import Views
 from bench.model import Estimator, KnownOptimum, Optimizer, Plugin, param
 from bench.model.program import OWN
 
@@ -29,21 +29,24 @@ class Optimise(Study):
     columns: ClassVar[Columns] = Columns.of(
         text("optimizer", "identity string of the optimizer"),
         text("stopped", "reason for the end of the search: budget, target, plateau or diverged"),
-        text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification"),
+        text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",
+             label="class"),
         Column("iterations", "steps of the optimizer"),
         Column("rollouts", "rollouts of the search, without those that score its path"),
         Column("gradients", "gradients of the search"),
         Column("gradient_ratio", "measured time of a gradient over that of a rollout", measured=True),
-        Column("search_s", "time of the search, without compilation and scores", "s", measured=True),
+        Column("search_s", "time of the search, without compilation and scores", "s", measured=True, label="search",
+               format="seconds"),
         Column("start_cost", "objective at the start"),
         Column("final_cost", "objective at the last theta", comparison=ComparisonRule("exact", "final cost")),
         Column("best_cost", "lowest objective on the path"),
         Column("optimum", "least known cost J*, from before the search"),
         text("optimum_status", "source of J*"),
         Column("score", "share of the way from the start to J*, between 0 and 1; empty without J*"),
-        Column("quality_rmse_rel", "relative root mean squared error of the estimator's gradients at the start"),
+        Column("quality_rmse_rel", "relative root mean squared error of the estimator's gradients at the start",
+               label="gradient's error, relative"),
         Column("quality_cosine", "mean cosine between those gradients and the reference"),
-        Column("quality_bias_share", "share of bias in the squared error of those gradients"),
+        Column("quality_bias_share", "share of bias in the squared error of those gradients", label="share of bias"),
         numbers("path_iteration", "iterations at which the path is recorded", table=False),
         numbers("path_cost", "objective at those iterations", table=False),
         numbers("path_rollouts", "rollouts up to those iterations", table=False),
@@ -100,24 +103,8 @@ class Optimise(Study):
                 return f"target={self.target:g} is below the optimum {optimum:.10g} of scene {cell.scene.name} ({how})"
         return None
 
-    def write(self, experiment: Experiment, rows: pd.DataFrame) -> list[Path]:
-        """Write the tables and charts."""
-        from bench.studies.optimise import report
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return the findings, tables and charts: targets reached by method, regret, errors of gradients, tuning."""
+        from bench.studies.optimise.views import views
 
-        return report.write(experiment, rows)
-
-    def show(self, experiment: Experiment, rows: pd.DataFrame) -> None:
-        """Print the findings and the tables."""
-        from bench.studies.optimise import report
-
-        report.show(experiment, rows)
-
-    def page(self, experiment: Experiment, rows: pd.DataFrame) -> Any:
-        """Return the page: the findings, and charts of quality against runtime, paths and learning rates."""
-        from bench.studies.optimise.page import content
-
-        return content(experiment, rows)
-
-    def chart(self, experiment: Experiment, rows: pd.DataFrame) -> tuple[str, ...]:
-        """Return the names of the charts of quality against runtime and of the paths, in order of preference."""
-        return ("quality_runtime", "anytime")
+        return views(experiment, rows)

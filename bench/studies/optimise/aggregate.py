@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -24,8 +23,8 @@ from bench.report.views import arrange, attempted
 PARTS = ("scene", "contact", "integrator", "backend")
 TARGETS = (10.0, 100.0, 1000.0)
 """Target regrets: the first regret divided by each of these factors."""
-RESTARTS = 100
-"""Number of simulated runs with restarts per method, problem and target."""
+FEWEST_POINTS = 5
+"""Fewest points for a rank correlation."""
 MIN_SEEDS_TO_SPLIT = 4
 """Fewest seeds to split: some choose the tunings, the others score."""
 ROUNDING = 1e-12
@@ -231,21 +230,37 @@ def times_to_targets(runs: RunSet, default: float) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def restart_runtimes(runs: RunSet, default: float) -> dict[str, np.ndarray]:
-    """Return, per method, runtimes in rollouts with simulated restarts, over all problems and targets."""
-    times: dict[str, list[np.ndarray]] = {method: [] for method in runs.methods}
+def runtimes(runs: RunSet, default: float) -> pd.DataFrame:
+    """Return the rollouts of each search until each target, infinite if it is missed, and the weight of the search.
+
+    The weights of a method add up to 1, in equal parts for its problems and targets.
+    """
+    lines = []
     for problem, method, part in runs.by_method():
-        ratio = runs.gradient_ratio(problem, default)
-        for seed, factor in enumerate(TARGETS):
-            times[method].append(performance.runtimes(*hitting_times(part, factor, ratio), RESTARTS, seed))
-    return {method: np.concatenate(parts) for method, parts in times.items() if parts}
+        for factor in TARGETS:
+            spent, reached = hitting_times(part, factor, runs.gradient_ratio(problem, default))
+            lines += [(method, 1.0 / len(spent), cost) for cost in np.where(reached, spent, math.inf)]
+    table = pd.DataFrame(lines, columns=["method", "weight", "runtime"])
+    return table.assign(weight=table["weight"] / table.groupby("method")["weight"].transform("sum"))
+
+
+def share_of_targets(reached: pd.DataFrame) -> tuple[float, float]:
+    """Return the mean success rate of a method's lines of :func:`times_to_targets`, and a bound of its standard error.
+
+    The error is due to the seeds. The variance of each rate is that of the estimate of Agresti and Coull (1998), with two more
+    successes and two more failures, so that few searches that agree are uncertain. The targets of a problem count as fully
+    dependent, the problems as independent.
+    """
+    p = (reached["successes"] + 2.0) / (reached["searches"] + 4.0)
+    by_problem = np.sqrt(p * (1 - p) / reached["searches"]).groupby(reached["problem"]).mean()
+    return float(reached["rate"].mean()), float(np.sqrt((by_problem**2).sum()) / len(by_problem))
 
 
 @remember
 def summarise(runs: RunSet, default: float, baseline: str = "fobg") -> pd.DataFrame:
-    """Return, per method, the interquartile mean score, the probability to beat the baseline, and the performance profile.
+    """Return, per method, the share of targets reached, the score, the chance to beat the baseline, and the profile.
 
-    The score's interval is a bootstrap stratified by problem. ``improvement``, with Wilson's interval, is the
+    The score is an interquartile mean, its interval a bootstrap stratified by problem. ``improvement``, with Wilson's interval, is the
     probability of a lower final cost than the first method whose estimator is ``baseline``, paired by problem and seed.
     """
     reached = times_to_targets(runs, default)
@@ -257,12 +272,15 @@ def summarise(runs: RunSet, default: float, baseline: str = "fobg") -> pd.DataFr
         strata = [scores for scores in strata if len(scores)]
         low, high = performance.bootstrap(strata, _pooled_score) if strata else (math.nan, math.nan)
         better, better_low, better_high = _improvement(runs, str(method), base)
-        times = reached.loc[reached["method"] == method, "art"]
+        own = reached[reached["method"] == method]
+        times, (share, error) = own["art"], share_of_targets(own)
         assert fastest is not None
         ratios = (times / fastest[times.index]).to_numpy()
         cells = runs.rows[runs.rows["method"] == method]
         lines.append({
             "method": method, "problems": part["problem"].nunique(), "searches": len(part),
+            "reached": share, "reached_low": max(0.0, share - performance.Z * error),
+            "reached_high": min(1.0, share + performance.Z * error), "reached_se": error,
             "score": _pooled_score(strata), "score_low": low, "score_high": high,
             "improvement": better, "improvement_low": better_low, "improvement_high": better_high,
             "profile": performance.profile_score(ratios), "diverged": int((part["status"] == "diverged").sum()),
@@ -312,27 +330,35 @@ def quality_and_runtime(runs: RunSet, default: float, factor: float = TARGETS[0]
     return pd.DataFrame(lines)
 
 
+@remember
+def effects_of_error(runs: RunSet, default: float) -> pd.DataFrame:
+    """Return :func:`rank_correlations` of the errors and runtimes of :func:`quality_and_runtime`."""
+    return rank_correlations(quality_and_runtime(runs, default))
+
+
 def rank_correlations(points: pd.DataFrame) -> pd.DataFrame:
     """Return Spearman's rho of gradient error against runtime, by class of scene.
 
     Costs vary between problems, so errors and runtimes are ranked within each problem, and the ranks are scaled to
-    0..1. A positive rho means that gradients with smaller errors reach the target sooner.
+    0..1. A positive rho means that gradients with smaller errors reach the target sooner. It is NaN from fewer than
+    :data:`FEWEST_POINTS` points.
     """
     lines = []
     if points.empty:
         return pd.DataFrame(columns=["scene_class", "rho", "rho_low", "rho_high", "chance", "points", "problems"])
-    for name, part in itertools.chain([("all", points)], points.groupby("scene_class", sort=False)):
+    for name, part in points.groupby("scene_class", sort=False):
         strata = []
         for _, methods in part.groupby("problem", sort=False):
             if len(methods) > 1:
                 ranks = [performance.ranks(methods[column].to_numpy()) for column in ("rmse_rel", "art")]
                 strata.append((np.stack(ranks, axis=1) - 1) / (len(methods) - 1))
         pooled = np.concatenate(strata) if strata else np.empty((0, 2))
-        low, high = performance.spearman_interval(strata) if len(pooled) > 2 else (math.nan, math.nan)
+        enough = len(pooled) >= FEWEST_POINTS
+        low, high = performance.spearman_interval(strata) if enough else (math.nan, math.nan)
         lines.append({
-            "scene_class": str(name), "rho": performance.spearman(pooled[:, 0], pooled[:, 1]), "rho_low": low,
-            "rho_high": high, "chance": performance.spearman_chance(strata) if len(pooled) > 2 else 1.0,
-                "points": len(pooled), "problems": len(strata),
+            "scene_class": str(name), "rho": performance.spearman(pooled[:, 0], pooled[:, 1]) if enough else math.nan,
+            "rho_low": low, "rho_high": high, "chance": performance.spearman_chance(strata) if enough else 1.0,
+            "points": len(pooled), "problems": len(strata),
         })  # fmt: skip
     return pd.DataFrame(lines)
 

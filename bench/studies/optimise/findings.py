@@ -1,147 +1,148 @@
-"""Formats the findings of the searches as sentences with intervals, and the titles of the charts."""
+"""States what searches show in at most three sentences: what reaches most targets, what tuning costs, what errors cost."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 
+import numpy as np
 import pandas as pd
 
-from bench.report.study_tables import interval
+from bench.measure.performance import Z
 from bench.report.text import counted, number
 from bench.studies.optimise import aggregate
 from bench.studies.optimise.aggregate import RunSet
 
 CHANCE = 0.05
 """An order counts as random if a random order is at least as good with more than this probability."""
-FEW_SEEDS = 5
-"""Fewest searches per problem for a bootstrap interval. With two, half of the resamples are one search twice."""
+NAMED = 3
+"""Most tied methods that a sentence names."""
+Name = Callable[[str], str]
 
 
-def sentences(runs: RunSet, default: float) -> list[str]:
-    """Return the findings, the answer to the study's question first."""
-    if not len(runs.rows):
-        return ["No search gave a result: the table has the reason of each."]
+def sentences(runs: RunSet, default: float, name: Name = str) -> list[str]:
+    """Return the findings; ``name`` shortens the name of a method."""
     summary = aggregate.summarise(runs, default)
-    findings = [
-        effect_of_error(aggregate.rank_correlations(aggregate.quality_and_runtime(runs, default))),
-        ranking(summary),
-        tuning(summary),
-        divergence(runs),
+    texts = [
+        recommendation(summary, name),
+        failures(runs, summary, name),
+        effect_of_error(aggregate.effects_of_error(runs, default)),
     ]
-    return [sentence for sentence in findings if sentence]
+    return [sentence for sentence in texts if sentence]
 
 
-def effect_of_error(rho: pd.DataFrame) -> str:
-    """Format for each class of scenes whether the gradient with the smaller error reaches the target sooner."""
-    if rho.empty:
-        return "Whether a better gradient pays is not known: no gradient's quality was measured."
+def uses_gradients(method: str) -> bool:
+    """Return whether a method has an estimator: its name is then ``estimator, optimizer``."""
+    return ", " in method
+
+
+def tied_with_best(summary: pd.DataFrame) -> pd.DataFrame:
+    """Return the methods that reach most targets, the first one first, and those not distinguishable from it.
+
+    Methods that were not run on all problems are not compared.
+    """
+    full = summary[summary["problems"] == summary["problems"].max()].sort_values(
+        "reached", ascending=False, kind="stable"
+    )
+    best = full.iloc[0]
+    error = np.sqrt(best["reached_se"] ** 2 + full["reached_se"] ** 2)
+    return full[(best["reached"] - full["reached"] < Z * error) | (full["method"] == best["method"])]
+
+
+def recommendation(summary: pd.DataFrame, name: Name = str) -> str:
+    """Return which method reaches most targets, its ties, and the best method that uses gradients."""
+    tied = tied_with_best(summary)
+    best = tied.iloc[0]
+    if not best["reached"] > 0:
+        return "No method reaches any target."
+    if len(summary) == 1:
+        return f"{name(best['method'])} reaches {_share(best)} of the targets."
+    if len(tied) == len(summary):
+        return f"Which method to use is open: {name(best['method'])} reaches most targets ({_share(best)}), and no other is distinguishable from it."
+    others = [name(method) for method in tied["method"][1:]]
+    also = f", not distinguishable from {_join(others) if len(others) <= NAMED else counted(len(others), 'other')}"
+    text = f"Use {name(best['method'])}: it reaches most targets ({_share(best)}{also if others else ''})"
+    graded = summary[[uses_gradients(method) for method in summary["method"]]]
+    if uses_gradients(best["method"]) or graded.empty:
+        return f"{text}."
+    tied = tied_with_best(graded)
+    first = tied.iloc[0]
+    others = [name(method) for method in tied["method"][1:]]
+    also = f" or {_join(others)}" if 0 < len(others) <= NAMED else ""
+    return f"{text}, or with gradients {name(first['method'])} ({_share(first)}){also}."
+
+
+def failures(runs: RunSet, summary: pd.DataFrame, name: Name = str) -> str:
+    """Return what tuning alone changes, and how many searches diverged."""
+    tuned = summary[(summary["tunings"] > 1) & summary["score"].notna() & summary["median_score"].notna()]
     parts = []
-    for row in rho[rho["scene_class"] != "all"].to_dict("records"):
-        if math.isnan(row["rho"]) or row["points"] < 4:
-            parts.append(f"{row['scene_class']}: not known from {counted(row['points'], 'point')}")
-            continue
-        figures = f"rho {row['rho']:.2f} [{row['rho_low']:.2f}, {row['rho_high']:.2f}], {row['points']} points"
-        if row["chance"] > CHANCE:
-            parts.append(
-                f"{row['scene_class']}: not known ({figures}; a random order is as good {row['chance']:.0%} of the time)"
+    if tuned.empty:
+        parts.append("nothing was tuned, so that a difference between methods may be one of their rates")
+    else:
+        worst = tuned.loc[(tuned["score"] - tuned["median_score"]).idxmax()]
+        parts.append(
+            f"tuning alone changes the score of {name(worst['method'])} from {number(worst['median_score'])}, its median over "
+            f"{worst['tunings']} tunings, to {number(worst['score'])} at the best"
+        )
+    diverged = runs.rows[runs.rows["stopped"] == "diverged"]
+    if len(diverged):
+        by = _join([f"{name(str(method))} {count}" for method, count in diverged["method"].value_counts().items()])
+        parts.append(f"{len(diverged)} of {counted(len(runs.rows), 'search', 'searches')} diverged ({by})")
+    text = ", and ".join(parts)
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def effect_of_error(rho: pd.DataFrame, figures: bool = True) -> str:
+    """Return on which classes of scenes gradients with smaller errors reach the target sooner, later, or it is open.
+
+    With ``figures`` the sentence has the rank correlations.
+    """
+    rows = rho.to_dict("records")
+    if not rows:
+        return "Whether a better gradient pays is open: no gradient's quality was measured."
+    verdicts = {row["scene_class"]: verdict(row) for row in rows}
+    parts = []
+    for kind in ("sooner", "later"):
+        on = [row for row in rows if verdicts[row["scene_class"]] == kind]
+        if on:
+            names = _join(
+                [f"{row['scene_class']} scenes" + (f" ({correlation(row)})" if figures else "") for row in on]
             )
-        elif row["rho_low"] > 0:
-            parts.append(f"{row['scene_class']}: yes ({figures})")
-        elif row["rho_high"] < 0:
-            parts.append(f"{row['scene_class']}: no, later ({figures})")
-        else:
-            parts.append(f"{row['scene_class']}: not known ({figures})")
-    return "Does the gradient with the smaller error at the start reach the target sooner? " + "; ".join(parts) + "."
+            parts.append(f"gradients with a smaller error reach a tenth of the first regret {kind} on {names}")
+    unsure = [row["scene_class"] for row in rows if verdicts[row["scene_class"]] == "open"]
+    if unsure and parts:
+        parts.append(f"this is open on {_join(unsure)} scenes")
+    elif unsure:
+        return f"Whether gradients with a smaller error reach the target sooner is open on {_join(unsure)} scenes."
+    text = ", and ".join(parts)
+    return f"{text[:1].upper()}{text[1:]}."
 
 
-def effect_title(rho: pd.DataFrame) -> str:
-    """Return the title of quality against runtime: the classes where the better gradient is sooner or later."""
-    classes = rho[rho["scene_class"] != "all"].to_dict("records")
-    known = [row for row in classes if row["points"] >= 4 and row["chance"] <= CHANCE]
-    sure = {
-        "sooner": [row["scene_class"] for row in known if row["rho_low"] > 0],
-        "later": [row["scene_class"] for row in known if row["rho_high"] < 0],
-    }
-    parts = [
-        f"the better gradient reaches the target {when} on {' and '.join(on)} scenes" for when, on in sure.items() if on
-    ]
-    unsure = [row["scene_class"] for row in classes if row["scene_class"] not in (*sure["sooner"], *sure["later"])]
-    parts += [f"not known on {', '.join(unsure)} scenes"] if unsure else []
-    text = "; ".join(parts)
-    if not any(sure.values()):
-        return f"Whether the better gradient reaches the target sooner is {text}"
-    return text[:1].upper() + text[1:]
+def verdict(row: dict[str, float]) -> str:
+    """Return ``sooner`` or ``later`` where the whole interval of the rank correlation is on one side of 0, else ``open``."""
+    if not row["points"] >= aggregate.FEWEST_POINTS or not row["chance"] <= CHANCE:
+        return "open"
+    return "sooner" if row["rho_low"] > 0 else "later" if row["rho_high"] < 0 else "open"
 
 
-def score_title(summary: pd.DataFrame) -> str:
-    """Return the title of the paths: the method with the best score, and the best method that uses gradients."""
-    known = summary[summary["score"].notna()].sort_values("score", ascending=False)
-    return _best("Best score", [(row["method"], number(row["score"], 3)) for row in known.to_dict("records")])
+def correlation(row: dict[str, float]) -> str:
+    """Return a rank correlation with its interval and the number of points."""
+    low, high = number(row["rho_low"]), number(row["rho_high"])
+    return f"rank correlation {number(row['rho'])} [{low}, {high}], {row['points']:.0f} points"
 
 
-def targets_title(shares: Mapping[str, float]) -> str:
-    """Return the title of targets reached: the method with the largest share, and the best method that uses gradients."""
-    order = sorted(shares.items(), key=lambda item: -item[1])
-    return _best("Most targets reached", [(name, f"{share:.0%}") for name, share in order])
-
-
-def _best(heading: str, order: Sequence[tuple[str, str]]) -> str:
-    """Format the methods tied for first and, if none of them uses gradients, the first method that does."""
-    if not order:
-        return "No method has a score"
-    figure = order[0][1]
-    level = [name for name, value in order if value == figure]
-    text = f"{heading}: {' and '.join(level)} ({figure})"
-    if not any(", " in name for name in level):  # names without a comma have no estimator
-        following = next(((name, value) for name, value in order if ", " in name), None)
-        text += f"; with gradients {following[0]} ({following[1]})" if following else ""
-    return text
-
-
-def tuning_title(lines: pd.DataFrame) -> str:
+def tuning_title(lines: pd.DataFrame, name: Name = str) -> str:
     """Return the title of scores by tuning: the method and problem whose score changes most."""
     spread = lines.groupby(["method", "problem"], sort=False)["score"].agg(["min", "max"])
-    far = (spread["max"] - spread["min"]).sort_values(ascending=False)
-    method, problem = far.index[0]
-    low, high = spread.loc[far.index[0]]
+    method, problem = (spread["max"] - spread["min"]).idxmax()
+    low, high = spread.loc[(method, problem)]
     scene = str(problem).partition(",")[0]
-    return f"Tuning alone changes the score of {method} from {number(low, 2)} to {number(high, 2)} on {scene}"
+    return f"Tuning alone changes the score of {name(method)} from {number(low)} to {number(high)} on {scene}"
 
 
-def ranking(summary: pd.DataFrame) -> str:
-    """Format which method has the best score, and which methods are not distinguishable from it; empty without scores."""
-    known = summary[summary["score"].notna()].sort_values("score", ascending=False)
-    if known.empty:
-        return ""
-    first = known.iloc[0]
-    text = f"Best score: {first['method']} with {interval(first, 'score', digits=3)}"
-    if known["searches"].sum() < FEW_SEEDS * known["problems"].sum():
-        text += f" (fewer than {FEW_SEEDS} seeds: the intervals are too narrow)"
-    level = known.iloc[1:][known.iloc[1:]["score_high"] >= first["score_low"]]["method"]
-    return text + (
-        f"; not distinguishable from it: {', '.join(level)}." if len(level) else "; no other interval overlaps it."
-    )
+def _share(row: pd.Series) -> str:
+    low, high = (f"{row[f'reached_{end}']:.0%}" for end in ("low", "high"))
+    return f"{row['reached']:.0%} [{low}, {high}]"
 
 
-def tuning(summary: pd.DataFrame) -> str:
-    """Format the largest change of a score by tuning only, and the range of the methods' best scores."""
-    tuned = summary[(summary["tunings"] > 1) & summary["score"].notna()]
-    if tuned.empty:
-        return "Nothing was tuned: a comparison at one learning rate compares rates as much as gradients."
-    change = tuned["score"] - tuned["median_score"]
-    worst = tuned.loc[change.idxmax()]
-    spread = summary["score"].max() - summary["score"].min()
-    return (
-        f"Tuning alone changes the score of {worst['method']} by {number(change.max())} (best of {worst['tunings']} "
-        f"tunings minus their median); the methods' best scores span {number(spread)}."
-    )
-
-
-def divergence(runs: RunSet) -> str:
-    """Format how many searches diverged, by method."""
-    diverged = runs.rows[runs.rows["stopped"] == "diverged"]
-    if diverged.empty:
-        return "No search diverged."
-    by = ", ".join(f"{name} {count}" for name, count in diverged["method"].value_counts().items())
-    return f"{len(diverged)} of {counted(len(runs.rows), 'search', 'searches')} diverged: {by}."
+def _join(parts: Sequence[str]) -> str:
+    return " and ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else "".join(parts)

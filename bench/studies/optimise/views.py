@@ -1,0 +1,339 @@
+"""What the study of searches shows: targets reached by method, regret along the paths, errors of gradients, and tuning."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from bench.experiment.axes import table
+from bench.experiment.columns import Column, text
+from bench.experiment.experiment import Experiment
+from bench.experiment.views import Chart, Mark, Style, Table, Views
+from bench.report.colours import estimator_colour, estimator_marker
+from bench.report.style import DEVIANT, MARKERS, VARIANTS
+from bench.report.text import counted, number
+from bench.report.writer import reasons
+from bench.studies.optimise import aggregate, findings
+from bench.studies.optimise.aggregate import TARGETS, RunSet
+
+CONTEXT = tuple(zip(("#666666", "#8c8c8c", "#4d4d4d", "#767676"), (*VARIANTS[1:], *DEVIANT[:2]), strict=True))
+"""Grey and line style of each method that uses only costs."""
+STEPS = 40
+"""Number of points of a drawn curve."""
+DEPTH = 3e-4
+"""Smallest regret that is drawn, as a share of the first: below the hardest target."""
+METHOD, PROBLEM = text("method"), text("problem")
+REACHED = Column(
+    "reached", label="targets reached", format="percent", low="reached_low", high="reached_high", log=False
+)
+SCORE = Column("score", low="score_low", high="score_high", digits=3, log=False)
+BETTER = Column("improvement", label="beats fobg", low="improvement_low", high="improvement_high")
+PROFILE, MEDIAN = Column("profile", log=False), Column("median_score", label="median over tunings", log=False)
+RUNTIME = Column(
+    "art", label="average runtime", unit="rollouts", low="art_low", high="art_high", log=True,
+    doc="expected rollouts per target reached: all rollouts of all searches over the searches that reached it",
+)  # fmt: skip
+RATE = Column("rate", label="searches that reach it", low="rate_low", high="rate_high")
+SPENT = Column("spent", label="rollouts", log=True)
+SECONDS = Column("spent", label="time", format="seconds", log=True)
+REGRET = Column("regret", label="regret / first regret", low="low", high="high", log=True)
+ERROR = Column("rmse_rel", label="relative error of a gradient at the start", log=True)
+NOTES = (
+    "targets reached: share of searches whose regret falls to 1/10, 1/100 and 1/1000 of the first, the mean over problems and "
+    "targets. score: share of the way from the first cost to J*, interquartile mean over searches, with a bootstrap interval "
+    "stratified by problem. beats fobg: chance of a lower final cost, paired by problem and seed. profile: integral of the "
+    "share of targets reached within 1 to 4 times the best method's runtime. average runtime (aRT): expected rollouts per "
+    "target reached, where a gradient counts as many rollouts as take its time: the rollouts of all searches over the number "
+    "of searches that reached the target, inf if none did. Each method is shown at its best tuning on each problem, chosen by "
+    "median final cost of {seeds}, next to the number of tunings and the median score over all of them. Methods that use "
+    "costs only (dashed in charts) are context and do not enter findings about gradients.",
+)
+PAGE = (
+    "stopped", "scene_class", "final_cost", "best_known", "score", "rollouts", "gradients", "search_s", "quality_rmse_rel",
+    "quality_bias_share",
+)  # fmt: skip
+
+
+def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
+    """Return findings, tables and charts of the searches."""
+    runs, default = aggregate.collect_runs(experiment, rows), default_ratio(experiment)
+    if not len(runs.rows):
+        every = Table(
+            "optimise", rows, [text("scene"), text("optimizer"), text("status")], data=table(experiment, rows)
+        )
+        return Views(["No search gave a result: the table has the reason of each."], [every], remarks=reasons(rows))
+    name = short_names(runs.methods)
+    texts = findings.sentences(runs, default, name)
+    cells = rows.assign(**{c: runs.rows[c] for c in ("problem", "method", "tuning", "best_known", "score")})
+    cells = cells.fillna({"problem": "", "method": "", "tuning": ""}).astype({"score": float, "best_known": float})
+    by_name = experiment.columns.by_name | {"best_known": Column("best_known", label="J*")}
+    return Views(
+        texts, tables(experiment, rows, runs, default, name), charts(runs, default, name, texts), rows=cells,
+        columns=[METHOD, *(by_name[column] for column in PAGE)], remarks=reasons(rows),
+    )  # fmt: skip
+
+
+def default_ratio(experiment: Experiment) -> float:
+    """Return the number of rollouts that a gradient counts as if no times were measured."""
+    return float(getattr(experiment.study, "gradient_cost", 4.0))
+
+
+def short_names(methods: Sequence[str]) -> Callable[[str], str]:
+    """Return the function that shortens a method's name by its parameters in brackets, where that leaves it unique."""
+    short = {method: re.sub(r"\[[^\]]*\]", "", method) for method in methods}
+    counts = Counter(short.values())
+    return lambda method: short[method] if counts[short[method]] == 1 else method
+
+
+# --------------------------------------------------------------------------------------------------------- tables
+
+
+def tables(
+    experiment: Experiment, rows: pd.DataFrame, runs: RunSet, default: float, name: Callable[[str], str]
+) -> list[Table]:
+    """Return the tables of methods, of times to targets and of lowest costs."""
+    reached, summary = aggregate.times_to_targets(runs, default), aggregate.summarise(runs, default)
+    methods = summary.sort_values(["reached", "score"], ascending=False, kind="stable")
+    methods = methods.assign(
+        diverged_of=[f"{d} of {n}" for d, n in zip(methods["diverged"], methods["searches"], strict=True)],
+        name=methods["method"].map(name),
+    )
+    key = "; ".join(f"{name(method)}: {method}" for method in runs.methods if name(method) != method)
+    first = runs.rows.drop_duplicates("problem")
+    return [
+        Table(
+            "optimise", methods,
+            [text("name", label="method"), REACHED, SCORE, BETTER, PROFILE, Column("tunings", format="setting"), MEDIAN, text("diverged_of", label="diverged")],
+            "methods by the share of targets they reach", [*notes(runs), *([f"{key}."] if key else [])], terminal=True, page=True,
+            data=table(experiment, rows),
+        ),
+        Table(
+            "optimise", reached.assign(regret=[f"1/{t:g}" for t in reached["target"]], name=reached["method"].map(name)),
+            [PROBLEM, text("name", label="method"), text("tuning"), text("regret"), RATE, RUNTIME], "Times to targets",
+            terminal=True,
+        ),
+        Table(
+            "optimise", first,
+            [PROBLEM, text("scene_class", label="class"), Column("start_cost", label="J0", digits=6),
+             Column("best_known", label="J*", digits=8), text("best_known_status", label="source of J*")],
+            "Lowest costs", terminal=True,
+        ),
+        Table("targets", reached, [], files=["csv"]),
+        Table("summary", summary, [], files=["csv"]),
+    ]  # fmt: skip
+
+
+def notes(runs: RunSet) -> list[str]:
+    """Return explanations of the tables' columns, with the seeds that chose the tunings."""
+    chosen = runs.tuning_seeds
+    seeds = f"seeds {', '.join(map(str, chosen))}, which do not score" if chosen else "the same seeds that score"
+    return [note.format(seeds=seeds) for note in NOTES]
+
+
+# --------------------------------------------------------------------------------------------------------- charts
+
+
+def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str, Style]:
+    """Return each method's style by its short name: its estimator's colour, or grey and dashed if it uses only costs."""
+    looks: dict[str, Style] = {}
+    uses: Counter[str] = Counter()
+    for method in methods:
+        estimator = re.split(r"[\[,]", method)[0] if findings.uses_gradients(method) else ""
+        turn = uses[estimator]
+        uses[estimator] += 1
+        grey, dashes = CONTEXT[turn % len(CONTEXT)]
+        looks[name(method)] = (
+            Style(estimator_colour(estimator), estimator_marker(estimator, turn), VARIANTS[turn % len(VARIANTS)])
+            if estimator
+            else Style(grey, MARKERS[turn % len(MARKERS)], dashes)
+        )
+    return looks
+
+
+def charts(runs: RunSet, default: float, name: Callable[[str], str], texts: Sequence[str]) -> list[Chart]:
+    """Return the charts, the shares of targets reached first."""
+    looks = styles(runs.methods, name)
+    charts_ = [
+        _targets(runs, default, texts[0]),
+        _progress(runs, default),
+        _quality(runs, default),
+        *_paths(runs, default),
+    ]
+    charts_ += [*_tunings(runs, name), _path_quality(runs)]
+    out = []
+    for chart in charts_:
+        if chart is not None and len(chart.frame):
+            frame = chart.frame.assign(method=chart.frame["method"].map(name))
+            out.append(
+                replace(
+                    chart,
+                    frame=frame,
+                    series="method",
+                    styles={n: looks[n] for n in looks if n in set(frame["method"])},
+                )
+            )
+    return out
+
+
+def _targets(runs: RunSet, default: float, title: str) -> Chart:
+    """Return the share of targets that each method reaches, the largest first."""
+    frame = aggregate.summarise(runs, default).sort_values("reached", ascending=False, kind="stable")
+    return Chart(
+        "targets", title, frame, [REACHED, SCORE, PROFILE, MEDIAN], [METHOD], "dots", height=0.24,
+        subtitle=_where(runs, "targets: a tenth, a hundredth and a thousandth of the first regret"),
+        text="Bars are 95% intervals over seeds. Choose the score or the profile to rank by them.",
+    )  # fmt: skip
+
+
+def _where(runs: RunSet, what: str) -> str:
+    return f"{len(runs.problems)} problems, {what}" if len(runs.problems) > 1 else f"{runs.problems[0]}, {what}"
+
+
+def _progress(runs: RunSet, default: float) -> Chart | None:
+    """Return the share of targets that single searches reach within a number of rollouts."""
+    times = aggregate.runtimes(runs, default)
+    finite = times.loc[np.isfinite(times["runtime"]) & (times["runtime"] > 0), "runtime"]
+    if finite.empty:
+        return None
+    grid = np.geomspace(finite.min() / 1.5, finite.max() * 1.2, STEPS)
+    lines = [
+        {"method": method, "spent": x, "share": float(part["weight"][part["runtime"] <= x].sum())}
+        for method, part in times.groupby("method", sort=False)
+        for x in grid
+    ]
+    ends = {
+        str(method): float(part["weight"][np.isfinite(part["runtime"])].sum())
+        for method, part in times.groupby("method")
+    }
+    half = {
+        str(method): float(part.sort_values("runtime")["runtime"][part.sort_values("runtime")["weight"].cumsum() >= 0.5].min())
+        for method, part in times.groupby("method", sort=False)
+        if ends[str(method)] >= 0.5
+    }  # fmt: skip
+    share = Column("share", label="share of targets reached", format="percent", log=False)
+    short = short_names(runs.methods)
+    title = "No method reaches half of the targets"
+    if half:
+        first = min(half, key=lambda method: half[method])
+        title = f"{short(first)} is first to half of the targets, after {number(half[first])} rollouts"
+    return Chart(
+        "runtimes", title, pd.DataFrame(lines), [SPENT], [share], labels="ends", height=2.6, panel="",
+        subtitle=_where(runs, "single searches, a gradient counts as its time in rollouts"),
+        text="Where a line ends is the share of targets reached in the whole budget.",
+    )  # fmt: skip
+
+
+def _quality(runs: RunSet, default: float) -> Chart | None:
+    """Return the average runtime to a tenth of the first regret against the error of the gradient, by class of scenes."""
+    points = aggregate.quality_and_runtime(runs, default)
+    if points.empty:
+        return None
+    rho = aggregate.effects_of_error(runs, default)
+    title = findings.effect_of_error(rho, figures=False)
+    rho = rho.set_index("scene_class")
+    remarks = {}
+    for kind in points["scene_class"].unique():
+        row = rho.loc[kind].to_dict()
+        verdict = findings.verdict(row)
+        few = f"{row['points']:.0f} comparable points" if math.isnan(row["rho"]) else findings.correlation(row)
+        remarks[str(kind)] = few if verdict != "open" else f"open: {few}"
+    missed = ~np.isfinite(points["art"])
+    scenes = points["problem"].str.split(r"[,\[]").str[0]
+    frame = points.assign(art=points["art"].mask(missed), missed=missed, scene=scenes)
+    others = [Column("bias_share", label="share of bias in the error", log=False), Column("cosine", log=False)]
+    return Chart(
+        "quality_runtime", title.rstrip("."), frame, [ERROR, *others], [replace(RUNTIME, low="", high="")], "points", panel="scene_class",
+        shape="scene", panel_notes=remarks, failed="missed", across=2, height=1.9, own_scales=False,
+        subtitle="average runtime: expected rollouts per search that reaches a tenth of the first regret; a cross: never reached",
+        text="A point per problem and method. Methods that never reach the target have no point.",
+    )  # fmt: skip
+
+
+def _paths(runs: RunSet, default: float) -> list[Chart]:
+    """Return the regret along the paths against rollouts, and for the page against time."""
+    ended: Counter[str] = Counter()
+    charts_ = []
+    for unit in ("rollouts", "seconds"):
+        lines = []
+        for problem in runs.problems:
+            ratio, ends = runs.gradient_ratio(problem, default), {}
+            for method, part in runs.best_runs[runs.best_runs["problem"] == problem].groupby("method", sort=False):
+                places = [
+                    aggregate.rollouts_spent(row, ratio)
+                    if unit == "rollouts"
+                    else np.asarray(row["path_s"], dtype=float)
+                    for _, row in part.iterrows()
+                ]
+                known = [place for place in places if len(place) > 1 and place[-1] > 0]
+                if len(known) < len(places) or not known:
+                    continue
+                grid = np.geomspace(
+                    max(min(place[1] for place in known), 1e-6), max(place[-1] for place in known), STEPS
+                )
+                first = max(part["start_cost"].iloc[0] - part["best_known"].iloc[0], 1e-300)
+                low, middle, high = np.clip(aggregate.regret_quantiles(part, places, grid) / first, DEPTH, None)
+                ends[str(method)] = middle[-1]
+                lines += [(problem, method, *values) for values in zip(grid, middle, low, high, strict=True)]
+            if unit == "rollouts" and ends:
+                best = min(ends.values())
+                ended.update([method for method, value in ends.items() if value == best])
+        frame = pd.DataFrame(lines, columns=["problem", "method", "spent", "regret", "low", "high"]).replace(
+            np.inf, np.nan
+        )
+        charts_.append(Chart(
+            "anytime" if unit == "rollouts" else "anytime_seconds", "", frame, [SPENT if unit == "rollouts" else SECONDS], [REGRET],
+            panel="problem", band=True, height=1.55, printed=unit == "rollouts",
+            marks=[Mark("", 1 / target, axis="y") for target in TARGETS],
+            subtitle=f"medians and 20% to 80% of the seeds, each method at its best tuning; lines: the targets; cut at {DEPTH:g}",
+        ))  # fmt: skip
+    if not ended:
+        return []
+    method, count = ended.most_common(1)[0]
+    title = f"No method ends with the lowest median regret on most of the {len(runs.problems)} problems"
+    if 2 * count > len(runs.problems):
+        title = f"{short_names(runs.methods)(method)} ends with the lowest median regret on {count} of {counted(len(runs.problems), 'problem')}"
+    return [replace(chart, title=title) for chart in charts_]
+
+
+def _tunings(runs: RunSet, name: Callable[[str], str]) -> list[Chart]:
+    """Return the score against each tuned parameter, by problem."""
+    lines = aggregate.scores_by_tuning(runs)
+    lines = lines[lines.groupby(["problem", "method", "axis"])["value"].transform("nunique") > 1]
+    several = lines["axis"].nunique() > 1
+    return [
+        Chart(
+            f"learning_rates_{axis}" if several else "learning_rates", findings.tuning_title(part, name), part,
+            [Column("value", label=str(axis), format="setting")], [Column("score", low="low", high="high", log=False)], panel="problem",
+            band=True, height=1.45, subtitle="median over seeds, and 20% to 80% of them",
+        )
+        for axis, part in lines.groupby("axis", sort=False)
+    ]  # fmt: skip
+
+
+def _path_quality(runs: RunSet) -> Chart | None:
+    """Return the gradient's error along the path; None if it was measured only at the start."""
+    lines = aggregate.path_quality(runs)
+    if lines.empty:
+        return None
+    errors = lines[lines["quantity"] == "rmse_rel"].drop(columns="quantity").reset_index(drop=True)
+    cosines = (
+        lines.loc[lines["quantity"] == "cosine", ["value", "low", "high"]].add_prefix("cosine_").reset_index(drop=True)
+    )
+    frame = errors.join(cosines)
+    change = frame.groupby(["problem", "method"], sort=False)["value"].agg(["first", "last"])
+    factor = (change["last"] / change["first"]).replace(np.inf, np.nan)
+    title = "The error of gradients along the path"
+    if factor.notna().any():
+        title = f"Along the path the relative error of gradients changes by up to a factor of {number(max(factor.max(), 1 / factor.min()))}"
+    return Chart(
+        "path_quality", title, frame, [Column("iteration", log=False)],
+        [Column("value", label="relative error of a gradient", low="low", high="high", log=True),
+         Column("cosine_value", label="cosine with the reference", low="cosine_low", high="cosine_high", log=False)],
+        panel="problem", band=True, subtitle="medians and 20% to 80% of the seeds",
+    )  # fmt: skip
