@@ -261,7 +261,6 @@ FIGURES: dict[str, Callable[[], str]] = {
     "implicit-time": lambda: span(implicit_time()),
     "trust-cells": lambda: count(trusted("fobg")["cells"]),
     "trust-trusted": lambda: count(trusted("fobg")["trusted"]),
-    "trust-wrong": lambda: count(trusted("fobg")["wrong"], "none"),
     "trust-worst": lambda: str(trusted("fobg")["worst"]),
     "trust-others": lambda: count(trusted("fobg")["others"]),
     "trust-missed": lambda: count(trusted("fobg")["missed"], "none"),
