@@ -104,7 +104,7 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
             for note in table.notes:
                 console.print(note)
     for text in (*views.remarks, *views.findings):
-        console.print(text, soft_wrap=True)  # a command stays one line, so that it can be copied
+        console.print(text, soft_wrap="python -m bench" in text)  # a command stays one line, so that it can be copied
 
 
 def _terminal_text(table: Table, width: int) -> pd.DataFrame:

@@ -43,7 +43,7 @@ def test_a_file_is_a_problem(file):
 
 def test_own_noise_comes_after_that_of_theta(file):
     values = dict(cost=f"{file}:noisy", grad="noisy_gradient", own_noise=1, sigma=0.1)
-    problem = bench.compose(scene(**values))
+    problem = bench.plugin.compose(scene(**values))
     assert (problem.dim, problem.n_noise) == (2, 3)
     made = registry.make("backends", "callable").compile(problem)
     w = np.array([[0.0], [0.0], [3.0]])
@@ -53,7 +53,7 @@ def test_own_noise_comes_after_that_of_theta(file):
 
 
 def test_without_a_gradient_differences_are_taken(file):
-    problem = bench.compose(scene(cost=f"{file}:cost", grad=""))
+    problem = bench.plugin.compose(scene(cost=f"{file}:cost", grad=""))
     made = registry.make("backends", "callable").compile(problem)
     np.testing.assert_allclose(made.grad(problem.theta0, np.zeros((2, 1)))[:, 0], [2.0, 4.0], rtol=1e-8)
     assert made.usage.rollouts == 4

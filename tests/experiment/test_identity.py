@@ -146,7 +146,7 @@ def keys_of_edited(folder: Path, path: Path | None = None, text: str = "") -> se
         ("bench/model/program.py", 6),
         ("bench/measure/statistics.py", 6),
         ("bench/studies/bias_variance/measure.py", 6),
-        ("bench/studies/bias_variance/page.py", 0),
+        ("bench/studies/bias_variance/views.py", 0),
         ("bench/studies/growth/measure.py", 0),
         ("bench/report/tables.py", 0),
         ("bench/run/runner.py", 0),

@@ -85,11 +85,11 @@ def test_rows_tables_and_charts_say_it_in_words(tmp_path):
     folder = tmp_path / "custom"
     assert SURROGATE in (folder / "bias_variance.md").read_text()
     from bench.experiment import config
-    from bench.studies.bias_variance import charts
 
-    figures = charts.figures(config.load([f"results_dir={tmp_path}", "sweep.sigma=[0.1,0.3]"]), rows)
-    words = " ".join(text.get_text() for figure in figures.values() for sub in figure.subfigs for text in sub.texts)
-    assert SURROGATE in " ".join(words.split())
+    given = config.load([f"results_dir={tmp_path}", "sweep.sigma=[0.1,0.3]"])
+    charts = [chart for chart in given.study.views(given, rows).charts if chart.printed]
+    assert charts
+    assert all(SURROGATE in chart.subtitle for chart in charts)
 
 
 @pytest.mark.slow

@@ -72,10 +72,14 @@ def findings(points: pd.DataFrame) -> list[str]:
     if faults.empty:
         first = f"No wrong gradient at {counted(len(points), 'checked point')}"
     else:
-        problems = ", ".join(dict.fromkeys(titled(faults, ["scene", "contact", "backend"])))
+        problems = " and ".join(
+            dict.fromkeys(
+                faults["scene"].where(faults["contact"] == "none", faults["scene"] + " with " + faults["contact"])
+            )
+        )
         first = (
             f"{len(faults)} of {counted(len(points), 'checked point')} {'has' if len(faults) == 1 else 'have'} a gradient "
-            f"that cannot be trusted ({', '.join(faults['verdict'].unique())}): {problems}"
+            f"that cannot be trusted ({', '.join(faults['verdict'].unique())}), on {problems}"
         )
     broken = points["verdict"].isin(UNTRUSTED)
     errors = points.loc[~broken, "error"].dropna()
