@@ -173,7 +173,7 @@ def test_findings_of_the_standard_gradient_check_computed_from_its_rows():
     grid = shown.charts[0].frame
     assert len(grid) == len(grid[["name", "horizon", "point"]].drop_duplicates())
     assert set(grid["letter"]) == {"ok", "K", "J"}
-    assert set(grid.loc[grid["letter"] != "ok", "point"]) == {"at"}
+    assert set(grid.loc[grid["letter"] != "ok", "point"]) <= {"at", "noise"}
     [verdicts] = [table for table in shown.tables if table.page]
     assert verdicts.frame["points"].sum() == len(worst)
 
