@@ -298,7 +298,8 @@ class State:
             names = [
                 name for name, value in before.items() if after.get(name, MISSING) is not value and _decides(value)
             ]
-            names += [name for name in after.keys() - before.keys() if _hides(owner, name)]
+            added = (name for name in after.keys() - before.keys() if not isinstance(after[name], ModuleType))
+            names += [name for name in added if _hides(owner, name)]
             yield from ((owner, name) for name in names)
             if not names:  # only names were added, such as modules that are imported when they are first used
                 self._tables[owner] = dict(after)

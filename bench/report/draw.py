@@ -400,6 +400,8 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -
     """Return the range of a logarithmic axis: all positive values, and their intervals within a factor of 100."""
     values = rows[column.name].to_numpy(float)
     values = values[np.isfinite(values) & (values > 0)]
+    if not values.size:
+        return 0.1, 10.0
     low, high = float(values.min()), float(values.max())
     for name in (column.low, column.high):
         if name:
