@@ -13,7 +13,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint
 from bench.experiment.study import Study, study_of
 from bench.measure import noise
-from bench.model import Backend, CallableScene, Plugin, guard
+from bench.model import Backend, CallableScene, Plugin, guard, registry
 from bench.model.isolation import State, reduced_precision
 from bench.run.plan import versions
 from bench.run.pool import Answer
@@ -77,8 +77,11 @@ class TaskHandler:
 
         A change of the process that would change other cells' numbers is undone and added to the reason.
         """
+        if _is_foreign(item.cell) and not self._ran_foreign_code:
+            registry.entries()  # imported before foreign code can change them, so that a change is seen
+            self._state.adopt()
+            self._ran_foreign_code = True
         result = self._handle(item)
-        self._ran_foreign_code |= _is_foreign(item.cell)
         changes = self._state.changes(functions=self._ran_foreign_code)
         if not changes:
             return result
