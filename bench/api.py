@@ -101,7 +101,7 @@ def run(experiment: str | Sequence[str] = (), **settings: Unpack[Settings]) -> p
     words = [f"experiment={experiment}"] if isinstance(experiment, str) and experiment else list(experiment)
     words += [word for key, value in settings.items() for word in _override_words(key, value)]
     resolved = config.load(words)
-    rows, _ = finish(execute(resolved), words)
+    rows, _, _ = finish(execute(resolved), words)
     return with_axes(resolved, rows).reset_index(drop=True)
 
 

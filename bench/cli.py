@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from bench.experiment.experiment import Experiment
+    from bench.experiment.views import Views
     from bench.run.execute import Finished
 
 SETTINGS = """\
@@ -251,14 +252,14 @@ def _finish(finished: Finished, words: Sequence[str]) -> tuple[int, pd.DataFrame
     """Write and show all files of a finished run. Returns the exit status and the rows."""
     from bench.report.finish import finish
 
-    rows, paths = finish(finished, words)
-    return _show(finished.experiment, rows, paths), rows
+    rows, views, paths = finish(finished, words)
+    return _show(finished.experiment, rows, views, paths), rows
 
 
-def _show(experiment: Experiment, rows: pd.DataFrame, paths: Sequence[Path]) -> int:
-    from bench.report.finish import show, shown
+def _show(experiment: Experiment, rows: pd.DataFrame, views: Views, paths: Sequence[Path]) -> int:
+    from bench.report import writer
 
-    show(experiment, shown(rows))
+    writer.show(experiment, rows, views)
     _print_written(paths)
     return 1 if (rows["status"] == "error").any() else 0
 

@@ -53,7 +53,8 @@ def chart(directory: Path, claim: type[Claim], result: ClaimResult) -> list[Path
         if labels:
             columns = 2 if max(map(len, labels)) <= WIDE else 1
             picture.legend(loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
-        return save(picture, directory / claim.name)[:1]
+        series = {name: pd.Series(values) for name, values in result.series.items()}
+        return save(picture, directory / claim.name, data=pd.DataFrame(series))[:1]
 
 
 def measured_text(figure: Figure) -> str:

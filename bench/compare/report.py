@@ -23,10 +23,9 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Views
 from bench.model import registry
 from bench.report import terminal
+from bench.report.problems import varying_identity
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted, one_line
-from bench.report.web import from_views
-from bench.report.web.content import identity_columns
 from bench.report.web.document import assemble
 from bench.run.files import make_directory, write_all
 
@@ -154,7 +153,7 @@ def _worst_first(table: pd.DataFrame) -> pd.DataFrame:
 
 def cell_names(table: pd.DataFrame) -> list[str]:
     """Return a name for each cell: the identity columns that vary, and the parameters in which cells of one name differ."""
-    columns = [column.name for column in identity_columns(table)]
+    columns = varying_identity(table)
     names = [", ".join(filter(None, map(_name_part, columns, row))) for row in table[columns].to_numpy(dtype=object)]
     positions: dict[tuple[str, str], list[int]] = {}
     for position, key in enumerate(zip(table["experiment"], names, strict=True)):
@@ -185,8 +184,7 @@ def page(comparison: Comparison) -> str:
     )
     shown = page_views(comparison)
     assert shown.rows is not None
-    content = from_views.content(experiment, shown.rows, shown)
-    return assemble(experiment, content, [[] for _ in range(len(shown.rows))], {})
+    return assemble(experiment, shown.rows, shown, [[] for _ in range(len(shown.rows))], {})
 
 
 def page_views(comparison: Comparison) -> Views:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from bench.examine.ci import as_junit, as_markdown
 from bench.examine.findings import Findings
@@ -54,8 +55,8 @@ def write(report: Findings, directory: Path) -> list[Path]:
     paths = write_all(directory, {"report.txt": f"{report}\n", **texts})
     pictures = []
     with styled():
-        for name, (title, figure) in charts(report).items():
-            saved = save(figure, directory / name)
+        for name, (title, figure, data) in charts(report).items():
+            saved = save(figure, directory / name, data=data)
             paths += saved
             pictures.append(f"<h2>{escape(title)}</h2>{shell.picture(saved[0], title)}")
     title = f"Examination of {report.name}"
@@ -114,15 +115,21 @@ def _wrapping(text: str) -> str:
     return "\n".join(line if row else f'<span class="sentence">{line}</span>' for line, row in lines)
 
 
-def charts(report: Findings) -> dict[str, tuple[str, Figure]]:
-    """Return, by name, the title and figure of each chart for which the report has data."""
+def charts(report: Findings) -> dict[str, tuple[str, Figure, pd.DataFrame]]:
+    """Return, by name, the title, figure and plotted data of each chart for which the report has data."""
     drawn = {}
     if report.check is not None and report.gradient:
-        drawn["steps"] = ("The gradient against differences of the cost", _steps(report))
+        steps = [
+            pd.DataFrame({"derivative": part.name if part.component is None else report.label(part), "step": part.sample.step,
+                          "difference": part.sample.differences, "program": part.program})
+            for part in report.check.parts
+        ]  # fmt: skip
+        drawn["steps"] = ("The gradient against differences of the cost", _steps(report), pd.concat(steps))
     if report.lines:
-        drawn["lines"] = ("The cost on lines through theta", _lines(report))
+        lines = [pd.DataFrame({"line": i + 1, "t": line.at, "cost": line.costs}) for i, line in enumerate(report.lines)]
+        drawn["lines"] = ("The cost on lines through theta", _lines(report), pd.concat(lines))
     if len(report.smoothed) > 1:
-        drawn["sigmas"] = ("Errors under noise on theta", _sigmas(report))
+        drawn["sigmas"] = ("Errors under noise on theta", _sigmas(report), report.sigmas)
     return drawn
 
 

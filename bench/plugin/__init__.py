@@ -5,13 +5,17 @@
 
 from bench import deprecated
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule
+from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
+from bench.experiment.views import Chart, Mark, Note, Style, Table, Views
 from bench.model import *  # noqa: F403
 from bench.model import __all__ as _contracts
 
-__all__ = [*_contracts, "Cell", "Column", "Columns", "ComparisonRule", "Experiment", "Session", "Study"]
+__all__ = [
+    *_contracts, "COMMON", "Cell", "Chart", "Column", "Columns", "ComparisonRule", "Experiment", "Mark", "Note", "Session", "Study",
+    "Style", "Table", "Views",
+]  # fmt: skip
 
 __getattr__ = deprecated.lookup(__name__, globals())

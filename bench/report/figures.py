@@ -14,7 +14,6 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from bench.report.plotted import plotted
 from bench.report.style import STYLE
 from bench.run.files import write_whole
 
@@ -35,21 +34,22 @@ def styled() -> Iterator[None]:
 
 
 def save(figure: Figure, stem: Path, formats: Sequence[str] = ("png",), data: pd.DataFrame | None = None) -> list[Path]:
-    """Write a figure as ``stem`` in some formats, and its data as ``stem.plotted.csv``; return the files' paths.
+    """Write a figure as ``stem`` in some formats, and the plotted data, if given, as ``stem.plotted.csv``; return the paths.
 
     Equal figures give equal files: the files contain no dates, and places are rounded. Fonts are embedded, as outlines in SVG and as
     TrueType in PDF.
     """
     _settle(figure)
-    data = plotted(figure) if data is None else data
-    contents = {"plotted.csv": data.to_csv(index=False, lineterminator="\n", float_format="%.9g").encode()}
+    contents = {}
     for suffix in formats:
         buffer = io.BytesIO()
         figure.savefig(buffer, format=suffix, dpi=DPI, metadata=METADATA[suffix])
         contents[suffix] = _with_palette(buffer) if suffix == "png" else buffer.getvalue()
+    if data is not None:
+        contents["plotted.csv"] = data.to_csv(index=False, lineterminator="\n", float_format="%.9g").encode()
     for suffix, content in contents.items():
         write_whole(stem.with_name(f"{stem.name}.{suffix}"), content)
-    return [stem.with_name(f"{stem.name}.{suffix}") for suffix in (*formats, "plotted.csv")]
+    return [stem.with_name(f"{stem.name}.{suffix}") for suffix in contents]
 
 
 def _settle(figure: Figure) -> None:

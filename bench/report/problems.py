@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 
 from bench.experiment.axes import Axis, smoothing_of
+from bench.experiment.columns import IDENTITY
 from bench.experiment.parameters import PROBLEM, number_problems
 from bench.report.text import axis_value
 from bench.report.views import CATEGORIES, RUN, Arranged, rows_along
@@ -95,6 +96,12 @@ def distinguishing_columns(
     return choice
 
 
+def varying_identity(rows: pd.DataFrame, swept: Sequence[str] = ()) -> list[str]:
+    """Return the identity and swept columns that vary; scene and estimator if none does."""
+    names = [name for name in dict.fromkeys((*IDENTITY, *swept)) if name in rows]
+    return [name for name in names if rows[name].nunique(dropna=False) > 1] or ["scene", "estimator"]
+
+
 def problem_names(
     shown: Arranged,
     parts: Sequence[str],
@@ -109,12 +116,25 @@ def problem_names(
     """
     rows = shown.rows if rows is None else rows
     groups = problem_numbers(rows, parts, without)
-    columns = distinguishing_columns(rows, groups, part_columns(shown, parts, without), always)
+    columns = label_columns(shown, parts, without, always, rows)
     names: dict[Any, str] = {}
     for group, line in constants(rows, groups, columns).iterrows():
         name = ", ".join(filter(None, (_with_name(column, value) for column, value in line.items())))
         names[group] = name if name not in names.values() else f"{name} ({group})"
     return groups.map(names).astype(object)
+
+
+def label_columns(
+    shown: Arranged,
+    parts: Sequence[str],
+    without: Sequence[Axis] = (),
+    always: Sequence[str] = ("scene", "contact"),
+    rows: pd.DataFrame | None = None,
+) -> list[str]:
+    """Return the columns that distinguish rows with different ``parts``; the arguments are those of :func:`problem_names`."""
+    rows = shown.rows if rows is None else rows
+    groups = problem_numbers(rows, parts, without)
+    return distinguishing_columns(rows, groups, part_columns(shown, parts, without), always)
 
 
 def part_columns(shown: Arranged, parts: Sequence[str], without: Sequence[Axis] = ()) -> list[str]:

@@ -12,12 +12,14 @@ import pandas as pd
 
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
+from bench.report import terminal
 from bench.report.cells import TableCell, cell, parts, readable
 from bench.report.cores import run_tasks
 from bench.report.draw import draw
 from bench.report.figures import save, styled
 from bench.report.latex import latex
 from bench.report.tables import csv, escape_markdown
+from bench.report.text import counted, one_line
 from bench.run.files import write_all
 
 FINDINGS = "findings.json"
@@ -92,18 +94,19 @@ def _in_markdown(one: TableCell) -> str:
 
 def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
     """Print the counts of cells, the findings, and the tables that are meant for the terminal."""
-    from bench.report.study_tables import open_console, print_table
-
-    console = open_console(experiment, rows)
+    console = terminal.open_console()
+    console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
+    counts = rows["status"].value_counts()
+    console.print(f"{counted(len(rows), 'cell')}: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
     for table in views.tables:
         if table.terminal:
             right = {column.heading for column in table.columns if column.kind == "number"}
             for place, (heading, part) in enumerate(parts(table)):
                 texts = _terminal_text(replace(table, frame=part), console.width)
-                print_table(console, texts, right=right, title=heading or (table.title if place == 0 else ""))
+                terminal.print_table(console, texts, heading or (table.title if place == 0 else ""), right=right)
             for note in table.notes:
-                console.print(note)
-    for text in (*views.remarks, *views.findings):
+                console.print(one_line(note))
+    for text in map(one_line, (*views.remarks, *views.findings)):
         console.print(text, soft_wrap="python -m bench" in text)  # a command stays one line, so that it can be copied
 
 

@@ -40,7 +40,7 @@ NAMES = {
 
 
 def write(trace: Trace, results_dir: Path, formats: Sequence[str] = ("png",)) -> list[Path]:
-    """Write ``trace.csv``, the chart in the given formats and its plotted data; return their paths.
+    """Write ``trace.csv``, which has the plotted data, and the chart in the given formats; return their paths.
 
     The directory is ``results_dir/trace/<scene>``. Raises :class:`StorageError` if a file cannot be written.
     """

@@ -78,8 +78,8 @@ def check(words: list[str], verb: str, capsys: pytest.CaptureFixture[str]) -> No
 @pytest.fixture(autouse=True)
 def no_reports(monkeypatch):
     """Tables and charts of tiny runs, a thousand times over, would take most of the time."""
-    monkeypatch.setattr("bench.report.finish.write", lambda experiment, rows: [])
-    monkeypatch.setattr("bench.report.finish.show", lambda experiment, rows: None)
+    monkeypatch.setattr("bench.report.finish.write", lambda experiment, rows: (None, []))
+    monkeypatch.setattr("bench.report.writer.show", lambda experiment, rows, views: None)
 
 
 @settings(max_examples=12, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))

@@ -12,7 +12,8 @@ from bench.claims import page as claims_page
 from bench.claims.claim import NOT_REPRODUCED, REPRODUCED, RESERVED, Claim, Figure
 from bench.claims.results import ClaimResult
 from bench.model import registry
-from bench.report import index, web
+from bench.report import index
+from bench.report.finish import views_of
 from bench.report.web import document, shell
 
 TEXT, MARK = 4.5, 3.0
@@ -63,7 +64,7 @@ def pages(tmp_path_factory):
     study.parent.mkdir()
     rows = small_rows()
     rows.to_parquet(study.parent / "rows.parquet")
-    study.write_text(document.assemble(made, web.content(made, rows), [["a=1"]] * len(rows), {}))
+    study.write_text(document.assemble(made, rows, views_of(made, rows), [["a=1"]] * len(rows), {}))
     (folder / "claims").mkdir()
     claims_page.write(folder / "claims", RESULTS)
     report = bench.examine(
@@ -127,7 +128,7 @@ def test_charts_have_the_contrast_of_level_aa(dark, browser, tmp_path):
     ]  # fmt: skip
     made = experiment(sweep={"stiffness": [1.0, 10.0]}, marks={"stiffness": {"limit": 5.0}})
     path = tmp_path / "report.html"
-    path.write_text(document.assemble(made, web.content(made, table(rows)), [["a=1"]] * len(rows), {}))
+    path.write_text(document.assemble(made, table(rows), views_of(made, table(rows)), [["a=1"]] * len(rows), {}))
     browser.size(1280, 4000, dark)
     browser.open(path)
     ground = browser.do("getComputedStyle(document.body).backgroundColor")

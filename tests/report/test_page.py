@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 import json
+import math
 import re
 import shlex
 from dataclasses import dataclass, replace
@@ -17,12 +18,14 @@ from helpers import experiment, row, small_rows, stiffness_rows, table
 
 from bench import cli
 from bench.experiment import config, grid
-from bench.experiment.columns import Columns
+from bench.experiment.columns import Column, Columns
 from bench.experiment.study import Study
+from bench.experiment.views import Chart, Mark, Views
 from bench.model import registry
-from bench.report import reproduce, web
+from bench.report import reproduce
+from bench.report.finish import views_of
 from bench.report.web import document
-from bench.report.web.content import Chart, Content, PlotAxis, TableColumn
+from bench.report.web.data import encode
 from bench.run.store import Store
 from bench.studies.bias_variance.charts import with_plotted_columns
 from bench.studies.bias_variance.columns import COLUMNS
@@ -47,12 +50,7 @@ def page(rows, study=None, **given):
     made = experiment(**given)
     if study is not None:
         made = replace(made, study=study, columns=study.columns)
-    return document.assemble(
-        made,
-        web.content(made, rows, made.study.views(made, rows) if study is None else None),
-        [["a=1"]] * len(rows),
-        {},
-    )
+    return document.assemble(made, rows, views_of(made, rows), [["a=1"]] * len(rows), {})
 
 
 def data_of(text):
@@ -101,7 +99,7 @@ def test_every_row_is_in_the_page_with_its_status_and_reason():
 
 
 def test_numbers_keep_six_digits_and_missing_ones_are_null():
-    assert document.column(pd.Series([1.23456789, np.nan, np.inf, 3.0, 1e-30])) == [1.23457, None, None, 3, 1e-30]
+    assert encode(pd.Series([1.23456789, np.nan, np.inf, 3.0, 1e-30])) == [1.23457, None, None, 3, 1e-30]
 
 
 def test_a_bias_that_cannot_be_told_from_0_is_drawn_as_its_upper_limit():
@@ -279,15 +277,18 @@ def test_print_fills_the_page_with_charts_and_tables_that_fit_it(browser, tmp_pa
 @pytest.mark.slow
 def test_20000_cells_open_within_three_seconds_of_processor_time_and_are_saved_as_csv(browser, tmp_path):
     rows = stiffness_rows()
-    made = web.content(experiment(), rows)
+    made = views_of(experiment(), rows)
     times = -(-20_000 // len(rows))
-    tables = {
-        name: pd.concat([each.assign(row=each["row"] + i * len(rows)) for i in range(times)], ignore_index=True)
-        for name, each in made.tables.items()
-    }
-    many = replace(made, rows=pd.concat([made.rows] * times, ignore_index=True), tables=tables)
+
+    def repeated(frame):
+        parts = [frame.assign(row=frame["row"] + i * len(rows)) if "row" in frame else frame for i in range(times)]
+        return pd.concat(parts, ignore_index=True)
+
+    charts = [replace(chart, frame=repeated(chart.frame)) for chart in made.charts]
+    many = replace(made, charts=charts, rows=None if made.rows is None else repeated(made.rows))
+    rows = repeated(rows)
     path = tmp_path / "report.html"
-    path.write_text(document.assemble(experiment(), many, [["a=1"]] * len(many.rows), {}))
+    path.write_text(document.assemble(experiment(), rows, many, [["a=1"]] * len(rows), {}))
     session = browser.page.context.new_cdp_session(browser.page)
     session.send("Performance.enable", {"timeDomain": "threadTicks"})
     browser.size(1280, 900)
@@ -299,7 +300,7 @@ def test_20000_cells_open_within_three_seconds_of_processor_time_and_are_saved_a
     with browser.page.expect_download() as download:
         browser.page.click("#csv")
     saved = pd.read_csv(download.value.path())
-    assert len(saved) == len(many.rows) >= 20_000
+    assert len(saved) == len(rows) >= 20_000
     assert (
         browser.do("(() => { const started = performance.now(); csv(); return performance.now() - started; })()") < 3000
     )
@@ -511,21 +512,22 @@ def test_a_chart_may_have_names_on_its_axis_and_lines_of_no_cell(browser, tmp_pa
         "name": ["zebra", "zebra", "<b>ant</b>", "<b>ant</b>"], "size": [1.0, 10.0, 2.0, 100.0], "low": [0.5, 5.0, 1.0, 50.0],
         "high": [2.0, 20.0, 4.0, 200.0], "is_limit": [False, False, True, False], "kind": list("abab"), "row": -1,
     })  # fmt: skip
+    size = Column("size", low="low", high="high", limit="is_limit", log=True)
     chart = Chart(
-        "Sizes", "text", [PlotAxis("size", "size", low="low", high="high", limit="is_limit")], [PlotAxis("name", "", False)],
-        table="sizes", series="kind", join=True, marks={"large": [50.0, None], "one": 1.0},
+        "sizes", "Sizes", frame, [size], [Column("name", kind="text")], "dots", series="kind", join=True, text="text",
+        marks=[Mark("large", 50.0, math.inf), Mark("one", 1.0)],
     )  # fmt: skip
     rows = small_rows()
-    content = Content("It works", rows, [TableColumn("scene", "scene", "text")], [chart], tables={"sizes": frame})
+    views = Views(["It works"], charts=[chart])
     path = tmp_path / "report.html"
-    path.write_text(document.assemble(experiment(), content, [["a=1"]] * len(rows), {}))
+    path.write_text(document.assemble(experiment(), rows, views, [["a=1"]] * len(rows), {}))
     browser.open(path)
     plot = "document.querySelector('.plot')"
     assert browser.do(f"{plot}.data.filter((one) => one.text).map((one) => [one.x, one.error_x.array])") == [
         [[1, 2], [1, 0]], [[10, 100], [10, 100]],
     ]  # fmt: skip
     assert browser.do(f"{plot}.data.filter((one) => one.text).flatMap((one) => one.marker.symbol)") == [
-        "circle", "circle-open", "circle",
+        "circle", "circle-open", "square",
     ]  # fmt: skip
     assert browser.do(f"{plot}.data.filter((one) => one.mode === 'lines').map((one) => one.x)") == [[1, 10], [2, 100]]
     texts = browser.do(
@@ -541,16 +543,14 @@ def test_a_chart_may_have_names_on_its_axis_and_lines_of_no_cell(browser, tmp_pa
 
 def test_cells_of_a_map_may_have_colours_and_texts_of_their_own(browser, tmp_path):
     frame = pd.DataFrame({
-        "x": ["b", "a"] * 15, "y": [f"line {i // 2}" for i in range(30)], "fill": ["#ffffe5", "#662506"] * 15, "text": ["1.5", ">9"] * 15,
-        "row": -1,
+        "x": ["b", "a"] * 15, "y": [f"line {i // 2}" for i in range(30)], "value": [1.5, 900.0] * 15, "text": ["1.5", ">9"] * 15,
     })  # fmt: skip
-    chart = Chart(
-        "Map", "", [PlotAxis("x", "x", False)], [PlotAxis("y", "y", False)], table="map", fill="fill", cell="text"
-    )
+    x, y = Column("x", kind="text"), Column("y", kind="text")
+    chart = Chart("map", "Map", frame, [x], [y], "grid", value="value", cell="text")
     rows = small_rows()
-    content = Content("It works", rows, [TableColumn("scene", "scene", "text")], [chart], tables={"map": frame})
     path = tmp_path / "report.html"
-    path.write_text(document.assemble(experiment(), content, [["a=1"]] * len(rows), {}))
+    views = Views(["It works"], charts=[chart])
+    path.write_text(document.assemble(experiment(), rows, views, [["a=1"]] * len(rows), {}))
     browser.open(path)
     shown = browser.do(
         "[...document.querySelectorAll('.plot .textpoint text')].map((one) => [one.textContent, getComputedStyle(one).fill])"
@@ -571,10 +571,6 @@ class Unknown(Study):
     def measure(self, cell, session):
         """Nothing."""
         return {"status": "ok"}
-
-    def write(self, experiment, rows):
-        """Nothing."""
-        return []
 
 
 STUDIES = {name: entry.plugin for name, entry in registry.entries()["studies"].items() if name != "bias_variance"}

@@ -36,7 +36,6 @@ from bench.report import latex, views, writer
 from bench.report.cells import readable
 from bench.report.draw import draw
 from bench.report.figures import save, styled
-from bench.report.plotted import plotted
 from bench.report.problems import split_by_problem
 from bench.report.style import PALETTE, colour, marker
 from bench.report.text import number
@@ -384,16 +383,6 @@ def figure_of_known_data():
         return made
 
 
-def test_plotted_data_is_that_of_the_figure():
-    found = plotted(figure_of_known_data())
-    assert list(found["title"]) == ["up", "up", "up"]
-    assert list(found["series"]) == ["a", "a", "b"]
-    assert list(found["mark"]) == ["point", "limit", "point"]
-    assert found[["x", "y"]].to_numpy().tolist() == [[1, 10], [2, 20], [5, 6]]
-    assert found[["y_low", "y_high"]].iloc[0].tolist() == [6.0, 15.0]
-    assert found[["x_low", "x_high"]].iloc[2].tolist() == [4.0, 6.0]
-
-
 def test_every_bias_and_interval_of_the_rows_is_in_the_data_of_the_chart(tmp_path):
     rows = stiffness_rows(sigmas=(0.1,), backends=("jax",), estimators=("fobg", "reinforce"))
     made = experiment(tmp_path, sweep={"stiffness": list(STIFFNESS)})
@@ -410,7 +399,7 @@ def test_every_bias_and_interval_of_the_rows_is_in_the_data_of_the_chart(tmp_pat
 def test_equal_figures_are_equal_files_with_their_fonts_inside(tmp_path):
     for name in ("first", "second"):
         with styled():
-            paths = save(figure_of_known_data(), tmp_path / name, ("png", "svg", "pdf"))
+            paths = save(figure_of_known_data(), tmp_path / name, ("png", "svg", "pdf"), pd.DataFrame({"x": [0.1]}))
         assert [path.name.partition(".")[2] for path in paths] == ["png", "svg", "pdf", "plotted.csv"]
     for path in paths:
         assert path.read_bytes() == (tmp_path / f"first.{path.name.partition('.')[2]}").read_bytes()

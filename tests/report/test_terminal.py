@@ -9,7 +9,7 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from bench.experiment import config
-from bench.report import finish, terminal
+from bench.report import finish, terminal, writer
 from bench.report.labels import Labels, shortened
 from bench.report.terminal import layout, wrap
 from bench.report.views import newest_rows
@@ -106,8 +106,9 @@ def test_columns_of_the_environment_count_in_a_pipe(monkeypatch):
 def test_what_a_command_prints_of_standard_results_fits(name, width, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", str(width))
     experiment = config.load([f"experiment={name}", "results_dir=results/standard"])
-    rows = finish.shown(newest_rows(store_of(experiment).load()))
-    finish.show(experiment, rows[rows["seed"] == rows["seed"].min()].head(150).reset_index(drop=True))
+    rows = newest_rows(store_of(experiment).load())
+    rows = rows[rows["seed"] == rows["seed"].min()].head(150).reset_index(drop=True)
+    writer.show(experiment, rows, finish.views_of(experiment, rows))
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) > 10
     assert max(map(cell_len, lines)) <= width

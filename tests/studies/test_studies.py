@@ -18,12 +18,13 @@ from bench.experiment.axes import axes, table
 from bench.experiment.grid import cells
 from bench.measure.gradcheck import EPS, TRUSTED, VERDICTS
 from bench.model import registry
-from bench.report import reproduce, web
+from bench.report import reproduce
 from bench.report.cells import parts, readable
+from bench.report.finish import views_of
 from bench.report.problems import problem_names, problem_numbers, split_by_problem
+from bench.report.style import colour
 from bench.report.views import arrange, rows_along
-from bench.report.web.content import Content, looks
-from bench.report.web.document import data
+from bench.report.web.data import page_data
 from bench.report.writer import write
 from bench.run.files import make_directory
 from bench.run.store import Store
@@ -317,7 +318,7 @@ def test_limits_in_texts_are_those_of_the_rows():
     given, rows = mapped("study=stability[inaccurate=0.25]", "scenes=[mass_spring]", "sweep.stiffness=[10,100]")
     shown = stability.views(given, rows)
     assert "25%" in shown.tables[1].notes[0]
-    assert web.content(given, rows).looks["right"]["meaning"].count("25%") == 1
+    assert shown.charts[0].styles["right"].meaning.count("25%") == 1
 
 
 def test_a_share_is_not_named_after_a_parameter_that_varies_in_it():
@@ -415,26 +416,27 @@ def test_zipped_axes_name_each_other():
 
 
 def test_colours_of_series_do_not_repeat():
-    found = looks([f"series {i}" for i in range(24)])
-    assert len({look["colour"][0] for look in found.values()}) == 24
+    assert len({colour(i) for i in range(24)}) == 24
 
 
 def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own):
     words = [f"plugins=['{own}']", "study=counted", "scenes=[mass_spring]", "estimators=[fobg]", "sweep.mass=[1,2,3]"]
     given, rows = made(*words)
     rows = rows.assign(weight=[1.0, 2.0, 30.0], outcome=["good", "bad", "good"])
-    content = web.content(given, rows)
-    assert content.finding == "3 of 3 cells gave a result."
-    assert [axis.label for axis in content.charts[0].y] == ["weight [kg]"]
-    assert content.charts[0].x[0].column == "mass"
-    assert data(content, [[]] * 3)["filters"] == ["mass", "outcome"]
-    assert data(content, [[]] * 3)["tables"]["rows"]["mass"] == [1, 2, 3]
+    views = views_of(given, rows)
+    assert views.findings == ["3 of 3 cells gave a result."]
+    data = page_data(given, rows, views, [[]] * 3)
+    assert [axis["label"] for axis in data["charts"][0]["y"]] == ["weight [kg]"]
+    assert data["charts"][0]["x"][0]["column"] == "mass"
+    assert data["filters"] == ["mass", "outcome"]
+    assert data["tables"]["rows"]["mass"] == [1, 2, 3]
 
 
 def test_verdicts_and_what_was_swept_can_be_filtered_by():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[0,1]")
     rows.loc[0, "verdict"] = "inaccurate"
-    assert data(web.content(given, rows), [[]] * len(rows))["filters"] == ["stiffness", "damping", "verdict"]
+    data = page_data(given, rows, views_of(given, rows), [[]] * len(rows))
+    assert data["filters"] == ["stiffness", "damping", "verdict"]
 
 
 def test_reports_name_no_plugin():
@@ -453,7 +455,7 @@ def test_findings_count_in_plain_english():
     text = three_errors.views(given, rows.assign(program_error_rel=1e-9)).findings[1]
     assert text.startswith("Of 1 gradient confirmed by differences of the program's cost, 1 is off by over 10%")
     given, rows = checked("scenes=[pendulum]", "backends=[jax]")
-    assert web.content(given, rows).finding.startswith("No wrong gradient at 1 checked point")
+    assert views_of(given, rows).findings[0].startswith("No wrong gradient at 1 checked point")
     here = Path(bench.report.__file__).parent
     for path in [*here.glob("web/*.py"), *here.parent.glob("studies/[gst]*/*.py")]:
         texts = (n.value for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Constant))
@@ -517,7 +519,7 @@ def test_a_row_of_a_plugin_that_is_not_installed_has_no_command():
     given, rows = made("scenes=[pushing]")
     rows["parameters"] = rows["parameters"].str.replace('"name":"pushing"', '"name":"gone"')
     assert reproduce.commands(given, rows) == [[]] * len(rows)
-    assert isinstance(web.content(given, rows), Content)
+    assert views_of(given, rows).findings
 
 
 @pytest.mark.parametrize(

@@ -315,7 +315,7 @@ def test_command_writes_table_and_chart(tmp_path, capsys):
     for scene, steps in (("pushing", 60), ("double_integrator", 20)):
         directory = tmp_path / "trace" / scene
         assert sorted(path.name for path in directory.iterdir()) == [
-            "trace.csv", "trace.plotted.csv", "trace.png",
+            "trace.csv", "trace.png",
         ]  # fmt: skip
         table = pd.read_csv(directory / "trace.csv")
         assert tuple(table.columns[: len(COLUMNS)]) == COLUMNS

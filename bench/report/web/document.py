@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
 from functools import cache
 from html import escape
 from importlib.util import find_spec
@@ -15,33 +13,35 @@ from typing import Any
 
 import pandas as pd
 
-from bench.experiment.columns import IDENTITY
 from bench.experiment.experiment import Experiment
-from bench.report import reproduce
+from bench.experiment.views import Views
+from bench.report.cells import readable
 from bench.report.web import shell
-from bench.report.web.content import Chart, Content, PlotAxis
+from bench.report.web.data import page_data
 
 HERE = Path(__file__).parent
-DIGITS = 6
-"""Significant digits of the numbers in a page."""
-MOST = 24
-"""Largest number of distinct values of a column that is offered as a filter."""
 
 
 def assemble(
-    experiment: Experiment, content: Content, commands: Sequence[Sequence[str]], record: Mapping[str, Any]
+    experiment: Experiment,
+    rows: pd.DataFrame,
+    views: Views,
+    commands: Sequence[Sequence[str]],
+    record: Mapping[str, Any],
 ) -> str:
     """Return the page as HTML. ``commands`` are the words that run each row's cell, ``record`` is ``run.json``."""
-    counts = content.rows["status"].value_counts()
+    counts = (rows if views.rows is None else views.rows)["status"].value_counts()
     statuses = "".join(f'<li class="{escape(str(s))}"><b>{n}</b> {escape(str(s))}</li>' for s, n in counts.items())
+    data = page_data(experiment, rows, views, commands)
+    first, *rest = (escape(finding) for finding in (*views.findings, "")[: max(1, len(views.findings))])
     parts = {
         "title": escape(experiment.name),
         "question": escape(experiment.question),
-        "finding": _finding(content.finding),
-        "counts": f"<li><b>{len(content.rows)}</b> cells</li>{statuses}",
-        "answers": _answers(content),
+        "finding": first + "".join(f"<span>{finding}</span>" for finding in rest),
+        "counts": f"<li><b>{counts.sum()}</b> cells</li>{statuses}",
+        "answers": _answers(views),
         "made": _made(record),
-        "data": in_script(json.dumps(data(content, commands), separators=(",", ":"), allow_nan=False)),
+        "data": in_script(json.dumps(data, separators=(",", ":"), allow_nan=False)),
     }
     template = (HERE / "page.html").read_text()
     body = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
@@ -62,90 +62,18 @@ def plotly() -> str:
     return (Path(spec.origin).parent / "package_data" / "plotly.min.js").read_text()
 
 
-# --------------------------------------------------------------------------------------------------------- data
-
-
-def data(content: Content, commands: Sequence[Sequence[str]]) -> dict[str, Any]:
-    """Return the data for the page's script: tables by column, charts, filters, and the commands of all rows."""
-    rows = content.rows
-    filters = filtered(content)
-    wanted = {"rows": {*IDENTITY, *content.swept, "reason", "status", *filters, *(c.name for c in content.columns)}}
-    wanted["rows"] |= {c.flag for c in content.columns}
-    for chart in content.charts:
-        wanted.setdefault(chart.table, {"row"}).update(_columns_of(chart))
-        wanted["rows"] |= _columns_of(chart)
-    sources = {"rows": rows, **content.tables}
-    flags = {c.flag for c in content.columns} | {
-        axis.limit for chart in content.charts for axis in (*chart.x, *chart.y)
-    }
-    tables = {
-        name: {
-            c: column(sources[name][c].astype(float) if c in flags else sources[name][c])
-            for c in sources[name]
-            if c in wanted[name]
-        }
-        for name in wanted
-    }
-    longest = max(map(len, commands), default=0)
-    words = [[line[i] if i < len(line) else "" for line in commands] for i in range(longest)]
-    return {
-        "tables": tables,
-        "columns": [asdict(c) for c in content.columns],
-        "charts": [asdict(chart) for chart in content.charts],
-        "looks": content.looks,
-        "filters": filters,
-        "identity": [c for c in dict.fromkeys((*IDENTITY, *content.swept)) if c in rows],
-        "command": {"head": reproduce.HEAD, "words": [column(pd.Series(part, dtype=object)) for part in words]},
-    }
-
-
-def filtered(content: Content) -> list[str]:
-    """Return the columns to filter by: cell identity, swept parameters and verdicts of the table, where they vary.
-
-    Columns with more than :data:`MOST` values and the column ``reason`` are omitted.
-    """
-    rows = content.rows
-    texts = [column.name for column in content.columns if column.kind == "text" and column.name != "reason"]
-    names = dict.fromkeys((*IDENTITY, *content.swept, *texts, "experiment", "status"))
-    return [name for name in names if name in rows and 1 < rows[name].nunique(dropna=False) <= MOST]
-
-
-def _columns_of(chart: Chart) -> set[str]:
-    axes: list[PlotAxis] = [*chart.x, *chart.y]
-    names = {name for axis in axes for name in (axis.column, axis.low, axis.high, axis.limit)}
-    return names | {chart.series, chart.facet, chart.line, chart.front, chart.level, chart.fill, chart.cell}
-
-
-def column(values: pd.Series) -> Any:
-    """Encode a column for JSON: numbers rounded, None where missing; texts as distinct values and an index."""
-    if pd.api.types.is_bool_dtype(values) or not pd.api.types.is_numeric_dtype(values):
-        codes, unique = pd.factorize(values.astype(str))
-        return {"values": list(unique), "index": codes.tolist()}
-    return [_short(value) for value in values.tolist()]
-
-
-def _short(value: float) -> float | int | None:
-    if value is None or not math.isfinite(value):
-        return None
-    value = float(f"{value:.{DIGITS}g}")
-    return int(value) if value.is_integer() and abs(value) < 1e15 else value
-
-
 # -------------------------------------------------------------------------------------------------------- texts
 
 
-def _finding(text: str) -> str:
-    """Return the finding as HTML; each part after the first semicolon is a separate line in a smaller font."""
-    first, *rest = text.split("; ")
-    return escape(first) + "".join(f"<span>{escape(part)}</span>" for part in rest)
-
-
-def _answers(content: Content) -> str:
-    """Return the answers as an HTML table with its heading; empty without answers."""
-    table = content.answers
-    if table.empty:
+def _answers(views: Views) -> str:
+    """Return the first table meant for the page as HTML with its heading; empty if there is none."""
+    table = next((table for table in views.tables if table.page), None)
+    if table is None or table.frame.empty:
         return ""
-    return f'<section id="answers"><h2>{escape(content.answers_title)}</h2>{shell.table(table)}</section>'
+    texts = readable(table)
+    if table.split:
+        texts.insert(0, "", table.frame[table.split].to_numpy())
+    return f'<section id="answers"><h2>{escape(table.title)}</h2>{shell.table(texts)}</section>'
 
 
 def _made(record: Mapping[str, Any]) -> str:

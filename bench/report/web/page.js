@@ -347,14 +347,16 @@ function drawChart(chart) {
   drawn.forEach((name, k) => {
     if (!chart.panels.children[k]) {
       const plot = element("div", { className: "plot" });
-      chart.panels.append(element("div", {}, element("h3"), plot));
+      chart.panels.append(element("div", {}, element("h3"), element("p", { className: "hint" }), plot));
     }
-    const [title, plot] = chart.panels.children[k].children;
+    const [title, note, plot] = chart.panels.children[k].children;
     title.textContent = name;
     title.hidden = !name;
+    note.textContent = chart.notes[name] || "";
+    note.hidden = !chart.notes[name];
     const lines = lineCount(chart, facets.get(name));
     plot.style.height = lines > 12 ? `${60 + 24 * lines}px` : "";
-    const [traces, layout] = isMap(chart) ? mapFigure(chart, facets.get(name)) : pointFigure(chart, facets.get(name), range);
+    const [traces, layout] = isMap(chart) ? mapFigure(chart, facets.get(name)) : pointFigure(chart, name, facets.get(name), range);
     Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true });
     plot.removeAllListeners("plotly_click");
     plot.on("plotly_click", (event) => {
@@ -369,7 +371,7 @@ function drawLegend(chart, panels) {
   const names = new Set();
   for (const panel of panels) for (const name of panel.names) names.add(name);
   const ordered = Object.keys(page.looks).filter((name) => names.has(name));
-  chart.legend.replaceChildren(...(chart.share ? [] : ordered).map((name) => {
+  chart.legend.replaceChildren(...ordered.map((name) => {
     const look = looks(name);
     const mark = element("b", { textContent: chart.level ? look.letter || "\u2003" : GLYPHS[look.symbol] });
     if (chart.level) { mark.className = "level"; mark.style.background = filling(name); mark.style.color = inkOn(filling(name)); }
@@ -420,12 +422,12 @@ function ranges(chart, panels) {
     return [first - margin, last + margin];
   };
   const points = panels.flatMap((panel) => [...panel.lines.values()].flat());
-  const ends = (marks) => (points.length ? Object.values(marks || {}).flat().filter((end) => end !== null) : []);
+  const ends = (marks) => (points.length ? Object.values(marks).flat().filter((end) => end !== null) : []);
   return { x: find(chart.xAxis, [...points.map((p) => p.x), ...ends(chart.marks)]),
     y: find(chart.yAxis, [...points.map((p) => p.y), ...ends(chart.y_marks)]) };
 }
 
-function pointFigure(chart, panel, range) {
+function pointFigure(chart, name, panel, range) {
   const traces = [];
   const joined = Boolean(chart.line);
   for (const points of panel.lines.values()) traces.push(trace(chart, points, joined));
@@ -440,8 +442,15 @@ function pointFigure(chart, panel, range) {
     annotations.push({ xref: "paper", x: 0.01, y: Math.max(0, range.y[0]), yanchor: "bottom", xanchor: "left", showarrow: false,
       text: chart.yAxis.above_one, font: { size: SMALL } });
   }
-  for (const [axis, marks] of [["x", chart.marks], ["y", chart.y_marks || {}]]) {
-    for (const [name, value] of Object.entries(marks)) mark(chart, axis, name, value, range, shapes, annotations);
+  for (const [axis, marks] of [["x", chart.marks], ["y", chart.y_marks]]) {
+    for (const [label, value] of Object.entries(marks)) mark(chart, axis, label, value, range, shapes, annotations);
+  }
+  const scaled = (value, axis) => (axis.log ? Math.log10(value) : value);
+  for (const { text, x, y, panel: only } of chart.xAxis === chart.x[0] && chart.yAxis === chart.y[0] ? chart.texts : []) {
+    if (only === null || only === name) {
+      annotations.push({ x: scaled(x, chart.xAxis), y: scaled(y, chart.yAxis), xanchor: "right", xshift: -6, showarrow: false,
+        align: "right", text: plotted(text).replace(/\n/g, "<br>"), font: { size: SMALL } });
+    }
   }
   annotations.push(...backendNames(chart, panel, joined, range));
   return [traces, { ...frame(chart, panel, range), shapes, annotations }];
@@ -519,11 +528,14 @@ function trace(chart, points, joined) {
 const tellingColumns = page.columns.filter((column) => page.identity.includes(column.name) && !column.name.startsWith("estimator"));
 const cellTexts = []; // per row that was drawn, a text that identifies its cell
 
+const valueText = (axis, value) => (axis.percent && typeof value === "number" ? number(100 * value) + "%" : number(value));
+
 function hover(chart, point) {
   const { xAxis, yAxis } = chart;
   const value = (axis, at, low, high, limit) => {
-    const interval = low !== null && high !== null && !limit ? ` [${number(low)}, ${number(high)}]` : "";
-    return `${axis.label ? plotted(axis.label) + ": " : ""}${limit ? "&lt; " : ""}${plotted(number(at))}${interval}`;
+    const text = (value) => valueText(axis, value);
+    const interval = low !== null && high !== null && !limit ? ` [${text(low)}, ${text(high)}]` : "";
+    return `${axis.label ? plotted(axis.label) + ": " : ""}${limit ? "&lt; " : ""}${plotted(text(at))}${interval}`;
   };
   if (point.row >= 0 && !cellTexts[point.row]) cellTexts[point.row] = tellingColumns.map((c) => plotted(`${c.label} ${shownAs(c, point.row)}`)).join("<br>");
   return [`<b>${plotted(point.series)}</b>`, cellTexts[point.row] || "",
@@ -571,7 +583,8 @@ function frame(chart, panel, range) {
 
 /* Ticks of a log axis: whole decades, or 1, 2 and 5 of each if there are few. */
 function ticks(axis, limits) {
-  if (!axis.log || !limits) return {};
+  if (!axis.log) return axis.percent ? { tickformat: ",.3~%" } : {};
+  if (!limits) return {};
   const [first, last] = limits;
   const step = Math.max(1, Math.round((last - first) / 5));
   const within = last - first > 1.6 ? [1] : [1, 2, 5];
@@ -579,7 +592,7 @@ function ticks(axis, limits) {
   for (let decade = Math.floor(first); decade <= last; decade++) {
     if (decade % step === 0) for (const k of within) tickvals.push(Number((k * 10 ** decade).toPrecision(3)));
   }
-  const ticktext = tickvals.map((value) => number(value).replace(/^1e(.*)$/, "10<sup>$1</sup>"));
+  const ticktext = tickvals.map((value) => valueText(axis, value).replace(/^1e(.*)$/, "10<sup>$1</sup>"));
   return { tickvals, ticktext };
 }
 
@@ -612,8 +625,6 @@ function mapPanels(chart) {
   return panels;
 }
 
-const SHARE = "#0072B2";
-
 function mapFigure(chart, panel) {
   const names = Object.keys(page.looks);
   const order = (axis, values) => {
@@ -626,19 +637,16 @@ function mapFigure(chart, panel) {
   const at = (x, y) => panel.places.get(JSON.stringify([x, y]));
   const grid = (make) => ys.map((y) => xs.map((x) => (at(x, y) ? make(at(x, y), x, y) : null)));
   const worst = (found) => found.reduce((a, b) => (names.indexOf(b.level) > names.indexOf(a.level) ? b : a));
-  const share = (found) => found.filter((one) => one.level === chart.share).length / found.length;
-  const fill = (found) => (chart.share ? mixed(ground(), SHARE, share(found))
-    : worst(found).fill || filling(worst(found).level));
-  const text = (found) => (chart.share ? Math.round(100 * share(found)) + "%"
-    : chart.cell ? worst(found).cell : looks(worst(found).level).letter || "");
-  const label = (found, x, y) => [`<b>${plotted(chart.share || !worst(found).level ? text(found) : worst(found).level)}</b>`,
+  const fill = (found) => worst(found).fill || filling(worst(found).level);
+  const text = (found) => (chart.cell ? worst(found).cell : looks(worst(found).level).letter || "");
+  const label = (found, x, y) => [`<b>${plotted(worst(found).level || text(found))}</b>`,
     `${plotted(chart.xAxis.label)} ${plotted(x)}`, `${plotted(chart.yAxis.label)} ${plotted(y)}`,
-    chart.share ? `${found.length} cells` : worst(found).row < 0 ? "" : plotted(reader("rows", "reason")(worst(found).row) || ""),
+    worst(found).row < 0 ? "" : plotted(reader("rows", "reason")(worst(found).row) || ""),
   ].filter(Boolean).join("<br>");
   const fills = [...new Set([...panel.places.values()].map(fill))];
   const made = {
     type: "heatmap", x: xs.map(plotted), y: ys.map(plotted), z: grid((found) => fills.indexOf(fill(found))), xgap: 1, ygap: 1,
-    customdata: grid((found) => (chart.share || worst(found).row < 0 ? null : worst(found).row)),
+    customdata: grid((found) => (worst(found).row < 0 ? null : worst(found).row)),
     hovertext: grid(label), hovertemplate: "%{hovertext}<extra></extra>", hoverongaps: false, showscale: false,
     colorscale: fills.flatMap((one, n) => [[n / fills.length, one], [(n + 1) / fills.length, one]]),
     zmin: -0.5, zmax: fills.length - 0.5,

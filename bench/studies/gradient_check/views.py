@@ -13,8 +13,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import parse
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.measure.gradcheck import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED, UNTRUSTED, VERDICTS
-from bench.report.problems import axes_of, problem_names, titled
-from bench.report.study_tables import label_columns
+from bench.report.problems import axes_of, label_columns, problem_names, titled
 from bench.report.style import PALETTE
 from bench.report.text import counted, listed, number
 from bench.report.views import Arranged, arrange

@@ -15,8 +15,7 @@ from bench.experiment.columns import COMMON, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.colours import estimator_colour
-from bench.report.problems import axes_of, problem_names
-from bench.report.study_tables import label_columns
+from bench.report.problems import axes_of, label_columns, problem_names
 from bench.report.style import PALETTE
 from bench.report.text import axis_value, listed, number
 from bench.report.views import Arranged, arrange, attempted

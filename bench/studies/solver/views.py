@@ -11,8 +11,7 @@ from bench.experiment.axes import table
 from bench.experiment.columns import COMMON, Column
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Table, Views
-from bench.report.problems import problem_names
-from bench.report.study_tables import label_columns
+from bench.report.problems import label_columns, problem_names
 from bench.report.text import counted, number
 from bench.report.views import arrange, attempted
 from bench.report.writer import reasons

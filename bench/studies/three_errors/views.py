@@ -12,8 +12,7 @@ from bench.experiment.axes import table
 from bench.experiment.columns import COMMON, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
-from bench.report.problems import problem_names, problem_numbers
-from bench.report.study_tables import label_columns
+from bench.report.problems import label_columns, problem_names, problem_numbers
 from bench.report.style import PALETTE
 from bench.report.text import counted, listed, number
 from bench.report.views import Arranged, arrange, attempted
