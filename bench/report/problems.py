@@ -131,7 +131,7 @@ def label_columns(
     always: Sequence[str] = ("scene", "contact"),
     rows: pd.DataFrame | None = None,
 ) -> list[str]:
-    """Return the columns that distinguish rows with different ``parts``; the arguments are those of :func:`problem_names`."""
+    """Return the columns that distinguish rows with different ``parts``, with the arguments of :func:`problem_names`."""
     rows = shown.rows if rows is None else rows
     groups = problem_numbers(rows, parts, without)
     return distinguishing_columns(rows, groups, part_columns(shown, parts, without), always)

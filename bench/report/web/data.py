@@ -38,7 +38,7 @@ def page_data(
     """Return the data of an experiment's page. ``commands`` are the words that run each row's cell.
 
     The table ``rows`` has a line per cell, with a column for every swept parameter. Each chart has a table of its own;
-    columns that it lacks are those of the cells.
+    columns that it lacks come from the cells.
     """
     arranged = arrange(experiment, rows.reset_index(drop=True))
     swept = [axis.column for axis in arranged.axes]
