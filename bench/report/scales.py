@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from bench.report.text import axis_value
@@ -19,11 +18,6 @@ TICKS = (
 
 SMALLEST, LARGEST = 1e-290, 1e290
 """Limits of logarithmic axes: the margins that matplotlib adds must not overflow."""
-
-
-def in_data(panel: Axes, artist: Line2D) -> bool:
-    """Return whether both coordinates of an artist are data coordinates, shifted or not."""
-    return bool(artist.get_transform().contains_branch(panel.transData))
 
 
 def log_axis(

@@ -26,8 +26,6 @@ VERDICTS = {
     NO_RESULT: "the cell failed: see its status and reason",
 }
 EQUAL_SAMPLES = "relative RMSE at equal samples"
-SETTING = ("problem", "axis", "at")
-"""The columns that identify a setting."""
 COLUMNS = (
     text("problem", "what distinguishes the problem from the others"),
     text("axis", "the swept quantity along which the problem is reported"),
@@ -69,7 +67,10 @@ def method_names(curves: Sequence[Curve]) -> list[str]:
 
 
 def method_table(shown: Arranged) -> pd.DataFrame:
-    """Return a line per setting and method: its relative RMSE with a 95% interval, its verdict, and its cost."""
+    """Return a line per setting and method: its relative RMSE with a 95% interval, its verdict, and its cost.
+
+    The column ``setting`` identifies a setting.
+    """
     lines = []
     for axis, problem in problems_by_axis(shown):
         curves = estimator_curves(problem.rows)
@@ -79,6 +80,7 @@ def method_table(shown: Arranged) -> pd.DataFrame:
                 low, high = (float(end) for end in rmse_interval(row))
                 error = float(row["rmse_rel"]) if row["status"] == "ok" else math.nan
                 lines.append({
+                    "setting": f"{problem.title()}; {axis.column} {x!r}" if axis else problem.title(),
                     "problem": problem.title(), **kinds, "axis": axis.column if axis else "", "at": x if axis else math.nan,
                     "method": name, "estimator": curve.label, "error": error, "low": low, "high": high,
                     "verdict": verdict(row["status"], error, low, high), "status": row["status"],
@@ -121,9 +123,9 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     the interval of their factor lies above 1.
     """
     lines = []
-    for key, part in methods.groupby(list(SETTING), sort=False, dropna=False):
+    for _, part in methods.groupby("setting", sort=False):
         good = part[np.isfinite(part["error"]) & np.isfinite(part["low"])].sort_values("error", kind="stable")
-        line: dict[str, Any] = dict(zip(SETTING, key, strict=True)) | {
+        line: dict[str, Any] = part.iloc[0][["setting", "problem", "axis", "at"]].to_dict() | {
             "basis": EQUAL_SAMPLES, "first": "", "value": math.nan, "value_low": math.nan,
             "value_high": math.nan, "second": "", "factor": math.nan, "factor_low": math.nan, "factor_high": math.nan,
             "tied": (),
@@ -140,34 +142,29 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
                 line |= dict(zip(("factor", "factor_low", "factor_high"), rivals[0][1], strict=True))
             line["tied"] = tuple(other["method"] for other, (_, low, _) in factors if not low > 1)
         lines.append(line)
-    return pd.DataFrame(lines, columns=[name for c in COLUMNS for name in (c.name, c.low, c.high) if name])
+    names = [name for c in COLUMNS for name in (c.name, c.low, c.high) if name]
+    return pd.DataFrame(lines, columns=["setting", *names])
 
 
 def _interval(row: Any) -> tuple[float, float, float]:
     return float(row["error"]), float(row["low"]), float(row["high"])
 
 
-def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> dict[tuple[Any, ...], list[str]]:
+def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> dict[str, list[str]]:
     """Return, per setting, the estimators that are first or tied with the first; empty if no error is known."""
     estimator = dict(zip(methods["method"], methods["estimator"], strict=True))
     result = {}
     for row in comparisons.to_dict("records"):
         names = [name for name in (row["first"], *row["tied"]) if name]
-        result[setting_of(row)] = list(dict.fromkeys(estimator[name] for name in names))
+        result[row["setting"]] = list(dict.fromkeys(estimator[name] for name in names))
     return result
-
-
-def setting_of(row: Any) -> tuple[Any, ...]:
-    """Return the setting of a line; a missing value of the axis is None, so that settings can be compared."""
-    return tuple(None if isinstance(row[name], float) and math.isnan(row[name]) else row[name] for name in SETTING)
 
 
 def verdicts_by_estimator(methods: pd.DataFrame) -> pd.DataFrame:
     """Return the number of settings per estimator and verdict; an estimator with several methods has the worst of them."""
     order = [WORKS, OPEN, FAILS, NO_RESULT]
-    worst = methods.assign(rank=methods["verdict"].map(order.index)).groupby(
-        ["estimator", *SETTING], sort=False, dropna=False
-    )["rank"].max()  # fmt: skip
+    ranks = methods.assign(rank=methods["verdict"].map(order.index))
+    worst = ranks.groupby(["estimator", "setting"], sort=False)["rank"].max()
     counts = worst.groupby(level="estimator", sort=False).value_counts().unstack(fill_value=0)
     return counts.rename(columns=dict(enumerate(order))).reindex(columns=order, fill_value=0)
 

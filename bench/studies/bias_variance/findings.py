@@ -5,9 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,12 +16,10 @@ from bench.studies.bias_variance.comparisons import (
     FAILS,
     NO_RESULT,
     OPEN,
-    SETTING,
     WORKS,
     estimators,
     known,
     leaders,
-    setting_of,
     verdicts_by_estimator,
 )
 
@@ -30,7 +27,6 @@ NAMED = 3
 """Most problems or estimators that a sentence names."""
 FEWEST = 3
 """Fewest problems, without an axis, that are compared by the worst case instead of by the number of wins."""
-Where = Callable[[pd.Series], bool]
 
 
 def findings(
@@ -58,7 +54,7 @@ def recommended(methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
     return max(estimators(methods), key=lambda name: wins[name])
 
 
-def best_elsewhere(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame, places: set[Any]) -> str:
+def best_elsewhere(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame, places: Collection[str]) -> str:
     """Return the estimator, other than ``main``, that is most often first or tied at some settings; empty if none is."""
     named = leaders(comparisons, methods)
     wins = Counter(name for place in places for name in named.get(place, []) if name != main)
@@ -71,9 +67,7 @@ def best_elsewhere(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame, 
 def _use(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
     """Return the recommendation: where an estimator has the lowest error, alone or tied, and that error."""
     named = {place: names for place, names in leaders(comparisons, methods).items() if names}
-    works = {
-        setting_of(row) for row in methods.to_dict("records") if (row["estimator"], row["verdict"]) == (main, WORKS)
-    }
+    works = set(methods.loc[(methods["estimator"] == main) & (methods["verdict"] == WORKS), "setting"])
     mine = {place for place, names in named.items() if main in names and place in works}
     alone = {place for place in mine if named[place] == [main]}
     errors = _errors(methods, main, mine)
@@ -86,7 +80,7 @@ def _use(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
         if alone
         else "ties for the lowest error"
     )
-    where = _where(methods, lambda row: setting_of(row) in mine, lambda row: setting_of(row) in named)
+    where = _where(methods, mine, named)
     return f"Use {main} {where}: it {how} (relative RMSE {value_range(errors)})."
 
 
@@ -116,7 +110,7 @@ def _record(name: str, methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
     mine = {place for place, names in leaders(comparisons, methods).items() if name in names}
     parts = []
     if mine:
-        problems = dict.fromkeys(row["problem"] for row in own.to_dict("records") if setting_of(row) in mine)
+        problems = own.loc[own["setting"].isin(mine), "problem"]
         parts.append(f"is best or tied on {_names(problems)} ({value_range(_errors(methods, name, mine))})")
     for kind, verb in ((FAILS, "fails on"), (NO_RESULT, "has no result on"), (OPEN, "is open on")):
         part = own[own["verdict"] == kind]
@@ -141,21 +135,16 @@ def _join(parts: Sequence[str]) -> str:
 def _failures(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame, marks: Mapping[str, float]) -> list[str]:
     """Return what fails: the recommended estimator with the best alternative, and how many estimators never fail."""
     own = methods[methods["estimator"] == main]
-    failing = {setting_of(row) for row in own.to_dict("records") if row["verdict"] in (FAILS, NO_RESULT)}
+    failing = set(own.loc[own["verdict"].isin((FAILS, NO_RESULT)), "setting"])
     texts = []
     if failing:
-        where = _where(methods, lambda row: setting_of(row) in failing, lambda row: row["estimator"] == main, marks)
-        lows = _lows(methods, main, failing)
+        where = _where(methods, failing, set(own["setting"]), marks)
+        lows = known(_at(methods, main, failing)["low"])
         how = f"its error is at least {number(min(lows))} times the gradient" if lows else "it has no result"
         text = f"{main} fails {where}: {how}"
         other = best_elsewhere(main, methods, comparisons, failing)
         errors = _errors(methods, other, failing)
-        works = other and all(
-            row["verdict"] == WORKS
-            for row in methods[methods["estimator"] == other].to_dict("records")
-            if setting_of(row) in failing
-        )
-        if works and errors:
+        if errors and (_at(methods, other, failing)["verdict"] == WORKS).all():
             text += f", where {other} is usable ({value_range(errors)})"
         texts.append(f"{text}.")
         texts += _remedy(main, methods, failing)
@@ -165,7 +154,7 @@ def _failures(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame, marks
         other = best_elsewhere(main, methods, comparisons, beaten)
         ahead = {place for place in beaten if other in named[place]}
         if other and ahead:
-            where = _where(methods, lambda row: setting_of(row) in ahead, lambda row: setting_of(row) in named)
+            where = _where(methods, ahead, named)
             own_errors = _errors(methods, main, ahead)
             against = f", where {main} has {value_range(own_errors)}" if own_errors else f", where {main} was not run"
             texts.append(f"{other} is better {where}: {value_range(_errors(methods, other, ahead))}{against}.")
@@ -189,12 +178,10 @@ def _share_that_fails(methods: pd.DataFrame) -> str:
     )
 
 
-def _remedy(main: str, methods: pd.DataFrame, failing: set[Any]) -> list[str]:
+def _remedy(main: str, methods: pd.DataFrame, failing: Collection[str]) -> list[str]:
     """Return which contact law or integrator removes a failure at the same values of the axis, and its cost in time."""
-    own = methods[methods["estimator"] == main].assign(
-        place=lambda rows: [setting_of(row) for row in rows.to_dict("records")]
-    )
-    bad = own[own["place"].isin(failing)]
+    own = methods[methods["estimator"] == main]
+    bad = own[own["setting"].isin(failing)]
     for kind in ("contact", "integrator"):
         wrong = set(bad[kind])
         others = own[~own[kind].isin(wrong) & own["at"].isin(bad["at"]) & own["scene"].isin(bad["scene"])]
@@ -216,16 +203,12 @@ def _verb(count: int, one: str, many: str = "") -> str:
     return (one if many else f"{one}s") if count == 1 else many or one
 
 
-def _chosen(methods: pd.DataFrame, estimator: str, places: set[Any]) -> list[dict[Any, Any]]:
-    return [row for row in methods[methods["estimator"] == estimator].to_dict("records") if setting_of(row) in places]
+def _at(methods: pd.DataFrame, estimator: str, places: Collection[str]) -> pd.DataFrame:
+    return methods[(methods["estimator"] == estimator) & methods["setting"].isin(places)]
 
 
-def _errors(methods: pd.DataFrame, estimator: str, places: set[Any]) -> list[float]:
-    return known(row["error"] for row in _chosen(methods, estimator, places))
-
-
-def _lows(methods: pd.DataFrame, estimator: str, places: set[Any]) -> list[float]:
-    return known(row["low"] for row in _chosen(methods, estimator, places))
+def _errors(methods: pd.DataFrame, estimator: str, places: Collection[str]) -> list[float]:
+    return known(_at(methods, estimator, places)["error"])
 
 
 def value_range(values: Sequence[float] | pd.Series) -> str:
@@ -234,17 +217,19 @@ def value_range(values: Sequence[float] | pd.Series) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _where(methods: pd.DataFrame, holds: Where, tried: Where, marks: Mapping[str, float] = MappingProxyType({})) -> str:
+def _where(
+    methods: pd.DataFrame,
+    holds: Collection[str],
+    tried: Collection[str],
+    marks: Mapping[str, float] = MappingProxyType({}),
+) -> str:
     """Format where something holds among the settings where it was tried.
 
     ``everywhere``, ``beyond the step size limit (6400) with penalty``, ``up to stiffness 3000 with penalty``, ``on pushing
     and heaviside``, ``at 12 of 20 settings``.
     """
-    rows = methods.drop_duplicates(list(SETTING))
-    relevant = {setting_of(row) for row in methods.to_dict("records") if tried(row)}
-    holding = {setting_of(row) for row in methods.to_dict("records") if holds(row)} & relevant
-    rows = rows[[setting_of(row) in relevant for row in rows.to_dict("records")]]
-    mask = np.array([setting_of(row) in holding for row in rows.to_dict("records")])
+    rows = methods[methods["setting"].isin(tried)].drop_duplicates("setting")
+    mask = rows["setting"].isin(holds).to_numpy()
     if mask.all():
         return "everywhere" if len(rows) > 1 else f"on {rows['problem'].iloc[0]}"
     by_problem = {

@@ -37,7 +37,6 @@ from bench.studies.bias_variance.comparisons import (
     leaders,
     method_names,
     problems_by_axis,
-    setting_of,
     verdicts_by_estimator,
 )
 from bench.studies.bias_variance.findings import span, value_range
@@ -72,7 +71,7 @@ def tables(
     if methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1:
         result.append(ranking(methods))
     result.append(recommendations(methods, comparisons[comparisons["basis"] == EQUAL_SAMPLES]))
-    joined = comparisons.assign(tied=[", ".join(names) for names in comparisons["tied"]])
+    joined = comparisons.drop(columns="setting").assign(tied=[", ".join(names) for names in comparisons["tied"]])
     result.append(Table("comparisons", joined, COMPARED, "the first and the next at each setting", COMPARISON_NOTES))
     return result
 
@@ -258,11 +257,10 @@ def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     named = leaders(comparisons, methods)
     lines = []
     for (problem, axis), part in methods.groupby(["problem", "axis"], sort=False):
-        places = {place: names for place, names in named.items() if place[0] == problem and place[1] == axis}
-        for use in dict.fromkeys(tuple(names) for names in places.values() if names):
-            mine = [place for place, names in places.items() if tuple(names) == use]
-            at = {float(place[2]): place in mine for place in places} if axis else {}
-            inside = part[[setting_of(row) in mine for row in part.to_dict("records")]]
+        uses = part["setting"].map(named).map(tuple)
+        for use in filter(None, uses.unique()):
+            inside = part[uses == use]
+            at = dict(zip(part["at"], uses == use, strict=True)) if axis else {}
             errors = inside.loc[inside["estimator"].isin(use[:1]), "error"]
             failing = dict.fromkeys(inside.loc[inside["verdict"].isin((FAILS, NO_RESULT)), "estimator"])
             lines.append({
