@@ -15,6 +15,7 @@ from helpers import experiment, failed, row, table
 from bench.experiment import config
 from bench.report.views import arrange, newest_rows
 from bench.run.execute import store_of
+from bench.studies.bias_variance.charts import accurate_and_fast
 from bench.studies.bias_variance.comparisons import (
     FAILS,
     NO_RESULT,
@@ -230,3 +231,13 @@ def test_stored_findings_are_short_and_their_chart_exists(path):
 def test_there_are_standard_results():
     assert len(MAIN) >= 6
     assert pd.Series(MAIN).is_unique
+
+
+def test_a_tie_is_no_win_of_the_lowest_error():
+    """The title of error against time counts ties for both, and times by their medians."""
+    near = {"rmse_rel": 0.5, "bias": 0.5, "bias_low": 0.3, "bias_high": 0.7}
+    methods, compared, _ = made(
+        row(stiffness=1.0, estimator="one", time_s=2.0, **near), row(stiffness=1.0, estimator="two", time_s=1.0, **near)
+    )
+    title = accurate_and_fast(methods, compared)
+    assert title.startswith("one has the lowest error or ties at 1 of 1 setting; two takes the least median time at 1")

@@ -33,7 +33,7 @@ from bench.report.views import (
 )
 from bench.studies.bias_variance import time_to_accuracy
 from bench.studies.bias_variance.columns import COLUMNS
-from bench.studies.bias_variance.comparisons import FAILS, NO_RESULT
+from bench.studies.bias_variance.comparisons import FAILS, NO_RESULT, leaders
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost
 from bench.studies.bias_variance.findings import findings, recommended
 from bench.studies.bias_variance.time_to_accuracy import SAMPLES, TARGETS
@@ -90,7 +90,7 @@ def charts(
         first = [_speed_accuracy(labelled, best, styles, subtitle), _costs_matrix(labelled, best)]
         main = [chart for chart in first if chart is not None] + main
     elif shown.rows["backend"].nunique() > 1:
-        main += [_error_and_cost(labelled, styles, subtitle, methods)]
+        main += [_error_and_cost(labelled, styles, subtitle, accurate_and_fast(methods, comparisons))]
     if not swept and methods["problem"].nunique() > 1:
         main = [_estimators(methods, texts), *main]
     everything = labelled.rows
@@ -339,13 +339,12 @@ def _costs_matrix(shown: Arranged, best: pd.DataFrame) -> Chart | None:
     )  # fmt: skip
 
 
-def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str, methods: pd.DataFrame) -> Chart:
+def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str, title: str) -> Chart:
     """Return error against time where samples were not swept: a dot per estimator and backend, by problem."""
     rows = TIME.known(shown.rows)
     problems = list(dict.fromkeys(rows["problem_"]))
     step = max(1, math.ceil(len(problems) / 6))
     chosen = problems[::step]
-    title = _accurate_and_fast(rows)
     shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
     return Chart(
         "speed_accuracy", title, rows, TIMES[:1], [RMSE], "points", series="series", shape="backend", panel="problem_",
@@ -354,18 +353,18 @@ def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str,
     )  # fmt: skip
 
 
-def _accurate_and_fast(rows: pd.DataFrame) -> str:
-    """Format which estimator is most accurate, and which is fastest, on most problems."""
-    if rows.empty:
-        return "No estimate was timed"
-    accurate, fast = (
-        Counter(rows.loc[rows.groupby("problem_")[by].idxmin(), "series"]).most_common(1)[0]
-        for by in ("rmse_rel", "time_s")
-    )
-    total = counted(rows["problem_"].nunique(), "problem")
-    if accurate[0] == fast[0]:
-        return f"{accurate[0]} has the lowest error on {accurate[1]} of {total}, and is fastest on {fast[1]}"
-    return f"{accurate[0]} has the lowest error on {accurate[1]} of {total}, {fast[0]} is fastest on {fast[1]}"
+def accurate_and_fast(methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
+    """Format which estimator is most often first or tied in error, and which most often takes the least median time."""
+    wins = Counter(name for names in leaders(comparisons, methods).values() for name in names)
+    times = methods[methods["time_s"] > 0]
+    if times.empty or not wins:
+        return "No estimate was timed" if times.empty else "No error could be compared"
+    fast = Counter(times.loc[times.groupby("setting")["time_s"].idxmin(), "estimator"])
+    (accurate, n_accurate), (fastest, n_fastest) = wins.most_common(1)[0], fast.most_common(1)[0]
+    total = counted(methods["setting"].nunique(), "setting")
+    takes = f"takes the least median time at {n_fastest}"
+    who = f", and {takes}" if accurate == fastest else f"; {fastest} {takes}"
+    return f"{accurate} has the lowest error or ties at {n_accurate} of {total}{who}"
 
 
 # --------------------------------------------------------------------------------------------------- estimators
