@@ -28,6 +28,13 @@ class Legged(EngineScene):
     friction: float = param(1.0, "Coulomb coefficient", low=0.0)
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2", positive=True)
 
+    clearance: float = param(
+        1e-4,
+        "height of the feet above the ground at the start, where at 0 rounding would decide about contact",
+        "m",
+        positive=True,
+    )
+
     @property
     def foot_radius(self) -> float:
         """The radius of a foot [m]."""

@@ -44,9 +44,9 @@ class Ant(Legged):
         return self.torque * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the torso just above its stance, falling forward."""
+        """Return the stance just above the ground, falling forward."""
         zero = 0.0 * theta[0]
-        height = 2 * self.link * float(np.sin(np.pi / 4)) + self.foot_radius
+        height = 2 * self.link * float(np.sin(np.pi / 4)) + self.foot_radius + self.clearance
         q = [zero, zero, zero + height, *([zero] * 11)]
         v = [zero + self.speed, zero, zero - self.fall, *([zero] * 11)]
         return State(xp.stack(q), xp.stack(v))

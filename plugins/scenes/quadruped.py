@@ -50,18 +50,11 @@ class Quadruped(Legged):
         return np.tile([0.0, self.bend, -2 * self.bend], 4)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the bent stance with all feet on the ground and the torso in motion."""
+        """Return the bent stance with all feet just above the ground and the torso in motion."""
         zero = 0.0 * theta[0]
         bend = zero + self.bend
-        q = [
-            zero,
-            zero,
-            2 * self.link * xp.cos(bend) + self.foot_radius,
-            zero,
-            zero,
-            zero,
-            *([zero, bend, -2 * bend] * 4),
-        ]
+        height = 2 * self.link * xp.cos(bend) + self.foot_radius + self.clearance
+        q = [zero, zero, height, zero, zero, zero, *([zero, bend, -2 * bend] * 4)]
         v = [zero + self.push, zero + self.drift, *([zero] * 16)]
         return State(xp.stack(q), xp.stack(v))
 
