@@ -321,6 +321,30 @@ def state_has_declared_size(scene: MechanicalScene) -> str:
     return f"n_q = {scene.n_q}, n_v = {n_v}"
 
 
+@verifies(EngineScene)
+def start_and_costs_are_traceable(scene: EngineScene) -> str:
+    """Verify that JAX can trace the initial state, the feedback and the final cost, parameters included."""
+    try:
+        import jax
+        import jax.numpy as jnp
+    except ImportError:
+        raise Skipped("needs jax") from None
+    program = programs(scene)[0]
+
+    def trace(parameters: Any, theta: Any) -> Any:
+        bound = program.bind(parameters).scene
+        assert isinstance(bound, EngineScene)
+        state = bound.initial_state(jnp, theta)
+        return state, bound.feedback(jnp, theta, state.q, state.v), bound.terminal_cost(jnp, state.q, state.v)
+
+    try:
+        jax.eval_shape(trace, program.parameters(), program.theta0[:, None])
+    except jax.errors.JAXTypeError as error:
+        cause = str(error).splitlines()[0]
+        raise Failed(f"JAX cannot trace it: {cause}: compute with the given xp instead of numpy or float()") from error
+    return f"{program.parameters().size} parameters traced"
+
+
 @verifies(ContactScene)
 def contact_geometry_is_consistent(scene: ContactScene) -> str:
     """Verify that ``gap_rate`` is the time derivative of ``gap``, and that forces act linearly and push bodies apart."""

@@ -305,17 +305,16 @@ def _batches(
         se = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)
         enough = se <= tolerance * np.linalg.norm(batches.mean(axis=0)) and count * BATCHES >= LEAST_SAMPLES
         if spent or enough:
-            unseen = _tail_error(problem, terms, batches.mean(axis=0), directions, count * BATCHES, columns)
-            if spent or math.hypot(se, np.nan_to_num(unseen)) <= tolerance * np.linalg.norm(batches.mean(axis=0)):
+            unseen, note = _tail_error(problem, terms, batches.mean(axis=0), directions, count * BATCHES, columns)
+            if spent or math.hypot(se, unseen) <= tolerance * np.linalg.norm(batches.mean(axis=0)):
                 break
     if not np.isfinite(batches).all():
         return _failed(problem, "rollouts are not finite")
-    note = ""
-    if math.isnan(unseen):
-        note, unseen = "rollouts in the far tails of the noise are not finite, so the reference may not exist", 0.0
-    elif heavy_tails(batches - batches.mean(axis=0)):
+    if math.isinf(unseen):
+        return _failed(problem, "noise rarer than any sample dominates the mean, which may not exist")
+    if not note and heavy_tails(batches - batches.mean(axis=0)):
         note = "the reference's batches have heavy tails, so its standard error is uncertain"
-    elif not np.ptp(pilot) and not pilot.any():
+    elif not note and not np.ptp(pilot) and not pilot.any():
         note = f"every sample of the reference has gradient 0: events rarer than {3.0 / (count * BATCHES):.1g} are not seen"
     # the spread does not show an error that all samples share, such as that of a backend's differences
     unseen = math.hypot(unseen, SHARED * math.sqrt(float(np.square(pilot).sum(axis=0).mean())))
@@ -387,12 +386,14 @@ def _cross_checked(
 
 def _tail_error(
     problem: Problem, terms: Terms, mean: np.ndarray, directions: np.ndarray, count: int, columns: int
-) -> float:
-    """Return the norm of the far tails' contribution to the mean, the largest over the directions; NaN if not finite.
+) -> tuple[float, str]:
+    """Return the norm of the far tails' contribution to the mean, the largest over the directions, and a note.
 
     The tails contain few of the ``count`` samples or none, so the spread of the samples does not show the contribution.
     Along each direction, the tails are where :data:`TAIL_EVENTS` samples are expected, and are sampled separately. What
-    lies beyond these samples, as of an exponential cost, is integrated along the direction.
+    lies beyond these samples, as of an exponential cost, is integrated along the direction. Where terms diverge faster
+    than the normal density falls, the note states the distance, and the contribution ends there. The contribution is
+    infinite where it exceeds the range whose squares are finite.
     """
     from scipy.special import ndtri
 
@@ -404,18 +405,38 @@ def _tail_error(
     middle = (np.arange(each) + 0.5) / each
     depth = -ndtri(0.5 * share * middle) * np.where(np.arange(each) % 2, 1.0, -1.0)
     w = w + along * (np.tile(depth, directions.shape[1]) - (along * w).sum(axis=0))
-    tails = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
+    with np.errstate(over="ignore", invalid="ignore"):
+        tails = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
     if not np.isfinite(tails).all():
-        return math.nan
+        return 0.0, "rollouts in the far tails of the noise are not finite, so the reference may not exist"
+    tails = np.abs(tails.mean(axis=2) - mean[:, None])
+    if tails.max() > EXTREME:
+        return math.inf, ""
+    error, note = share * float(np.linalg.norm(tails, axis=0).max()), ""
     # the same noise across the direction, at depths beyond the deepest sample of the tails
     depth = float(np.abs(depth).max()) + DEEPER * (np.arange(each) // 2 + 0.5)
     side = np.where(np.arange(each) % 2, 1.0, -1.0)
     w = w + along * (np.tile(side * depth, directions.shape[1]) - (along * w).sum(axis=0))
+    weight = np.exp(-(depth**2) / 2) * DEEPER / math.sqrt(2.0 * math.pi)
     with np.errstate(over="ignore", invalid="ignore"):
         deep = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
-        deep = np.nan_to_num(deep * np.exp(-(depth**2) / 2) * DEEPER / math.sqrt(2.0 * math.pi), posinf=0.0, neginf=0.0)
-    beyond = float(np.linalg.norm(deep.sum(axis=2), axis=0).max())
-    return beyond + share * float(np.linalg.norm(tails.mean(axis=2) - mean[:, None], axis=0).max())
+        deep = np.where(weight > 0.0, deep * weight, 0.0)
+        sizes = np.abs(deep).max(axis=0)
+    for first in (0, 1):  # either sign of the depth
+        for ray in sizes[:, first::2]:
+            if np.isfinite(ray).all():
+                continue
+            # the ray ends before its terms begin to diverge
+            finite = ray[: int(np.argmin(np.isfinite(ray)))]
+            end = finite.size - int(np.argmin(finite[::-1])) if finite.size else 0
+            if finite[end:].sum() > max(error, finite[:end].sum()):
+                limit = depth[first::2][end - 1]
+                note = f"rollouts beyond {limit:.2g} standard deviations diverge, so the mean may not exist"
+            ray[end:] = 0.0
+    deep = np.where(sizes > 0.0, deep, 0.0).sum(axis=2)
+    if np.abs(deep).max() > EXTREME:
+        return math.inf, note
+    return error + float(np.linalg.norm(deep, axis=0).max()), note
 
 
 def _directions(effect: np.ndarray) -> np.ndarray:

@@ -6,14 +6,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.model import Array, EngineScene, State, param
+from bench.model import Array, State, param
 
-LEGS = {"a": 45, "b": 135, "c": 225, "d": 315}
+from ..legged import Legged
+
+DIRECTIONS = {"a": 45, "b": 135, "c": 225, "d": 315}
 """Direction of each leg in the plane [deg]."""
 
 
 @dataclass(frozen=True)
-class Ant(EngineScene):
+class Ant(Legged):
     """A round torso on four spread legs lands on its four feet, with friction, under constant torques.
 
     q = (x, y, z, yaw, pitch, roll) of the torso, then hip (about the vertical) and ankle of each leg. theta holds the
@@ -21,23 +23,18 @@ class Ant(EngineScene):
     """
 
     name = "ant"
-    neglected_effects: ClassVar[str] = "joint limits, self-collision, contacts other than the feet"
     n_q: ClassVar[int] = 14
     n_u: ClassVar[int] = 8
-    n_contacts: ClassVar[int] = 4
+    legs: ClassVar[tuple[str, ...]] = tuple(DIRECTIONS)
+    joints: ClassVar[tuple[str, ...]] = ("hip", "ankle")
+    torso: ClassVar[str] = 'type="sphere" size=".15"'
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 100.0, "damping_mode": "clipped"}
 
     sigma: float = param(0.1, "standard deviation of the noise on the torques", "N m", positive=True)
     horizon: int = param(30, "number of time steps", "steps", positive=True)
-    dt: float = param(0.005, "length of a time step", "s", positive=True)
-    mass: float = param(2.0, "mass of the torso", "kg", positive=True)
-    leg_mass: float = param(0.2, "mass of a thigh and of a shank", "kg", positive=True)
     link: float = param(0.2, "length of a thigh; a shank is twice as long", "m", positive=True)
     damping: float = param(0.3, "damping of the joints", "N m s/rad", low=0.0)
     stiffness: float = param(4.0, "stiffness of the joints", "N m/rad", low=0.0)
-    armature: float = param(0.02, "inertia of a motor, as seen from its joint", "kg m^2", low=0.0)
-    friction: float = param(1.0, "Coulomb coefficient", low=0.0)
-    gravity: float = param(9.81, "gravitational acceleration", "m/s^2", positive=True)
     fall: float = param(0.5, "initial downward velocity", "m/s")
     speed: float = param(0.5, "initial forward velocity", "m/s")
     torque: float = param(0.5, "torque of each joint at theta; hips alternate in sign", "N m")
@@ -47,9 +44,9 @@ class Ant(EngineScene):
         return self.torque * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the torso just above its stance, falling forward."""
+        """Return the stance just above the ground, falling forward."""
         zero = 0.0 * theta[0]
-        height = 2 * self.link * float(np.sin(np.pi / 4)) + self._radius
+        height = 2 * self.link * float(np.sin(np.pi / 4)) + self.foot_radius + self.clearance
         q = [zero, zero, zero + height, *([zero] * 11)]
         v = [zero + self.speed, zero, zero - self.fall, *([zero] * 11)]
         return State(xp.stack(q), xp.stack(v))
@@ -62,51 +59,17 @@ class Ant(EngineScene):
         """Return minus the forward position."""
         return -q[0]
 
-    def mjcf(self) -> str:
-        """Return a sphere on slides and hinges with four legs, whose feet are spheres over a plane."""
-        pairs = "".join(
-            f'<pair geom1="ground" geom2="{leg}" condim="3" friction="{self.friction} {self.friction} 1 1 1"/>'
-            for leg in LEGS
-        )
-        motors = "".join(f'<motor joint="{leg}_{joint}"/>' for leg in LEGS for joint in ("hip", "ankle"))
-        return f"""
-            <option gravity="0 0 {-self.gravity}"/>
-            <default>
-              <geom contype="0" conaffinity="0"/>
-              <default class="motor"><joint armature="{self.armature}"/></default>
-            </default>
-            <worldbody>
-              <geom name="ground" type="plane" size="1 1 1"/>
-              <body>
-                <joint name="x" type="slide" axis="1 0 0"/>
-                <joint name="y" type="slide" axis="0 1 0"/>
-                <joint name="z" type="slide" axis="0 0 1"/>
-                <joint name="yaw" type="hinge" axis="0 0 1"/>
-                <joint name="pitch" type="hinge" axis="0 1 0"/>
-                <joint name="roll" type="hinge" axis="1 0 0"/>
-                <geom type="sphere" size=".15" mass="{self.mass}"/>
-                {"".join(self._leg(leg, direction) for leg, direction in LEGS.items())}
-              </body>
-            </worldbody>
-            <contact>{pairs}</contact>
-            <actuator>{motors}</actuator>"""
-
-    @property
-    def _radius(self) -> float:
-        """The radius of a foot [m]."""
-        return 0.1 * self.link
-
-    def _leg(self, name: str, direction: int) -> str:
+    def leg(self, name: str) -> str:
         """Return a leg: a level thigh, a shank that slopes down at 45 degrees, and a foot."""
         down = 2 * self.link * float(np.sin(np.pi / 4))
         size = 0.1 * self.link
         return f"""
-            <body euler="0 0 {direction}">
+            <body euler="0 0 {DIRECTIONS[name]}">
               <joint class="motor" name="{name}_hip" type="hinge" axis="0 0 1" pos=".15 0 0"/>
               <geom type="capsule" fromto=".15 0 0 {0.15 + self.link} 0 0" size="{size}" mass="{self.leg_mass}"/>
               <body pos="{0.15 + self.link} 0 0">
                 <joint class="motor" name="{name}_ankle" type="hinge" axis="0 1 0"/>
                 <geom type="capsule" fromto="0 0 0 {down} 0 {-down}" size="{size}" mass="{self.leg_mass}"/>
-                <geom name="{name}" type="sphere" size="{self._radius}" pos="{down} 0 {-down}" mass="0"/>
+                <geom name="{name}" type="sphere" size="{self.foot_radius}" pos="{down} 0 {-down}" mass="0"/>
               </body>
             </body>"""

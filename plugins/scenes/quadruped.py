@@ -6,14 +6,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.model import Array, EngineScene, State, param
+from bench.model import Array, State, param
 
-LEGS = {"front_left": (1, 1), "front_right": (1, -1), "back_left": (-1, 1), "back_right": (-1, -1)}
+from ..legged import Legged
+
+SIDES = {"front_left": (1, 1), "front_right": (1, -1), "back_left": (-1, 1), "back_right": (-1, -1)}
 """Sign of the hip's x and y by leg."""
 
 
 @dataclass(frozen=True)
-class Quadruped(EngineScene):
+class Quadruped(Legged):
     """A torso on four legs is pushed sideways and stands on four feet with friction; the joints are held by springs.
 
     q = (x, y, z, yaw, pitch, roll) of the torso, then abduction, hip and knee of each leg. theta holds the target angles
@@ -22,15 +24,15 @@ class Quadruped(EngineScene):
     """
 
     name = "quadruped"
-    neglected_effects: ClassVar[str] = "torque limits, self-collision, contacts other than the feet"
     n_q: ClassVar[int] = 18
     n_u: ClassVar[int] = 12
-    n_contacts: ClassVar[int] = 4
+    legs: ClassVar[tuple[str, ...]] = tuple(SIDES)
+    joints: ClassVar[tuple[str, ...]] = ("side", "hip", "knee")
+    torso: ClassVar[str] = 'type="box" size=".2 .1 .05"'
     contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 2e4, "damping": 200.0, "damping_mode": "clipped"}
 
     sigma: float = param(0.02, "standard deviation of the noise on the target angles", "rad", positive=True)
     horizon: int = param(20, "number of time steps", "steps", positive=True)
-    dt: float = param(0.005, "length of a time step", "s", positive=True)
     mass: float = param(8.0, "mass of the torso", "kg", positive=True)
     leg_mass: float = param(0.4, "mass of a thigh and of a shank", "kg", positive=True)
     link: float = param(0.2, "length of a thigh and of a shank", "m", positive=True)
@@ -38,7 +40,6 @@ class Quadruped(EngineScene):
     damping: float = param(2.0, "damping of the joints' control", "N m s/rad", low=0.0)
     armature: float = param(0.05, "inertia of a motor, as seen from its joint", "kg m^2", low=0.0)
     friction: float = param(0.6, "Coulomb coefficient", low=0.0)
-    gravity: float = param(9.81, "gravitational acceleration", "m/s^2", positive=True)
     push: float = param(0.5, "initial forward velocity", "m/s")
     drift: float = param(0.3, "initial sideways velocity", "m/s")
     bend: float = param(0.6, "hip angle at theta; knees are bent by twice as much", "rad")
@@ -49,10 +50,11 @@ class Quadruped(EngineScene):
         return np.tile([0.0, self.bend, -2 * self.bend], 4)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the bent stance with all feet on the ground and the torso in motion."""
+        """Return the bent stance with all feet just above the ground and the torso in motion."""
         zero = 0.0 * theta[0]
-        height = 2 * self.link * float(np.cos(self.bend)) + self._radius
-        q = [zero, zero, zero + height, zero, zero, zero, *(zero + angle for angle in self.theta0())]
+        bend = zero + self.bend
+        height = 2 * self.link * xp.cos(bend) + self.foot_radius + self.clearance
+        q = [zero, zero, height, zero, zero, zero, *([zero, bend, -2 * bend] * 4)]
         v = [zero + self.push, zero + self.drift, *([zero] * 16)]
         return State(xp.stack(q), xp.stack(v))
 
@@ -64,42 +66,9 @@ class Quadruped(EngineScene):
         """Return the squared distance to the target."""
         return (q[0] - self.target) ** 2 + q[1] ** 2
 
-    def mjcf(self) -> str:
-        """Return a torso on slides and hinges with four legs, whose feet are spheres over a plane."""
-        pairs = "".join(
-            f'<pair geom1="ground" geom2="{leg}" condim="3" friction="{self.friction} {self.friction} 1 1 1"/>'
-            for leg in LEGS
-        )
-        motors = "".join(f'<motor joint="{leg}_{joint}"/>' for leg in LEGS for joint in ("side", "hip", "knee"))
-        return f"""
-            <option gravity="0 0 {-self.gravity}"/>
-            <default>
-              <geom contype="0" conaffinity="0"/>
-              <default class="motor"><joint armature="{self.armature}"/></default>
-            </default>
-            <worldbody>
-              <geom name="ground" type="plane" size="1 1 1"/>
-              <body>
-                <joint name="x" type="slide" axis="1 0 0"/>
-                <joint name="y" type="slide" axis="0 1 0"/>
-                <joint name="z" type="slide" axis="0 0 1"/>
-                <joint name="yaw" type="hinge" axis="0 0 1"/>
-                <joint name="pitch" type="hinge" axis="0 1 0"/>
-                <joint name="roll" type="hinge" axis="1 0 0"/>
-                <geom type="box" size=".2 .1 .05" mass="{self.mass}"/>
-                {"".join(self._leg(leg, *sides) for leg, sides in LEGS.items())}
-              </body>
-            </worldbody>
-            <contact>{pairs}</contact>
-            <actuator>{motors}</actuator>"""
-
-    @property
-    def _radius(self) -> float:
-        """The radius of a foot [m]."""
-        return 0.1 * self.link
-
-    def _leg(self, name: str, front: int, left: int) -> str:
+    def leg(self, name: str) -> str:
         """Return a leg: thigh and shank, both capsules, and a foot."""
+        front, left = SIDES[name]
         bone = (
             f'<geom type="capsule" fromto="0 0 0 0 0 {-self.link}" size="{0.08 * self.link}" mass="{self.leg_mass}"/>'
         )
@@ -111,6 +80,6 @@ class Quadruped(EngineScene):
               <body pos="0 0 {-self.link}">
                 <joint class="motor" name="{name}_knee" type="hinge" axis="0 1 0"/>
                 {bone}
-                <geom name="{name}" type="sphere" size="{self._radius}" pos="0 0 {-self.link}" mass="0"/>
+                <geom name="{name}" type="sphere" size="{self.foot_radius}" pos="0 0 {-self.link}" mass="0"/>
               </body>
             </body>"""

@@ -1,7 +1,6 @@
 """Every registered plugin passes the conformance kit, and the kit catches the faults planted here."""
 
 import contextlib
-import re
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -21,7 +20,7 @@ from bench.plugins.scenes.quadratic import Quadratic
 
 from bench import conformance
 from bench.conformance import Skipped, check, main, parametrize
-from bench.conformance.kit import Failed, variants
+from bench.conformance.kit import variants
 from bench.conformance.subjects import all_programs, available, distinguishing_programs, sound_scenes
 from bench.conformance.subjects import programs as programs_of
 from bench.errors import UserError
@@ -90,15 +89,7 @@ def test_registered_plugin_conforms(plugin, check):
 @pytest.mark.slow
 @parametrize([p for p in PLUGINS if _is_long(p) or p.kind in ("backends", "scenes", "contacts")])
 def test_registered_plugin_conforms_on_every_program(plugin, check):
-    try:
-        check(plugin)
-    except Failed as error:
-        # known gap: contacts of the robots switch within the steps of the kit's differences
-        if plugin.name in ("mujoco", "mjx") and re.match(
-            r"(ant|quadruped) \+ .*differs from central differences", str(error)
-        ):
-            pytest.xfail(str(error))
-        raise
+    check(plugin)
 
 
 # ------------------------------------------------------------------------------------------- planted: estimators

@@ -168,6 +168,22 @@ def test_costs_that_are_not_finite_in_a_part_of_the_samples_are_a_remark():
             assert "not finite" in found.note
 
 
+@pytest.mark.parametrize("rare", [1.0, 1e280])
+def test_costs_that_diverge_beyond_all_samples_are_a_remark(rare):
+    """exp(exp(u - 7)) overflows at 13.6 deviations, and a bump 9 deviations away has a mean of 1e260."""
+    pieces = {
+        1.0: bank.Piece("twice exponential", lambda u: np.exp(np.exp(np.minimum(u - 7.0, 7.0))), lambda u, s: math.nan),
+        1e280: bank.Piece("rare", lambda u: 1e280 * np.maximum(u - 9.0, 0.0), lambda u, s: math.nan),
+    }
+    with np.errstate(all="ignore"):
+        found = bank.certified(ridge(bank.power(1), pieces[rare], sigma=1.0), 1 << 14)
+    assert found.is_finite == (rare == 1.0)
+    assert "may not exist" in found.note
+    if rare == 1.0:
+        # without what diverges: E exp(exp(u - 7)) u is .0023
+        assert found.known().standard_error < 0.1
+
+
 def test_rounding_of_single_precision_is_no_jump():
     start, end = np.full((1, 2), -1.0), np.full((1, 2), 1.0)
 

@@ -25,11 +25,12 @@ from bench.plugins.scenes.double_pendulum import DoublePendulum
 from bench.plugins.scenes.hopper import Hopper
 from bench.plugins.scenes.pendulum import Pendulum
 from bench.plugins.scenes.pushing import Pushing
+from bench.plugins.scenes.quadruped import Quadruped
 from bench.plugins.scenes.tossed_box import TossedBox
 from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
 
 from bench.cli import main
-from bench.conformance import backends
+from bench.conformance import backends, scenes
 from bench.conformance.kit import Failed
 from bench.conformance.subjects import distance, law_for, samples
 from bench.experiment.cell import Cell
@@ -320,3 +321,24 @@ def test_references_of_an_engine_miss_the_gradient_by_the_error_they_state(engin
         ratios.append(np.linalg.norm(found.gradient - truth) / found.known().standard_error)
     assert 0.5 < np.mean(np.square(ratios)) < 1.7, ratios
     assert max(ratios) < 4.0
+
+
+def test_differences_that_straddle_a_switch_of_contact_are_taken_again():
+    """Central differences of a step were 50 times too large where a foot touches within the differences."""
+    robot = compose(Quadruped(), Penalty(**Quadruped.contact_values), SemiImplicitEuler())
+    theta, w = samples(robot)
+    coarse, fine = (Mujoco(step=step).compile(robot).grad(theta, w) for step in (1e-5, 1e-9))
+    assert distance(coarse, fine) < 1e-4
+
+
+def test_engine_scene_that_jax_cannot_trace_fails_its_check():
+    """A parameter under ``numpy``: MJX traces all parameters."""
+
+    class Concrete(Quadruped):
+        def initial_state(self, xp, theta):
+            state = super().initial_state(xp, theta)
+            return state._replace(q=state.q + float(np.cos(self.bend)))
+
+    assert "parameters traced" in scenes.start_and_costs_are_traceable(Quadruped())
+    with pytest.raises(Failed, match="JAX cannot trace it"):
+        scenes.start_and_costs_are_traceable(Concrete())

@@ -196,7 +196,6 @@ def test_sharing_takes_every_sample_for_both_orders():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["action", "parameter"])
-@pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")  # squares of a diverging cost
 def test_smoothing_gains_is_not_smoothing_actions(model):
     """Under action noise REINFORCE aims at grad J_sigma and smoothing of the gains at something else; under parameter noise not."""
     scene = Cartpole(sigma=1.0, noise=model)

@@ -34,6 +34,10 @@ ELSEWHERE = 4
 """Most other thetas at which the ratio of a wrong component is computed."""
 FAR = (1.0, 3.0)
 """Standard deviations, in units of each input's scale, of thetas where a term such as a contact may be inactive."""
+LOOSE = 1e-3
+"""Largest error of a slope, relative to the largest |gradient * scale|, that a solver which stops early explains."""
+EXPLAINED = 10.0
+"""Largest such error as a multiple of the sum of the cost's jumps per unit of a direction."""
 PLAINLY = ("smooth", "nonlinear", "mode_crossing")
 """Verdicts that count as right at the thetas drawn with :data:`FAR`."""
 
@@ -206,6 +210,7 @@ class _Checker:
         self.evaluations = self.gradients = 0
         self.scale = self._scales() if options.scale is None else np.asarray(options.scale, dtype=np.float64)
         self.random = np.random.default_rng([options.seed, 0x67726164])
+        self._rates: list[float] = []
 
     def _scales(self) -> np.ndarray:
         """Return :func:`scales`, with its own magnitude for each tiny input that changes the cost at that magnitude."""
@@ -357,6 +362,11 @@ class _Checker:
                     findings[m], steps[m] = self._settle(
                         thetas[:, m], vectors[:, m], float(lengths[m]), measured[m], finding
                     )
+        for m, finding in enumerate(findings):
+            apart = abs(finding.difference - measured[m].derivative) * float(lengths[m])
+            if finding.verdict == "wrong_adjoint" and apart <= LOOSE * whole[:, m].max():
+                if self._has_loose_solver(thetas[:, m], gradients[:, m], apart):
+                    findings[m] = replace(finding, verdict="rounding")
         modes = [(tuple(a), tuple(b)) for a, b in zip(minus, plus, strict=True)]
         return [
             replace(_part(names[m], components[m], sample, finding, modes[m]), step=steps[m])
@@ -381,6 +391,26 @@ class _Checker:
             if abs(slope - sample.derivative) <= AGREES * abs(slope):
                 return replace(finding, verdict="nonlinear", difference=slope, uncertainty=AGREES * abs(slope)), step
         return finding, step
+
+    def _has_loose_solver(self, theta: np.ndarray, gradient: np.ndarray, apart: float) -> bool:
+        """Return whether small jumps of the cost explain an error ``apart`` of a slope in units of the inputs' scales.
+
+        Such jumps show a solver that stops early. The cost is scanned along its gradient, for at most
+        :attr:`Options.scanned` thetas.
+        """
+        steepest = self.scale * gradient
+        vector = self.scale * steepest / np.linalg.norm(steepest)
+        for reach in roughness.REACHES:
+            if apart <= EXPLAINED * max(self._rates, default=0.0):
+                return True
+            if len(self._rates) >= len(roughness.REACHES) * self.options.scanned:
+                return False
+            along = np.linspace(-reach, reach, roughness.STOPPED)
+            with np.errstate(all="ignore"):
+                values = self.cost(theta[:, None] + vector[:, None] * along)
+                least = 8.0 * self.unit * float(np.abs(values).max())
+                self._rates.append(roughness.stopping_rate(values, 2.0 * reach, least))
+        return apart <= EXPLAINED * max(self._rates)
 
     def _sides(self, at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the contact modes on the minus side and on the plus side, each ``(M, K)``: directions by steps."""

@@ -18,6 +18,16 @@ EDGES = 3
 """Fewest isolated edges of a staircase; with fewer, the cost has single jumps."""
 APART = 3.0
 """Least ratio of an edge to the variation of increments on the treads."""
+STOPPED = 513
+"""Points of a scan for jumps of a solver that stops early."""
+REACHES = (1.0, 0.5, 0.25)
+"""Distances of the scans on either side of theta, in units of the input's scale."""
+SIXTH, IMPULSE, CLEAR = 6, 10.0, 50.0
+"""Order of the differences that show jumps, the largest of a unit jump, and the ratio to their median of a jump."""
+STOPS = 3
+"""Fewest jumps of a solver that stops early; fewer may be a contact."""
+SMALL = 1e-3
+"""Largest sum of such jumps, as a share of the cost's range on the scan."""
 
 
 def offsets(unit: float) -> np.ndarray:
@@ -84,3 +94,22 @@ def is_staircase(values: np.ndarray, rounding: float) -> bool:
         return False
     apart = edge & ~np.r_[False, edge[:-1]] & ~np.r_[edge[1:], False]
     return bool(apart.sum() >= EDGES and apart.sum() >= 0.9 * edge.sum())
+
+
+def stopping_rate(values: np.ndarray, length: float, rounding: float) -> float:
+    """Return the sum of jumps per unit length in equally spaced ``values (n,)``; 0 unless jumps are small and at least 3.
+
+    An iterative solver needs one iteration more or less at some inputs, where the cost jumps by about its tolerance. Between
+    the jumps, the slope of the cost is the derivative of a fixed number of iterations. It differs from the derivative of
+    the solution by about this rate.
+    """
+    if not np.isfinite(values).all():
+        return 0.0
+    sizes = np.abs(np.diff(values, SIXTH))
+    high = sizes > CLEAR * float(np.median(sizes)) + 2.0**SIXTH * rounding
+    # a jump raises neighbouring differences
+    starts = np.flatnonzero(high & ~np.r_[False, high[:-1]])
+    jumps = np.array([sizes[start : start + SIXTH].max() for start in starts]) / IMPULSE
+    if jumps.size < STOPS or jumps.sum() > SMALL * np.ptp(values):
+        return 0.0
+    return float(jumps.sum() / length)
