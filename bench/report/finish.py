@@ -96,5 +96,6 @@ def _page(experiment: Experiment, rows: pd.DataFrame, views: Views | None) -> li
 
 def shown(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with strings on one line and without control characters, for a terminal (except ``parameters``)."""
-    texts = [name for name in rows if rows[name].map(type).eq(str).all()]
-    return rows.assign(**{str(name): rows[name].map(printable) for name in texts if name != "parameters"})
+    texts = [name for name in rows if pd.api.types.infer_dtype(rows[name], skipna=False) == "string"]
+    lines = {name: {text: printable(text) for text in rows[name].unique()} for name in texts if name != "parameters"}
+    return rows.assign(**{str(name): rows[name].map(lines[name]) for name in lines})

@@ -12,6 +12,8 @@ import sys
 import tempfile
 import traceback
 
+from configurations import is_refusal
+
 from bench.cli import main
 from bench.experiment.config import _known_keys
 
@@ -90,7 +92,7 @@ def fuzz(count: int, seed: int) -> int:
             statuses[status] += 1
         if (
             status not in statuses
-            or (status == 2 and len(said.splitlines()) != 1)
+            or (status == 2 and not is_refusal(said))
             or "Traceback" in said
             or "\x1b" in said
         ):

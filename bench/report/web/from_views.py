@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import pandas as pd
 
@@ -62,10 +63,15 @@ def _table(chart: Chart) -> pd.DataFrame:
     frame = chart.frame.reset_index(drop=True)
     frame = frame if "row" in frame else frame.assign(row=-1)
     key = [name for name in (chart.series, chart.line) if name]
-    frame = frame.assign(line_=frame[key].astype(str).agg(" ".join, axis=1) if key else "", one_="")
+    frame = frame.assign(line_=_joined(frame, key) if key else "", one_="")
     if chart.panel_row:
         frame = frame.assign(facet_=frame[chart.panel] + ", " + frame[chart.panel_row])
     return frame.assign(fill_=draw.cell_colours(chart)) if chart.kind == "grid" and chart.value else frame
+
+
+def _joined(frame: pd.DataFrame, columns: Sequence[str]) -> pd.Series:
+    first, *rest = (frame[name].astype(str) for name in columns)
+    return first.str.cat(rest, sep=" ") if rest else first
 
 
 def _chart(chart: Chart) -> page.Chart:
