@@ -122,7 +122,8 @@ def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataF
         f"{len(every) - n_requested} of {len(every)} requested cells have no row" if n_requested < len(every) else ""
     )
     hidden = f"{n_others} stored rows of other settings are not shown" if n_others else ""
-    return rows[is_requested].reset_index(drop=True), "; ".join(part for part in (missing, hidden) if part)
+    shown = rows[is_requested].reset_index(drop=True) if n_others else rows
+    return shown, "; ".join(part for part in (missing, hidden) if part)
 
 
 def _identity_of(cell: Cell) -> Identity:

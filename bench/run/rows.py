@@ -63,7 +63,9 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     if metadata.num_rows > MAX_ROWS or size > MAX_BYTES:
         raise ValueError(f"{metadata.num_rows} rows and {size} bytes are more than a run writes")
     content.seek(0)
-    return pd.read_parquet(content, columns=columns and list(columns))
+    # a column is freed as soon as it is converted
+    freed = {"split_blocks": True, "self_destruct": True}
+    return pd.read_parquet(content, columns=columns and list(columns), to_pandas_kwargs=freed)
 
 
 def valid_rows(table: pd.DataFrame, columns: Columns, path: Path) -> pd.DataFrame:
