@@ -45,7 +45,9 @@ def printable(text: object) -> str:
         raise
     except BaseException:  # str() of a plugin's own exception class runs the plugin's code
         line = "(a message that cannot be printed)"
-    return " ".join("".join(c if c.isprintable() else " " for c in line).split())
+    if not line.isprintable():
+        line = "".join(c if c.isprintable() else " " for c in line)
+    return " ".join(line.split())
 
 
 def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:

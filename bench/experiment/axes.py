@@ -186,7 +186,8 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     wide = with_axes(experiment, rows)
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
     texts = [name for name in experiment.columns.of_kind("text") if name in wide]
-    return wide.assign(**{name: wide[name].map(_escape_formula) for name in texts})
+    escaped = {name: {text: _escape_formula(text) for text in wide[name].unique()} for name in texts}
+    return wide.assign(**{name: wide[name].map(escaped[name]) for name in texts})
 
 
 def _escape_formula(text: Any) -> Any:

@@ -62,6 +62,10 @@ def labels(parts: Mapping[str, Plugin | None], without: Mapping[str, Collection[
 
 _ranked: dict[str, tuple[Backend, ...]] = {}
 """Cache of the backends that can compute references, best first, by program key."""
+_program_keys: dict[tuple[str, ...], str] = {}
+"""Cache of the keys of programs, by all that decides them."""
+_reference_keys: dict[tuple[str, ...], str] = {}
+"""Cache of the keys of references, by all that decides them."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,10 @@ class Cell:
     def program_key(self) -> str:
         """Hash of everything that decides the program."""
         parts = [fingerprint(part) for part in (self.scene, self.contact, self.integrator)]
-        return hashed(parts, self._theta(), module_hash(PROGRAM))
+        given = (*parts, repr(self.decision))
+        if given not in _program_keys:
+            _program_keys[given] = hashed(parts, self._theta(), module_hash(PROGRAM))
+        return _program_keys[given]
 
     @cached_property
     def reference_key(self) -> str:
@@ -136,14 +143,17 @@ class Cell:
             raise ValueError(
                 f"study {self.study.name} computes no reference: add a column `reference_method` to its columns to get one"
             )
-        budget = [self.budget.samples, self.budget.tolerance]
-        radius = []
-        with suppress(
-            Exception
-        ):  # a combination without meaning has no smoothing; an error shows up in the cell's own row
-            smoothing = self.smoothing()
-            radius = [] if smoothing is None else [[smoothing.shape, smoothing.radius]]
-        return hashed(self.program_key, budget, fingerprint(self.reference_backends[0]), *radius)
+        backend, estimator = fingerprint(self.reference_backends[0]), fingerprint(self.parts.get("estimator"))
+        given = (self.program_key, repr(self.budget), backend, estimator)
+        if given not in _reference_keys:
+            radius = []
+            # a combination without meaning has no smoothing; an error shows up in the cell's own row
+            with suppress(Exception):
+                smoothing = self.smoothing()
+                radius = [] if smoothing is None else [[smoothing.shape, smoothing.radius]]
+            budget = [self.budget.samples, self.budget.tolerance]
+            _reference_keys[given] = hashed(self.program_key, budget, backend, *radius)
+        return _reference_keys[given]
 
     @property
     def reference_backends(self) -> tuple[Backend, ...]:
@@ -178,7 +188,7 @@ class Cell:
         return None if self.decision == OWN else dataclasses.asdict(self.decision)
 
     def _budget(self) -> dict[str, Any] | None:
-        return None if self.budget is None else dataclasses.asdict(self.budget)
+        return None if self.budget is None else dict(vars(self.budget))
 
     def columns(self) -> dict[str, Any]:
         """Return the identity columns of the cell's row: views of its parameters and counts."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -194,6 +195,12 @@ class Columns:
     def compared(self) -> list[Column]:
         """The columns that ``compare`` compares."""
         return [column for column in self.all if column.comparison]
+
+    @cached_property
+    def vectors(self) -> frozenset[str]:
+        """The columns of vectors that ``compare`` computes with."""
+        rules = [column.comparison for column in self.compared if column.comparison is not None]
+        return frozenset(name for rule in rules for name in (rule.mean, rule.reference) if name)
 
     @property
     def referenced(self) -> bool:

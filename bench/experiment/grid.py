@@ -20,6 +20,7 @@ MAX_CELLS = 1_000_000
 """Largest number of cells in a sweep; planning that many takes minutes."""
 COUNTS = ("samples", "repeats", "seed")
 """Settings that a sweep can vary besides plugin parameters and :data:`THETA`."""
+NOT_A_UNION = "sweep.union must be a list of sweeps"
 THETA = "theta0"
 """The axis of the point at which gradients are taken: ``theta0``, or ``theta0.2`` for one of its coordinates."""
 
@@ -113,18 +114,24 @@ def expand(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:
         if axis == "product":
             factors.append(expand(_mapping(value, "sweep.product")))
         elif axis == "zip":
-            columns = {name: _values(name, v) for name, v in _flat(_mapping(value, "sweep.zip")).items()}
-            lengths = {name: len(v) for name, v in columns.items()}
-            if len(set(lengths.values())) > 1:
-                raise UserError(f"zipped axes must be equally long, given {lengths}")
+            columns = _zipped(value)
             factors.append([dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)])
         elif axis == "union":
             if not isinstance(value, list | tuple):
-                raise UserError("sweep.union must be a list of sweeps")
+                raise UserError(NOT_A_UNION)
             factors.append([point for part in value for point in expand(_mapping(part, "sweep.union"))])
         else:
             factors.extend([{name: v} for v in _values(name, vs)] for name, vs in _flat({axis: value}).items())
     return [_join(combo) for combo in itertools.product(*factors)]
+
+
+def _zipped(value: Any) -> dict[str, list[Any]]:
+    """Return the values of the axes in a ``zip``; raises :class:`UserError` unless they are equally long."""
+    columns = {name: _values(name, v) for name, v in _flat(_mapping(value, "sweep.zip")).items()}
+    lengths = {name: len(v) for name, v in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise UserError(f"zipped axes must be equally long, given {lengths}")
+    return columns
 
 
 def _join(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -137,8 +144,25 @@ def _join(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def swept(sweep: Mapping[str, Any]) -> list[str]:
-    """Return the names of the axes of a sweep, in order."""
-    return list(dict.fromkeys(name for point in expand(sweep) for name in point))
+    """Return the names of the axes of a sweep, in order; raises :class:`UserError` as :func:`expand` does.
+
+    >>> swept({"a": [1, 2], "union": [{"b": [1]}, {"zip": {"a": [1], "c": [2]}}]})
+    ['a', 'b', 'c']
+    """
+    names: list[str] = []
+    for axis, value in sweep.items():
+        if axis == "product":
+            names += swept(_mapping(value, "sweep.product"))
+        elif axis == "union" and isinstance(value, list | tuple):
+            names += [name for part in value for name in swept(_mapping(part, "sweep.union"))]
+        elif axis == "union":
+            raise UserError(NOT_A_UNION)
+        elif axis == "zip":
+            names += _zipped(value)
+        else:
+            flat = _flat({axis: value})
+            names += [name for name in flat if _values(name, flat[name])]
+    return list(dict.fromkeys(names))
 
 
 def _mapping(value: Any, where: str) -> Mapping[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,9 @@ import pandas as pd
 from bench.experiment.columns import Column
 from bench.experiment.views import Table
 from bench.report.text import axis_value, duration, number
+
+BLOCK = 4096
+"""Rows that are turned into dictionaries at a time."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +66,15 @@ def value_text(column: Column, value: float) -> str:
 def readable(table: Table) -> pd.DataFrame:
     """Return the table as strings for readers; the headings are the names of the columns."""
     return pd.DataFrame(
-        [[str(cell(column, row)) for column in table.columns] for row in table.frame.to_dict("records")],
+        [[str(cell(column, row)) for column in table.columns] for row in records(table.frame)],
         columns=[column.heading for column in table.columns],
     )
+
+
+def records(frame: pd.DataFrame) -> Iterator[dict[Any, Any]]:
+    """Yield each row as a dictionary, with few rows in memory at a time."""
+    for start in range(0, len(frame), BLOCK):
+        yield from frame.iloc[start : start + BLOCK].to_dict("records")
 
 
 def parts(table: Table) -> list[tuple[str, pd.DataFrame]]:

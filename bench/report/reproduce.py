@@ -20,6 +20,7 @@ from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, registry
 from bench.model.identity import changed, identity
 from bench.model.parameters import build
+from bench.report.cells import records
 
 HEAD = "python -m bench name=one_cell"
 
@@ -29,7 +30,7 @@ def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     folders = plugin_folders(experiment.plugins)
     revive = CellBuilder()
     lines: list[list[str]] = []
-    for given, row in zip(parse(rows), rows[["key", *COUNTS]].to_dict("records"), strict=True):
+    for given, row in zip(parse(rows), records(rows[["key", *COUNTS]]), strict=True):
         try:
             cell = revive.cell(given, row, experiment.timing)
         except (UserError, KeyError):

@@ -27,9 +27,16 @@ def plain_markdown(table: pd.DataFrame, heads: Mapping[str, str] = MappingProxyT
     return "\n".join(out)
 
 
+SPECIAL = re.compile(r"[&<>\\`*|$~_]|\]\(")
+"""What :func:`escape_markdown` escapes."""
+
+
 def escape_markdown(text: str) -> str:
     """Return text escaped so that a Markdown renderer prints it verbatim, also in a table cell."""
-    text = one_line(text).replace("&", "&amp;")
+    text = one_line(text)
+    if not SPECIAL.search(text):
+        return text
+    text = text.replace("&", "&amp;")
     text = re.sub(r"<(?! )", "&lt;", text).replace(">", "&gt;")
     text = re.sub(r"([\\`*|$~])", r"\\\1", text).replace("](", r"]\(")
     return re.sub(r"(?<!\w)_|_(?!\w)", r"\\_", text)

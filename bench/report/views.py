@@ -50,7 +50,7 @@ def newest_rows(rows: pd.DataFrame) -> pd.DataFrame:
     rows = completed_rows(rows)
     bare = rows["parameters"] == ""
     old = np.where(bare, rows.duplicated(list(IDENTITY), keep="last"), rows.duplicated(list(CELL), keep="last"))
-    return rows[~old.astype(bool)].reset_index(drop=True)
+    return rows[~old.astype(bool)].reset_index(drop=True) if old.any() else rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ import pandas as pd
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.report import terminal
-from bench.report.cells import TableCell, cell, parts, readable
+from bench.report.cells import TableCell, cell, parts, readable, records
 from bench.report.cores import run_tasks
 from bench.report.draw import draw
 from bench.report.figures import save, styled
@@ -28,12 +28,13 @@ FINDINGS = "findings.json"
 
 def write(experiment: Experiment, views: Views) -> list[Path]:
     """Write all tables, charts and findings of an experiment; return the files' paths."""
-    contents = {FINDINGS: _findings(experiment, views)}
-    for name in dict.fromkeys(table.name for table in views.tables):
-        contents |= table_files([table for table in views.tables if table.name == name], experiment.name)
     tasks = [partial(_draw, experiment, chart) for chart in views.charts if chart.printed and len(chart.drawn())]
-    paths = [path for saved in run_tasks(tasks) for path in saved]
-    return [*write_all(experiment.directory, contents), *paths]
+    charts = [path for saved in run_tasks(tasks) for path in saved]
+    paths = write_all(experiment.directory, [(FINDINGS, _findings(experiment, views))])
+    for name in dict.fromkeys(table.name for table in views.tables):
+        tables = [table for table in views.tables if table.name == name]
+        paths += write_all(experiment.directory, table_files(tables, experiment.name))
+    return [*paths, *charts]
 
 
 def _draw(experiment: Experiment, chart: Chart) -> list[Path]:
@@ -49,15 +50,16 @@ def _findings(experiment: Experiment, views: Views) -> str:
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
-def table_files(tables: Sequence[Table], experiment: str) -> dict[str, str]:
-    """Return the content of the files of tables with one name; the CSV has the first."""
+def table_files(tables: Sequence[Table], experiment: str) -> Iterator[tuple[str, str]]:
+    """Yield the name and the content of each file of tables with one name; the CSV has the first."""
     first = tables[0]
     makers = {
         "csv": lambda: csv(first.frame if first.data is None else first.data),
         "md": lambda: markdown(tables, experiment),
         "tex": lambda: latex([table for table in tables if "tex" in table.files], experiment),
     }
-    return {f"{first.name}.{kind}": makers[kind]() for kind in first.files}
+    for kind in first.files:
+        yield f"{first.name}.{kind}", makers[kind]()
 
 
 # --------------------------------------------------------------------------------------------------------- files
@@ -77,7 +79,7 @@ def markdown(tables: Sequence[Table], experiment: str) -> str:
             rule = "|" + "".join("--:|" if column.kind == "number" else "---|" for column in table.columns)
             lines = [
                 "| " + " | ".join(_in_markdown(cell(column, row)) for column in table.columns) + " |"
-                for row in part.to_dict("records")
+                for row in records(part)
             ]
             blocks.append("\n".join([head, rule, *lines]))
         blocks += [note if note.startswith("    ") else e(note) for note in table.notes]  # a command is a block of code

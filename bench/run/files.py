@@ -11,6 +11,7 @@ import platform
 import re
 import time
 import uuid
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -65,11 +66,13 @@ def write_whole(path: Path, content: bytes) -> None:
         raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
 
 
-def write_all(directory: Path, contents: dict[str, str]) -> list[Path]:
-    """Write ``contents``, strings by file name, to files in a directory; returns the paths."""
-    for name, text in contents.items():
-        write_whole(directory / name, text.encode())
-    return [directory / name for name in contents]
+def write_all(directory: Path, contents: Mapping[str, str] | Iterable[tuple[str, str]]) -> list[Path]:
+    """Write files, given as their names with their texts, to a directory; returns the paths."""
+    paths = []
+    for name, text in contents.items() if isinstance(contents, Mapping) else contents:
+        paths.append(directory / name)
+        write_whole(paths[-1], text.encode())
+    return paths
 
 
 def make_directory(path: Path) -> None:

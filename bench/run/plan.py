@@ -13,7 +13,7 @@ from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.defaults import completed_json, missing_parameters
 from bench.experiment.experiment import Experiment
-from bench.experiment.grid import cells
+from bench.experiment.grid import COUNTS, cells
 from bench.experiment.study import study_of
 from bench.model import Backend, Plugin, guard
 from bench.model.parameters import remember
@@ -104,14 +104,15 @@ def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataF
     try:
         with guard.capture_output("a plugin"), guard.protect_process():
             every = cells(experiment)
-            keys, identities = {cell.key for cell in every}, {_identity_of(cell) for cell in every}
+            keys = {cell.key for cell in every}
+            is_requested = rows["key"].isin(keys).to_numpy(copy=True)
+            others = rows.loc[~is_requested, ["parameters", *COUNTS]]
+            identities = {_identity_of(cell) for cell in every} if len(others) else set()
     except UserError:
         return rows, ""  # a plugin of the rows may not be installed any more
-    facts = zip(
-        rows["key"], rows["parameters"].map(completed_json), rows["samples"], rows["repeats"], rows["seed"], strict=True
-    )
-    is_requested = [key in keys or identity in identities for key, *rest in facts for identity in [tuple(rest)]]
-    n_requested, n_others = sum(is_requested), len(rows) - sum(is_requested)
+    facts = zip(others["parameters"].map(completed_json), *(others[name] for name in COUNTS), strict=True)
+    is_requested[~is_requested] = [identity in identities for identity in facts]
+    n_requested, n_others = int(is_requested.sum()), int((~is_requested).sum())
     if not n_requested:
         return (
             rows,
@@ -120,8 +121,9 @@ def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataF
     missing = (
         f"{len(every) - n_requested} of {len(every)} requested cells have no row" if n_requested < len(every) else ""
     )
-    others = f"{n_others} stored rows of other settings are not shown" if n_others else ""
-    return rows[is_requested].reset_index(drop=True), "; ".join(part for part in (missing, others) if part)
+    hidden = f"{n_others} stored rows of other settings are not shown" if n_others else ""
+    shown = rows[is_requested].reset_index(drop=True) if n_others else rows
+    return shown, "; ".join(part for part in (missing, hidden) if part)
 
 
 def _identity_of(cell: Cell) -> Identity:

@@ -63,7 +63,9 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     if metadata.num_rows > MAX_ROWS or size > MAX_BYTES:
         raise ValueError(f"{metadata.num_rows} rows and {size} bytes are more than a run writes")
     content.seek(0)
-    return pd.read_parquet(content, columns=columns and list(columns))
+    # a column is freed as soon as it is converted
+    freed = {"split_blocks": True, "self_destruct": True}
+    return pd.read_parquet(content, columns=columns and list(columns), to_pandas_kwargs=freed)
 
 
 def valid_rows(table: pd.DataFrame, columns: Columns, path: Path) -> pd.DataFrame:
@@ -120,7 +122,7 @@ def _fault(row: dict[str, Any], columns: Columns) -> str:
             fault = "" if value in ("", *STATUSES) else _rule(name, columns)
         else:
             check = _is_parameters if name == "parameters" else _is_text if column.kind == "text" else _is_list
-            check = _is_vector if name in _vectors(columns) else check
+            check = _is_vector if name in columns.vectors else check
             fault = "" if check(value) else _rule(name, columns)
         if fault:
             return f"{printable(name)[:60]}={printable(repr(value))[:60]} {fault}"
@@ -138,7 +140,6 @@ def _fault_of_number(name: str, value: float | None) -> str:
 def _checks(columns: Columns, table: pd.DataFrame) -> dict[str, Callable[[pd.Series], np.ndarray]]:
     """Return a check of each column of the table, which returns whether each of its values is right."""
     checks: dict[str, Callable[[pd.Series], np.ndarray]] = {}
-    vectors = _vectors(columns)
     for column in columns.all:
         if column.name not in table:
             continue
@@ -152,7 +153,7 @@ def _checks(columns: Columns, table: pd.DataFrame) -> dict[str, Callable[[pd.Ser
         elif column.kind == "text":
             checks[column.name] = lambda values: _each(values, _is_text)
         elif column.kind == "list":
-            is_list = _is_vector if column.name in vectors else _is_list
+            is_list = _is_vector if column.name in columns.vectors else _is_list
             checks[column.name] = lambda values, is_list=is_list: _each(values, is_list)  # type: ignore[misc]
         elif column.kind == "number" and values.dtype.kind in "fiu":
             if column.name in COUNTS:
@@ -219,12 +220,6 @@ def _is_vector(value: Any) -> bool:
         return value.ndim == 1
     items = value if isinstance(value, list | tuple | np.ndarray) else ()
     return _is_list(value) and not any(isinstance(item, str) for item in items)
-
-
-def _vectors(columns: Columns) -> set[str]:
-    """Return the columns of vectors that ``compare`` computes with."""
-    rules = [column.comparison for column in columns.compared if column.comparison is not None]
-    return {name for rule in rules for name in (rule.mean, rule.reference) if name}
 
 
 def _is_scalar(value: Any) -> bool:

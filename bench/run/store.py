@@ -198,15 +198,15 @@ class Store:
         if not frames:
             self._sequence = self._sequence or 0
             return pd.DataFrame(columns=self._columns.stored)
-        table = pd.concat(frames, ignore_index=True)
+        table = pd.concat(frames, ignore_index=True) if len(frames) > 1 else frames[0].reset_index(drop=True)
         self._refuse_other_studies(table["study"])
         sequence = table["sequence"].where(table["sequence"].between(0, MAX_SEQUENCE), 0.0)
         self._sequence = max(self._sequence or 0, int(sequence.max()))
         # rows of older versions have no sequence: the clock orders them, and any row with a sequence is newer
         age = table.assign(sequence=sequence)[["sequence", "stored_at"]]
         newest_last = age.sort_values(["sequence", "stored_at"], kind="stable", na_position="first").index
-        table = table.loc[newest_last].drop_duplicates("key", keep="last")
-        return table.sort_index().reset_index(drop=True)
+        is_older = table["key"].loc[newest_last].duplicated(keep="last").sort_index()
+        return table[~is_older].reset_index(drop=True) if is_older.any() else table
 
     # ------------------------------------------------------------------------------------------- writing
 

@@ -66,8 +66,7 @@ def check(words: list[str], verb: str, capsys: pytest.CaptureFixture[str]) -> No
         assert status in (0, 1, 2)
         assert "Traceback" not in said
         if status == 2:
-            assert said.startswith("bench: ")
-            assert all(line.startswith("bench: ") for line in said.splitlines()), "remarks on settings, then the error"
+            assert configurations.is_refusal(said)
         elif verb == "run":
             stores = [path for path in where.iterdir() if path.name != "references"]
             assert len(stores) == 1

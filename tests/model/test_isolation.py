@@ -87,10 +87,12 @@ def check_rows(rows, kinds, clean):
         assert "a plugin of this cell changed" in row["reason"], kind
         assert CHANGES[kind][1] in row["reason"]
         assert row["status"] in ("ok", "error")
-        if row["status"] == "ok":  # its gradients precede its change
+        if row["status"] == "ok" and kind not in OWN_SUMS:  # its gradients precede its change
             assert row["mean_estimate"].tobytes() == clean["mean_estimate"]["fobg"].tobytes()
 
 
+OWN_SUMS = ("rounding",)
+"""Changes that reach the means and norms of the cell itself, which follow its gradients."""
 QUICK = ["norm", "seterr", "environment", "json", "own_method", "np_draw", "sqrt", "builtin"]
 
 
@@ -102,7 +104,6 @@ def test_a_change_reaches_no_other_cell_of_a_run_in_this_process(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=False, reason="known gap: a module that a cell imports first and then changes is not seen")
 @pytest.mark.parametrize("backend", ["numpy", "jax"])
 def test_a_change_of_any_kind_reaches_no_other_cell_of_a_worker(tmp_path, backend):
     kinds = [kind for kind in CHANGES if kind != "cores" or len(os.sched_getaffinity(0)) > 1]

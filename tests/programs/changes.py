@@ -1,4 +1,4 @@
-"""Plugins that change the process: 45 kinds of state, each with code that changes it and the words that name it.
+"""Plugins that change the process, one for each kind of state, with code that changes it and the words that name it.
 
 :func:`plugin` is the source of an estimator that is the sample mean of gradients and changes one kind of state.
 """

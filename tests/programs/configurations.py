@@ -223,6 +223,20 @@ class Interrupted:
         runner._Run._finish = self._real  # type: ignore[method-assign]
 
 
+REMARKS = (" is given twice: ", " has no effect: ", "bench: sweep: ")
+"""What only remarks on settings contain; a refused command may print some before its error."""
+
+
+def is_refusal(said: str) -> bool:
+    """Return whether the stderr of a refused command is one line with the error, after any remarks on its settings."""
+    *remarks, error = said.splitlines() or [""]
+    return (
+        all(line.startswith("bench: ") for line in (*remarks, error))
+        and all(any(part in line for part in REMARKS) for line in remarks)
+        and "\x1b" not in said
+    )
+
+
 class Ledger:
     """Runs configurations, and records their rows and faults."""
 
@@ -275,7 +289,7 @@ class Ledger:
         self.statuses[status] += 1
         if status not in (0, 1, 2) or "Traceback" in said:
             return self.fault("traceback", words, said[-1500:])
-        if status == 2 and (len(said.splitlines()) != 1 or not said.startswith("bench: ") or "\x1b" in said):
+        if status == 2 and not is_refusal(said):
             self.fault("message", words, said)
         self.look(words, words[-1].removeprefix("name="))
         if status != 2:

@@ -12,6 +12,8 @@ import sys
 import tempfile
 import traceback
 
+from configurations import is_refusal
+
 from bench.cli import main
 from bench.experiment.config import _known_keys
 
@@ -88,12 +90,7 @@ def fuzz(count: int, seed: int) -> int:
         said = err.getvalue().strip()
         if status in statuses:
             statuses[status] += 1
-        if (
-            status not in statuses
-            or (status == 2 and len(said.splitlines()) != 1)
-            or "Traceback" in said
-            or "\x1b" in said
-        ):
+        if status not in statuses or (status == 2 and not is_refusal(said)) or "Traceback" in said or "\x1b" in said:
             faults += 1
             print(f"{status}: {verb} {words!r}: {said[:300]!r}")
     print(f"{count} configurations: statuses {statuses}, {faults} faults")

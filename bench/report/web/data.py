@@ -125,7 +125,8 @@ def _frame(chart: Chart) -> pd.DataFrame:
     frame = chart.frame.reset_index(drop=True)
     frame = frame if "row" in frame else frame.assign(row=-1)
     key = [name for name in (chart.series, chart.line) if name]
-    frame = frame.assign(line_=frame[key].astype(str).agg(" ".join, axis=1) if key else "", one_="")
+    first, *rest = [frame[name].astype(str) for name in key] or [""]
+    frame = frame.assign(line_=first.str.cat(rest, sep=" ") if rest else first, one_="")
     if chart.panel_row:
         frame = frame.assign(facet_=frame[chart.panel] + ", " + frame[chart.panel_row])
     return frame.assign(fill_=draw.cell_colours(chart)) if chart.kind == "grid" and chart.value else frame

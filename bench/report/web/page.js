@@ -9,6 +9,7 @@ const page = JSON.parse(document.getElementById("data").textContent);
 const rowCount = size("rows");
 const SMALL = 12; // size of the smallest text in a chart [px]
 const PANELS = 4; // most panels of a chart that are drawn at once
+const CROWD = 2000; // most points that a panel draws, of more only one is drawn of those close together
 const FIRST = 60, MORE = 240; // rows of the table at first, and with every "Show more"
 const GLYPHS = {
   circle: "●", square: "■", diamond: "◆", "triangle-up": "▲", "triangle-down": "▼", cross: "✚", x: "✖", star: "★", line: "━",
@@ -430,8 +431,14 @@ function ranges(chart, panels) {
 function pointFigure(chart, name, panel, range) {
   const traces = [];
   const joined = Boolean(chart.line);
-  for (const points of panel.lines.values()) traces.push(trace(chart, points, joined));
-  if (chart.front) traces.push(...frontTraces(panel));
+  const every = [...panel.lines.values()];
+  const kept = apart(chart, every.flat(), range);
+  if (kept) chart.note.textContent = `${kept.size} of ${every.flat().length} points are drawn: of those close together one`;
+  for (const points of every) {
+    const drawn = kept ? points.filter((point) => kept.has(point)) : points;
+    if (drawn.length) traces.push(trace(chart, drawn, joined));
+  }
+  if (chart.front) traces.push(...frontTraces(panel, kept));
   if (chart.join) traces.unshift(...joins(panel));
   const chosen = [...panel.lines.values()].flat().filter((point) => point.row >= 0 && point.row === state.selected);
   if (chosen.length) traces.push(rings(chosen, 17, 3, colour("")));
@@ -454,6 +461,20 @@ function pointFigure(chart, name, panel, range) {
   }
   annotations.push(...backendNames(chart, panel, joined, range));
   return [traces, { ...frame(chart, panel, range), shapes, annotations }];
+}
+
+/* The points to draw of a crowd, one for each cell of a grid that is as fine as CROWD allows; null to draw all. */
+function apart(chart, points, range) {
+  if (points.length <= CROWD || !range.x || !range.y) return null;
+  const place = (value, axis, [low, high], count) => Math.round(count * ((axis.log ? Math.log10(value) : value) - low) / (high - low));
+  for (let count = 400; ; count /= 2) {
+    const cells = new Map();
+    for (const p of points) {
+      const cell = `${p.series} ${place(p.x, chart.xAxis, range.x, count)} ${place(p.y, chart.yAxis, range.y, count / 2)}`;
+      if (!cells.has(cell)) cells.set(cell, p);
+    }
+    if (cells.size <= CROWD || count < 20) return new Set(cells.values());
+  }
 }
 
 /* A value of an axis as a dashed line, or a range [from, to] as a shaded band, to null for the rest of the axis. */
@@ -486,10 +507,14 @@ function backendNames(chart, panel, joined, range) {
   const every = [...panel.lines.values()].flat().filter((p) => p.row >= 0);
   if (!range.x || !range.y) return []; // an axis of names
   if (new Set(every.map((p) => read(p.row))).size < 2) return [];
-  const apart = (p) => Math.max(1, ...every.filter((q) => q.series === p.series && q.x === p.x)
-    .map((q) => Math.max(q.y / p.y, p.y / q.y)));
-  const farthest = (points) => points.reduce((best, p) => (apart(p) > apart(best) ? p : best));
-  const told = joined ? [...panel.lines.values()].map(farthest).filter((p) => apart(p) > 1.03) : every;
+  const groups = new Map();
+  for (const p of every) {
+    const [low, high] = groups.get(p.series + " " + p.x) || [p.y, p.y];
+    groups.set(p.series + " " + p.x, [Math.min(low, p.y), Math.max(high, p.y)]);
+  }
+  const ratio = (p) => { const [low, high] = groups.get(p.series + " " + p.x); return Math.max(1, high / p.y, p.y / low); };
+  const farthest = (points) => points.reduce((best, p) => (ratio(p) > ratio(best) ? p : best));
+  const told = joined ? [...panel.lines.values()].map(farthest).filter((p) => ratio(p) > 1.03) : every;
   const scaled = (value, axis) => (axis.log ? Math.log10(value) : value);
   const near = (a, b, [low, high], share) => Math.abs(a - b) < share * (high - low);
   const names = [];
@@ -549,14 +574,14 @@ function rings(points, size, width, color) {
 }
 
 /* Per problem, the points that no other beats in both coordinates; joined where there are few problems. */
-function frontTraces(panel) {
+function frontTraces(panel, among) {
   const grey = dark() ? "#9aa3ab" : "#8a8a8a";
   const found = [];
   const all = [];
   for (const points of panel.fronts.values()) {
     let best = Infinity;
     const kept = [...points].sort((a, b) => a.x - b.x || a.y - b.y).filter((p) => p.y < best && ((best = p.y), true));
-    all.push(...kept);
+    all.push(...kept.filter((p) => !among || among.has(p)));
     if (panel.fronts.size > 3) continue;
     found.push({ type: "scatter", mode: "lines", x: kept.map((p) => p.x), y: kept.map((p) => p.y), hoverinfo: "skip",
       line: { shape: "hv", color: grey, width: 2 } });
