@@ -4,6 +4,7 @@
 """
 
 from bench import deprecated
+from bench.engines.backend import EngineBackend
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule
 from bench.experiment.experiment import Experiment
@@ -12,6 +13,6 @@ from bench.experiment.study import Study
 from bench.model import *  # noqa: F403
 from bench.model import __all__ as _contracts
 
-__all__ = [*_contracts, "Cell", "Column", "Columns", "ComparisonRule", "Experiment", "Session", "Study"]
+__all__ = [*_contracts, "Cell", "Column", "Columns", "ComparisonRule", "EngineBackend", "Experiment", "Session", "Study"]
 
 __getattr__ = deprecated.lookup(__name__, globals())
