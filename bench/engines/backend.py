@@ -33,6 +33,9 @@ class EngineBackend(Backend):
     integrator: ClassVar[str] = "semi_implicit_euler"
     """Name of the integrator that the engine's step stands for."""
 
+    own_contact: ClassVar[bool] = False
+    """Whether contacts are the engine's own, with at most the law's stiffness and damping, and not compared with the law."""
+
     python: str | None = param(None, "Python of the engine's environment; null: the one that `bench engines install` makes")
 
     def compile(self, program: Program) -> Problem:

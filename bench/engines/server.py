@@ -7,6 +7,8 @@ description of a program, with
 - ``jacobians(x, u)``: its derivatives ``(n, n, B)`` by x and ``(n, m, B)`` by u, or ``pull(x, u, slope)``: the derivatives
   ``(n, B)`` by x and ``(m, B)`` by u of the sum of ``slope * step(x, u)``; neither if the engine has no derivatives;
 - ``rollout(x, u)``, optional: the states ``(T + 1, n, B)`` under controls ``(T, m, B)``, otherwise T steps;
+- ``takes_forces``, optional: whether u are the generalised forces ``(n_q, B)`` of motors, springs and dampers, in place of
+  the controls;
 - ``widths``, optional: the batch sizes B that it can compute, otherwise all;
 - ``device``, optional: the device that it computes on.
 """
@@ -110,12 +112,41 @@ def _rollout(model, x, u):
 def _jacobians(model, x, u):
     if hasattr(model, "jacobians"):
         return model.jacobians(x, u)
+    if not hasattr(model, "pull"):
+        raise NotImplementedError("this engine has no derivatives")
     rows = []
     for i in range(len(x)):
         slope = np.zeros_like(x)
         slope[i] = 1.0
         rows.append([np.array(part, dtype=np.float64) for part in model.pull(x, u, slope)])
     return [np.stack(parts) for parts in zip(*rows)]
+
+
+class _Forced:
+    """A model of controls from a model of generalised forces: constant + by_state x + by_control u."""
+
+    def __init__(self, model, forces):
+        self._model = model
+        self.widths, self.device = getattr(model, "widths", None), getattr(model, "device", "cpu")
+        n = len(forces["constant"])
+        self._constant = np.reshape(np.array(forces["constant"], dtype=np.float64), (n, 1))
+        self._by_state = np.reshape(np.array(forces["by_state"], dtype=np.float64), (n, 2 * n))
+        self._by_control = np.reshape(np.array(forces["by_control"], dtype=np.float64), (n, -1))
+        for name in ("jacobians", "pull"):
+            if hasattr(model, name):
+                self.jacobians = self._jacobians
+                break
+
+    def _force(self, x, u):
+        return self._constant + self._by_state @ x + self._by_control @ u
+
+    def step(self, x, u):
+        return self._model.step(x, self._force(x, u))
+
+    def _jacobians(self, x, u):
+        a, b = (np.asarray(part, dtype=np.float64) for part in _jacobians(self._model, x, self._force(x, u)))
+        by_state = a + np.einsum("ifb,fj->ijb", b, self._by_state)
+        return by_state, np.einsum("ifb,fj->ijb", b, self._by_control)
 
 
 # ------------------------------------------------------------------------------------------------------ the server
@@ -136,6 +167,8 @@ def serve(file, requests, answers):
                 module = _load(file)
             if name == "build":
                 models[key] = module.Model(header["description"])
+                if getattr(models[key], "takes_forces", False):
+                    models[key] = _Forced(models[key], header["description"]["forces"])
                 answer["device"] = str(getattr(models[key], "device", "cpu"))
                 while len(models) > KEPT:
                     del models[next(iter(models))]

@@ -9,19 +9,21 @@ from bench.errors import Unsupported
 
 KNOWN = {"option", "worldbody", "contact", "actuator", "tendon", "geom", "body", "joint", "inertial", "pair", "motor", "fixed"}
 """The elements of twins."""
+JOINT = {"name", "type", "axis", "damping", "stiffness"}
+"""The attributes of their joints."""
 
 
 def read(mjcf: str) -> dict[str, Any]:
     """Return a twin as numbers: gravity, bodies, ground, contacts, tendons and motors.
 
     - ``gravity``: ``(3,)`` [m/s^2].
-    - ``bodies``: each with ``parent`` (an index, -1 for the world), ``joint`` (``slide`` or ``hinge``), ``axis``, ``damping``,
-      ``mass``, ``com``, ``inertia`` (diagonal) and its sphere's ``radius`` and ``centre``, 0 without one. Body i has
-      coordinate i of q.
+    - ``bodies``: each with ``parent`` (an index, -1 for the world), ``joint`` (``slide`` or ``hinge``), ``axis``, ``mass``,
+      ``com``, ``inertia`` (diagonal) and its sphere's ``radius`` and ``centre``, 0 without one. Body i has coordinate i
+      of q.
     - ``has_ground``: whether there is the plane z = 0.
     - ``contacts``: pairs of bodies, -1 for the ground, each with ``friction``, 0 without.
-    - ``motors``: the coordinate, or ``[tendon]`` as a list, that each control acts on.
-    - ``tendons``: each with ``stiffness``, ``damping``, ``length`` and ``coefficients`` by coordinate.
+    - ``forces``: the generalised forces of motors, springs and dampers of joints and tendons, ``constant (n_q,)`` plus
+      ``by_state (n_q, 2 n_q)`` times (q, v) plus ``by_control (n_q, m)`` times u.
 
     Raises :class:`Unsupported` for a twin with other elements, or a body with other than one slide or hinge.
     """
@@ -29,7 +31,9 @@ def read(mjcf: str) -> dict[str, Any]:
     if strange := sorted({node.tag for node in root.iter()} - KNOWN - {"mujoco"}):
         raise Unsupported(f"the twin has {', '.join(strange)}, which this engine's models do not have")
     bodies: list[dict[str, Any]] = []
-    geoms, joints = {}, {}
+    geoms: dict[str | None, int] = {}
+    joints: dict[str | None, int] = {}
+    springs: list[tuple[float, float, float, dict[int, float]]] = []
     option = root.find("option")
     gravity = _numbers(option.get("gravity", "0 0 -9.81")) if option is not None else [0.0, 0.0, 0.0]
     world = root.find("worldbody")
@@ -42,10 +46,13 @@ def read(mjcf: str) -> dict[str, Any]:
         if len(own) != 1 or own[0].get("type") not in ("slide", "hinge"):
             raise Unsupported("the twin has a body without exactly one slide or hinge")
         joint, inertial, geom = own[0], node.find("inertial"), node.find("geom")
+        if strange := sorted(set(joint.keys()) - JOINT):
+            raise Unsupported(f"the twin has a joint with {', '.join(strange)}, which this engine's models do not have")
         if geom is not None and geom.get("type") != "sphere":
             raise Unsupported(f"the twin has a {geom.get('type')}, and this engine's models have spheres and a ground")
         index = len(bodies)
         joints[joint.get("name")] = index
+        springs.append((float(joint.get("stiffness", "0")), float(joint.get("damping", "0")), 0.0, {index: 1.0}))
         radius = 0.0 if geom is None else float(geom.get("size", "0").split()[0])
         centre = [0.0, 0.0, 0.0] if geom is None else _numbers(geom.get("pos", "0 0 0"))
         mass = float(inertial.get("mass", "0")) if inertial is not None else float(geom.get("mass", "0")) if geom is not None else 0.0
@@ -54,8 +61,7 @@ def read(mjcf: str) -> dict[str, Any]:
         com = _numbers(inertial.get("pos", "0 0 0")) if inertial is not None else centre
         bodies.append({
             "parent": parent, "joint": joint.get("type"), "axis": _numbers(joint.get("axis", "0 0 1")),
-            "damping": float(joint.get("damping", "0")), "stiffness": float(joint.get("stiffness", "0")), "mass": mass,
-            "com": com, "inertia": inertia, "radius": radius, "centre": centre,
+            "mass": mass, "com": com, "inertia": inertia, "radius": radius, "centre": centre,
         })  # fmt: skip
         if geom is not None:
             geoms[geom.get("name")] = index
@@ -66,16 +72,11 @@ def read(mjcf: str) -> dict[str, Any]:
 
     for node in world.findall("body"):
         add(node, -1)
-    tendons, ropes = [], {}
+    ropes: dict[str | None, dict[int, float]] = {}
     for rope in root.findall("tendon/fixed"):
-        coefficients = [0.0] * len(bodies)
-        for part in rope.findall("joint"):
-            coefficients[joints[part.get("joint")]] = float(part.get("coef", "1"))
-        ropes[rope.get("name")] = len(tendons)
-        tendons.append({
-            "stiffness": float(rope.get("stiffness", "0")), "damping": float(rope.get("damping", "0")),
-            "length": float(rope.get("springlength", "0")), "coefficients": coefficients,
-        })  # fmt: skip
+        ropes[rope.get("name")] = {joints[p.get("joint")]: float(p.get("coef", "1")) for p in rope.findall("joint")}
+        stiffness, damping, length = (float(rope.get(name, "0")) for name in ("stiffness", "damping", "springlength"))
+        springs.append((stiffness, damping, length, ropes[rope.get("name")]))
     contacts = [
         {
             "bodies": [geoms[pair.get("geom1")], geoms[pair.get("geom2")]],
@@ -84,13 +85,27 @@ def read(mjcf: str) -> dict[str, Any]:
         for pair in root.findall("contact/pair")
     ]
     motors = [
-        [ropes[motor.get("tendon")]] if motor.get("tendon") else joints[motor.get("joint")]
+        {joints[motor.get("joint")]: 1.0} if motor.get("joint") else ropes[motor.get("tendon")]
         for motor in root.findall("actuator/motor")
     ]
     return {
-        "gravity": gravity, "bodies": bodies, "has_ground": bool(grounds), "contacts": contacts, "tendons": tendons,
-        "motors": motors,
+        "gravity": gravity, "bodies": bodies, "has_ground": bool(grounds), "contacts": contacts,
+        "forces": _forces(len(bodies), springs, motors),
     }  # fmt: skip
+
+
+def _forces(
+    n: int, springs: list[tuple[float, float, float, dict[int, float]]], motors: list[dict[int, float]]
+) -> dict[str, Any]:
+    constant, by_state = [0.0] * n, [[0.0] * (2 * n) for _ in range(n)]
+    by_control = [[motor.get(i, 0.0) for motor in motors] for i in range(n)]
+    for stiffness, damping, length, arms in springs:
+        for i, arm in arms.items():
+            constant[i] += arm * stiffness * length
+            for j, other in arms.items():
+                by_state[i][j] -= arm * stiffness * other
+                by_state[i][n + j] -= arm * damping * other
+    return {"constant": constant, "by_state": by_state, "by_control": by_control}
 
 
 def _numbers(text: str) -> list[float]:

@@ -22,10 +22,8 @@ class Newton(EngineBackend):
     dtype: str = param("float32", "floating-point type of the simulation", choices=("float32",))
 
     def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
-        """Return why the solver cannot run the twin: tendons, joint springs, or a damper that acts while bodies part."""
+        """Return why the solver cannot run the twin: a contact damper that acts while bodies part; or None."""
         law = program.contact
-        if model["tendons"]:
-            return "newton's Featherstone solver has no tendons"
         if law is not None and law.damping and law.damping_mode != "approach":
             return f"newton's contact damper acts on approach only: it supports damping_mode=approach, not {law.damping_mode}"
         return None

@@ -13,6 +13,7 @@ GAP = 10.0
 class Model:
     """A twin as a batch of worlds, one model per width."""
 
+    takes_forces = True
     widths = (1, 64, 1024)
 
     def __init__(self, program):
@@ -65,9 +66,8 @@ class _Batch:
             parent = links[body["parent"]] if body["parent"] >= 0 else -1
             add = builder.add_joint_prismatic if body["joint"] == "slide" else builder.add_joint_revolute
             joint = add(
-                parent, links[i], axis=wp.vec3(*body["axis"]), damping=body["damping"], stiffness=body["stiffness"],
-                armature=0.0, target_ke=0.0, target_kd=0.0, friction=0.0,
-            )  # fmt: skip
+                parent, links[i], axis=wp.vec3(*body["axis"]), armature=0.0, target_ke=0.0, target_kd=0.0, friction=0.0
+            )
             if parent < 0:
                 chains.append([])
             chains[-1].append(joint)
@@ -82,10 +82,7 @@ class _Batch:
         n = self._n
         self._before.joint_q.assign(np.float32(x[:n].T.reshape(-1)))
         self._before.joint_qd.assign(np.float32(x[n:].T.reshape(-1)))
-        force = np.zeros((self._width, n), np.float32)
-        for coordinate, value in zip(self._program["motors"], u):
-            force[:, coordinate] += value
-        self._control.joint_f.assign(force.reshape(-1))
+        self._control.joint_f.assign(np.float32(u.T.reshape(-1)))
         if self._pipeline:
             newton.eval_fk(self._model, self._before.joint_q, self._before.joint_qd, self._before)
             self._pipeline.collide(self._before, self._contacts)
@@ -101,9 +98,8 @@ class _Batch:
         return np.concatenate([array.numpy().reshape(self._width, self._n).T for array in arrays]).astype(np.float64)
 
     def jacobians(self, x, u):
-        n, motors = self._n, self._program["motors"]
-        tape = self._run(x, u)
-        a, b = np.empty((2 * n, 2 * n, self._width)), np.empty((2 * n, len(motors), self._width))
+        n, tape = self._n, self._run(x, u)
+        a, b = np.empty((2 * n, 2 * n, self._width)), np.empty((2 * n, n, self._width))
         for i in range(2 * n):
             tape.zero()
             seed = np.zeros((self._width, 2, n), np.float32)
@@ -111,6 +107,6 @@ class _Batch:
             seeds = [wp.array(np.ascontiguousarray(seed[:, k].reshape(-1))) for k in (0, 1)]
             tape.backward(grads={self._after.joint_q: seeds[0], self._after.joint_qd: seeds[1]})
             a[i] = self._read(self._before.joint_q.grad, self._before.joint_qd.grad)
-            b[i] = self._read(self._control.joint_f.grad)[motors]
+            b[i] = self._read(self._control.joint_f.grad)
         tape.zero()
         return a, b

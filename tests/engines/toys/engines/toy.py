@@ -6,9 +6,11 @@ import numpy as np
 class Model:
     """One program's model."""
 
+    takes_forces = True
+
     def __init__(self, program):
         self.dt, self.bodies = program["dt"], program["bodies"]
-        self.stiffness, self.motors = program["contact"]["stiffness"], program["motors"]
+        self.stiffness = program["contact"]["stiffness"]
         if len(self.bodies) != 1 or program["contact"]["damping"]:
             raise NotImplementedError("one body and no damping only")
         self.mass, self.gravity = self.bodies[0]["mass"], program["gravity"][2]
@@ -17,7 +19,7 @@ class Model:
     def step(self, x, u):
         """Return the next states."""
         q, v = x
-        force = self.stiffness * np.maximum(0.0, -(q + self.offset)) + sum(u)
+        force = self.stiffness * np.maximum(0.0, -(q + self.offset)) + u[0]
         v = v + self.dt * (force / self.mass + self.gravity)
         return np.stack([q + self.dt * v, v])
 
@@ -26,5 +28,4 @@ class Model:
         slope = -self.dt * self.stiffness / self.mass * (x[0] + self.offset < 0)
         one = np.ones_like(slope)
         a = np.array([[one + self.dt * slope, self.dt * one], [slope, one]])
-        b = np.stack([self.dt**2 / self.mass * one, self.dt / self.mass * one])[:, None]
-        return a, np.repeat(b, len(u), axis=1)
+        return a, np.stack([self.dt**2 / self.mass * one, self.dt / self.mass * one])[:, None]
