@@ -453,6 +453,11 @@ VERBS = {
         _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
         "KIND is scenes, contacts, integrators, backends, estimators, optimizers or studies.\n", "Experiments",
     ),
+    "engines": Verb(
+        _main_of("bench.engines.command"), "engines [install NAME ... [--again]] [plugins=DIR]", "physics engines in a Python of their own: versions, installation",
+        "Without arguments: each engine's environment, or how to make it. install makes it from the engine's requirements;\n"
+        "--again makes it from the start. The environments are in $BENCH_ENGINES, otherwise in the user's cache.\n", "Experiments",
+    ),
     "check": Verb(
         _check, "check [NAME ...] [plugins=DIR]", "plugins: does each do what it declares?",
         "Runs the conformance kit on some plugins, or all. Exit status 1 when a check fails.\n\n" + FAMILY, "Is it right?",

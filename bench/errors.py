@@ -33,6 +33,14 @@ class Unsupported(Exception):
     """Raised for an incompatible combination of plugins. Its cell gets the status ``unsupported``."""
 
 
+class Unavailable(Exception):
+    """Raised where a library or an environment is missing. Its cell gets the status ``unavailable``."""
+
+
+class Crashed(Exception):
+    """Raised where a process that computes a cell's numbers has ended. Its cell gets the status ``crashed``."""
+
+
 def printable(text: object) -> str:
     """Return text on one line without control characters, for a terminal or a message.
 
@@ -61,8 +69,9 @@ def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:
 
 def failure(error: BaseException) -> dict[str, str]:
     """Return the row fields ``status`` and ``reason`` for an exception: its message and the last 3 traceback frames."""
-    if isinstance(error, Unsupported):
-        return {"status": "unsupported", "reason": printable(error)}
+    for kind, status in ((Unsupported, "unsupported"), (Unavailable, "unavailable"), (Crashed, "crashed")):
+        if isinstance(error, kind):
+            return {"status": status, "reason": printable(error)}
     frames = traceback.extract_tb(error.__traceback__, limit=-3)
     lines = [f"{os.path.basename(frame.filename)}:{frame.lineno} in {frame.name}" for frame in reversed(frames)]
     return {"status": "error", "reason": f"{type(error).__name__}: {printable(error)[:1000]} ({' < '.join(lines)})"}

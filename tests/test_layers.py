@@ -15,6 +15,7 @@ BENCH = ROOT / "bench"
 LAYERS = [
     ["errors", "interrupts", "deprecated"],
     ["model"],
+    ["engines"],
     ["measure", "plugins"],
     ["experiment", "conformance"],
     ["run"],

@@ -250,6 +250,8 @@ class Cell:
                 entry = registry.find(part.kind, part.name)
                 if not entry.available:
                     return "unavailable", f"{singular(part.kind)} {part.name} is {entry.reason}"
+                if reason := part.unavailable_reason():
+                    return "unavailable", reason
         try:
             program = self.program()
         except (Unsupported, UserError) as error:  # another scene of the sweep may have this theta

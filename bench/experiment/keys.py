@@ -14,12 +14,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from bench.engines.backend import EngineBackend
 from bench.model import CallableScene
 from bench.model.parameters import Plugin, remember, values
 from bench.model.sources import code_of, file_of, hash_of, hash_of_tree, imports_of_tree, is_below
 
 HARMLESS = {
     "bench.deprecated": "old names of the same things",
+    "bench.engines.environments": "finds and installs the environments of engines, whose versions are in the row",
+    "bench.engines.process": "carries arrays to an engine and back unchanged",
     "bench.errors": "statuses and the wording of messages",
     "bench.experiment": "describes cells and rows; all that it passes on to plugins is in the key",
     "bench.model.guard": "protects the process from plugins, and sees none of their numbers",
@@ -56,7 +59,7 @@ def fingerprint(plugin: Plugin | None) -> str:
         parameters = dict(sorted(values(plugin).items()))
         hashes = [
             plugin_hash(type(plugin)),
-            *([files_hash(plugin.files())] if isinstance(plugin, CallableScene) else []),
+            *([files_hash(plugin.files())] if isinstance(plugin, CallableScene | EngineBackend) else []),
         ]
         text = json.dumps([plugin.kind, plugin.name, parameters, hashes], default=repr)
         # the plugin is stored too, so that no other object gets its id

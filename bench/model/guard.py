@@ -14,6 +14,10 @@ MAX_CAPTURED_CHARACTERS = 300
 """Maximum number of characters of a plugin's output that are quoted."""
 
 
+SPARED: set[int] = set()
+"""Ids of child processes that later cells use too, which :func:`kill_children` spares."""
+
+
 def exit_if_forked(pid: int) -> None:
     """Exit this process if it is a fork: its id is not ``pid``, the id of the original process."""
     if os.getpid() != pid:
@@ -89,15 +93,22 @@ def _working_folder() -> str:
 
 
 def kill_children() -> None:
-    """Kill all child processes of this process, which a plugin has left running."""
-    try:
-        # raises ChildProcessError if there are no children, which avoids a search through all processes
-        os.waitpid(-1, os.WNOHANG)
-    except ChildProcessError:
-        return
+    """Kill all child processes of this process, which a plugin has left running, except :data:`SPARED` ones."""
+    if not SPARED:
+        try:
+            # raises ChildProcessError if there are no children, which avoids a search through all processes
+            os.waitpid(-1, os.WNOHANG)
+        except ChildProcessError:
+            return
     import psutil
 
-    for child in psutil.Process().children(recursive=True):
+    # the children of a child are found before it is killed
+    own = [child for child in psutil.Process().children() if child.pid not in SPARED]
+    below = []
+    for child in own:
+        with contextlib.suppress(psutil.Error):
+            below += child.children(recursive=True)
+    for child in own + below:
         with contextlib.suppress(psutil.Error):
             child.kill()
         with contextlib.suppress(ChildProcessError):

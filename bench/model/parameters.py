@@ -68,6 +68,10 @@ class Plugin(ABC):  # noqa: B024, each kind has its own abstract methods
         require_decorated(cls)
         return super().__new__(cls)
 
+    def unavailable_reason(self) -> str | None:
+        """Return why an instance with these parameters cannot be used here, with what to install, or None."""
+        return None
+
 
 @dataclass(frozen=True)
 class Parameter:

@@ -36,6 +36,8 @@ CORE = "bench.studies"
 BUILT_IN = ("bench.plugins", CORE)
 KINDS = ("scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "studies")
 """The built-in kinds, in listing order. A plugin may declare another kind."""
+ENGINES = "engines"
+"""Name of the folders with files that only the Pythons of engines import."""
 ENTRY_POINT_GROUP = "bench.plugins"
 NAME = re.compile(r"\w[\w.-]*")
 """Pattern of plugin names. Brackets, commas and spaces are syntax of identity strings, so names contain none."""
@@ -165,13 +167,15 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
     """Yield (kind, full name) of each module in a package and its subfolders; the kind is the module's folder name."""
     for module in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
         name = f"{package.__name__}.{module.name}"
+        if module.name == ENGINES:
+            continue
         if module.name in KINDS:
             yield from ((module.name, path) for _, path in _modules(importlib.import_module(name)))
         else:
             yield package.__name__.rpartition(".")[2], name
     for folder in sorted(path for place in package.__path__ for path in Path(place).iterdir()):
         # folders without __init__.py are (namespace) packages too, but pkgutil does not list them
-        bare = folder.is_dir() and folder.name.isidentifier() and not (folder / "__init__.py").exists()
+        bare = folder.is_dir() and folder.name.isidentifier() and folder.name != ENGINES and not (folder / "__init__.py").exists()
         if bare and any(folder.glob("*.py")):
             space = importlib.import_module(f"{package.__name__}.{folder.name}")
             for module in sorted(pkgutil.iter_modules(space.__path__), key=lambda m: m.name):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
+from bench.engines.backend import EngineBackend
 from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.defaults import completed_json, missing_parameters
@@ -156,8 +157,9 @@ def expected_seconds(runs: Sequence[Planned], rows: pd.DataFrame) -> float:
 
 
 def versions(backend: Backend) -> str:
-    """Return the versions of the libraries that a backend's numbers depend on."""
-    return _versions(type(backend))
+    """Return the versions of the libraries that a backend's numbers depend on, also in an engine's own Python."""
+    own = backend.library_versions() if isinstance(backend, EngineBackend) else {}
+    return ";".join([_versions(type(backend)), *(f"{backend.name}:{name}={value}" for name, value in own.items())])
 
 
 @remember

@@ -1,0 +1,101 @@
+"""The contract of a backend whose engine runs in another Python."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from bench.engines import environments, server, twin
+from bench.engines.process import EngineModel
+from bench.engines.problem import EngineProblem
+from bench.errors import Unavailable, Unsupported
+from bench.model import Backend, EngineTwin, MechanicalScene, Problem, Program, param
+from bench.model.parameters import values
+
+
+@dataclass(frozen=True)
+class EngineBackend(Backend):
+    """A backend whose steps an engine in a Python of its own computes; :mod:`bench.engines.server` has the engine's part.
+
+    The engine's file is in a folder ``engines``, from which the harness imports nothing.
+    """
+
+    provides = frozenset({"value", "grad", "score", "physics"})
+
+    file: ClassVar[str]
+    """The engine's file, relative to the folder of the backend's own file, such as ``engines/my_engine.py``."""
+    libraries: ClassVar[tuple[str, ...]] = ()
+    """Distributions that the engine needs. Rows have their versions."""
+    laws: ClassVar[tuple[str, ...]] = ("penalty",)
+    """Names of the contact laws that the engine's contacts stand for."""
+    integrator: ClassVar[str] = "semi_implicit_euler"
+    """Name of the integrator that the engine's step stands for."""
+
+    own_contact: ClassVar[bool] = False
+    """Whether contacts are the engine's own, with at most the law's stiffness and damping, and not compared with the law."""
+
+    python: str | None = param(None, "Python of the engine's environment; null: the one that `bench engines install` makes")
+
+    def compile(self, program: Program) -> Problem:
+        """Return the program as a problem; the engine is started when it is first called."""
+        if reason := self.unsupported_reason(program):
+            raise Unsupported(reason)
+        if reason := self.unavailable_reason():
+            raise Unavailable(reason)
+        python = self.python or str(environments.python_of(self.name))
+        return EngineProblem(program, EngineModel(self.name, python, self.files()[0], self.describe(program)))
+
+    def unavailable_reason(self) -> str | None:
+        """Return why the engine's environment cannot be used, with the command that makes it, or None."""
+        return environments.missing(self.name, self.python, self.libraries)
+
+    def library_versions(self) -> dict[str, str]:
+        """Return the versions of the engine's Python and libraries, by name; empty if the environment is missing."""
+        try:
+            return environments.library_versions(self.python or str(environments.python_of(self.name)), self.libraries)
+        except Unavailable:
+            return {}
+
+    def unsupported_reason(self, program: Program) -> str | None:
+        """Return why the engine cannot run the program, or None."""
+        scene, law = program.scene, program.contact
+        if not isinstance(scene, EngineTwin) or not isinstance(scene, MechanicalScene):
+            return f"scene {scene.name} has no MJCF twin"
+        if program.decision.names:
+            return f"{self.name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
+        if program.integrator is None or program.integrator.name != self.integrator:
+            name = program.integrator.name if program.integrator else "none"
+            return f"{self.name} uses its own integrator, which replaces {self.integrator}, not {name}"
+        if law is not None and law.name not in self.laws:
+            return f"{self.name} uses its own contact model, which replaces {' and '.join(self.laws)}, not {law.name}"
+        try:
+            return self.unsupported_twin(program, twin.read(scene.mjcf()))
+        except Unsupported as error:
+            return str(error)
+
+    def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
+        """Return why the engine cannot run a program with the twin ``model`` of :func:`bench.engines.twin.read`, or None."""
+        return None
+
+    def describe(self, program: Program) -> dict[str, Any]:
+        """Return what the engine's ``Model`` is built from, as JSON: the twin, the contact law and all parameters."""
+        scene, law = program.scene, program.contact
+        assert isinstance(scene, MechanicalScene)
+        assert isinstance(scene, EngineTwin)
+        return {
+            "scene": scene.name, "parameters": values(scene), "backend": values(self), "dt": scene.dt,
+            "horizon": scene.horizon, "mjcf": scene.mjcf(), "contact": {} if law is None else {"name": law.name, **values(law)},
+            **twin.read(scene.mjcf()),
+        }  # fmt: skip
+
+    @classmethod
+    def files(cls) -> list[Path]:
+        """Return the files that run in the engine's Python: the engine's own, first, and the server's."""
+        return [Path(inspect.getfile(cls)).parent / cls.file, Path(server.__file__)]
+
+    @classmethod
+    def requirements(cls) -> Path:
+        """Return the file of the engine's requirements, beside the engine's file."""
+        return cls.files()[0].with_suffix(".txt")

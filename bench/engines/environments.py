@@ -1,0 +1,91 @@
+"""The environments of engines: their folders, their installation, and the versions of the libraries in them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from bench.engines.process import run_python
+from bench.errors import Unavailable, UserError
+from bench.model.parameters import remember
+
+FOLDER = "BENCH_ENGINES"
+"""Environment variable with the folder that contains the environments."""
+VERSIONS = """
+import importlib.metadata, json, platform, sys
+found = {"python": platform.python_version()}
+for name in sys.argv[1:]:
+    try:
+        found[name] = importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        pass
+print(json.dumps(found))
+"""
+
+
+def folder() -> Path:
+    """Return the folder that contains the environments: ``$BENCH_ENGINES``, otherwise a folder in the user's cache."""
+    if given := os.environ.get(FOLDER):
+        return Path(given).expanduser().absolute()
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return (Path(cache) / "diffsim-bench" / "engines").expanduser()
+
+
+def python_of(engine: str) -> Path:
+    """Return the Python of an engine's environment, which may not exist."""
+    return folder() / engine / "bin" / "python"
+
+
+@remember
+def library_versions(python: str, libraries: tuple[str, ...]) -> dict[str, str]:
+    """Return the versions of Python and of the installed libraries of another Python, by name.
+
+    Raises :class:`Unavailable` if it is not a Python.
+    """
+    versions = run_python(python, VERSIONS, *libraries)
+    if not isinstance(versions, dict):
+        raise Unavailable("it is not a working Python")
+    return {str(name): str(version) for name, version in versions.items()}
+
+
+def missing(engine: str, python: str | None, libraries: Sequence[str]) -> str | None:
+    """Return why an engine's environment cannot be used, with the command that makes it; None if it can."""
+    path = str(python or python_of(engine))
+    make = f"make its environment with `python -m bench engines install {engine}`"
+    try:
+        if not Path(path).exists():
+            raise Unavailable("there is no such file" if python else "it is not installed")
+        versions = library_versions(path, tuple(libraries))
+    except Unavailable as error:
+        where = f"python={path}" if python else f"engine {engine}"
+        return f"{where}: {error}; {make}"
+    absent = [name for name in libraries if name not in versions]
+    return f"python={path} has no {', '.join(absent)}; {make}" if absent else None
+
+
+def install(engine: str, requirements: Path, again: bool = False) -> Path:
+    """Make an engine's environment from a file of requirements, and return its folder.
+
+    An environment that exists is completed, or with ``again`` made from the start. Raises :class:`UserError` if pip
+    fails; then a new folder is removed.
+    """
+    place = folder() / engine
+    if again and place.exists():
+        shutil.rmtree(place)
+    is_new = not place.exists()
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if is_new:
+            subprocess.run([sys.executable, "-m", "venv", str(place)], check=True)
+        pip = [str(place / "bin" / "python"), "-m", "pip", "install", "--disable-pip-version-check", "--quiet"]
+        subprocess.run([*pip, "-r", str(requirements)], check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        if is_new:
+            shutil.rmtree(place, ignore_errors=True)
+        raise UserError(f"the environment of engine {engine} cannot be made in {place}: {error}") from error
+    library_versions.cache_clear()  # type: ignore[attr-defined]
+    return place

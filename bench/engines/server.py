@@ -1,0 +1,222 @@
+"""Runs in the Python of an engine's environment: answers calls of the engine's model over pipes. Requires only NumPy.
+
+A message is a header (JSON) followed by the bytes of its arrays. An engine's file defines a class ``Model``, built from the
+description of a program, with
+
+- ``step(x, u)``: the states ``(n, B)`` after one step from states x and controls ``u (m, B)``;
+- ``jacobians(x, u)``: its derivatives ``(n, n, B)`` by x and ``(n, m, B)`` by u, or ``pull(x, u, slope)``: the derivatives
+  ``(n, B)`` by x and ``(m, B)`` by u of the sum of ``slope * step(x, u)``; neither if the engine has no derivatives;
+- ``rollout(x, u)``, optional: the states ``(T + 1, n, B)`` under controls ``(T, m, B)``, otherwise T steps;
+- ``takes_forces``, optional: whether u are the generalised forces ``(n_q, B)`` of motors, springs and dampers, in place of
+  the controls;
+- ``widths``, optional: the batch sizes B that it can compute, otherwise all;
+- ``device``, optional: the device that it computes on.
+"""
+
+import importlib.util
+import json
+import os
+import resource
+import signal
+import struct
+import sys
+import threading
+import time
+import traceback
+
+import numpy as np
+
+LENGTHS = struct.Struct(">QQ")
+"""The lengths in bytes of a message's header and of all its arrays."""
+KEPT = 4
+"""Number of models that a server stores."""
+
+
+class Closed(Exception):
+    """Raised when the other end of a pipe is closed."""
+
+
+def send(descriptor, header, arrays=()):
+    """Write a message: a header that JSON can encode, and arrays."""
+    arrays = [np.ascontiguousarray(array) for array in arrays]
+    text = json.dumps({**header, "arrays": [[array.dtype.str, array.shape] for array in arrays]}).encode()
+    parts = [LENGTHS.pack(len(text), sum(array.nbytes for array in arrays)) + text]
+    parts += [memoryview(array.reshape(-1)).cast("B") for array in arrays if array.size]
+    try:
+        for part in parts:
+            view = memoryview(part)
+            while view:
+                view = view[os.write(descriptor, view) :]
+    except OSError as error:
+        raise Closed from error
+
+
+def receive(descriptor):
+    """Return the header and the arrays of the next message."""
+    length, n_bytes = LENGTHS.unpack(_read(descriptor, LENGTHS.size))
+    header = json.loads(bytes(_read(descriptor, length)))
+    content, arrays, start = _read(descriptor, n_bytes), [], 0
+    for kind, shape in header.pop("arrays"):
+        dtype, count = np.dtype(kind), int(np.prod(shape))
+        arrays.append(np.frombuffer(content, dtype, count, start).reshape(shape))
+        start += count * dtype.itemsize
+    return header, arrays
+
+
+def _read(descriptor, count):
+    content = bytearray(count)
+    view = memoryview(content)
+    while view:
+        try:
+            n_read = os.readv(descriptor, [view])
+        except OSError as error:
+            raise Closed from error
+        if not n_read:
+            raise Closed
+        view = view[n_read:]
+    return content
+
+
+# --------------------------------------------------------------------------------------------------------- calls
+
+
+def call(model, name, arrays):
+    """Return the arrays that a call of the model results in, and the width of its batches."""
+    function = {"step": _step, "rollout": _rollout, "jacobians": _jacobians}[name]
+    n_columns = arrays[0].shape[-1]
+    widths = sorted(getattr(model, "widths", None) or [n_columns])
+    width = next((width for width in widths if width >= n_columns), widths[-1])
+    blocks = []
+    for start in range(0, n_columns, width):
+        part = [array[..., start : start + width] for array in arrays]
+        missing = width - part[0].shape[-1]
+        padded = [np.concatenate([x, np.repeat(x[..., -1:], missing, axis=-1)], axis=-1) if missing else x for x in part]
+        results = function(model, *(np.ascontiguousarray(x) for x in padded))
+        blocks.append([np.asarray(x, dtype=np.float64)[..., : width - missing] for x in results])
+    return [np.concatenate(parts, axis=-1) for parts in zip(*blocks)], width
+
+
+def _step(model, x, u):
+    return [model.step(x, u)]
+
+
+def _rollout(model, x, u):
+    if hasattr(model, "rollout"):
+        return [model.rollout(x, u)]
+    states = [x]
+    for control in u:
+        states.append(np.asarray(model.step(states[-1], control), dtype=np.float64))
+    return [np.stack(states)]
+
+
+def _jacobians(model, x, u):
+    if hasattr(model, "jacobians"):
+        return model.jacobians(x, u)
+    if not hasattr(model, "pull"):
+        raise NotImplementedError("this engine has no derivatives")
+    rows = []
+    for i in range(len(x)):
+        slope = np.zeros_like(x)
+        slope[i] = 1.0
+        rows.append([np.array(part, dtype=np.float64) for part in model.pull(x, u, slope)])
+    return [np.stack(parts) for parts in zip(*rows)]
+
+
+class _Forced:
+    """A model of controls from a model of generalised forces: constant + by_state x + by_control u."""
+
+    def __init__(self, model, forces):
+        self._model = model
+        self.widths, self.device = getattr(model, "widths", None), getattr(model, "device", "cpu")
+        n = len(forces["constant"])
+        self._constant = np.reshape(np.array(forces["constant"], dtype=np.float64), (n, 1))
+        self._by_state = np.reshape(np.array(forces["by_state"], dtype=np.float64), (n, 2 * n))
+        self._by_control = np.reshape(np.array(forces["by_control"], dtype=np.float64), (n, -1))
+        for name in ("jacobians", "pull"):
+            if hasattr(model, name):
+                self.jacobians = self._jacobians
+                break
+
+    def _force(self, x, u):
+        return self._constant + self._by_state @ x + self._by_control @ u
+
+    def step(self, x, u):
+        return self._model.step(x, self._force(x, u))
+
+    def _jacobians(self, x, u):
+        a, b = (np.asarray(part, dtype=np.float64) for part in _jacobians(self._model, x, self._force(x, u)))
+        by_state = a + np.einsum("ifb,fj->ijb", b, self._by_state)
+        return by_state, np.einsum("ifb,fj->ijb", b, self._by_control)
+
+
+# ------------------------------------------------------------------------------------------------------ the server
+
+
+def serve(file, requests, answers):
+    """Answer requests until the pipe is closed."""
+    models, first_calls, module = {}, set(), None
+    while True:
+        try:
+            header, arrays = receive(requests)
+        except Closed:
+            return
+        started, name, key = time.perf_counter(), header["call"], header.get("model")
+        answer, results = {}, []
+        try:
+            if module is None:
+                module = _load(file)
+            if name == "build":
+                models[key] = module.Model(header["description"])
+                if getattr(models[key], "takes_forces", False):
+                    models[key] = _Forced(models[key], header["description"]["forces"])
+                answer["device"] = str(getattr(models[key], "device", "cpu"))
+                while len(models) > KEPT:
+                    del models[next(iter(models))]
+            elif key not in models:
+                answer["is_unknown"] = True
+            else:
+                models[key] = models.pop(key)
+                results, width = call(models[key], name, arrays)
+                answer["is_first"] = (key, name, width) not in first_calls
+                answer["width"] = width
+                first_calls.add((key, name, width))
+        except Exception as error:
+            kind = "unsupported" if isinstance(error, NotImplementedError) else "error"
+            kind = "unavailable" if isinstance(error, ImportError) else kind
+            frames = traceback.extract_tb(error.__traceback__)[-2:]
+            places = " < ".join(f"{os.path.basename(f.filename)}:{f.lineno}" for f in reversed(frames))
+            answer, results = {"error": f"{type(error).__name__}: {error}", "kind": kind, "places": places}, []
+        answer["seconds"] = time.perf_counter() - started
+        scale = 2**20 if sys.platform == "darwin" else 2**10
+        answer["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale
+        try:
+            send(answers, answer, results)
+        except Closed:
+            return
+
+
+def _load(file):
+    spec = importlib.util.spec_from_file_location("bench_engine_model", file)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def _end_with(life):
+    """End this process when the other end of the pipe ``life`` is closed, even during a call."""
+    os.read(life, 1)
+    os._exit(0)
+
+
+def main():
+    """Serve the engine's file; the arguments are the file and the descriptors of requests, answers and life."""
+    file, requests, answers, life = sys.argv[1], *map(int, sys.argv[2:5])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the run, which ends its engines
+    threading.Thread(target=_end_with, args=(life,), daemon=True).start()
+    serve(file, requests, answers)
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

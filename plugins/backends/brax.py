@@ -1,0 +1,30 @@
+"""Brax: the scene's twin in the generalized pipeline, in a Python of its own."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from bench.engines.backend import EngineBackend
+from bench.model import Program, param
+
+
+@dataclass(frozen=True)
+class Brax(EngineBackend):
+    """Gradients: JAX's forward mode of each step of Brax's generalized pipeline, chained; float64.
+
+    A contact cancels a share ``impedance`` of all other forces. At 1e-4, Brax's contacts have no force at all. Brax's
+    physics is no longer maintained.
+    """
+
+    name = "brax"
+    file = "../engines/brax.py"
+    libraries: ClassVar[tuple[str, ...]] = ("brax", "jax", "mujoco", "mujoco-mjx", "numpy")
+
+    dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
+    impedance: float = param(0.01, "share of other forces that a contact cancels", low=1e-3, high=0.9999)
+
+    def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
+        """Return why Brax cannot run the program: a damper that pulls; or None."""
+        law = program.contact
+        if law is not None and law.damping and law.damping_mode != "clipped":
+            return f"brax's contacts never pull: it supports damping_mode=clipped only, not {law.damping_mode}"
+        return None

@@ -1,0 +1,28 @@
+"""Taichi: the scene's twin as a kernel of spheres on slides, in a Python of its own."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from bench.engines.backend import EngineBackend
+from bench.model import Program, param
+
+
+@dataclass(frozen=True)
+class Taichi(EngineBackend):
+    """Gradients: reverse mode of a Taichi kernel per step, chained; float64. Spheres on slides, contacts are springs."""
+
+    name = "taichi"
+    file = "../engines/taichi.py"
+    libraries: ClassVar[tuple[str, ...]] = ("taichi", "numpy")
+
+    dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
+
+    def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
+        """Return why the kernel cannot run the twin: hinges, linked bodies or friction; or None."""
+        if any(body["joint"] != "slide" or body["parent"] >= 0 for body in model["bodies"]):
+            return "taichi's kernel has bodies on slides only, each attached to the world"
+        if any(contact["friction"] for contact in model["contacts"]):
+            return "taichi's kernel has no friction"
+        if program.contact is not None and program.contact.damping:
+            return "taichi's kernel has contacts without damping"
+        return None

@@ -1,0 +1,273 @@
+"""Engines in another Python: equal numbers, nothing lost when they die, one message where the environment is missing."""
+
+import dataclasses
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.integrators.rk4 import Rk4
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.bounce_once import BounceOnce
+from bench.plugins.scenes.bouncing_ball import BouncingBall
+from bench.plugins.scenes.cartpole import Cartpole
+from bench.plugins.scenes.hopper import Hopper
+from bench.plugins.scenes.pushing import Pushing
+
+import bench
+from bench.cli import main
+from bench.conformance.subjects import law_for
+from bench.engines import environments, process, twin
+from bench.engines.process import close_engines
+from bench.errors import Crashed, Unsupported
+from bench.experiment.keys import fingerprint
+from bench.model import compose, guard, registry
+
+TOYS = Path(__file__).parent / "toys"
+HERE = sys.executable
+SMALL = ["samples=4", "repeats=4", "timing=false", "reference.samples=256", "reference.tolerance=1", "--quiet"]
+SETTINGS = ["scenes=[bouncing_ball]", "contacts=[penalty]", "scene.bouncing_ball.horizon=40", f"plugins={TOYS}", *SMALL]
+
+
+@pytest.fixture(autouse=True)
+def toys():
+    registry.add_folder(TOYS)
+    yield
+    close_engines()
+
+
+def toy(**values):
+    return registry.usable("backends", "toy")(python=HERE, **values)
+
+
+def program(scene):
+    return compose(scene, law_for(scene, Penalty, {}) if scene.n_contacts else None, SemiImplicitEuler())
+
+
+def noise(problem, columns=5):
+    return np.random.default_rng(0).standard_normal((problem.program.n_noise, columns))
+
+
+# --------------------------------------------------------------------------------------------------------- numbers
+
+
+@pytest.mark.parametrize("scene", [BounceOnce(), BouncingBall()], ids=lambda s: s.name)
+def test_costs_and_gradients_equal_those_of_this_process(scene):
+    ours, theirs = Numpy().compile(program(scene)), toy().compile(program(scene))
+    w = noise(ours)
+    np.testing.assert_allclose(theirs.value(ours.program.theta0, w), ours.value(ours.program.theta0, w), rtol=1e-12)
+    np.testing.assert_allclose(theirs.grad(ours.program.theta0, w), ours.grad(ours.program.theta0, w), atol=1e-6)
+
+
+def test_calls_are_counted_and_compilation_is_charged_once():
+    problem = toy().compile(program(BouncingBall()))
+    problem.grad(problem.program.theta0, noise(problem))
+    first = problem.usage.compile_s
+    problem.grad(problem.program.theta0, noise(problem))
+    assert problem.usage.compile_s == first > 0
+    assert problem.n_calls == 4
+    assert problem.engine_s > 0
+    assert problem.pipe_s > 0
+    assert problem.peak_memory_mb > 10
+
+
+def test_two_programs_share_one_process_of_the_engine():
+    problems = [toy().compile(program(scene)) for scene in (BounceOnce(), BouncingBall())]
+    for problem in problems * 2:
+        problem.value(problem.program.theta0, noise(problem))
+    assert len(process._running) == 1
+
+
+def test_a_model_that_the_engine_has_dropped_is_built_again():
+    """An engine stores its last models only."""
+    problems = [toy().compile(program(BouncingBall(horizon=2 + i))) for i in range(6)]
+    values = [problem.value(problem.program.theta0, noise(problem)) for problem in problems]
+    for problem, value in zip(problems, values, strict=True):
+        np.testing.assert_array_equal(problem.value(problem.program.theta0, noise(problem)), value)
+
+
+@pytest.mark.parametrize("scene", [Hopper(), Pushing(), BouncingBall()], ids=lambda s: s.name)
+def test_forces_of_a_twin_are_those_of_the_scene(scene):
+    """Of bodies on slides: gravity plus the forces of motors, springs and dampers by mass is the scene's acceleration."""
+    model = twin.read(scene.mjcf())
+    rng = np.random.default_rng(0)
+    q, v, u = (rng.uniform(-1, 1, (n, 3)) for n in (scene.n_q, scene.n_q, scene.n_u))
+    forces = model["forces"]
+    force = np.array(forces["constant"])[:, None] + np.array(forces["by_state"]) @ np.concatenate([q, v])
+    force += np.reshape(forces["by_control"], (scene.n_q, scene.n_u)) @ u
+    masses = np.array([body["mass"] for body in model["bodies"]])[:, None]
+    axes = np.array([body["axis"] for body in model["bodies"]])
+    acceleration = force / masses + (axes @ np.array(model["gravity"]))[:, None]
+    damped = 1.0 - getattr(scene, "velocity_factor", 1.0)
+    expected = scene.acceleration(np, q, v, u) - damped * v / scene.dt
+    np.testing.assert_allclose(acceleration, expected, rtol=1e-12)
+
+
+def test_a_twin_with_other_elements_is_refused_by_their_name():
+    with pytest.raises(Unsupported, match="joint with frictionloss"):
+        twin.read(
+            '<worldbody><body><joint name="a" type="slide" frictionloss="1"/><geom type="sphere"/></body></worldbody>'
+        )
+    with pytest.raises(Unsupported, match="the twin has equality"):
+        twin.read("<worldbody/><equality/>")
+
+
+# ---------------------------------------------------------------------------------------------------------- deaths
+
+
+def test_an_engine_that_is_killed_is_started_again_and_the_call_repeated():
+    problem = toy().compile(program(BouncingBall()))
+    before = problem.grad(problem.program.theta0, noise(problem))
+    (engine,) = process._running.values()
+    os.kill(engine.process.pid, signal.SIGKILL)
+    np.testing.assert_array_equal(problem.grad(problem.program.theta0, noise(problem)), before)
+    (other,) = process._running.values()
+    assert other.process.pid != engine.process.pid
+
+
+def test_an_engine_that_dies_again_is_a_crash_with_its_signal_and_last_output():
+    problem = toy(fault="exit").compile(program(BouncingBall()))
+    with pytest.raises(Crashed, match="toy ended twice during jacobians: killed by SIGKILL; its last output: .*another"):
+        problem.grad(problem.program.theta0, noise(problem))
+
+
+def test_an_error_in_an_engine_names_its_file_and_line_and_the_engine_goes_on():
+    problem = toy(fault="raise").compile(program(BouncingBall()))
+    with pytest.raises(process.EngineError, match=r"ValueError: the engine has a fault \(toy.py:\d+ < toy.py:\d+\)"):
+        problem.grad(problem.program.theta0, noise(problem))
+    assert np.isfinite(problem.value(problem.program.theta0, noise(problem))).all()
+    assert len(process._running) == 1
+
+
+def test_an_engine_killed_in_mid_sweep_loses_nothing(tmp_path):
+    """Rows are those of a sweep in which the engine lives."""
+    results = []
+    for name, fault in ("killed", f",fault=exit,marker={tmp_path / 'marker'}"), ("alive", ""):
+        words = [f"name={name}", *SETTINGS, "estimators=[fobg,randomized_smoothing]", "workers=0"]
+        assert main([*words, f"backends=['toy[python={HERE}{fault}]']", f"results_dir={tmp_path}"]) == 0
+        results.append(bench.load(tmp_path / name))
+    assert (tmp_path / "marker").exists()
+    killed, alive = results
+    assert list(killed["status"]) == ["ok", "ok"]
+    assert [list(x) for x in killed["mean_estimate"]] == [list(x) for x in alive["mean_estimate"]]
+
+
+def test_an_engine_ends_with_its_run_even_if_it_hangs():
+    code = f"""
+import sys, threading, time
+sys.path[:0] = {[str(Path(__file__).parent)]!r}
+from test_other_python import BouncingBall, noise, process, program, registry, toy, TOYS
+registry.add_folder(TOYS)
+problem = toy(fault="loop").compile(program(BouncingBall()))
+threading.Thread(target=lambda: problem.grad(problem.program.theta0, noise(problem)), daemon=True).start()
+while problem.n_calls < 1:
+    time.sleep(0.05)
+print(next(iter(process._running.values())).process.pid, flush=True)
+time.sleep(100)
+"""
+    with subprocess.Popen([HERE, "-c", code], stdout=subprocess.PIPE, text=True) as run:
+        engine = psutil.Process(int(run.stdout.readline()))
+        run.kill()
+        assert engine.wait(10) is None
+
+
+def test_children_that_plugins_leave_are_killed_and_engines_are_not():
+    problem = toy().compile(program(BouncingBall()))
+    problem.value(problem.program.theta0, noise(problem))
+    left = subprocess.Popen(["sleep", "100"])
+    guard.kill_children()
+    assert not psutil.pid_exists(left.pid)
+    left.wait(5)
+    (engine,) = process._running.values()
+    assert engine.process.poll() is None
+
+
+# ---------------------------------------------------------------------------------------------------- environments
+
+
+def test_a_missing_environment_is_one_message_with_its_command(tmp_path, monkeypatch):
+    monkeypatch.setenv(environments.FOLDER, str(tmp_path))
+    words = ["name=missing", *SETTINGS, "backends=[toy]", "estimators=[fobg,reinforce]", f"results_dir={tmp_path}"]
+    assert main(words) == 0
+    rows = bench.load(tmp_path / "missing")
+    assert set(rows["status"]) == {"unavailable"}
+    assert set(rows["reason"]) == {
+        "engine toy: it is not installed; make its environment with `python -m bench engines install toy`"
+    }
+
+
+@pytest.mark.parametrize(
+    ("python", "reason"),
+    [
+        ("/nowhere/python", "python=/nowhere/python: there is no such file; make"),
+        (shutil.which("true"), "it is not a working Python"),
+        ("/etc/passwd", "it cannot be started"),
+    ],
+)
+def test_a_wrong_python_is_named(python, reason):
+    assert reason in dataclasses.replace(toy(), python=python).unavailable_reason()
+
+
+def test_a_missing_library_is_named(monkeypatch):
+    monkeypatch.setattr(type(toy()), "libraries", ("numpy", "no_such_library"))
+    assert "has no no_such_library; make its environment" in toy().unavailable_reason()
+
+
+def test_versions_of_the_other_python_are_in_the_row(tmp_path):
+    words = ["name=versions", *SETTINGS, f"backends=['toy[python={HERE}]']", "estimators=[fobg]", "workers=0"]
+    assert main([*words, f"results_dir={tmp_path}"]) == 0
+    (versions,) = bench.load(tmp_path / "versions")["versions"]
+    python = ".".join(map(str, sys.version_info[:3]))
+    assert versions == f"numpy={np.__version__};toy:python={python};toy:numpy={np.__version__}"
+
+
+def test_the_command_lists_engines_and_installs_requirements(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv(environments.FOLDER, str(tmp_path))
+    assert main(["engines", f"plugins={TOYS}"]) == 0
+    assert "install newton" in capsys.readouterr().out
+    assert main(["engines", "install", "toy", f"plugins={TOYS}"]) == 2
+    assert "has no file of requirements" in capsys.readouterr().err
+    assert main(["engines", "install", "newtom"]) == 2
+    assert "did you mean 'newton'" in capsys.readouterr().err
+    assert main(["engines", "remove"]) == 2
+    assert "engines: remove is not a request" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------------------------- contracts
+
+
+def test_files_of_engines_are_neither_imported_nor_listed():
+    names = {name for table in registry.entries().values() for name in table}
+    assert {"newton", "drake", "toy"} <= names
+    assert not [name for name in sys.modules if ".engines." in name and not name.startswith("bench.engines.")]
+    assert not {"warp", "pydrake", "brax", "taichi"} & set(sys.modules)
+
+
+def test_a_change_of_an_engines_file_changes_the_key(tmp_path):
+    names = []
+    for text in "", "\n# a remark\n", "\nCHANGED = True\n":
+        folder = tmp_path / f"toys{len(names)}"
+        shutil.copytree(TOYS, folder)
+        with (folder / "engines" / "toy.py").open("a") as file:
+            file.write(text)
+        registry._folders.clear()
+        registry.add_folder(folder)
+        names.append(fingerprint(toy()))
+    assert names[0] == names[1] != names[2]
+
+
+def test_programs_that_an_engine_does_not_run_are_refused():
+    law = law_for(BouncingBall(), Penalty, {})
+    assert "replaces semi_implicit_euler, not rk4" in toy().incompatibility(compose(BouncingBall(), law, Rk4()))
+    taichi = registry.usable("backends", "taichi")()
+    assert "slides only" in taichi.incompatibility(program(Cartpole()))
+    damped = compose(BouncingBall(), law_for(BouncingBall(), Penalty, {"damping": 1.0}), SemiImplicitEuler())
+    newton = registry.usable("backends", "newton")()
+    assert "supports damping_mode=approach, not clipped" in newton.incompatibility(damped)

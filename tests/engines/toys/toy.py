@@ -1,0 +1,17 @@
+"""A point mass on a spring floor, in another Python."""
+
+from dataclasses import dataclass
+
+from bench.plugin import EngineBackend, param
+
+
+@dataclass(frozen=True)
+class Toy(EngineBackend):
+    """Gradients: closed-form step Jacobians of a point mass over a spring floor; float64."""
+
+    name = "toy"
+    file = "engines/toy.py"
+    libraries = ("numpy",)
+
+    fault: str = param("", "what happens when Jacobians are computed: exit, loop or raise")
+    marker: str = param("", "file of a fault that happens once, in the third call; empty: it happens in each call")
