@@ -441,10 +441,13 @@ class Findings:
         parts = [part for part in self.check.components if part.difference != 0.0 and math.isfinite(part.error)]
         if not parts:
             return f"{self._n_checked()} checked"
-        largest = max(part.error for part in parts)
-        doubt = max(part.uncertainty / abs(part.difference) for part in parts)
+        resolved = [part for part in parts if part.uncertainty < 0.1 * abs(part.difference)] or parts
+        largest = max(part.error for part in resolved)
+        doubt = max(part.uncertainty / abs(part.difference) for part in resolved)
         within = number(100 * max(largest, min(doubt, 1.0)), 1)
-        return f"{self._n_checked()} agree with differences to {within}%"
+        few = len(parts) - len(resolved)
+        rest = f", {few} of them only within rounding, since they are too small to resolve" if few else ""
+        return f"{self._n_checked()} agree with differences to {within}%{rest}"
 
     def _n_checked(self) -> str:
         n_seen = len(self.check.components) if self.check is not None else 0
@@ -564,7 +567,7 @@ class Findings:
 
     def _named_parts(self, check: Check) -> list[Part]:
         """Return the worst parts that name an input: located groups, then components, then directions."""
-        located = [part for part in check.worst_parts if part.name in self.located]
+        located = [part for part in check.parts if part.name in self.located]
         inside = [part for part in check.worst_parts if part.component is not None]
         exact = [part for part in inside if self.label(part) in self.located.values()]
         return exact or located or inside or list(check.worst_parts)
