@@ -441,13 +441,18 @@ class Findings:
         parts = [part for part in self.check.components if part.difference != 0.0 and math.isfinite(part.error)]
         if not parts:
             return f"{self._n_checked()} checked"
-        resolved = [part for part in parts if part.uncertainty < 0.1 * abs(part.difference)] or parts
+        resolved = self._resolved_parts() or parts
         largest = max(part.error for part in resolved)
         doubt = max(part.uncertainty / abs(part.difference) for part in resolved)
         within = number(100 * max(largest, min(doubt, 1.0)), 1)
         few = len(parts) - len(resolved)
         rest = f", {few} of them only within rounding, since they are too small to resolve" if few else ""
         return f"{self._n_checked()} agree with differences to {within}%{rest}"
+
+    def _resolved_parts(self) -> list[Part]:
+        """Return the components whose differences have at least one correct digit."""
+        parts = () if self.check is None else self.check.components
+        return [part for part in parts if math.isfinite(part.error) and part.uncertainty < 0.1 * abs(part.difference)]
 
     def _n_checked(self) -> str:
         n_seen = len(self.check.components) if self.check is not None else 0
@@ -513,7 +518,7 @@ class Findings:
         if self.is_small_spread and (self.spread > 0 or self.gradient_spread > 0):
             warnings.append(
                 f"equal calls differ in the last digits, costs by {number(self.spread)}{self._relative(self.spread)}: "
-                "errors below what this allows are not seen"
+                f"errors of the gradient below about {self.resolution} are not seen"
             )
         if self.elsewhere:
             warnings.append(
@@ -548,8 +553,10 @@ class Findings:
 
     @property
     def resolution(self) -> str:
-        """The smallest relative error that central differences detect in this precision, about u^(2/3), as text in %."""
-        return f"{100 * self._unit ** (2 / 3):.1g}%"
+        """The smallest relative error that the differences detect, as text in %: at least u^(2/3), as for central differences."""
+        parts = self._resolved_parts()
+        doubt = max((part.uncertainty / abs(part.difference) for part in parts), default=0.0)
+        return f"{100 * max(self._unit ** (2 / 3), doubt):.1g}%"
 
     def label(self, part: Part) -> str:
         """Return a part's name: the name of its component of theta, or the name of its direction, ``direction 0``."""

@@ -35,6 +35,10 @@ OTHER_NOISE = 2
 """Number of further draws of the simulator's own noise under which the gradient is checked along random directions."""
 ROUGH = 0.1
 """Share of the cost's change over the widest step that noise between neighbouring thetas makes up where a cost is rough."""
+IN_CELL = 0.4
+"""Distance from a float32 number, in units of its last place, that float32 rounds away."""
+CELLS, DISTINCT_CELLS = 9, 6
+"""Number of neighbouring float32 thetas at which costs are compared, and fewest different costs of a cost in float32."""
 STATE = 0.1
 """Largest share of the difference between histories by which a cost with equal histories differs."""
 
@@ -99,6 +103,7 @@ class GradientStages:
         """Largest difference between equal calls, of the cost, and of the gradient relative to its norm."""
         self.has_state = False
         """Whether the cost depends on the call before it, in a repeatable way."""
+        self._repeated = False
         self.is_hidden_single = False
         """Whether the cost has single precision, though it returns a float64."""
         self._share = 0.5 if has_sigma else 0.8
@@ -183,7 +188,7 @@ class GradientStages:
         try:
             for stage in (partial(self._compare_quickly, space), self._repeat):
                 stage()
-                if self.simulator.precision == "float64" and self.simulator.has_single_precision:
+                if self._has_hidden_single():
                     self.simulator.precision, self.is_hidden_single = "float32", True
                     self._compare_quickly(space)
         except OutOfTime:
@@ -248,6 +253,7 @@ class GradientStages:
                     others.append(value)
                 else:
                     after[before].append(value)
+            self._repeated = True
         except OutOfTime:
             self.left_out.append("repeating a call")
         spreads = []
@@ -259,6 +265,30 @@ class GradientStages:
         if self.spread > 0 and len(after["theta"]) > 1 and len(last) > 1:
             apart = abs(after["theta"][-1] - last[-1])
             self.has_state = max(np.ptp(after["theta"]), np.ptp(last)) <= STATE * apart
+
+    def _has_hidden_single(self) -> bool:
+        """Return whether a cost that returns float64 computes in float32: its values have single precision, or it reads
+        theta as float32.
+
+        A cost that reads theta as float32 is constant within one rounding cell of float32, and changes from each cell to
+        the next, unlike a staircase with wider treads.
+        """
+        if self.simulator.unit > float(np.finfo(np.float64).eps) or self.spread > 0.0:
+            return False
+        if self.simulator.has_single_precision:
+            return True
+        if not self._repeated:
+            return False
+        self.clock.start_stage("precision")
+        first = np.float32(self.theta)
+        ulp = np.spacing(np.abs(first)).astype(np.float64) * np.where(np.arange(first.size) % 3 == 1, -1.0, 1.0)
+        at = first[:, None] + ulp[:, None] * np.array([0.0, IN_CELL])
+        if not _are_equal(self.costs(at)):
+            return False
+        cells = self.costs(first[:, None] + ulp[:, None] * np.arange(CELLS))
+        inside = self.costs(first[:, None] + ulp[:, None] * np.array([[-IN_CELL], [CELLS // 2 - IN_CELL], [CELLS // 2 + IN_CELL]]).T)
+        is_constant = _are_equal(np.r_[cells[0], inside[0]]) and _are_equal(np.r_[cells[CELLS // 2], inside[1:]])
+        return is_constant and np.unique(cells).size >= DISTINCT_CELLS
 
     def _plan(self, size: int, is_right: bool) -> list[tuple[str, Options]]:
         """Return the stages after the quick one, from the cheapest to the full check."""
@@ -420,6 +450,10 @@ class GradientStages:
                 self.more.append(space.restore(self._check_once(space, options, drawn)))
         except OutOfTime:
             self.left_out.append("checks under other noise")
+
+
+def _are_equal(values: np.ndarray) -> bool:
+    return bool(np.isfinite(values).all() and (values == values[0]).all())
 
 
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:
