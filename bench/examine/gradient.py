@@ -27,6 +27,10 @@ NOISE_POINTS = 17
 """Costs per direction that no step needs: the centre, and the points at which the noise is measured."""
 SCAN = 7 * 65
 """Number of costs of a staircase search along one direction that is not clearly right."""
+ALL_STEPS, FEW_DRAWS, DRAWS = "all steps and random directions", "2 other thetas", "8 other thetas"
+"""Names of the later stages."""
+WRONG_SHARE = 0.3
+"""Share of the remaining budget within which a wrong gradient is checked at 8 other thetas without 2 first."""
 SMALL = 0.6
 """Power of the unit roundoff: a relative difference between equal calls below it is a floor, not a fault."""
 MANY = 10_000
@@ -304,14 +308,14 @@ class GradientStages:
         stages = [
             ("more steps", base),
             (
-                "all steps and random directions",
+                ALL_STEPS,
                 replace(base, eps=eps, directions=2, scanned=scanned, repeated=repeated),
             ),
-            ("2 other thetas", replace(base, eps=eps, directions=2, draws=2, scanned=scanned)),
-            ("8 other thetas", replace(base, eps=eps, directions=2, draws=8, scanned=4)),
+            (FEW_DRAWS, replace(base, eps=eps if is_right else few, directions=2, draws=2, scanned=scanned)),
+            (DRAWS, replace(base, eps=eps, directions=2, draws=8, scanned=4)),
         ]
         if self.theta.size > MANY:
-            return [*stages[:2], ("2 other thetas", replace(base, eps=eps, directions=2, draws=2, scanned=2))]
+            return [*stages[:2], (FEW_DRAWS, replace(base, eps=eps, directions=2, draws=2, scanned=2))]
         return stages
 
     def _cost_of(self, options: Options, size: int) -> tuple[int, int]:
@@ -333,19 +337,23 @@ class GradientStages:
         self.clock.start_stage("checking the gradient")
         assert self.check is not None
         is_done: list[str] = []
-        for index in range(len(self._plan(space.size, True))):
-            stages = self._plan(space.size, self.check.trusted)
-            name, options = stages[index]
-            is_last = index == len(stages) - 1
-            if not self.clock.can_afford(*self._cost_of(options, space.size), share=self._share):
+        names = [name for name, _ in self._plan(space.size, True)]
+        for name in names:
+            plan = dict(self._plan(space.size, self.check.trusted))
+            is_wrong = any(part.verdict in FAULTS for part in self.check.parts)
+            if name == ALL_STEPS and is_wrong:
+                continue  # the ratios at other thetas name the fault, and these stages also have all steps
+            if not self.clock.can_afford(*self._cost_of(plan[name], space.size), share=self._share):
                 self.left_out.append(name)
-                if name != "2 other thetas":
+                if name != FEW_DRAWS:
                     break
                 continue
-            if name == "2 other thetas" and not is_last and self.clock.can_afford(
-                *self._cost_of(stages[-1][1], space.size), share=self._share
+            share = WRONG_SHARE if is_wrong else self._share
+            if name == FEW_DRAWS != names[-1] and self.clock.can_afford(
+                *self._cost_of(plan[names[-1]], space.size), share=share
             ):
                 continue
+            options = plan[name]
             self._refresh()
             self.clock.limit(max(self._share, 0.9))
             try:
@@ -356,8 +364,8 @@ class GradientStages:
                 break
             finally:
                 self.clock.limit(1.0)
-        if "8 other thetas" in is_done:
-            self.left_out = [name for name in self.left_out if name != "2 other thetas"]
+        if DRAWS in is_done:
+            self.left_out = [name for name in self.left_out if name != FEW_DRAWS]
 
     def _run_stage(self, space: Subspace, options: Options) -> None:
         outcome = self._check_once(space, options)
