@@ -441,10 +441,18 @@ class Findings:
         parts = [part for part in self.check.components if part.difference != 0.0 and math.isfinite(part.error)]
         if not parts:
             return f"{self._n_checked()} checked"
-        largest = max(part.error for part in parts)
-        doubt = max(part.uncertainty / abs(part.difference) for part in parts)
+        resolved = self._resolved_parts() or parts
+        largest = max(part.error for part in resolved)
+        doubt = max(part.uncertainty / abs(part.difference) for part in resolved)
         within = number(100 * max(largest, min(doubt, 1.0)), 1)
-        return f"{self._n_checked()} agree with differences to {within}%"
+        few = len(parts) - len(resolved)
+        rest = f", {few} of them only within rounding, since they are too small to resolve" if few else ""
+        return f"{self._n_checked()} agree with differences to {within}%{rest}"
+
+    def _resolved_parts(self) -> list[Part]:
+        """Return the components whose differences have at least one correct digit."""
+        parts = () if self.check is None else self.check.components
+        return [part for part in parts if math.isfinite(part.error) and part.uncertainty < 0.1 * abs(part.difference)]
 
     def _n_checked(self) -> str:
         n_seen = len(self.check.components) if self.check is not None else 0
@@ -510,7 +518,7 @@ class Findings:
         if self.is_small_spread and (self.spread > 0 or self.gradient_spread > 0):
             warnings.append(
                 f"equal calls differ in the last digits, costs by {number(self.spread)}{self._relative(self.spread)}: "
-                "errors below what this allows are not seen"
+                f"errors of the gradient below about {self.resolution} are not seen"
             )
         if self.elsewhere:
             warnings.append(
@@ -545,8 +553,10 @@ class Findings:
 
     @property
     def resolution(self) -> str:
-        """The smallest relative error that central differences detect in this precision, about u^(2/3), as text in %."""
-        return f"{100 * self._unit ** (2 / 3):.1g}%"
+        """The smallest relative error that the differences detect, as text in %: at least u^(2/3), as for central differences."""
+        parts = self._resolved_parts()
+        doubt = max((part.uncertainty / abs(part.difference) for part in parts), default=0.0)
+        return f"{100 * max(self._unit ** (2 / 3), doubt):.1g}%"
 
     def label(self, part: Part) -> str:
         """Return a part's name: the name of its component of theta, or the name of its direction, ``direction 0``."""
@@ -564,7 +574,7 @@ class Findings:
 
     def _named_parts(self, check: Check) -> list[Part]:
         """Return the worst parts that name an input: located groups, then components, then directions."""
-        located = [part for part in check.worst_parts if part.name in self.located]
+        located = [part for part in check.parts if part.name in self.located]
         inside = [part for part in check.worst_parts if part.component is not None]
         exact = [part for part in inside if self.label(part) in self.located.values()]
         return exact or located or inside or list(check.worst_parts)

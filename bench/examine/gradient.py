@@ -27,25 +27,33 @@ NOISE_POINTS = 17
 """Costs per direction that no step needs: the centre, and the points at which the noise is measured."""
 SCAN = 7 * 65
 """Number of costs of a staircase search along one direction that is not clearly right."""
+ALL_STEPS, FEW_DRAWS, DRAWS = "all steps and random directions", "2 other thetas", "8 other thetas"
+"""Names of the later stages."""
+WRONG_SHARE = 0.3
+"""Share of the remaining budget within which a wrong gradient is checked at 8 other thetas without 2 first."""
 SMALL = 0.6
 """Power of the unit roundoff: a relative difference between equal calls below it is a floor, not a fault."""
-MOST_STORED = 10_000
-"""Largest theta whose costs and gradients are stored between stages."""
+MANY = 10_000
+"""Largest theta that is checked at 8 other thetas; a larger one at 2, since each call copies all its numbers."""
 OTHER_NOISE = 2
 """Number of further draws of the simulator's own noise under which the gradient is checked along random directions."""
 ROUGH = 0.1
 """Share of the cost's change over the widest step that noise between neighbouring thetas makes up where a cost is rough."""
+IN_CELL = 0.4
+"""Distance from a float32 number, in units of its last place, that float32 rounds away."""
+CELLS, DISTINCT_CELLS = 9, 6
+"""Number of neighbouring float32 thetas at which costs are compared, and fewest different costs of a cost in float32."""
 STATE = 0.1
 """Largest share of the difference between histories by which a cost with equal histories differs."""
 
 
 class Store:
-    """Values by theta. A stored value is used once; the next request computes it again and compares."""
+    """Values by coordinates. A stored value is used once; the next request computes it again and compares."""
 
     def __init__(self) -> None:
         self._values: dict[bytes, tuple[np.ndarray, bool]] = {}
         self.spread = 0.0
-        """Largest difference between two values of one theta."""
+        """Largest difference between two values of one key."""
 
     def take(self, key: bytes) -> np.ndarray | None:
         """Return a value that has not been used since it was computed, or None."""
@@ -99,12 +107,12 @@ class GradientStages:
         """Largest difference between equal calls, of the cost, and of the gradient relative to its norm."""
         self.has_state = False
         """Whether the cost depends on the call before it, in a repeatable way."""
+        self._repeated = False
         self.is_hidden_single = False
         """Whether the cost has single precision, though it returns a float64."""
         self._share = 0.5 if has_sigma else 0.8
         self._random = random
         self._costs_store, self._gradients_store = Store(), Store()
-        self._is_storing = self.theta.size <= MOST_STORED
 
     # ------------------------------------------------------------------------------------------------ calls
 
@@ -117,34 +125,25 @@ class GradientStages:
         """Return the simulator's gradient at ``theta (d,)``."""
         return np.asarray(self.simulator.gradients(theta[:, None], self.w if w is None else w)[:, 0])
 
-    def _stored_costs(self, thetas: np.ndarray) -> np.ndarray:
-        if not self._is_storing:
-            return self.costs(thetas)
-        keys = [column.tobytes() for column in np.ascontiguousarray(thetas.T)]
+    def _stored_costs(self, space: Subspace, z: np.ndarray) -> np.ndarray:
+        keys = [column.tobytes() for column in np.ascontiguousarray(z.T)]
         taken = [self._costs_store.take(key) for key in keys]
         missing = [i for i, value in enumerate(taken) if value is None]
-        if missing:
-            self._compute(thetas, keys, taken, missing)
-        return np.array([float(value) for value in taken if value is not None])
-
-    def _compute(
-        self, thetas: np.ndarray, keys: list[bytes], taken: list[np.ndarray | None], missing: list[int]
-    ) -> None:
-        """Compute missing costs and store them batch by batch, so that an interrupted stage keeps its costs."""
+        # batch by batch, so that an interrupted stage keeps its costs
         width = self.simulator.width
         for first in range(0, len(missing), width):
             part = missing[first : first + width]
-            for i, value in zip(part, self.costs(thetas[:, part]), strict=True):
+            for i, value in zip(part, space.costs(self.costs, z[:, part], width), strict=True):
                 taken[i] = computed = np.asarray(value)
                 self._costs_store.put(keys[i], computed)
+        return np.array([float(value) for value in taken if value is not None])
 
-    def _stored_gradient(self, theta: np.ndarray) -> np.ndarray:
-        if not self._is_storing:
-            return self.gradient_at(theta)
-        key = theta.tobytes()
+    def _stored_gradient(self, space: Subspace, z: np.ndarray) -> np.ndarray:
+        """Return the derivatives by the coordinates of a space at ``z (m,)``, ``(m,)``."""
+        key = z.tobytes()
         value = self._gradients_store.take(key)
         if value is None:
-            value = self.gradient_at(theta)
+            value = space.project(self.gradient_at(space.place(z[:, None])[:, 0]))
             self._gradients_store.put(key, value)
         return value
 
@@ -188,10 +187,12 @@ class GradientStages:
         if self.is_failed:
             return
         space = choose(self.layout, self.scale, self.gradient, self.seed)
+        if self.gradient is not None:
+            self._gradients_store.put(space.origin().tobytes(), space.project(self.gradient), is_fresh=True)
         try:
             for stage in (partial(self._compare_quickly, space), self._repeat):
                 stage()
-                if self.simulator.precision == "float64" and self.simulator.has_single_precision:
+                if self._has_hidden_single():
                     self.simulator.precision, self.is_hidden_single = "float32", True
                     self._compare_quickly(space)
         except OutOfTime:
@@ -217,8 +218,6 @@ class GradientStages:
         self.is_failed = simulator.n_failed_gradients > 0
         if not self.is_failed:
             self.gradient = gradient
-            if self._is_storing:
-                self._gradients_store.put(self.theta.tobytes(), gradient, is_fresh=True)
 
     def _compare_quickly(self, space: Subspace) -> None:
         """Compare the gradient with two costs per coordinate, and with more where the full steps do not fit."""
@@ -226,7 +225,7 @@ class GradientStages:
         slope = None if self.gradient is None else space.project(self.gradient)
 
         def cost(z: np.ndarray) -> np.ndarray:
-            return space.costs(self._stored_costs, z, self.simulator.width)
+            return self._stored_costs(space, z)
 
         quick = QuickCheck(cost, space.origin(), space.scale, slope, self.value, self.simulator.unit, self.spread)
         names = [f"component {i}" for i in range(space.size)]
@@ -258,6 +257,7 @@ class GradientStages:
                     others.append(value)
                 else:
                     after[before].append(value)
+            self._repeated = True
         except OutOfTime:
             self.left_out.append("repeating a call")
         spreads = []
@@ -270,6 +270,30 @@ class GradientStages:
             apart = abs(after["theta"][-1] - last[-1])
             self.has_state = max(np.ptp(after["theta"]), np.ptp(last)) <= STATE * apart
 
+    def _has_hidden_single(self) -> bool:
+        """Return whether a cost that returns float64 computes in float32: its values have single precision, or it reads
+        theta as float32.
+
+        A cost that reads theta as float32 is constant within one rounding cell of float32, and changes from each cell to
+        the next, unlike a staircase with wider treads.
+        """
+        if self.simulator.unit > float(np.finfo(np.float64).eps) or self.spread > 0.0:
+            return False
+        if self.simulator.has_single_precision:
+            return True
+        if not self._repeated:
+            return False
+        self.clock.start_stage("precision")
+        first = np.float32(self.theta)
+        ulp = np.spacing(np.abs(first)).astype(np.float64) * np.where(np.arange(first.size) % 3 == 1, -1.0, 1.0)
+        at = first[:, None] + ulp[:, None] * np.array([0.0, IN_CELL])
+        if not _are_equal(self.costs(at)):
+            return False
+        cells = self.costs(first[:, None] + ulp[:, None] * np.arange(CELLS))
+        inside = self.costs(first[:, None] + ulp[:, None] * np.array([[-IN_CELL], [CELLS // 2 - IN_CELL], [CELLS // 2 + IN_CELL]]).T)
+        is_constant = _are_equal(np.r_[cells[0], inside[0]]) and _are_equal(np.r_[cells[CELLS // 2], inside[1:]])
+        return is_constant and np.unique(cells).size >= DISTINCT_CELLS
+
     def _plan(self, size: int, is_right: bool) -> list[tuple[str, Options]]:
         """Return the stages after the quick one, from the cheapest to the full check."""
         unit = self.simulator.unit
@@ -281,15 +305,18 @@ class GradientStages:
         repeated = self.spread == 0.0
         # a wrong gradient is named by its ratios at other thetas first, and then searched for staircases
         scanned = 4 if is_right else 0
-        return [
+        stages = [
             ("more steps", base),
             (
-                "all steps and random directions",
+                ALL_STEPS,
                 replace(base, eps=eps, directions=2, scanned=scanned, repeated=repeated),
             ),
-            ("2 other thetas", replace(base, eps=eps, directions=2, draws=2, scanned=scanned)),
-            ("8 other thetas", replace(base, eps=eps, directions=2, draws=8, scanned=4)),
+            (FEW_DRAWS, replace(base, eps=eps if is_right else few, directions=2, draws=2, scanned=scanned)),
+            (DRAWS, replace(base, eps=eps, directions=2, draws=8, scanned=4)),
         ]
+        if self.theta.size > MANY:
+            return [*stages[:2], (FEW_DRAWS, replace(base, eps=eps, directions=2, draws=2, scanned=2))]
+        return stages
 
     def _cost_of(self, options: Options, size: int) -> tuple[int, int]:
         """Return the numbers of costs and gradients of a stage that no stored value makes cheaper."""
@@ -310,18 +337,23 @@ class GradientStages:
         self.clock.start_stage("checking the gradient")
         assert self.check is not None
         is_done: list[str] = []
-        for index in range(4):
-            stages = self._plan(space.size, self.check.trusted)
-            name, options = stages[index]
-            if not self.clock.can_afford(*self._cost_of(options, space.size), share=self._share):
+        names = [name for name, _ in self._plan(space.size, True)]
+        for name in names:
+            plan = dict(self._plan(space.size, self.check.trusted))
+            is_wrong = any(part.verdict in FAULTS for part in self.check.parts)
+            if name == ALL_STEPS and is_wrong:
+                continue  # the ratios at other thetas name the fault, and these stages also have all steps
+            if not self.clock.can_afford(*self._cost_of(plan[name], space.size), share=self._share):
                 self.left_out.append(name)
-                if name != "2 other thetas":
+                if name != FEW_DRAWS:
                     break
                 continue
-            if name == "2 other thetas" and self.clock.can_afford(
-                *self._cost_of(stages[-1][1], space.size), share=self._share
+            share = WRONG_SHARE if is_wrong else self._share
+            if name == FEW_DRAWS != names[-1] and self.clock.can_afford(
+                *self._cost_of(plan[names[-1]], space.size), share=share
             ):
                 continue
+            options = plan[name]
             self._refresh()
             self.clock.limit(max(self._share, 0.9))
             try:
@@ -332,14 +364,13 @@ class GradientStages:
                 break
             finally:
                 self.clock.limit(1.0)
-        if "8 other thetas" in is_done:
-            self.left_out = [name for name in self.left_out if name != "2 other thetas"]
+        if DRAWS in is_done:
+            self.left_out = [name for name in self.left_out if name != FEW_DRAWS]
 
     def _run_stage(self, space: Subspace, options: Options) -> None:
         outcome = self._check_once(space, options)
         self.spread = max(self.spread, self._costs_store.spread)
-        size = float(np.linalg.norm(np.nan_to_num(self.gradient) if self.gradient is not None else 0.0))
-        self.gradient_spread = self._gradients_store.spread / size if size else 0.0
+        self.gradient_spread = self._spread_of_gradients(space)
         if outcome.cause == "nondeterministic" and self.is_small_spread and self.spread > 0.0:
             self._refresh()
             outcome = self._check_once(space, replace(options, repeated=False))
@@ -347,12 +378,14 @@ class GradientStages:
 
     def _check_once(self, space: Subspace, options: Options, w: np.ndarray | None = None) -> Check:
         def cost(z: np.ndarray) -> np.ndarray:
-            known = self._stored_costs if w is None else lambda thetas: self.costs(thetas, w)
-            return space.costs(known, z, self.simulator.width)
+            if w is None:
+                return self._stored_costs(space, z)
+            return space.costs(lambda thetas: self.costs(thetas, w), z, self.simulator.width)
 
         def slope(z: np.ndarray) -> np.ndarray:
-            theta = space.place(z[:, None])[:, 0]
-            return space.project(self._stored_gradient(theta) if w is None else self.gradient_at(theta, w))
+            if w is None:
+                return self._stored_gradient(space, z)
+            return space.project(self.gradient_at(space.place(z[:, None])[:, 0], w))
 
         outcome = check(
             cost, slope if self.gradient is not None else None, space.origin(), replace(options, scale=space.scale)
@@ -362,14 +395,18 @@ class GradientStages:
             outcome = recaused(
                 replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
             )
-        return self._with_roughness(self._without_small_spread(outcome))
+        return self._with_roughness(self._without_small_spread(space, outcome))
 
-    def _without_small_spread(self, outcome: Check) -> Check:
+    def _spread_of_gradients(self, space: Subspace) -> float:
+        """Return the largest difference between equal calls of the gradient, relative to its norm."""
+        slope = np.zeros(1) if self.gradient is None else np.nan_to_num(space.project(self.gradient))
+        size = float(np.linalg.norm(slope))
+        return self._gradients_store.spread / size if size else 0.0
+
+    def _without_small_spread(self, space: Subspace, outcome: Check) -> Check:
         """Return a check without the verdict ``nondeterministic`` where only the last digits of the gradient differ."""
-        size = float(np.linalg.norm(np.nan_to_num(self.gradient) if self.gradient is not None else 0.0))
-        spread = self._gradients_store.spread / size if size else 0.0
         is_own = any(part.verdict == "nondeterministic" for part in outcome.parts)
-        if outcome.cause != "nondeterministic" or is_own or spread > self.simulator.unit**SMALL:
+        if outcome.cause != "nondeterministic" or is_own or self._spread_of_gradients(space) > self.simulator.unit**SMALL:
             return outcome
         return recaused(outcome)
 
@@ -421,6 +458,10 @@ class GradientStages:
                 self.more.append(space.restore(self._check_once(space, options, drawn)))
         except OutOfTime:
             self.left_out.append("checks under other noise")
+
+
+def _are_equal(values: np.ndarray) -> bool:
+    return bool(np.isfinite(values).all() and (values == values[0]).all())
 
 
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:

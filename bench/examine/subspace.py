@@ -57,6 +57,7 @@ class Subspace:
         self.scale = np.r_[scale[components], np.ones(len(groups))]
         """The size of each coordinate ``(m,)``."""
         self.is_whole = not groups
+        self._thetas = np.empty((0, 0))
 
     @property
     def size(self) -> int:
@@ -77,7 +78,11 @@ class Subspace:
         """Return the thetas ``(d, B)`` at coordinates ``z (m, B)``."""
         if self.is_whole:
             return z
-        thetas = np.repeat(self.theta[:, None], z.shape[1], axis=1)
+        return self._place_into(np.empty((self.theta.size, z.shape[1])), z)
+
+    def _place_into(self, thetas: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Write the thetas at coordinates ``z (m, B)`` into ``thetas (d, B)``, and return them."""
+        thetas[:] = self.theta[:, None]
         if self.components:
             thetas[self.components] += z[: len(self.components)]
         for k, group in enumerate(self.groups, len(self.components)):
@@ -96,9 +101,14 @@ class Subspace:
         """Return the costs ``(B,)`` at ``z (m, B)``, from ``cost`` of at most ``width`` thetas ``(d, width)`` at a time."""
         if self.is_whole:
             return cost(z)
-        return np.concatenate(
-            [cost(self.place(z[:, i : i + width])) for i in range(0, z.shape[1], width)] or [np.zeros(0)]
-        )
+        # one array for all calls, since new memory for a million numbers takes longer than writing them
+        costs = [np.zeros(0)]
+        for first in range(0, z.shape[1], width):
+            part = z[:, first : first + width]
+            if self._thetas.shape != (self.theta.size, part.shape[1]):
+                self._thetas = np.empty((self.theta.size, part.shape[1]))
+            costs.append(cost(self._place_into(self._thetas, part)))
+        return np.concatenate(costs)
 
     def restore(self, check: Check) -> Check:
         """Return a check in these coordinates with its parts named after theta's components and groups."""

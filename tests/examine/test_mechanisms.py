@@ -112,17 +112,30 @@ def test_a_warm_start_is_one_finding():
     assert len(report.problems) == 1
 
 
+@pytest.mark.parametrize("is_mixed", [False, True])
 @pytest.mark.parametrize(("factor", "status", "cause"), [(1.0, 0, None), (1.55, 1, "wrong_factor")])
-def test_float32_behind_float_is_checked_as_float32(factor, status, cause):
-    report = bench.examine(mechanisms.single, START, grad=lambda x: factor * mechanisms.single_gradient(x), **QUICK)
+def test_float32_behind_float_is_checked_as_float32(factor, status, cause, is_mixed):
+    def cost(x):
+        return mechanisms.single(x, is_mixed)
+
+    report = bench.examine(cost, START, grad=lambda x: factor * mechanisms.single_gradient(x), **QUICK)
     assert report.status == status, str(report)
     assert cause is None or report.cause == cause
     assert (report.precision, report.is_hidden_single) == ("float32", True)
     assert report.check.components[0].step > 1e-4  # where float32 resolves a difference
 
 
-def test_float64_is_not_taken_for_float32():
-    report = bench.examine(lambda x: float(np.floor(8 * x[0]) + x[0] * 0.5), [0.75], grad=lambda x: [0.5], **QUICK)
+@pytest.mark.parametrize(
+    "cost",
+    [
+        lambda x: float(np.floor(8 * x[0]) + x[0] * 0.5),
+        lambda x: float(np.round(x[0], 5)),
+        lambda x: float(np.round(x[0] ** 2, 7)),
+        lambda x: 0.5 * x[0] + 1e-7 * np.floor(1e7 * x[0]),
+    ],
+)
+def test_float64_is_not_taken_for_float32(cost):
+    report = bench.examine(cost, [0.75], grad=lambda x: [0.5], **QUICK)
     assert report.precision == "float64"
 
 

@@ -91,12 +91,17 @@ def swinging(x, steps=20, shared=False, slope=False):
     return np.array([dq, dv])
 
 
-def single(x):
-    """Return a float32 rollout's cost as a Python float, as ``float(loss.numpy()[0])`` does."""
+def single(x, is_mixed=False):
+    """Return a float32 rollout's cost as a Python float, as ``float(loss.numpy()[0])`` does.
+
+    With ``is_mixed`` only the states are float32, and the cost is computed from them in float64.
+    """
     q, v, dt = np.float32(x[0]), np.float32(x[1]), np.float32(0.02)
     for _ in range(40):
         v = v - dt * np.float32(9.81) * np.sin(q)
         q = q + dt * v
+    if is_mixed:
+        return float(q) ** 2 + 0.1 * float(v) ** 2
     return float(q * q + np.float32(0.1) * v * v)
 
 

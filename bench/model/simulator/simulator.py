@@ -172,11 +172,13 @@ class Simulator:
         for start in range(0, count, size):
             part = slice(start, min(start + size, count))
             self.clock.check(part.stop - part.start)
-            columns = np.arange(part.start, part.stop)
+            columns: Any = part
+            n_columns = part.stop - part.start
             if (self.library == "jax" or self.fixed) and size > 1:
-                columns = np.r_[columns, np.repeat(columns[-1:], size - columns.size)]
-            is_first = (kind, columns.size) not in self._shapes
-            self._shapes.add((kind, columns.size))
+                columns = np.minimum(np.arange(part.start, part.start + size), part.stop - 1)
+                n_columns = size
+            is_first = (kind, n_columns) not in self._shapes
+            self._shapes.add((kind, n_columns))
             began = self.clock.spent
             with self.clock.interrupt_when_over(first=is_first):
                 results = function(thetas[:, columns], None if w is None else w[:, columns])
@@ -242,7 +244,7 @@ class Simulator:
         if self.library == "jax":
             import jax.numpy as jnp
 
-            return jnp.asarray(value)
+            return jnp.array(value)
         if self.library == "torch":
             import torch
 

@@ -1,0 +1,720 @@
+"""Runs `bench.examine` on failures of engines and on simulators of other fields, and writes a table.
+
+    python tests/programs/engine_cases.py [OUT.md] [NAME ...]
+
+Each case runs in a process of its own with the default budget of `bench.examine`. It needs an environment with the engines
+(`examples/requirements-engines.txt`) and `diffrax torchdiffeq jax-md phiflow`; a case whose library is missing is a row that
+says so. The table states the cause that was found, the seconds with first calls, the calls and the peak memory of the process.
+"""
+
+import ctypes
+import functools
+import importlib.util
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+LIMIT = 600
+"""Seconds for one case."""
+HEAD = ("case", "library", "expected", "found", "named", "seconds", "of these first calls", "costs + gradients", "GB")
+MARK = "\x1eROW "
+BEGIN, END = "<!-- cases -->\n", "<!-- end of cases -->"
+RIGHT = ("smooth", "nonlinear", "rounding", "saturated", "mode_crossing")
+"""Causes of a right gradient."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A cost with a gradient: ``make()`` returns (cost, theta, settings) of `bench.examine`."""
+
+    name: str
+    library: str
+    """The package, as pip names it."""
+    expected: tuple[str, ...]
+    """Causes that name the planted or known fault, or :data:`RIGHT`."""
+    make: Callable[[], tuple[Any, Any, dict[str, Any]]]
+
+
+CASES: dict[str, Case] = {}
+
+
+def case(name: str, library: str, *expected: str, **variants: Any) -> Callable[..., Any]:
+    """Register a function as a case."""
+
+    def register(make: Callable[..., Any]) -> Callable[..., Any]:
+        CASES[name] = Case(name, library, expected or RIGHT, functools.partial(make, **variants))
+        return make
+
+    return register
+
+
+# ------------------------------------------------------------------------------------------------ engines: MJX, MuJoCo
+
+SLIDER = """<mujoco><option timestep="0.005" cone="{cone}" iterations="{iterations}"><flag frictionloss="{loss}"/></option>
+<worldbody><geom type="plane" size="5 5 1" friction=".5" condim="{condim}"/><body pos="0 0 0.095">
+<joint type="slide" axis="1 0 0" frictionloss=".2"/><joint type="slide" axis="0 0 1"/>
+<geom type="sphere" size="0.1" mass="1" friction=".5" condim="{condim}"/></body></worldbody></mujoco>"""
+
+
+def slider(steps=4, at_target=False, by_friction=False, **options):
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    import jax.numpy as jnp
+    import mujoco
+    from mujoco import mjx
+
+    settings = {"cone": "pyramidal", "iterations": 1, "condim": 3, "loss": "enable"} | options
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(SLIDER.format(**settings)))
+
+    def rolled(m, v):
+        data = mjx.make_data(m).replace(qvel=v)
+        for _ in range(steps):
+            data = mjx.step(m, data)
+        return data.qpos
+
+    def cost(v):
+        q = rolled(model, v)
+        return (q[0] - 0.2) ** 2 + q[1] ** 2
+
+    def to_target(v):
+        return jnp.linalg.norm(rolled(model, v) - jax.lax.stop_gradient(rolled(model, jnp.array([1.0, -0.2]))))
+
+    def with_friction(p):
+        m = model.replace(dof_frictionloss=model.dof_frictionloss.at[0].set(p["friction loss"]))
+        return rolled(m, jnp.array([1.0, -0.2]) * p["speed"])[0] ** 2
+
+    if by_friction:
+        return with_friction, {"friction loss": 0.2, "speed": 1.0}, {"grad": "jax", "allow_zero": False}
+    return to_target if at_target else cost, np.array([1.0, -0.2]), {"grad": "jax"}
+
+
+case("MJX, elliptic cone", "mujoco-mjx", "nan_gradient", cone="elliptic")(slider)
+case("MJX, reverse mode with 20 iterations", "mujoco-mjx", "raised", iterations=20)(slider)
+case("MJX, distance to the target, at the target", "mujoco-mjx", "nan_gradient", at_target=True)(slider)
+case("MJX, friction loss disabled", "mujoco-mjx", "no_effect", by_friction=True, loss="disable")(slider)
+case("MJX, pyramidal cone, one iteration", "mujoco-mjx")(slider)
+
+
+@case("MuJoCo, data and warm start kept between calls", "mujoco", "nondeterministic")
+def mujoco_warm():
+    import mujoco
+
+    options = {"cone": "pyramidal", "iterations": 2, "condim": 3, "loss": "enable"}
+    model = mujoco.MjModel.from_xml_string(SLIDER.format(**options))
+    data = mujoco.MjData(model)
+
+    def cost(v):
+        data.qpos[:], data.qvel[:] = 0.0, v
+        for _ in range(20):
+            mujoco.mj_step(model, data)
+        return float((data.qpos[0] - 0.2) ** 2)
+
+    def grad(v):
+        return [(cost(v + 1e-6 * e) - cost(v - 1e-6 * e)) / 2e-6 for e in np.eye(2)]
+
+    return cost, [1.0, -0.2], {"grad": grad}
+
+
+# ------------------------------------------------------------------------------------------------ engines: Warp, Newton
+
+
+def _quiet_warp():
+    import warp as wp
+
+    wp.config.quiet = True
+    wp.set_device("cpu")
+    return wp
+
+
+@case("Newton Featherstone, one tape over 30 steps", "newton", "overwritten")
+def featherstone():
+    _quiet_warp()
+    sys.path.insert(0, str(ROOT / "examples"))
+    import newton_cartpole as n
+
+    settings = {"grad": lambda x, steps=30: n.rollout(x, steps, False)[1], "horizons": [1, 10, 30], "tolerance": 0.01}
+    settings["twin_grad"] = lambda x: n.rollout(x, 30, True)[1]
+    return lambda x, steps=30: n.rollout(x, steps, False)[0], n.theta, settings
+
+
+@case("Newton Featherstone, a solver per step", "newton")
+def featherstone_right():
+    _quiet_warp()
+    sys.path.insert(0, str(ROOT / "examples"))
+    import newton_cartpole as n
+
+    return lambda x: n.rollout(x, 10, True)[0], n.theta, {"grad": lambda x: n.rollout(x, 10, True)[1]}
+
+
+def newton_body(solver_name, free):
+    """Return a rigid ball on the ground, by height and speed, in one of Newton's solvers."""
+    wp = _quiet_warp()
+    import newton
+
+    builder = newton.ModelBuilder()
+    builder.default_shape_cfg.ke, builder.default_shape_cfg.kd = 1e3, 0.0
+    if free:
+        body = builder.add_body(xform=wp.transform((0, 0, 0.5), wp.quat_identity()))
+    else:
+        body = builder.add_link(mass=1.0)
+        builder.add_articulation([builder.add_joint_prismatic(-1, body, axis=(0, 0, 1))])
+    builder.add_shape_sphere(body, radius=0.1)
+    builder.add_ground_plane()
+    model = builder.finalize(requires_grad=True)
+    pipeline = newton.CollisionPipeline(model, requires_grad=True)
+
+    def rollout(x, steps=30):
+        solver = getattr(newton.solvers, f"Solver{solver_name}")(model)
+        states = [model.state() for _ in range(steps + 1)]
+        q, qd = states[0].body_q.numpy(), states[0].body_qd.numpy()
+        q[body][2], qd[body][2] = x[0], x[1]
+        states[0].body_q.assign(q)
+        states[0].body_qd.assign(qd)
+        if states[0].joint_q is not None and len(states[0].joint_q):
+            newton.eval_ik(model, states[0], states[0].joint_q, states[0].joint_qd)
+        with wp.Tape() as tape:
+            for before, after in zip(states, states[1:], strict=False):
+                contacts = pipeline.contacts()
+                pipeline.collide(before, contacts)
+                before.clear_forces()
+                solver.step(before, after, model.control(), contacts, 2e-3)
+        height = states[-1].body_q.numpy()[body][2]
+        seed = np.zeros((model.body_count, 7), np.float32)
+        seed[body][2] = 2 * (height - np.float32(0.3))
+        tape.backward(grads={states[-1].body_q: wp.array(seed, dtype=wp.transform)})
+        first = states[0]
+        if solver_name == "Featherstone":
+            slopes = [float(first.joint_q.grad.numpy()[2]), float(first.joint_qd.grad.numpy()[2])]
+        else:
+            slopes = [float(first.body_q.grad.numpy()[body][2]), float(first.body_qd.grad.numpy()[body][2])]
+        return float((height - np.float32(0.3)) ** 2), slopes
+
+    return lambda x: rollout(x)[0], [0.12, -1.0], {"grad": lambda x: rollout(x)[1]}
+
+
+WRONG = ("wrong_adjoint", "missing_term", "wrong_factor", "disconnected")
+case("Newton XPBD, a rigid body at the ground", "newton", *WRONG, solver_name="XPBD", free=True)(newton_body)
+case("Newton Featherstone, a free joint", "newton", "nan_gradient", *WRONG, solver_name="Featherstone", free=True)(
+    newton_body
+)
+
+
+def warp_spring(overwritten, right=False):
+    """Return a spring of 20 steps in a Warp kernel that overwrites an array that its adjoint reads."""
+    wp = _quiet_warp()
+    dt = wp.constant(wp.float64(0.05))
+
+    @wp.kernel
+    def step(x: wp.array(dtype=wp.float64), v: wp.array(dtype=wp.float64), k: wp.array(dtype=wp.float64), a: int, b: int):
+        v[b] = v[a] - dt * k[0] * wp.sin(x[a])
+        x[b] = x[a] + dt * v[b]
+
+    @wp.kernel
+    def soften(k: wp.array(dtype=wp.float64)):
+        k[0] = k[0] * wp.float64(0.9)
+
+    def rollout(theta, steps=20):
+        x, v = (wp.array(np.r_[first, np.zeros(steps)], dtype=wp.float64, requires_grad=True) for first in theta[:2])
+        k = wp.array([theta[2]], dtype=wp.float64, requires_grad=True)
+        last = 0 if overwritten == "state" else steps
+        with wp.Tape() as tape:
+            for t in range(steps):
+                at = (0, 0) if overwritten == "state" else (t, t + 1)
+                if overwritten == "parameter":
+                    wp.launch(soften, dim=1, inputs=[k])
+                wp.launch(step, dim=1, inputs=[x, v, k, *at])
+        end = x.numpy()[last]
+        seed = np.zeros(steps + 1)
+        seed[last] = 2 * end
+        tape.backward(grads={x: wp.array(seed, dtype=wp.float64)})
+        return float(end**2), [x.grad.numpy()[0], v.grad.numpy()[0], k.grad.numpy()[0]]
+
+    settings = {"grad": lambda x, steps=20: rollout(x, steps)[1]}
+    if not right:
+        settings["horizons"] = [1, 2, 5, 20]
+    return lambda x, steps=20: rollout(x, steps)[0], [0.7, 0.3, 9.0], settings
+
+
+case("Warp, parameter overwritten between launches", "warp-lang", "overwritten", overwritten="parameter")(warp_spring)
+case("Warp, state overwritten in place", "warp-lang", "overwritten", overwritten="state")(warp_spring)
+case("Warp, an array entry per step", "warp-lang", overwritten="", right=True)(warp_spring)
+
+
+@case("MuJoCo Warp, a tape around its steps", "mujoco-warp", *WRONG, "nan_gradient")
+def mujoco_warp():
+    wp = _quiet_warp()
+    import mujoco
+    import mujoco_warp as mjw
+
+    options = {"cone": "pyramidal", "iterations": 4, "condim": 3, "loss": "enable"}
+    host = mujoco.MjModel.from_xml_string(SLIDER.format(**options))
+    model = mjw.put_model(host)
+
+    def rollout(v):
+        data = mjw.make_data(host)
+        data.qvel.assign(np.float32([v]))
+        data.qvel.requires_grad = data.qpos.requires_grad = True
+        with wp.Tape() as tape:
+            for _ in range(4):
+                mjw.step(model, data)
+        q = data.qpos.numpy()[0]
+        tape.backward(grads={data.qpos: wp.array(np.float32([[2 * (q[0] - 0.2), 2 * q[1]]]), dtype=wp.float32)})
+        return float((q[0] - np.float32(0.2)) ** 2 + q[1] ** 2), data.qvel.grad.numpy()[0]
+
+    return lambda v: rollout(v)[0], [1.0, -0.2], {"grad": lambda v: rollout(v)[1]}
+
+
+# ------------------------------------------------------------------------------------------------ engines: Drake, Genesis
+
+
+@case("Drake, speed of a body at rest", "drake", "nan_gradient")
+def drake_rest():
+    import pydrake.all as drake
+
+    builder = drake.DiagramBuilder()
+    plant, _ = drake.AddMultibodyPlantSceneGraph(builder, time_step=2e-3)
+    body = plant.AddRigidBody("body", drake.SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+    plant.AddJoint(drake.PrismaticJoint("slide", plant.world_frame(), body.body_frame(), [1, 0, 0]))
+    plant.Finalize()
+    diagram = builder.Build()
+    models = {float: diagram, drake.AutoDiffXd: diagram.ToAutoDiffXd()}
+
+    def cost(x, kind=float):
+        model = models[kind]
+        simulator = drake.Simulator_[kind](model)
+        own, context = model.GetSubsystemByName("plant"), simulator.get_mutable_context()
+        zero = 0.0 * x[0]
+        own.SetPositionsAndVelocities(own.GetMyMutableContextFromRoot(context), [x[0], zero])
+        simulator.AdvanceTo(0.1)
+        q, v = own.GetPositionsAndVelocities(own.GetMyContextFromRoot(context))
+        return (q - 0.3) ** 2 + 0.1 * np.sqrt(v * v)
+
+    return (
+        lambda x: float(cost(x)),
+        [0.5],
+        {"grad": lambda x: cost(drake.InitializeAutoDiff(x)[:, 0], drake.AutoDiffXd).derivatives()},
+    )
+
+
+def genesis_scene(requires_grad):
+    import genesis as gs
+
+    scene = gs.Scene(sim_options=gs.options.SimOptions(dt=4e-3, requires_grad=requires_grad), show_viewer=False)
+    scene.add_entity(gs.morphs.Plane())
+    box = scene.add_entity(gs.morphs.Box(size=(0.2, 0.2, 0.2), pos=(0.0, 0.0, 0.5)))
+    scene.build()
+    return scene, box
+
+
+@case("Genesis, scenes with and without gradients", "genesis-world", "twin")
+def genesis_twin():
+    import genesis as gs
+    import torch
+
+    gs.init(backend=gs.cpu, precision="64", logging_level="error")
+    scenes = {key: genesis_scene(key) for key in (True, False)}
+
+    def rollout(x, with_gradient, slope=False):
+        scene, box = scenes[with_gradient]
+        scene.reset()
+        start = torch.as_tensor(np.array(x)).requires_grad_(slope)
+        zero = torch.zeros(1, dtype=start.dtype)
+        box.set_pos(torch.cat([zero, zero, start[:1]]))
+        box.set_dofs_velocity(torch.cat([zero, zero, start[1:], zero, zero, zero]))
+        for _ in range(30):
+            scene.step()
+        cost = (box.get_state().pos.reshape(-1)[2] - 0.3) ** 2
+        return torch.autograd.grad(cost, start)[0].numpy() if slope else float(cost)
+
+    settings = {"grad": lambda x: rollout(x, True, True), "twin": lambda x: rollout(x, False)}
+    return lambda x: rollout(x, True), [0.12, -1.0], settings
+
+
+# ------------------------------------------------------------------------------------------------ adaptive ODE solvers
+
+
+def van_der_pol(p, y, stack):
+    return stack([y[1], p * (1 - y[0] ** 2) * y[1] - y[0]])
+
+
+def dopri5(rtol=1e-6, adjoint=False, forgotten=False, is_refined=False):
+    import torch
+
+    torch.set_default_dtype(torch.float64)
+    torch.set_num_threads(1)
+    import torchdiffeq
+
+    def solved(rtol):
+        def cost(p):
+            solver = torchdiffeq.odeint_adjoint if adjoint else torchdiffeq.odeint
+            damping = p[0].detach() if forgotten else p[0]
+            more = {"adjoint_params": (p,)} if adjoint else {}
+            at = torch.tensor([0.0, 1.0])
+            y = solver(lambda t, y: van_der_pol(damping, y, torch.stack), torch.stack([p[1], p[2]]), at,
+                       method="dopri5", rtol=rtol, atol=rtol * 1e-2, **more)  # fmt: skip
+            return (y[-1] ** 2).sum()
+
+        return cost
+
+    return solved(rtol), [2.0, 1.0, 0.5], {"grad": "torch", **({"refined": solved(1e-9)} if is_refined else {})}
+
+
+case("dopri5, rtol 1e-6", "torchdiffeq")(dopri5)
+case("dopri5, rtol 1e-3, with refined=", "torchdiffeq", "adaptive", rtol=1e-3, is_refined=True)(dopri5)
+case("odeint_adjoint used rightly", "torchdiffeq", *RIGHT, "adaptive", adjoint=True)(dopri5)
+case("dopri5, a detached parameter", "torchdiffeq", "disconnected", forgotten=True)(dopri5)
+
+
+def diffrax_cost(rtol=1e-6, forgotten=False, is_refined=False):
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    import diffrax
+    import jax.numpy as jnp
+
+    def solved(rtol):
+        def cost(p):
+            damping = jax.lax.stop_gradient(p[0]) if forgotten else p[0]
+            term = diffrax.ODETerm(lambda t, y, args: van_der_pol(damping, y, jnp.stack))
+            control = diffrax.PIDController(rtol=rtol, atol=rtol * 1e-2)
+            solution = diffrax.diffeqsolve(term, diffrax.Dopri5(), 0.0, 3.0, 0.01, p[1:], stepsize_controller=control)
+            return jnp.sum(solution.ys[-1] ** 2)
+
+        return cost
+
+    return solved(rtol), np.array([1.0, 1.0, 0.5]), {"grad": "jax", **({"refined": solved(1e-9)} if is_refined else {})}
+
+
+case("recursive checkpoints, rtol 1e-6", "diffrax")(diffrax_cost)
+case("recursive checkpoints, rtol 1e-3, with refined=", "diffrax", "adaptive", rtol=1e-3, is_refined=True)(diffrax_cost)
+case("recursive checkpoints, a stopped gradient", "diffrax", "disconnected", forgotten=True)(diffrax_cost)
+
+
+def solve_ivp_cost(rtol=1e-6, step=1.5e-8):
+    from scipy.integrate import solve_ivp
+
+    def cost(x):
+        slope = lambda t, y: [y[1], x[0] * (1 - y[0] ** 2) * y[1] - y[0]]  # noqa: E731
+        end = solve_ivp(slope, (0, 3), [x[1], x[2]], rtol=rtol, atol=rtol * 1e-2).y[:, -1]
+        return float((end**2).sum())
+
+    def grad(x):
+        first = cost(x)
+        return [(cost(x + step * e) - first) / step for e in np.eye(3)]
+
+    return cost, [1.0, 1.0, 0.5], {"grad": grad}
+
+
+case("solve_ivp, forward differences", "scipy")(solve_ivp_cost)
+case("solve_ivp, forward differences of 1e-14", "scipy", *WRONG, step=1e-14)(solve_ivp_cost)
+
+
+# ------------------------------------------------------------------------------------------------ other fields
+
+
+def molecules(forgotten=False):
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    import jax.numpy as jnp
+    from jax_md import energy, simulate, space
+
+    box = 4.0
+    shift_by, shift = space.periodic(box)
+    start = jnp.asarray(np.random.default_rng(0).random((16, 2)) * box)
+
+    def cost(p):
+        sigma = jax.lax.stop_gradient(p["sigma"]) if forgotten else p["sigma"]
+        potential = energy.soft_sphere_pair(shift_by, sigma=sigma, epsilon=p["epsilon"])
+        init, apply = simulate.nve(potential, shift, 1e-2)
+        state = init(jax.random.PRNGKey(0), start, kT=0.1)
+        state, _ = jax.lax.scan(lambda s, _: (apply(s), None), state, None, length=40)
+        return potential(state.position)
+
+    return cost, {"sigma": np.float64(1.0), "epsilon": np.float64(1.0)}, {"grad": "jax"}
+
+
+case("molecular dynamics", "jax-md")(molecules)
+case("molecular dynamics, a stopped gradient", "jax-md", "disconnected", "missing_term", forgotten=True)(molecules)
+
+
+def fluid(forgotten=False):
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from phi.jax import flow
+
+    flow.math.set_global_precision(64)
+    start = np.sin(np.linspace(0, 2 * np.pi, 32, endpoint=False)) + 0.3
+
+    def cost(p):
+        values = flow.math.tensor(start * p["amplitude"], flow.spatial("x"))
+        u = flow.CenteredGrid(values, flow.extrapolation.PERIODIC, bounds=flow.Box(x=1.0))
+        viscosity = jax.lax.stop_gradient(p["viscosity"]) if forgotten else p["viscosity"]
+        for _ in range(5):
+            u = flow.diffuse.explicit(u, flow.math.tensor(viscosity), 1e-2, substeps=2)
+            u = flow.advect.semi_lagrangian(u, u * flow.vec(x=1.0), 1e-2)
+        return (u.values.native("x") ** 2).sum()
+
+    return cost, {"amplitude": np.float64(1.0), "viscosity": np.float64(0.01)}, {"grad": "jax"}
+
+
+case("fluid, Burgers' equation", "phiflow")(fluid)
+case("fluid, a stopped gradient", "phiflow", "disconnected", forgotten=True)(fluid)
+
+
+def heat(transposed=True):
+    """Return a rod with convection, implicit steps and a handwritten adjoint; theta is the source at 50 places."""
+    from scipy.linalg import lu_factor, lu_solve
+
+    n, steps = 50, 20
+    a = np.eye(n) * 1.4 - np.eye(n, k=1) * 0.1 - np.eye(n, k=-1) * 0.3
+    factors = lu_factor(a)
+
+    def rollout(source):
+        u = np.zeros(n)
+        for _ in range(steps):
+            u = lu_solve(factors, u + 0.1 * source)
+        return u
+
+    def cost(source):
+        return float(((rollout(source) - 0.2) ** 2).sum())
+
+    def grad(source):
+        adjoint, total = 2 * (rollout(source) - 0.2), np.zeros(n)
+        for _ in range(steps):
+            adjoint = lu_solve(factors, adjoint, trans=1 if transposed else 0)
+            total = total + 0.1 * adjoint
+        return total
+
+    return cost, np.random.default_rng(0).random(n), {"grad": grad}
+
+
+case("heat and convection, handwritten adjoint", "scipy")(heat)
+case("heat and convection, matrix not transposed", "scipy", *WRONG, transposed=False)(heat)
+
+C_CODE = """#include <math.h>
+double cost(const double *x) { double q = x[0], v = x[1]; for (int i = 0; i < 200; i++) { v -= 0.01 * x[2] * sin(q); q += 0.01 * v; }
+  return q * q; }
+void grad(const double *x, double *g) { double q[201], v = x[1]; q[0] = x[0];
+  for (int i = 0; i < 200; i++) { v -= 0.01 * x[2] * sin(q[i]); q[i + 1] = q[i] + 0.01 * v; }
+  double dq = 2 * q[200], dv = 0, dk = 0;
+  for (int i = 199; i >= 0; i--) { dv += 0.01 * dq; dk SIGN= 0.01 * sin(q[i]) * dv; dq -= 0.01 * x[2] * cos(q[i]) * dv; }
+  g[0] = dq; g[1] = dv; g[2] = dk; }
+"""
+
+
+def c_code(sign="-"):
+    place = Path(tempfile.mkdtemp())
+    (place / "code.c").write_text(C_CODE.replace("SIGN", sign))
+    subprocess.run(["cc", "-O2", "-shared", "-fPIC", "-o", place / "code.so", place / "code.c", "-lm"], check=True)
+    library = ctypes.CDLL(str(place / "code.so"))
+    array = np.ctypeslib.ndpointer(np.float64, flags="C")
+    library.cost.restype, library.cost.argtypes, library.grad.argtypes = ctypes.c_double, [array], [array, array]
+
+    def grad(x):
+        out = np.zeros(3)
+        library.grad(np.ascontiguousarray(x, dtype=float), out)
+        return out
+
+    return lambda x: library.cost(np.ascontiguousarray(x, dtype=float)), [0.7, 0.3, 9.0], {"grad": grad}
+
+
+case("C by ctypes", "numpy")(c_code)
+case("C by ctypes, a sign wrong", "numpy", "wrong_factor", sign="+")(c_code)
+
+
+class Unit:
+    """A co-simulation unit with the calls of an FMU: parameters, steps, outputs and directional derivatives."""
+
+    def __init__(self):
+        self.instantiate()
+
+    def instantiate(self):
+        self.parameters, self.state, self.slopes = np.array([1.0, 0.5]), np.array([0.7, 0.0]), np.zeros((2, 2))
+
+    def set_real(self, values):
+        self.parameters = np.array(values, dtype=float)
+
+    def do_step(self, dt):
+        k, c = self.parameters
+        (q, v), s = self.state, self.slopes
+        self.slopes = s + dt * np.array([s[1], -k * np.cos(q) * s[0] - c * s[1] + [-np.sin(q), -v]])
+        self.state = self.state + dt * np.array([v, -k * np.sin(q) - c * v])
+
+
+def unit(is_reset=True):
+    fmu = Unit()
+
+    def run(x):
+        if is_reset:
+            fmu.instantiate()
+        fmu.set_real(x)
+        for _ in range(100):
+            fmu.do_step(0.02)
+        return fmu
+
+    return lambda x: run(x).state[0] ** 2, [2.0, 0.5], {"grad": lambda x: 2 * run(x).state[0] * fmu.slopes[0]}
+
+
+case("co-simulation unit, as an FMU", "numpy")(unit)
+case("co-simulation unit that is not reset", "numpy", "nondeterministic", is_reset=False)(unit)
+
+
+@case("gymnasium CartPole, a linear policy", "gymnasium", "staircase", "jumps", "jump")
+def cartpole():
+    import gymnasium
+
+    env = gymnasium.make("CartPole-v1")
+
+    def cost(x):
+        state, _ = env.reset(seed=0)
+        total = 0.0
+        for _ in range(60):
+            state, _, _, _, _ = env.unwrapped.step(int(state @ x > 0))
+            total += float(state[2] ** 2)
+        return total
+
+    return cost, [0.1, 0.2, 1.0, 0.5], {}
+
+
+def pendulum(clipped=True):
+    """Return gymnasium's pendulum under a linear policy, with a handwritten derivative with or without its clip."""
+    import gymnasium
+
+    env = gymnasium.make("Pendulum-v1").unwrapped
+
+    def rollout(x, slope=False):
+        env.reset(seed=0)
+        env.state, env.last_u = np.array([1.0, 0.0]), None
+        d, total, dtotal = np.zeros((2, 2)), 0.0, np.zeros(2)
+        for _ in range(15):
+            q, v = env.state
+            u = x[0] * q + x[1] * v
+            du = x[0] * d[0] + x[1] * d[1] + np.array([q, v])
+            du = du * (abs(u) < 2.0) if clipped else du
+            env.step(np.array([u]))
+            dv = d[1] + (15.0 * np.cos(q) * d[0] + 3.0 * du) * 0.05
+            d = np.array([d[0] + dv * 0.05, dv])
+            total, dtotal = total + env.state[0] ** 2, dtotal + 2 * env.state[0] * d[0]
+        return dtotal if slope else float(total)
+
+    return rollout, [-1.8, -0.5], {"grad": lambda x: rollout(x, True)}
+
+
+case("gymnasium Pendulum, handwritten derivative", "gymnasium")(pendulum)
+case("gymnasium Pendulum, its clip forgotten", "gymnasium", *WRONG, clipped=False)(pendulum)
+
+
+def taichi_spring(overwritten=False):
+    import taichi as ti
+
+    ti.init(arch=ti.cpu, default_fp=ti.f64, log_level=ti.ERROR, offline_cache=False)
+    steps = 20
+    x, v = (ti.field(ti.f64, steps + 1, needs_grad=True) for _ in range(2))
+    loss = ti.field(ti.f64, (), needs_grad=True)
+
+    @ti.kernel
+    def step(a: int, b: int):
+        for _ in range(1):
+            v[b] = v[a] - 0.05 * 9.0 * ti.sin(x[a])
+            x[b] = x[a] + 0.05 * v[b]
+
+    @ti.kernel
+    def end(a: int):
+        loss[None] = x[a] ** 2
+
+    def rollout(theta, slope=False):
+        x[0], v[0] = theta
+        with ti.ad.Tape(loss, validation=False):
+            for t in range(steps):
+                step(0, 0) if overwritten else step(t, t + 1)
+            end(0 if overwritten else steps)
+        return [x.grad[0], v.grad[0]] if slope else loss[None]
+
+    return rollout, [0.7, 0.3], {"grad": lambda x: rollout(x, True)}
+
+
+case("Taichi kernels", "taichi")(taichi_spring)
+case("Taichi kernels, state overwritten", "taichi", *WRONG, "nan_gradient", overwritten=True)(taichi_spring)
+
+
+# ------------------------------------------------------------------------------------------------ the table
+
+
+def record(name: str) -> None:
+    """Run one case and print its row."""
+    import bench
+    from bench.report.text import duration
+
+    one = CASES[name]
+    cost, theta, settings = one.make()
+    report = bench.examine(cost, theta, progress=False, name=name, **settings)
+    print(report, file=sys.stderr)
+    is_right = one.expected == RIGHT or report.cause in RIGHT
+    found = bool(report.status) != (one.expected == RIGHT)
+    named = report.cause in one.expected
+    status = "right" if not report.status else report.derivative if report.gradient else "no derivative"
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    said = report.cause if report.status or not is_right else f"right ({report.cause})"
+    row = [
+        name, f"{one.library} {metadata.version(one.library)}", "right" if one.expected == RIGHT else one.expected[0],
+        said if report.status else f"{status} ({report.cause})", "yes" if named and found else "no" if not named else "-",
+        duration(report.seconds + report.compile_s), duration(report.compile_s),
+        f"{report.costs:,} + {report.gradients:,}", f"{memory:.2f}",
+    ]  # fmt: skip
+    print(MARK + json.dumps(row), flush=True)
+
+
+def run(name: str) -> list[str]:
+    """Return the row of a case that runs in a process of its own."""
+    one = CASES[name]
+    rest = ["-"] * (len(HEAD) - 4)
+    expected = "right" if one.expected == RIGHT else one.expected[0]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    words = [sys.executable, __file__, "--record", name]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, env=environment)
+    except subprocess.TimeoutExpired:
+        return [name, one.library, expected, f"no end after {LIMIT} s", *rest]
+    text, _, row = done.stdout.partition(MARK)
+    print(f"=== {name}\n{text}{done.stderr}", file=sys.stderr, flush=True)
+    if not row:
+        last = (done.stderr.strip().splitlines() or ["no report"])[-1]
+        return [name, one.library, expected, f"failed: {last[:100]}", *rest]
+    return json.loads(row.splitlines()[0])
+
+
+def main(words: list[str]) -> int:
+    """Write the table of all cases, or of those named."""
+    if words[:1] == ["--record"]:
+        record(words[1])
+        return 0
+    out = [Path(word) for word in words if word.endswith(".md")]
+    wanted = [word for word in words if not word.endswith(".md")]
+    chosen = [name for name in CASES if not wanted or any(part.lower() in name.lower() for part in wanted)]
+    table = [list(HEAD), ["---"] * len(HEAD)]
+    for name in chosen:
+        table.append(run(name))
+        print(f"| {' | '.join(table[-1])} |", flush=True)
+    for path in out:
+        before, begin, rest = path.read_text().partition(BEGIN)
+        text = "".join(f"| {' | '.join(cells)} |\n" for cells in table)
+        path.write_text(f"{before}{begin}{text}{END}{rest.partition(END)[2]}")
+    return int(any(row[4] != "yes" for row in table[2:]))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
