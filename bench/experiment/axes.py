@@ -43,7 +43,7 @@ class Axis:
     @property
     def title(self) -> str:
         """The axis with its unit and the axes that step with it: ``dt [s], with horizon``."""
-        unit = f" [{self.unit}]" if self.unit else ""
+        unit = f" [{self.unit}]" if self.unit not in ("", self.column) else ""
         return f"{self.column}{unit}" + (f", with {', '.join(self.moves)}" if self.moves else "")
 
 

@@ -447,9 +447,10 @@ def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> Non
             span(start, end, zorder=0, color="#D55E00", alpha=0.12, linewidth=0)
             if mark.name:
                 middle = math.sqrt(start * end) if start > 0 and panel.get_xscale() == "log" else (start + end) / 2
+                lines = textwrap.wrap(plain(mark.name), 16)
                 panel.text(
-                    middle, 0.015, "\n".join(textwrap.wrap(plain(mark.name), 14)), transform=panel.get_xaxis_transform(),
-                    ha="center", va="bottom", color="#9c4400", fontsize=SIZE - 0.5,
+                    middle, _free_height(panel, start, end, LINE * len(lines) / chart.height), "\n".join(lines),
+                    transform=panel.get_xaxis_transform(), ha="center", va="center", color="#9c4400", fontsize=SIZE - 0.5,
                 )  # fmt: skip
         elif low < mark.at < high:
             dash = next(dashes)
@@ -473,6 +474,20 @@ def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> Non
                 plain_lines(note.text), (note.x, note.y), (-6, 0), textcoords="offset points", fontsize=SIZE - 0.5,
                 va="center", ha="right",
             )  # fmt: skip
+
+
+def _free_height(panel: Axes, start: float, end: float, height: float) -> float:
+    """Return where, between 0 and 1, a text of some height is farthest from the lines drawn between two values of x."""
+    taken: list[float] = []
+    for line in panel.lines:
+        if line.get_transform() == panel.transData and len(line.get_xdata()) > 1:
+            x, y = panel.transAxes.inverted().transform(panel.transData.transform(line.get_xydata())).T
+            left, right = panel.transAxes.inverted().transform(panel.transData.transform([(start, 1), (end, 1)]))[:, 0]
+            known = np.isfinite(x) & np.isfinite(y)
+            if known.sum() > 1:
+                taken += list(np.interp(np.linspace(left, right, 50), x[known], y[known]))
+    choices = np.linspace(height / 2 + 0.02, 0.98 - height / 2, 21)
+    return float(max(choices, key=lambda at: min((abs(at - y) for y in taken), default=-at)))
 
 
 def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], width: float) -> None:
@@ -583,8 +598,11 @@ def _draw_grid(
         _categories(y, chart.frame if chart.panel_row else part, downwards=True),
     )
     norm = _norm(chart)
-    panel_width = _inner_width(panel, down)
-    size = min(SIZE - 1, 0.8 * 72 * panel_width / max(len(across), 1))
+    every = _categories(y, chart.frame, downwards=True)  # the panels of a column have labels of one width
+    panel_width = _inner_width(panel, _grid_labels(chart, y, every, width))
+    cell_width = panel_width / max(len(across), 1)
+    widest = max(map(width_in_inches, map(str, chart.frame[chart.cell])), default=0.0) if chart.cell else 0.0
+    size = min(SIZE - 1, 0.8 * 72 * cell_width, SIZE * 0.92 * cell_width / max(widest, 0.1))
     for line in part.to_dict("records"):
         place = across.index(_category(line[x.name])), len(down) - 1 - down.index(_category(line[y.name]))
         if chart.level:
@@ -603,7 +621,7 @@ def _draw_grid(
     panel.set_ylim(-0.5, len(down) - 0.5)
     for which, column, names in (("x", x, across), ("y", y, down[::-1])):
         labels = _grid_labels(chart, column, names, width)
-        if which == "x" and any("…" in label for label in labels) and max(map(width_in_inches, names)) < 1:
+        if which == "x" and any("…" in label for label in labels) and max(map(width_in_inches, names)) < 1.6:
             labels = [plain(name) for name in names]  # short names read upwards rather than shortened
             panel.tick_params(axis="x", rotation=90)
         few = _thinned(labels, which, panel, panel_width)
@@ -616,10 +634,11 @@ def _draw_grid(
 
 
 def _grid_labels(chart: Chart, column: Column, names: Sequence[str], width: float) -> list[str]:
-    """Return the labels of an axis of a grid, x labels in at most three lines of the width of a cell."""
+    """Return the labels of an axis of a grid, y labels beside at most half of it, x labels in lines as wide as a cell."""
+    widest = min(3.0, max(0.45 * width, 1.2))
     if column is chart.y[0] or column.kind != "text":
-        return [plain(_clipped(name, 3.0)) for name in names]
-    beside = min(3.0, max(map(width_in_inches, map(plain, _categories(chart.y[0], chart.frame))), default=0.0))
+        return [plain(_clipped(name, widest)) for name in names]
+    beside = min(widest, max(map(width_in_inches, map(plain, _categories(chart.y[0], chart.frame))), default=0.0))
     if chart.panel and not chart.own_scales:  # the labels beside the first panel serve all
         across = max(1, round(WIDTH / width))
         beside /= across

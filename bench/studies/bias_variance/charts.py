@@ -256,7 +256,7 @@ def _unstable(shown: Arranged, axis: Axis, frame: pd.DataFrame, names: Sequence[
             if beyond.any() and bad[beyond].all() and not bad[~beyond].any():
                 marks.append(Mark(f"beyond the {name}", value, math.inf, panel=str(panel)))
                 worst = part.loc[part["rmse_rel"].where(part["failed"] == 0).idxmax()]
-                text_ = f"at least {number(worst['rmse_low'])}\ntimes the gradient"
+                text_ = f"at least\n{number(worst['rmse_low'])} times\nthe gradient"
                 notes.append(Note(text_, worst["x"], worst["rmse_rel"], str(panel)))
     if not marks:
         marks = [Mark(name, value) for name, value in shown.marks(axis).items()]
