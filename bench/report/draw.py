@@ -480,7 +480,7 @@ def _free_height(panel: Axes, start: float, end: float, height: float) -> float:
     """Return where, between 0 and 1, a text of some height is farthest from the lines drawn between two values of x."""
     taken: list[float] = []
     for line in panel.lines:
-        if line.get_transform() == panel.transData and len(line.get_xdata()) > 1:
+        if line.get_transform() == panel.transData and len(np.asarray(line.get_xdata())) > 1:
             x, y = panel.transAxes.inverted().transform(panel.transData.transform(line.get_xydata())).T
             left, right = panel.transAxes.inverted().transform(panel.transData.transform([(start, 1), (end, 1)]))[:, 0]
             known = np.isfinite(x) & np.isfinite(y)
