@@ -203,7 +203,7 @@ def described(entry: registry.Entry, availability: bool = True) -> str:
     plugin = entry.plugin
     facts: list[str] = []
     if plugin is not None:
-        facts.append((plugin.__doc__ or "").strip().split("\n")[0])
+        facts.append((plugin.__doc__ or "").strip().split("\n")[0].rstrip("."))
         if issubclass(plugin, Backend):
             facts.append(f"provides {', '.join(sorted(plugin.provides))}")
         elif issubclass(plugin, Estimator):

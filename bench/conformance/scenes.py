@@ -137,7 +137,11 @@ def continuity_is_as_declared(scene: Scene) -> str:
         raise Skipped("no continuous contact law is available")
     jump = largest_jump(runs[0], lines=2)
     if scene.continuous:
-        require(not jump, f"declares to be continuous, but jumps by {jump:.1e} of its range under {describe(runs[0])}")
+        require(
+            not jump,
+            f"is continuous unless it declares `continuous: ClassVar[bool] = False`, but jumps by {jump:.1e} of its range under "
+            f"{describe(runs[0])}",
+        )
         jump = max(largest_jump(runs[0], offset=side * ELSEWHERE) for side in (1, -1))
         require(
             not jump,

@@ -68,7 +68,7 @@ class Chart:
     name: str
     """The stem of the files' names."""
     title: str
-    """The finding that the chart shows."""
+    """The finding that print shows."""
     frame: pd.DataFrame
     """A line per point. Its column ``row``, if any, is the position of the cell in ``Views.rows``."""
     x: Sequence[Column]
@@ -90,6 +90,10 @@ class Chart:
     """How to read the chart, for the page."""
     subtitle: str = ""
     """Conditions that all panels share, for print."""
+    page_title: str = ""
+    """The finding of all of the table, for the page; by default ``title``."""
+    value_range: tuple[float, float] | None = None
+    """The numbers ``value`` of the lightest and the darkest cell; by default the smallest and the largest."""
     panel_notes: Mapping[str, str] = field(default_factory=dict)
     """A sentence below the title of a panel, by panel."""
     styles: Mapping[str, Style] = field(default_factory=dict)

@@ -175,7 +175,12 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
             yield package.__name__.rpartition(".")[2], name
     for folder in sorted(path for place in package.__path__ for path in Path(place).iterdir()):
         # folders without __init__.py are (namespace) packages too, but pkgutil does not list them
-        bare = folder.is_dir() and folder.name.isidentifier() and folder.name != ENGINES and not (folder / "__init__.py").exists()
+        bare = (
+            folder.is_dir()
+            and folder.name.isidentifier()
+            and folder.name != ENGINES
+            and not (folder / "__init__.py").exists()
+        )
         if bare and any(folder.glob("*.py")):
             space = importlib.import_module(f"{package.__name__}.{folder.name}")
             for module in sorted(pkgutil.iter_modules(space.__path__), key=lambda m: m.name):

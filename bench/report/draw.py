@@ -178,7 +178,7 @@ class _Head:
 
     def __init__(self, chart: Chart, width: float) -> None:
         self._width = width
-        self._title = _fill(chart.title, 0.97 * width / BOLD)
+        self._title = _fill(chart.title.rstrip("."), 0.97 * width / BOLD)
         self._subtitle = _fill(chart.subtitle, 0.97 * width) if chart.subtitle else ""
         self._lines = self._title.count("\n") + 1
         self.height = (
@@ -710,6 +710,8 @@ def _categories(column: Column, rows: pd.DataFrame, downwards: bool = False) -> 
 
 
 def _norm(chart: Chart) -> Normalize:
+    if chart.value_range:
+        return LogNorm(*chart.value_range, clip=True)
     values = chart.frame[chart.value].to_numpy(float) if chart.value else np.array([1.0])
     values = values[np.isfinite(values)]
     if not values.size:

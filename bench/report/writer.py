@@ -100,6 +100,8 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
     console.print(f"{counted(len(rows), 'cell')}: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
+    for text in map(one_line, views.findings):
+        console.print(text)
     for table in views.tables:
         if table.terminal:
             right = {column.heading for column in table.columns if column.kind == "number"}
@@ -108,7 +110,7 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
                 terminal.print_table(console, texts, heading or (table.title if place == 0 else ""), right=right)
             for note in table.notes:
                 console.print(one_line(note))
-    for text in map(one_line, (*views.remarks, *views.findings)):
+    for text in map(one_line, views.remarks):
         console.print(text, soft_wrap="python -m bench" in text)  # a command stays one line, so that it can be copied
 
 

@@ -235,8 +235,8 @@ def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.Data
         print(f"  {count} {reason}")
     if runs:
         seconds = expected_seconds(runs, rows)
-        duration = "unknown until some cells have run" if math.isnan(seconds) else f"about {seconds:.0f} s"
-        print(f"expected time: {duration} of one worker, new references not counted")
+        known = f"about {seconds:.0f} s of one worker, without new references"
+        print(f"expected time: {'not known before some cells have run' if math.isnan(seconds) else known}")
 
 
 def _older_code(runs: Sequence[Planned]) -> str:

@@ -241,3 +241,17 @@ def test_a_tie_is_no_win_of_the_lowest_error():
     )
     title = accurate_and_fast(methods, compared)
     assert title.startswith("one has the lowest error or ties at 1 of 1 setting; two takes the least median time at 1")
+
+
+def test_a_biased_estimator_is_not_recommended_beside_a_far_lower_error_that_is_not_sure():
+    """fobg 0.90 [0.87, 0.92] is tied with smoothing 0.17 [0.10, 1.7], whose interval is wide: no recommendation of fobg there."""
+    exact = {"reference_norm": 1.0, "variance_low": 0.0, "variance_high": 0.0}
+    biased = exact | {"rmse_rel": 0.9, "bias": 0.9, "bias_low": 0.87, "bias_high": 0.92}
+    wide = exact | {"rmse_rel": 0.17, "bias": 0.17, "bias_low": 0.1, "bias_high": 1.7}
+    good = exact | {"rmse_rel": 0.14, "bias": 0.14, "bias_low": 0.13, "bias_high": 0.15}
+    _, _, texts = made(
+        row(stiffness=1.0, estimator="fobg", **good), row(stiffness=1.0, estimator="smooth", **wide),
+        row(stiffness=2.0, estimator="fobg", **biased), row(stiffness=2.0, estimator="smooth", **wide),
+    )  # fmt: skip
+    assert "fobg everywhere" not in texts[0]
+    assert any("smooth may be better" in text and "more repeats" in text for text in texts)

@@ -543,14 +543,3 @@ def test_the_command_of_a_gradient_check_repeats_its_cell(words):
 def test_the_command_of_a_gradient_check_without_time_steps_has_no_horizon():
     (cell,) = cells(config.load(["study=gradient_check", "scenes=[quadratic]", "estimators=[fobg]"]))
     assert reproduce.check_of(cell) == "python -m bench gradcheck quadratic 'backends=[jax]' seed=0"
-
-
-def test_the_grid_of_gradient_checks_leads_with_what_is_wrong():
-    points = pd.DataFrame({"name": ["a", "b"], "point": ["start", "before"], "verdict": ["wrong_factor", "kink"]})
-    doubtful = "kinks, jumps or undecided checks away from contact switches in 1 of"
-    assert gradient_check.headline(points) == f"Wrong gradients: a, and {doubtful} 2 problems"
-    assert gradient_check.headline(points[1:]) == f"No gradient is wrong for its program, and {doubtful} 1 problem"
-    assert gradient_check.headline(points.assign(verdict="smooth")).startswith(
-        "Away from contact switches, every gradient is the derivative"
-    )
-    assert gradient_check.headline(points[1:].assign(point="at")).startswith("Away from contact switches, every")

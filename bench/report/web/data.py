@@ -28,8 +28,8 @@ DIGITS = 6
 """Significant digits of the numbers in a page."""
 MOST = 24
 """Largest number of distinct values of a column that is offered as a filter."""
-IN_SIGHT = 5
-"""Most identity columns before the status and its reason, which a laptop then shows without scrolling."""
+IN_SIGHT, FIRST = 5, 3
+"""Most identity and result columns before the status, which a laptop then shows without scrolling."""
 
 
 def page_data(
@@ -76,7 +76,7 @@ def page_data(
 
 
 def _columns(experiment: Experiment, views: Views, cells: pd.DataFrame, swept: Sequence[str]) -> list[dict[str, str]]:
-    """Return the columns of the table of cells: identity, status and results, the first result beside the identity."""
+    """Return the columns of the table of cells: identity, the first results, status, the other results, the reason."""
     identity = [
         _column(name, name.replace("_", " "), "number" if pd.api.types.is_numeric_dtype(cells[name]) else "text")
         for name in varying_identity(cells, swept)
@@ -86,8 +86,8 @@ def _columns(experiment: Experiment, views: Views, cells: pd.DataFrame, swept: S
         and (cells[c.name].nunique() > 1 if c.kind == "text" else cells[c.name].notna().any())
     ]  # fmt: skip
     results = [_result(column, cells) for column in own]
-    status = [_column(name, name, "text") for name in ("status", "reason")]
-    return [*identity[:IN_SIGHT], *results[:1], *status, *results[1:], *identity[IN_SIGHT:]]
+    status, reason = (_column(name, name, "text") for name in ("status", "reason"))
+    return [*identity[:IN_SIGHT], *results[:FIRST], status, *results[FIRST:], *identity[IN_SIGHT:], reason]
 
 
 def _result(column: Column, cells: pd.DataFrame) -> dict[str, str]:
@@ -134,8 +134,8 @@ def _frame(chart: Chart) -> pd.DataFrame:
 
 def _chart(chart: Chart) -> dict[str, Any]:
     return {
-        "title": chart.title,
-        "text": " ".join(filter(None, (chart.text, chart.subtitle))),
+        "title": (chart.page_title or chart.title).rstrip("."),
+        "text": " ".join(filter(None, (chart.text, "" if chart.chosen else chart.subtitle))),
         "x": [_axis(column, chart) for column in chart.x],
         "y": [_axis(column, chart) for column in chart.y],
         "table": chart.name,
@@ -172,8 +172,10 @@ def _axis(column: Column, chart: Chart) -> dict[str, Any]:
     values = chart.frame[column.name]
     is_text = not pd.api.types.is_numeric_dtype(values)
     log = not is_text and (is_logarithmic(values) if column.log is None else column.log)
+    label = f"{column.heading} [s]" if column.format == "seconds" and not log else column.heading
     return {
-        "column": column.name, "label": column.heading, "log": log, "percent": column.format == "percent",
+        "column": column.name, "label": label, "log": log, "percent": column.format == "percent",
+        "seconds": column.format == "seconds" and log,
         "low": column.low, "high": column.high, "limit": column.limit, "above_one": column.above_one,
     }  # fmt: skip
 

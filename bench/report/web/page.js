@@ -85,7 +85,7 @@ function shownAs(column, row) {
   if (column.kind === "text") return value === null ? "" : String(value);
   const flagged = column.flag && value !== null && reader("rows", column.flag)(row);
   if (column.kind === "seconds") return duration(value) + (flagged ? " !" : "");
-  if (column.kind === "limit" && flagged) return "0 (< " + number(value) + ")";
+  if (column.kind === "limit" && flagged) return "< " + number(value);
   return page.identity.includes(column.name) ? exact(value) : number(value);
 }
 
@@ -553,7 +553,10 @@ function trace(chart, points, joined) {
 const tellingColumns = page.columns.filter((column) => page.identity.includes(column.name) && !column.name.startsWith("estimator"));
 const cellTexts = []; // per row that was drawn, a text that identifies its cell
 
-const valueText = (axis, value) => (axis.percent && typeof value === "number" ? number(100 * value) + "%" : number(value));
+function valueText(axis, value) {
+  if (typeof value !== "number") return number(value);
+  return axis.seconds ? duration(value) : axis.percent ? number(100 * value) + "%" : number(value);
+}
 
 function hover(chart, point) {
   const { xAxis, yAxis } = chart;
@@ -749,6 +752,7 @@ function drawTable() {
       return cell;
     }));
     line.dataset.row = i;
+    line.className = reader("rows", "status")(i) || "";
     return line;
   }));
   const more = document.getElementById("more");

@@ -190,6 +190,8 @@ def _along(
         return None
     own, compared = (table[table["axis"] == axis.column] for table in (methods, comparisons))
     title = (findings(own, compared, shown.marks(axis)) if 0 < len(compared) < len(comparisons) else whole)[0]
+    if 0 < len(compared) < len(comparisons):
+        title = f"Along {axis.column}: {title}"
     frame = pd.concat([_lines(problem) for problem in problems], ignore_index=True)
     if shown.rows["seed"].nunique() > 1:
         frame = frame.drop(columns="row")  # a median over seeds is not a cell
@@ -197,11 +199,14 @@ def _along(
     names = _main_series(frame, methods, comparisons)
     total = frame["series"].nunique()
     panels = [problem.title() for problem in drawn]
+    ours, of_ours = (table[table["problem"].isin(panels)] for table in (own, compared))
+    printed = findings(ours, of_ours, shown.marks(axis))[0] if 0 < len(of_ours) < len(compared) else title
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
     marks, remarks = _unstable(shown, axis, frame[frame["panel"].isin(panels) & frame["first"]], names)
     x = Column("x", label=axis.title, format="setting")
     return Chart(
-        "bias_variance_" + re.sub(r"\W", "_", axis.column), title, frame, [x], [RMSE, BIAS, SPREAD], series="series",
+        "bias_variance_" + re.sub(r"\W", "_", axis.column), printed, frame, [x], [RMSE, BIAS, SPREAD], series="series",
+        page_title=title,
         line="line", panel="panel", styles=styles, marks=marks, notes=remarks, failed="failed", across=len(drawn),
         labels="ends" if len(drawn) <= 2 else "legend", height=2.7 if len(drawn) <= 2 else 2.1,
         subtitle=", ".join(filter(None, [subtitle, *notes, *shares])), chosen=(("first", [True]), ("series", names), ("panel", panels)),
@@ -296,7 +301,8 @@ def _speed_accuracy(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, St
             continue
         entries = best[(best["problem"] == problem.title()) & (best["by"] == ("time" if timed else "rollouts"))]
         notes[problem.title()] = "\n".join(map(time_to_accuracy.sentence, entries.to_dict("records")))
-        for _, part in rows.groupby("series", sort=False):
+        for _, every in rows.groupby("series", sort=False):
+            part = _on_fastest(every, cost)
             front = part[pareto(cost.of(part), part["rmse_rel"])]
             parts.append(front.assign(panel=problem.title()))
     if not parts:
@@ -309,6 +315,14 @@ def _speed_accuracy(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, St
         subtitle=", ".join(filter(None, [subtitle, "each estimator on its fastest backend"])),
         text="Only estimates that no other of the same estimator beats in both error and cost are drawn.",
     )  # fmt: skip
+
+
+def _on_fastest(rows: pd.DataFrame, cost: Cost) -> pd.DataFrame:
+    """Return an estimator's rows on the backend with the lowest cost, by the median over the samples that all have."""
+    lines = rows["line"]
+    shared = rows[rows.groupby("x")["line"].transform("nunique") == lines.nunique()]
+    rows_of = shared if len(shared) else rows
+    return rows[lines == cost.of(rows_of).groupby(rows_of["line"]).median().idxmin()]
 
 
 def _costs_matrix(shown: Arranged, best: pd.DataFrame) -> Chart | None:
@@ -329,13 +343,13 @@ def _costs_matrix(shown: Arranged, best: pd.DataFrame) -> Chart | None:
                 factor = value / lowest if math.isfinite(value) else math.nan
                 lines.append({
                     "panel": f"to {target:.0%} error", "series": name, "problem": problem.title(), "factor": factor,
-                    "cell": number(factor) if math.isfinite(factor) else "not shown",
+                    "cell": number(factor) if math.isfinite(factor) else "-",
                 })  # fmt: skip
     what = "Time" if timed else "Rollouts"
     return Chart(
         "summary_matrix", f"{what} to reach an error, relative to the first of each column", pd.DataFrame(lines),
         [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="factor", cell="cell", across=1, height=0.24,
-        subtitle="not shown: no estimate is known to have a bias below the error",
+        subtitle="-: no estimate is known to have a bias below the error",
     )  # fmt: skip
 
 
@@ -387,7 +401,7 @@ def _estimators(methods: pd.DataFrame, texts: Sequence[str]) -> Chart:
     frame = pd.DataFrame(lines)
     return Chart(
         "estimators", texts[0], frame, [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="value",
-        cell="cell", across=1, height=0.2,
+        cell="cell", across=1, height=0.2, value_range=(1e-2, 1e2),
         subtitle="relative RMSE of one estimate, sorted by the worst case; above 1 the zero estimate is better",
     )  # fmt: skip
 

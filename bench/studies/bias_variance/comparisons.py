@@ -19,6 +19,8 @@ from bench.report.views import CATEGORIES, Arranged, Curve, attempted, estimator
 
 WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
 """Verdicts of a method at a setting: its interval is below 1, above 1, contains 1 or is not known; it has no number."""
+NEAR = 2.0
+"""A method whose error is more than this many times the lowest does not share the first place: the order is open."""
 VERDICTS = {
     WORKS: "its error is below the gradient's norm, with the whole 95% interval",
     FAILS: "its error is above the gradient's norm, with the whole 95% interval: the zero estimate is better",
@@ -151,12 +153,22 @@ def _interval(row: Any) -> tuple[float, float, float]:
 
 
 def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> dict[str, list[str]]:
-    """Return, per setting, the estimators that are first or tied with the first; empty if no error is known."""
-    estimator = dict(zip(methods["method"], methods["estimator"], strict=True))
+    """Return, per setting, the estimators that are first, or tied and near the first; empty if no error is known."""
+    return _first_and_tied(comparisons, methods, NEAR)
+
+
+def not_excluded(comparisons: pd.DataFrame, methods: pd.DataFrame) -> dict[str, list[str]]:
+    """Return, per setting, the estimators that are first or tied with the first, however large their errors are."""
+    return _first_and_tied(comparisons, methods, math.inf)
+
+
+def _first_and_tied(comparisons: pd.DataFrame, methods: pd.DataFrame, most: float) -> dict[str, list[str]]:
+    known = methods.set_index(["setting", "method"])[["estimator", "error"]]
     result = {}
-    for row in comparisons.to_dict("records"):
-        names = [name for name in (row["first"], *row["tied"]) if name]
-        result[row["setting"]] = list(dict.fromkeys(estimator[name] for name in names))
+    for row in comparisons[["setting", "first", "value", "tied"]].to_dict("records"):
+        lines = [known.loc[(row["setting"], name)] for name in (row["first"], *row["tied"]) if name]
+        near = [line["estimator"] for line in lines if not line["error"] > most * row["value"]]
+        result[row["setting"]] = list(dict.fromkeys(near))
     return result
 
 

@@ -20,6 +20,7 @@ from bench.studies.bias_variance.comparisons import (
     estimators,
     known,
     leaders,
+    not_excluded,
     verdicts_by_estimator,
 )
 
@@ -49,9 +50,12 @@ def findings(
 
 
 def recommended(methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
-    """Return the estimator that is most often first or tied with the first."""
-    wins = Counter(name for names in leaders(comparisons, methods).values() for name in names)
-    return max(estimators(methods), key=lambda name: wins[name])
+    """Return the estimator that is most often first or tied with the first and certain to be better than zero there."""
+    working = set(methods.loc[methods["verdict"] == WORKS, ["estimator", "setting"]].itertuples(index=False, name=None))
+    wins = Counter(
+        (name, (name, place) in working) for place, names in leaders(comparisons, methods).items() for name in names
+    )
+    return max(estimators(methods), key=lambda name: (wins[name, True], wins[name, False]))
 
 
 def best_elsewhere(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame, places: Collection[str]) -> str:
@@ -151,13 +155,20 @@ def _failures(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame, marks
     else:
         named = leaders(comparisons, methods)
         beaten = {place for place, names in named.items() if names and main not in names}
-        other = best_elsewhere(main, methods, comparisons, beaten)
-        ahead = {place for place in beaten if other in named[place]}
-        if other and ahead:
+        tied = not_excluded(comparisons, methods)
+        for verb, places in (
+            ("is better", {place for place in beaten if main not in tied[place]}),
+            ("may be better", {place for place in beaten if main in tied[place]}),
+        ):
+            other = best_elsewhere(main, methods, comparisons, places)
+            ahead = {place for place in places if other in named[place]}
+            if not other or not ahead:
+                continue
             where = _where(methods, ahead, named)
             own_errors = _errors(methods, main, ahead)
             against = f", where {main} has {value_range(own_errors)}" if own_errors else f", where {main} was not run"
-            texts.append(f"{other} is better {where}: {value_range(_errors(methods, other, ahead))}{against}.")
+            open_ = "; more repeats would decide it" if verb == "may be better" else ""
+            texts.append(f"{other} {verb} {where}: {value_range(_errors(methods, other, ahead))}{against}{open_}.")
     return [*texts, _share_that_fails(methods)]
 
 

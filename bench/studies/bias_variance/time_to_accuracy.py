@@ -228,7 +228,10 @@ def sentence(entry: Any) -> str:
     if entry["next"] == "-":
         return f"{what}only {entry['fastest']}"
     if not entry["factor_low"] > 1.0:
-        return f"{what}open, {estimator_of(entry['fastest'])} or {estimator_of(entry['next'])}"
+        first, second = entry["fastest"], entry["next"]
+        if estimator_of(first) != estimator_of(second):
+            first, second = estimator_of(first), estimator_of(second)
+        return f"{what}open, {first} or {second}"
     low, high = number(entry["factor_low"]), number(entry["factor_high"])
     return f"{what}{estimator_of(entry['fastest'])}, {number(entry['factor'])} times ahead [{low}, {high}]"
 

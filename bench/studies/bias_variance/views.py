@@ -42,8 +42,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         charts.charts(shown, methods, errors, best, texts),
         rows=charts.with_plotted_columns(with_gradient_cost(rows)),
         columns=[
+            *(replace(c, label=label) for c, label in ((charts.RMSE, "rel. RMSE"), (charts.BIAS, "rel. bias"))),
             replace(COLUMNS.by_name["time_s"], label="time"),
-            *(replace(c, label=label) for c, label in ((charts.BIAS, "rel. bias"), (charts.RMSE, "rel. RMSE"))),
             *(COLUMNS.by_name[name] for name in RESULTS),
         ],
         remarks=[*tables.remarks(rows), *reported.sentences(rows)],

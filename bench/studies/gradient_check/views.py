@@ -47,7 +47,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
               title="gradients against differences of the cost", notes=_notes(rows, untrusted(points))),
         Table("gradient_components", component_table(rows), [], files=["csv"]),
     ]  # fmt: skip
-    charts = [] if points.empty else [_grid(points), _errors(shown)]
+    charts = [] if points.empty else [_grid(points, findings(points)[0]), _errors(shown)]
     answers = Table("gradient_verdicts", *_verdicts(points), title="Verdicts", files=[], page=True)
     shown_columns = [experiment.columns.by_name[name] for name in ("verdict", "best_error", "best_eps")]
     return Views(
@@ -94,19 +94,6 @@ def findings(points: pd.DataFrame) -> list[str]:
         if len(edges) else []
     )  # fmt: skip
     return [f"{first}.", *largest, *one_sided]
-
-
-def headline(points: pd.DataFrame) -> str:
-    """Return the title of the grid: problems with wrong gradients, then the number with other untrusted checks."""
-    faults = points[points["verdict"].isin(FAULTS)]
-    other = untrusted(points[~points["verdict"].isin(FAULTS)])
-    parts = [f"Wrong gradients: {', '.join(dict.fromkeys(faults['name']))}"] if len(faults) else []
-    if len(other):
-        n_problems = f"{other['name'].nunique()} of {counted(points['name'].nunique(), 'problem')}"
-        parts.append(f"kinks, jumps or undecided checks away from contact switches in {n_problems}")
-    if not parts:
-        return "Away from contact switches, every gradient is the derivative of its program's cost"
-    return ", and ".join(parts if len(faults) else ["No gradient is wrong for its program", *parts])
 
 
 # ------------------------------------------------------------------------------------------------------- tables
@@ -210,7 +197,7 @@ def _count_reasons(rows: pd.DataFrame, of_checked: bool = False) -> Sequence[tup
 # ------------------------------------------------------------------------------------------------------- charts
 
 
-def _grid(points: pd.DataFrame) -> Chart:
+def _grid(points: pd.DataFrame, title: str) -> Chart:
     """Return the main chart: the worst verdict of each problem at each horizon and point, over backends and checks."""
     letters = {verdict: letter for letter, (verdicts, _) in KINDS.items() for verdict in verdicts}
     names = {name: place for place, name in enumerate(dict.fromkeys(points["name"]))}
@@ -223,7 +210,7 @@ def _grid(points: pd.DataFrame) -> Chart:
     )
     switches = "Blank: no switch of contact was found." if frame["point"].nunique() > 1 else ""
     return Chart(
-        "gradient_check", headline(points), frame, [text("point", label="")], [text("name", label="")], "grid",
+        "gradient_check", title, frame, [text("point", label="")], [text("name", label="")], "grid",
         panel="steps", level="letter", cell="letter", styles={letter: style for letter, (_, style) in KINDS.items()},
         height=0.17, subtitle=switches,
         text="The worst verdict over backends and checks: at the start, and before, at and after a switch of contact mode.",
