@@ -100,6 +100,14 @@ def judge(
     return Adequacy(probability, tuple(findings) or ("its residuals are unlikely",) * (probability <= LEVEL))
 
 
+def pool(residuals: np.ndarray, jacobians: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return residual ``(m,)`` and Jacobian ``(m, p)`` of all records together, from those of each, ``(m, R)`` and ``(m, p, R)``.
+
+    Noise keeps its size in the sum of independent records over sqrt(R). The effect of what the model lacks grows by sqrt(R).
+    """
+    return residuals.sum(axis=1) / np.sqrt(residuals.shape[1]), jacobians.mean(axis=2)
+
+
 def _statistics(residuals: np.ndarray, directions: np.ndarray, channels: int) -> np.ndarray:
     """Return the statistics of residuals ``(n, m)``, ``(k, n)``: size, correlation, slow changes, and each term's."""
     n, m = residuals.shape

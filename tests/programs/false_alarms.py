@@ -2,7 +2,7 @@
 
     python tests/programs/false_alarms.py 5000
 
-runs 5,000 checks at random thetas and horizons up to 2,000, and prints the counts of verdicts, every reported fault, and the
+runs 5,000 checks at random thetas and horizons up to 3,000, and prints the counts of verdicts, every reported fault, and the
 seconds per check. The first check of a program includes its compilation.
 """
 
@@ -20,7 +20,7 @@ SCENES = (
     "pendulum", "double_pendulum", "cartpole", "mass_spring", "double_integrator", "stiff_decay", "quadratic",
     "rosenbrock", "cubic",
 )  # fmt: skip
-HORIZONS = (1, 30, 300, 1000, 2000)
+HORIZONS = (1, 30, 300, 1000, 2000, 3000)
 INTEGRATORS = ("semi_implicit_euler", "rk4")
 SPREAD = 0.3
 """Standard deviation of theta around the scene's theta0, relative to each component (absolute where theta0 is 0)."""

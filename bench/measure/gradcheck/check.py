@@ -364,9 +364,9 @@ class _Checker:
                     )
         for m, finding in enumerate(findings):
             apart = abs(finding.difference - measured[m].derivative) * float(lengths[m])
-            if finding.verdict == "wrong_adjoint" and apart <= LOOSE * whole[:, m].max():
-                if self._has_loose_solver(thetas[:, m], gradients[:, m], apart):
-                    findings[m] = replace(finding, verdict="rounding")
+            is_close = finding.verdict == "wrong_adjoint" and apart <= LOOSE * whole[:, m].max()
+            if is_close and self._has_loose_solver(thetas[:, m], gradients[:, m], apart):
+                findings[m] = replace(finding, verdict="rounding")
         modes = [(tuple(a), tuple(b)) for a, b in zip(minus, plus, strict=True)]
         return [
             replace(_part(names[m], components[m], sample, finding, modes[m]), step=steps[m])

@@ -37,6 +37,7 @@ class Identify(Study):
         Column("explained", "share of records that no test of the residuals contradicts, at 5% false alarms",
                label="explained", format="percent"),
         Column("misfit", "share of records of a right model that contradict it as much as the first record"),
+        Column("misfit_together", "the same for all records together; a small effect adds up, and noise does not"),
         numbers("wide_low", "by unknown, lower end of the 95% interval of the first fit under correlated noise"),
         numbers("wide_high", "by unknown, its upper end"),
         numbers("unknowns", "names of the parameters"),

@@ -297,6 +297,7 @@ def _explanation(
         adequacy.judge(residual[:, i], jacobian[:, :, i], channels, terms, seed=i)
         for i in np.flatnonzero(is_finite)[:TESTED]
     ]
+    together = _together(residual[:, is_finite], jacobian[:, :, is_finite], channels, terms, len(residual) - p)
     wide_low, wide_high = [math.nan] * p, [math.nan] * p
     if is_finite[0]:
         independent = np.linalg.pinv(jacobian[:, :, 0].T @ jacobian[:, :, 0], rcond=1e-11, hermitian=True)
@@ -310,10 +311,27 @@ def _explanation(
             f"{name} {low:.4g} to {high:.4g}" for name, low, high in zip(model.names, wide_low, wide_high, strict=True)
         )
         first += f"; under correlated noise they would be {intervals}"
+    elif together and not together.is_explained:
+        first = f"all records together: {together.sentence()}"
     return {
         "explained": share, "reason": first, "wide_low": wide_low, "wide_high": wide_high,
         "misfit": verdicts[0].probability if verdicts else math.nan,
+        "misfit_together": together.probability if together else math.nan,
     }  # fmt: skip
+
+
+def _together(
+    residual: np.ndarray, jacobian: np.ndarray, channels: int, terms: dict[str, np.ndarray], free: int
+) -> adequacy.Adequacy | None:
+    """Return whether the model explains all records together, or None for fewer than two.
+
+    A fit that ended elsewhere, with residuals far above the noise, is left out if at least half of the fits did not.
+    """
+    is_small = np.square(residual).sum(axis=0) <= chdtri(max(free, 1), UNEXPLAINED)
+    chosen = is_small if is_small.mean() >= 0.5 else np.ones_like(is_small)
+    if chosen.sum() < 2:
+        return None
+    return adequacy.judge(*adequacy.pool(residual[:, chosen], jacobian[:, :, chosen]), channels, terms)
 
 
 def missing_terms(cell: Cell, model: Model, theta: np.ndarray, sigma: float) -> dict[str, np.ndarray]:
