@@ -15,19 +15,11 @@ from unittest import mock
 
 from bench.plugins.contacts.complementarity import Complementarity
 from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.estimators.fobg import Fobg
 from bench.plugins.estimators.inverse_variance import InverseVariance
-from bench.plugins.estimators.measure_valued import MeasureValued
-from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
-from bench.plugins.estimators.reinforce import Reinforce
-from bench.plugins.estimators.sphere_smoothing import SphereSmoothing
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.optimizers.gradient_descent import GradientDescent
 
 from bench.claims import discovery, results
 from bench.claims.claim import NOT_REPRODUCED
-from bench.model import Problem, State
+from bench.model import DiagnosticEstimator, Problem, SampleMean, State, registry
 
 
 @contextlib.contextmanager
@@ -71,25 +63,71 @@ def fast_step(original: Any, self: Any, dynamics: Any, state: Any, u: Any, dt: A
     return original(self, dynamics, state, u, 1.05 * dt)
 
 
-def long_step(original: Any, self: Any, state: Any, gradient: Any) -> Any:
-    return original(self, state, 1.3 * gradient)
+def too_far(original: Any, self: Any, state: Any, theta: Any, answer: Any) -> Any:
+    new = original(self, state, theta, answer)
+    return new | {"theta": state["theta"] + 1.05 * (new["theta"] - state["theta"])}
 
 
-BUGS: dict[str, tuple[type, str, Callable[..., Any], tuple[str, ...]]] = {
-    "kappa halved": (Complementarity, "impulse", halved_kappa, ("C5",)),
-    "time of impact .9 dt": (Impulse, "impulse", early_impact, ("C8", "C13")),
-    "penalty force 5% large": (Penalty, "force", scaled(1.05), ("C14",)),
-    "step 5% long": (SemiImplicitEuler, "step", fast_step, ("C8", "C13")),
-    "fobg 5% large": (Fobg, "terms", scaled(1.05), ("C5", "C6", "C19")),
-    "score 5% large": (Problem, "score", scaled(1.05), ("C1", "C5", "C6")),
-    "reinforce 5% large": (Reinforce, "terms", scaled(1.05), ("C1", "C5", "C6")),
-    "measure_valued 5% large": (MeasureValued, "estimate", scaled(1.05), ("C6",)),
-    "weights swapped": (InverseVariance, "estimate_with_diagnostics", swapped_weights, ("C19",)),
-    "randomized_smoothing 5% large": (RandomizedSmoothing, "estimate", scaled(1.05), ("C7",)),
-    "sphere_smoothing 5% large": (SphereSmoothing, "estimate", scaled(1.05), ("C7",)),
-    "descent 30% fast": (GradientDescent, "step", long_step, ("C10",)),
-}
-"""The bug, the class and method that has it, the wrapper, and the claims that are run."""
+def with_numbers(original: Any, self: Any, problem: Any, theta: Any, noise: Any) -> Any:
+    values, numbers = original(self, problem, theta, noise)
+    return 1.05 * values, numbers
+
+
+Bug = tuple[type, str, Callable[..., Any], tuple[str, ...]]
+"""The class and method with the bug, the wrapper, and the claims that are run."""
+
+
+def of(kind: str, name: str) -> type:
+    """Return a plugin's class."""
+    plugin = registry.find(kind, name).plugin
+    assert plugin is not None
+    return plugin
+
+
+CLAIMS = {
+    "estimators": {
+        "alpha_order": ("C3",), "clipped": ("C24",), "control_variate": ("C24",), "finite_difference": ("C7",),
+        "fobg": ("C5", "C6", "C19"), "guided": ("C24",), "inverse_variance": ("C19",), "measure_valued": ("C6",),
+        "orthogonal": ("C24",), "randomized_smoothing": ("C7",), "reinforce": ("C1", "C5", "C6"),
+        "sphere_smoothing": ("C7",), "total_propagation": ("C24",), "windowed": ("C24",),
+    },
+    "contacts": {"penalty": ("C14",), "softplus": ("C16",), "straight_through": ("C15",)},
+    "integrators": {
+        "event_driven": ("C13",), "explicit_euler": ("C22",), "implicit_euler": ("C22",), "implicit_midpoint": ("C22",),
+        "midpoint": ("C22",), "rk4": ("C22",), "semi_implicit_euler": ("C8", "C13", "C22"), "stormer_verlet": ("C22",),
+    },
+    "optimizers": {
+        name: ("C23",)
+        for name in (
+            "adam", "cem", "cma_es", "gauss_newton", "gradient_descent", "lbfgs", "line_search", "momentum", "mppi", "ppo",
+        )
+    },
+}  # fmt: skip
+"""The claims that use a plugin, by kind and name. `impulse` and `complementarity` have bugs of their own below."""
+
+
+def _bugs() -> Iterator[tuple[str, Bug]]:
+    yield "kappa halved", (Complementarity, "impulse", halved_kappa, ("C5",))
+    yield "time of impact .9 dt", (Impulse, "impulse", early_impact, ("C8", "C13"))
+    yield "score 5% large", (Problem, "score", scaled(1.05), ("C1", "C5", "C6"))
+    yield "weights swapped", (InverseVariance, "estimate_with_diagnostics", swapped_weights, ("C19",))
+    for name, claims in CLAIMS["estimators"].items():
+        plugin = of("estimators", name)
+        if issubclass(plugin, DiagnosticEstimator):
+            bug: Bug = (plugin, "estimate_with_diagnostics", with_numbers, claims)
+        else:
+            bug = (plugin, "terms" if issubclass(plugin, SampleMean) else "estimate", scaled(1.05), claims)
+        yield f"{name} 5% large", bug
+    for name, claims in CLAIMS["contacts"].items():
+        yield f"{name} force 5% large", (of("contacts", name), "force", scaled(1.05), claims)
+    for name, claims in CLAIMS["integrators"].items():
+        yield f"{name} step 5% long", (of("integrators", name), "step", fast_step, claims)
+    for name, claims in CLAIMS["optimizers"].items():
+        yield f"{name} steps 5% far", (of("optimizers", name), "tell", too_far, claims)
+
+
+BUGS: dict[str, Bug] = dict(_bugs())
+"""Bugs by name: at least one in every estimator, contact law, integrator and optimizer."""
 
 
 def failing(bug: str) -> tuple[list[str], list[str]]:
