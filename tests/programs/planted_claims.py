@@ -86,18 +86,18 @@ def of(kind: str, name: str) -> type:
 
 CLAIMS = {
     "estimators": {
-        "alpha_order": ("C3",), "clipped": ("C24",), "control_variate": ("C24",), "finite_difference": ("C7",),
-        "fobg": ("C5", "C6", "C19"), "guided": ("C24",), "inverse_variance": ("C19",), "measure_valued": ("C6",),
-        "orthogonal": ("C24",), "randomized_smoothing": ("C7",), "reinforce": ("C1", "C5", "C6"),
-        "sphere_smoothing": ("C7",), "total_propagation": ("C24",), "windowed": ("C24",),
+        "alpha_order": ("C25",), "clipped": ("C25",), "control_variate": ("C25",), "finite_difference": ("C25",),
+        "fobg": ("C5", "C6", "C19"), "guided": ("C25",), "inverse_variance": ("C19",), "measure_valued": ("C6",),
+        "orthogonal": ("C25",), "randomized_smoothing": ("C7",), "reinforce": ("C1", "C5", "C6"),
+        "sphere_smoothing": ("C7",), "total_propagation": ("C25",), "windowed": ("C25",),
     },
-    "contacts": {"penalty": ("C14",), "softplus": ("C16",), "straight_through": ("C15",)},
+    "contacts": {"penalty": ("C14", "C18"), "softplus": ("C16",), "straight_through": ("C15",)},
     "integrators": {
-        "event_driven": ("C13",), "explicit_euler": ("C22",), "implicit_euler": ("C22",), "implicit_midpoint": ("C22",),
-        "midpoint": ("C22",), "rk4": ("C22",), "semi_implicit_euler": ("C8", "C13", "C22"), "stormer_verlet": ("C22",),
+        "event_driven": ("C13",), "explicit_euler": ("C23",), "implicit_euler": ("C23",), "implicit_midpoint": ("C23",),
+        "midpoint": ("C23",), "rk4": ("C23",), "semi_implicit_euler": ("C8", "C13", "C23"), "stormer_verlet": ("C23",),
     },
     "optimizers": {
-        name: ("C23",)
+        name: ("C24",)
         for name in (
             "adam", "cem", "cma_es", "gauss_newton", "gradient_descent", "lbfgs", "line_search", "momentum", "mppi", "ppo",
         )

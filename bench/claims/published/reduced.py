@@ -1,4 +1,4 @@
-"""C24: variances and biases of the estimators that clip, guide, rotate, mix, correct or cut gradients."""
+"""C25: variances and biases of the estimators that clip, guide, rotate, mix, correct or cut gradients."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Parabola(FunctionScene):
 class Reduced(Claim):
     """Estimators that change gradients."""
 
-    name = "C24"
+    name = "C25"
     lesson = "Low variance is not low bias"
     statement = (
         "Clipping at 1 takes the mean of N(1, 1) to .6095; the best coefficient of a linear control variate is 1 on a parabola; "
@@ -67,11 +67,16 @@ class Reduced(Claim):
         assert isinstance(linear, DiagnosticEstimator)
         corrected, fitted = linear.estimate_with_diagnostics(at, theta, draw.standard_normal((4000, 400, 1)))
         assert isinstance(mixing, DiagnosticEstimator)
+        # one confidence interval of the zeroth order is wide enough for its weights
+        mixed = estimator("alpha_order").estimate(at, theta, draw.standard_normal((400, 4000, 1)))
+        differences = estimator("finite_difference").estimate(at, theta, draw.standard_normal((400, 400, 1)))
         values, decided = mixing.estimate_with_diagnostics(at, theta, draw.standard_normal((400, 4000, 1)))
         return [
             Figure("clipped: mean of N(1, 1) within 1", "0.6095", *centre(cut)),
             Figure("control_variate: coefficient", "1.000", *centre(fitted["coefficient"]), spread=0.005),
             Figure("control_variate: mean", "1.000", *centre(corrected[:, 0]), spread=1e-4),
+            Figure("alpha_order: mean", "1.000", *centre(mixed[:, 0]), spread=0.005),
+            Figure("finite_difference: slope of a parabola", "1.000", *centre(differences[:, 0]), spread=0.005),
             Figure("total_propagation: weight, 5.75 / 6.75", "0.852", *centre(decided["weight"].mean(axis=1))),
             Figure("total_propagation: mean", "1.000", *centre(values[:, 0]), spread=0.005),
         ]

@@ -1,4 +1,4 @@
-"""C22: every integrator changes the energy and the frequency of an oscillator as its stability function states."""
+"""C23: every integrator changes the energy and the frequency of an oscillator as its stability function states."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ arccos(1 - h^2 / 2)."""
 class Integrators(Claim):
     """Stability functions on an oscillator."""
 
-    name = "C22"
+    name = "C23"
     lesson = "Stiffness or step size"
     statement = (
         "On an oscillator, explicit Euler multiplies the energy by 1 + h^2 in each step and implicit Euler divides it by the "

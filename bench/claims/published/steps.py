@@ -1,4 +1,4 @@
-"""C23: the first steps of every optimizer on costs where its published rule gives a number."""
+"""C24: the first steps of every optimizer on costs where its published rule gives a number."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def along(x: np.ndarray) -> np.ndarray:
 class Steps(Claim):
     """First steps of the optimizers."""
 
-    name = "C23"
+    name = "C24"
     lesson = "Steps of the optimizers"
     statement = (
         "Heavy-ball steps contract by the square root of the momentum; Adam's step is the rate for any gradient, and .1 / "

@@ -1,0 +1,72 @@
+"""C18: the distance of first from zeroth order on a throw comes from the damper that acts at first touch, not from stiffness."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims.toolkit import estimator, native, terms
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SAMPLES = 80_000
+STIFFNESSES = (1e4, 2e4, 3e4, 5e4, 1e5, 2e5)
+DISTANCES = {
+    320: ("4.48", "9.12", "13.8", "23.2", "47.6", "101.6"),
+    288: ("3.39", "6.97", "10.57", "17.86", "36.75", "78.38"),
+}
+"""By number of steps, the distance at each stiffness, with a damping of a thousandth of it."""
+SPREAD = 0.01
+"""Relative error of the printed distances, which are means of samples as well."""
+
+
+class Damper(Claim):
+    """First and zeroth order on a throw with a damped penalty."""
+
+    name = "C18"
+    lesson = "Stiffness or step size"
+    statement = (
+        "With a damper of a thousandth of the stiffness, the means of first and zeroth order differ by 3.39 at 1e4 N/m and by "
+        "78.4 at 2e5. Without a damper they agree, and a step ten times finer changes nothing: the damper jumps at first touch."
+    )
+    source = "Zhong, Han, Brikis 2022, task 2; distances by an independent program"
+    learned = "A stiff contact does not bias the first order; a force that jumps does, at any step."
+    labels = ("stiffness", "distance of first from zeroth order")
+
+    def measure(self) -> Outcome:
+        """Estimate both means with the same samples."""
+        figures, series = [], {"stiffness": list(STIFFNESSES)}
+        for steps, published in DISTANCES.items():
+            distances = []
+            for stiffness, text in zip(STIFFNESSES, published, strict=True):
+                distance, error = _distance(stiffness, stiffness / 1e3, steps)
+                label = f"distance at {stiffness:.0e} N/m, {steps} steps"
+                figures.append(Figure(label, text, distance, error, spread=SPREAD * float(text)))
+                distances.append(distance)
+            figures.append(Figure(f"without a damper, {steps} steps", "0.00", *_distance(1e4, 0.0, steps)))
+            series[str(steps)] = distances
+        figures.append(Figure("a damper of 30", "9.16", *_distance(1e4, 30.0, 288), spread=SPREAD * 9.16))
+        finer = _distance(1e4, 10.0, 2880)
+        figures.append(Figure("a damper of 10, steps ten times finer", "3.36", *finer, spread=SPREAD * 3.36))
+        return Outcome(figures, series=series)
+
+    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+        """Draw the distances."""
+        for steps in DISTANCES:
+            axes.loglog(series["stiffness"], series[str(steps)], "o-", label=f"{steps} steps")
+
+
+def _distance(stiffness: float, damping: float, steps: int) -> tuple[float, float]:
+    """Return the distance of the means of both orders on a throw, and its standard error."""
+    dt = 0.6 / 288 if steps <= max(DISTANCES) else 0.6 / steps
+    at = native(
+        f"ground_wall[sigma=0.1,horizon={steps},dt={dt!r}]", f"penalty[stiffness={stiffness!r},damping={damping!r}]"
+    )
+    noise = np.random.default_rng(18).standard_normal((2, SAMPLES))
+    difference = terms(at, estimator("fobg"), noise) - terms(at, estimator("reinforce"), noise)
+    error = float(np.sqrt(difference.var(axis=0, ddof=1).sum() / SAMPLES))
+    return float(np.linalg.norm(difference.mean(axis=0))), error
