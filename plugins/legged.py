@@ -29,8 +29,8 @@ class Legged(EngineScene):
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2", positive=True)
 
     clearance: float = param(
-        1e-4,
-        "height of the feet above the ground at the start, where at 0 rounding would decide about contact",
+        1e-6,
+        "height of the feet above the ground at the start, above rounding",
         "m",
         positive=True,
     )
