@@ -1,4 +1,4 @@
-"""Differences of single steps in MuJoCo: too wide ones straddle the switches of a contact that sticks."""
+"""Differences of single steps in MuJoCo: those that straddle the switches of a contact that sticks are taken again."""
 
 import pytest
 
@@ -7,8 +7,6 @@ import straddled
 
 
 @pytest.mark.slow
-def test_finer_differences_of_steps_chain_to_the_derivative_of_the_rollout():
-    assert straddled.straddled(1e-6, 8).sum() > 0
-    assert straddled.straddled(1e-7, 8).sum() == 0
-    assert straddled.wrong(1e-6, 8).sum() > 0
-    assert straddled.wrong(1e-7, 8).sum() == 0
+def test_differences_of_steps_chain_to_the_derivative_of_the_rollout():
+    assert straddled.straddled(1e-6, 8).sum() == 0
+    assert straddled.wrong(1e-6, 8).sum() == 0

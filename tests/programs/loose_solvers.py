@@ -1,0 +1,62 @@
+"""Counts verdicts on right implicit gradients over solvers that stop early: `python tests/programs/loose_solvers.py [COUNT]`.
+
+x solves x = a cos x + b by a fixed-point or a damped iteration that ends at a change below 1e-6 or 1e-8. Three costs of x are
+checked at COUNT random (a, b) each. Verdicts other than right ones are false alarms.
+"""
+
+import sys
+from collections import Counter
+
+import numpy as np
+
+from bench.measure import gradcheck
+
+COSTS = {
+    "square": (lambda x, t: (x - 2.0) ** 2 + 0.1 * t @ t, lambda x, t: (2.0 * (x - 2.0), 0.2 * t)),
+    "linear": (lambda x, t: x, lambda x, t: (1.0, 0.0 * t)),
+    "wave": (
+        lambda x, t: np.sin(3.0 * x) + t[1] ** 2,
+        lambda x, t: (3.0 * np.cos(3.0 * x), np.array([0.0, 2.0 * t[1]])),
+    ),
+}
+
+
+def verdicts(rate, tolerance, count):
+    """Return the counts of verdicts for an iteration that moves x by ``rate`` times the residual."""
+
+    def solve(theta):
+        x, change = 0.0, np.inf
+        while abs(change) > tolerance:
+            change = rate * (theta[0] * np.cos(x) + theta[1] - x)
+            x += change
+        return x
+
+    random, found = np.random.default_rng(0), Counter()
+    for value, slopes in COSTS.values():
+        for _ in range(count):
+            theta = np.array([random.uniform(0.2, 0.8), random.uniform(-1.0, 1.0)])
+
+            def cost(thetas, value=value):
+                with np.errstate(all="ignore"):
+                    return np.array([value(solve(t), t) if abs(t[0]) < 1.2 else np.nan for t in thetas.T])
+
+            def gradient(t, slopes=slopes):
+                x = solve(t)
+                by_x, direct = slopes(x, t)
+                return by_x * np.array([np.cos(x), 1.0]) / (1.0 + t[0] * np.sin(x)) + direct
+
+            found[gradcheck.check(cost, gradient, theta).cause] += 1
+    return found
+
+
+if __name__ == "__main__":
+    total = Counter()
+    for name, rate in (("fixed point", 1.0), ("damped", 0.5)):
+        for tolerance in (1e-6, 1e-8):
+            found = verdicts(rate, tolerance, int(sys.argv[1]) if len(sys.argv) > 1 else 36)
+            total += found
+            print(
+                f"{name}, {tolerance:g}: " + ", ".join(f"{n} {cause}" for cause, n in found.most_common()), flush=True
+            )
+    wrong = sum(n for cause, n in total.items() if cause not in gradcheck.TRUSTED)
+    print(f"{wrong} of {total.total()} right gradients blamed")
