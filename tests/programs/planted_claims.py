@@ -91,7 +91,7 @@ CLAIMS = {
         "orthogonal": ("C25",), "randomized_smoothing": ("C7",), "reinforce": ("C1", "C5", "C6"),
         "sphere_smoothing": ("C7",), "total_propagation": ("C25",), "windowed": ("C25",),
     },
-    "contacts": {"penalty": ("C14", "C18"), "softplus": ("C16",), "straight_through": ("C15",)},
+    "contacts": {"penalty": ("C14", "C18"), "softplus": ("C25",), "straight_through": ("C15",)},
     "integrators": {
         "event_driven": ("C13",), "explicit_euler": ("C23",), "implicit_euler": ("C23",), "implicit_midpoint": ("C23",),
         "midpoint": ("C23",), "rk4": ("C23",), "semi_implicit_euler": ("C8", "C13", "C23"), "stormer_verlet": ("C23",),
