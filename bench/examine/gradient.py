@@ -175,8 +175,8 @@ class GradientStages:
         size = abs(self.value) if math.isfinite(self.value) else 0.0
         return not self.has_state and self.spread <= limit * size and self.gradient_spread <= limit
 
-    def run(self) -> None:
-        """Run all stages that the budget allows."""
+    def run(self, is_explained: Callable[[Check], bool] = lambda check: False) -> None:
+        """Run all stages that the budget allows, until ``is_explained`` accepts the outcome of a wrong gradient."""
         try:
             self._start()
         except OutOfTime:
@@ -200,7 +200,7 @@ class GradientStages:
             return
         if self.check is None:
             return
-        self._check_in_stages(space)
+        self._check_in_stages(space, is_explained)
         self._locate(space)
         self._check_under_other_noise()
 
@@ -333,7 +333,7 @@ class GradientStages:
         gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)
         return costs, gradients
 
-    def _check_in_stages(self, space: Subspace) -> None:
+    def _check_in_stages(self, space: Subspace, is_explained: Callable[[Check], bool]) -> None:
         self.clock.start_stage("checking the gradient")
         assert self.check is not None
         is_done: list[str] = []
@@ -342,6 +342,8 @@ class GradientStages:
             plan = dict(self._plan(space.size, self.check.trusted))
             is_wrong = any(part.verdict in FAULTS for part in self.check.parts)
             if name == ALL_STEPS and is_wrong:
+                if is_explained(self.check):
+                    return
                 continue  # the ratios at other thetas name the fault, and these stages also have all steps
             if not self.clock.can_afford(*self._cost_of(plan[name], space.size), share=self._share):
                 self.left_out.append(name)

@@ -211,45 +211,69 @@ case("Newton Featherstone, a free joint", "newton", "nan_gradient", *WRONG, solv
 )
 
 
-def warp_spring(overwritten, right=False):
-    """Return a spring of 20 steps in a Warp kernel that overwrites an array that its adjoint reads."""
+def warp_rollout(fault):
+    """Return a rollout of a spring, 20 steps in a Warp kernel: (cost, gradient, tape).
+
+    ``fault`` overwrites the ``state`` or the ``parameter`` that the adjoint reads, or doubles the ``adjoint`` of the sine.
+    """
     wp = _quiet_warp()
-    dt = wp.constant(wp.float64(0.05))
+    dt, factor = wp.constant(wp.float64(0.05)), wp.constant(wp.float64(2.0 if fault == "adjoint" else 1.0))
+
+    @wp.func
+    def sine(x: wp.float64):
+        return wp.sin(x)
+
+    @wp.func_grad(sine)
+    def adjoint_of_sine(x: wp.float64, slope: wp.float64):
+        wp.adjoint[x] += factor * wp.cos(x) * slope
+
+    array = wp.array(dtype=wp.float64)
 
     @wp.kernel
-    def step(x: wp.array(dtype=wp.float64), v: wp.array(dtype=wp.float64), k: wp.array(dtype=wp.float64), a: int, b: int):
-        v[b] = v[a] - dt * k[0] * wp.sin(x[a])
-        x[b] = x[a] + dt * v[b]
+    def step(k: array, x: array, v: array, after_x: array, after_v: array):
+        speed = v[0] - dt * k[0] * sine(x[0])
+        after_x[0] = x[0] + dt * speed
+        after_v[0] = speed
 
     @wp.kernel
-    def soften(k: wp.array(dtype=wp.float64)):
+    def soften(k: array):
         k[0] = k[0] * wp.float64(0.9)
 
+    def numbers(value):
+        return wp.array([value], dtype=wp.float64, requires_grad=True)
+
     def rollout(theta, steps=20):
-        x, v = (wp.array(np.r_[first, np.zeros(steps)], dtype=wp.float64, requires_grad=True) for first in theta[:2])
-        k = wp.array([theta[2]], dtype=wp.float64, requires_grad=True)
-        last = 0 if overwritten == "state" else steps
+        x, v, k = [numbers(theta[0])], [numbers(theta[1])], numbers(theta[2])
         with wp.Tape() as tape:
-            for t in range(steps):
-                at = (0, 0) if overwritten == "state" else (t, t + 1)
-                if overwritten == "parameter":
-                    wp.launch(soften, dim=1, inputs=[k])
-                wp.launch(step, dim=1, inputs=[x, v, k, *at])
-        end = x.numpy()[last]
-        seed = np.zeros(steps + 1)
-        seed[last] = 2 * end
-        tape.backward(grads={x: wp.array(seed, dtype=wp.float64)})
-        return float(end**2), [x.grad.numpy()[0], v.grad.numpy()[0], k.grad.numpy()[0]]
+            for _ in range(steps):
+                if fault == "parameter":
+                    wp.launch(soften, dim=1, inputs=[], outputs=[k])
+                after = (x[0], v[0]) if fault == "state" else (numbers(0.0), numbers(0.0))
+                wp.launch(step, dim=1, inputs=[k, x[-1], v[-1]], outputs=[*after])
+                x.append(after[0])
+                v.append(after[1])
+        end = x[-1].numpy()[0]
+        tape.backward(grads={x[-1]: wp.array([2 * end], dtype=wp.float64)})
+        return float(end**2), [one.grad.numpy()[0] for one in (x[0], v[0], k)], tape
 
+    return rollout
+
+
+SPRING = [0.7, 0.3, 9.0]
+
+
+def warp_spring(fault):
+    rollout = warp_rollout(fault)
     settings = {"grad": lambda x, steps=20: rollout(x, steps)[1]}
-    if not right:
+    if fault in ("state", "parameter"):
         settings["horizons"] = [1, 2, 5, 20]
-    return lambda x, steps=20: rollout(x, steps)[0], [0.7, 0.3, 9.0], settings
+    return lambda x, steps=20: rollout(x, steps)[0], SPRING, settings
 
 
-case("Warp, parameter overwritten between launches", "warp-lang", "overwritten", overwritten="parameter")(warp_spring)
-case("Warp, state overwritten in place", "warp-lang", "overwritten", overwritten="state")(warp_spring)
-case("Warp, an array entry per step", "warp-lang", overwritten="", right=True)(warp_spring)
+case("Warp, parameter overwritten between launches", "warp-lang", "overwritten", fault="parameter")(warp_spring)
+case("Warp, state overwritten in place", "warp-lang", "overwritten", fault="state")(warp_spring)
+case("Warp, adjoint of a function doubled", "warp-lang", *WRONG, fault="adjoint")(warp_spring)
+case("Warp, an array entry per step", "warp-lang", fault="")(warp_spring)
 
 
 @case("MuJoCo Warp, a tape around its steps", "mujoco-warp", *WRONG, "nan_gradient")
