@@ -2,12 +2,15 @@
 
     python tests/programs/simulators.py [numpy] [right] [torch] [jax] [engines]
 
-prints a line per case: the cause that `bench.examine` reports, its exit status, calls and seconds. `checkers.py` runs other
-gradient checkers on the same cases.
+    python tests/programs/simulators.py slowed [numpy] [right] [engines]
+
+The first prints a line per case: the cause that `bench.examine` reports, its exit status, calls and seconds. `checkers.py` runs other
+gradient checkers on the same cases. The second compares each verdict with that of a cost that is four times slower.
 """
 
 from __future__ import annotations
 
+import functools
 import sys
 import time
 import warnings
@@ -497,12 +500,43 @@ CASES = {
 }
 
 
-def examined(case):
+def examined(case, cost=None, **settings):
+    """Return the report on a case, or on a slower cost of it."""
     from bench.examine import examine
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return examine(case.cost, case.theta, grad=case.grad, progress=False, budget=60, **case.settings)
+        settings = {"budget": 60, **case.settings, **settings}
+        return examine(cost or case.cost, case.theta, grad=case.grad, progress=False, **settings)
+
+
+def slowed(cost, factor):
+    """Return a cost that takes ``factor`` times as long, as on a loaded machine."""
+
+    @functools.wraps(cost)
+    def call(*arguments, **settings):
+        started = time.perf_counter()
+        value = cost(*arguments, **settings)
+        time.sleep((factor - 1.0) * (time.perf_counter() - started))
+        return value
+
+    return call
+
+
+def compare_speeds(libraries):
+    """Print the cases whose exit status or cause differs where every cost takes four times as long."""
+    different = total = 0
+    for library in libraries:
+        for case, again in zip(CASES[library](), CASES[library](), strict=True):
+            total += 1
+            for settings in ({"budget": 5}, {"budget": None, "calls": 400}):
+                fast = examined(case, **settings)
+                slow = examined(again, slowed(again.cost, 4.0), **settings)
+                if (fast.status, fast.cause) != (slow.status, slow.cause):
+                    different += 1
+                    print(f"{library} {case.name} {settings}: {fast.status} {fast.cause}, slower {slow.status} {slow.cause}")
+    print(f"{different} of {2 * total} examinations differ")
+    return int(different > 0)
 
 
 def main(libraries):
@@ -530,6 +564,7 @@ def main(libraries):
 
 if __name__ == "__main__":
     started = time.perf_counter()
-    status = main(sys.argv[1:])
+    words = sys.argv[1:]
+    status = compare_speeds(words[1:] or ["numpy", "right", "engines"]) if words[:1] == ["slowed"] else main(words)
     print(f"{time.perf_counter() - started:.0f} s in all")
     sys.exit(status)
