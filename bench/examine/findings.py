@@ -834,7 +834,9 @@ class Findings:
             order = float(np.median(orders)) if check.trusted else min(orders)
             # curvature hides a small error at wide steps: an order near 2 would contradict the verdict
             if check.trusted or order < CLEAR_ORDER:
-                lines.append(f"  Taylor remainder |f(x + h d) - f(x) - h g.d|: order {order:.2f} in h (2 right, 1 wrong)")
+                lines.append(
+                    f"  Taylor remainder |f(x + h d) - f(x) - h g.d|: order {order:.2f} in h (2 right, 1 wrong)"
+                )
         return lines
 
     def _breaks(self) -> list[str]:

@@ -107,7 +107,7 @@ class GradientStages:
         """Largest difference between equal calls, of the cost, and of the gradient relative to its norm."""
         self.has_state = False
         """Whether the cost depends on the call before it, in a repeatable way."""
-        self._repeated = False
+        self._repeated = False  # whether calls were repeated within the budget
         self.is_hidden_single = False
         """Whether the cost has single precision, though it returns a float64."""
         self._share = 0.5 if has_sigma else 0.8
@@ -284,13 +284,18 @@ class GradientStages:
         if not self._repeated:
             return False
         self.clock.start_stage("precision")
-        first = np.float32(self.theta)
-        ulp = np.spacing(np.abs(first)).astype(np.float64) * np.where(np.arange(first.size) % 3 == 1, -1.0, 1.0)
-        at = first[:, None] + ulp[:, None] * np.array([0.0, IN_CELL])
-        if not _are_equal(self.costs(at)):
+        with np.errstate(all="ignore"):
+            rounded = self.theta.astype(np.float32)
+            first, ulp = rounded.astype(np.float64), np.spacing(np.abs(rounded)).astype(np.float64)
+        ulp = ulp * np.where(np.arange(first.size) % 3 == 1, -1.0, 1.0)
+
+        def costs(*units: float) -> np.ndarray:
+            return self.costs(first[:, None] + ulp[:, None] * np.array(units))
+
+        if not _are_equal(costs(0.0, IN_CELL)):
             return False
-        cells = self.costs(first[:, None] + ulp[:, None] * np.arange(CELLS))
-        inside = self.costs(first[:, None] + ulp[:, None] * np.array([[-IN_CELL], [CELLS // 2 - IN_CELL], [CELLS // 2 + IN_CELL]]).T)
+        cells = costs(*range(CELLS))
+        inside = costs(-IN_CELL, CELLS // 2 - IN_CELL, CELLS // 2 + IN_CELL)
         is_constant = _are_equal(np.r_[cells[0], inside[0]]) and _are_equal(np.r_[cells[CELLS // 2], inside[1:]])
         return is_constant and np.unique(cells).size >= DISTINCT_CELLS
 
@@ -408,7 +413,11 @@ class GradientStages:
     def _without_small_spread(self, space: Subspace, outcome: Check) -> Check:
         """Return a check without the verdict ``nondeterministic`` where only the last digits of the gradient differ."""
         is_own = any(part.verdict == "nondeterministic" for part in outcome.parts)
-        if outcome.cause != "nondeterministic" or is_own or self._spread_of_gradients(space) > self.simulator.unit**SMALL:
+        if (
+            outcome.cause != "nondeterministic"
+            or is_own
+            or self._spread_of_gradients(space) > self.simulator.unit**SMALL
+        ):
             return outcome
         return recaused(outcome)
 

@@ -360,7 +360,10 @@ def test_changes_in_the_last_digits_are_no_jumps(size):
         return np.nextafter(value, np.inf) if x[0] > 0.7003 else value
 
     report = bench.examine(
-        cost, START, grad=lambda x: size * np.array([np.cos(x[0]) * np.cos(x[1]), -np.sin(x[0]) * np.sin(x[1])]), **QUICK
+        cost,
+        START,
+        grad=lambda x: size * np.array([np.cos(x[0]) * np.cos(x[1]), -np.sin(x[0]) * np.sin(x[1])]),
+        **QUICK,
     )
     assert report.status == 0
     assert not report.breaks.size

@@ -9,7 +9,7 @@ says so. The table states the cause that was found, the seconds with first calls
 
 import ctypes
 import functools
-import importlib.util
+import itertools
 import json
 import os
 import resource
@@ -185,7 +185,7 @@ def newton_body(solver_name, free):
         if states[0].joint_q is not None and len(states[0].joint_q):
             newton.eval_ik(model, states[0], states[0].joint_q, states[0].joint_qd)
         with wp.Tape() as tape:
-            for before, after in zip(states, states[1:], strict=False):
+            for before, after in itertools.pairwise(states):
                 contacts = pipeline.contacts()
                 pipeline.collide(before, contacts)
                 before.clear_forces()

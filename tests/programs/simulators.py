@@ -479,7 +479,9 @@ def engine_cases():
         "input without effect", "numpy", lambda x: m.swinging(x[:2]), [*start, 1.0], lambda x: np.r_[slope(x[:2]), 0.0],
         ("no_effect",), {"allow_zero": False},
     )  # fmt: skip
-    yield Case("no input moves the cost", "numpy", lambda x: 3.3 + 0 * x[0], start, lambda x: 0 * np.array(x), ("zero",))
+    yield Case(
+        "no input moves the cost", "numpy", lambda x: 3.3 + 0 * x[0], start, lambda x: 0 * np.array(x), ("zero",)
+    )
     yield Case("0.2% off", "numpy", m.swinging, start, lambda x: slope(x) * [1, 1.002], (by,))
     yield Case("1e-5 off", "numpy", m.swinging, start, lambda x: slope(x) * (1 + 1e-5), warned="small error")
     yield Case("raises elsewhere", "numpy", m.swinging, start, raising, (by, "wrong_adjoint"))
@@ -534,7 +536,9 @@ def compare_speeds(libraries):
                 slow = examined(again, slowed(again.cost, 4.0), **settings)
                 if (fast.status, fast.cause) != (slow.status, slow.cause):
                     different += 1
-                    print(f"{library} {case.name} {settings}: {fast.status} {fast.cause}, slower {slow.status} {slow.cause}")
+                    print(
+                        f"{library} {case.name} {settings}: {fast.status} {fast.cause}, slower {slow.status} {slow.cause}"
+                    )
     print(f"{different} of {2 * total} examinations differ")
     return int(different > 0)
 
