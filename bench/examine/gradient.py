@@ -29,8 +29,6 @@ SCAN = 7 * 65
 """Number of costs of a staircase search along one direction that is not clearly right."""
 ALL_STEPS, FEW_DRAWS, DRAWS = "all steps and random directions", "2 other thetas", "8 other thetas"
 """Names of the later stages."""
-WRONG_SHARE = 0.3
-"""Share of the remaining budget within which a wrong gradient is checked at 8 other thetas without 2 first."""
 SMALL = 0.6
 """Power of the unit roundoff: a relative difference between equal calls below it is a floor, not a fault."""
 MANY = 10_000
@@ -171,9 +169,12 @@ class GradientStages:
     @property
     def is_small_spread(self) -> bool:
         """Whether differences between equal calls are so small that they only limit the accuracy of the check."""
-        limit = self.simulator.unit**SMALL
-        size = abs(self.value) if math.isfinite(self.value) else 0.0
-        return not self.has_state and self.spread <= limit * size and self.gradient_spread <= limit
+        return self.spread <= self._floor and self.gradient_spread <= self.simulator.unit**SMALL
+
+    @property
+    def _floor(self) -> float:
+        """Largest difference between equal calls of the cost that only limits the accuracy of the check."""
+        return float(self.simulator.unit**SMALL * (abs(self.value) if math.isfinite(self.value) else 0.0))
 
     def run(self, is_explained: Callable[[Check], bool] = lambda check: False) -> None:
         """Run all stages that the budget allows, until ``is_explained`` accepts the outcome of a wrong gradient."""
@@ -268,7 +269,9 @@ class GradientStages:
         last = after["other"][1:]  # the first of them followed the differences, so other thetas
         if self.spread > 0 and len(after["theta"]) > 1 and len(last) > 1:
             apart = abs(after["theta"][-1] - last[-1])
-            self.has_state = max(np.ptp(after["theta"]), np.ptp(last)) <= STATE * apart
+            is_alike = max(np.ptp(after["theta"]), np.ptp(last)) <= STATE * apart
+            # last digits that vary at random are alike by chance
+            self.has_state = bool(is_alike and self.spread > self._floor)
 
     def _has_hidden_single(self) -> bool:
         """Return whether a cost that returns float64 computes in float32: its values have single precision, or it reads
@@ -355,10 +358,9 @@ class GradientStages:
                 if name != FEW_DRAWS:
                     break
                 continue
-            share = WRONG_SHARE if is_wrong else self._share
-            if name == FEW_DRAWS != names[-1] and self.clock.can_afford(
-                *self._cost_of(plan[names[-1]], space.size), share=share
-            ):
+            # a wrong gradient is named by few thetas first, so that the name does not depend on the time that is left
+            is_skipped = name == FEW_DRAWS != names[-1] and not is_wrong
+            if is_skipped and self.clock.can_afford(*self._cost_of(plan[names[-1]], space.size), share=self._share):
                 continue
             options = plan[name]
             self._refresh()

@@ -108,6 +108,18 @@ def test_last_digits_that_do_not_repeat_are_a_floor():
     assert (twice.status, twice.cause) == (1, "wrong_factor")
 
 
+def test_last_digits_that_vary_are_never_a_state():
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+
+        def cost(x, random=random):
+            value = swing(x)
+            return np.nextafter(value, value + random.integers(-1, 2))
+
+        report = bench.examine(cost, START, grad=slope, progress=False, calls=30)
+        assert (report.status, report.has_state) == (0, False), seed
+
+
 def test_noise_above_the_last_digits_is_a_fault_that_does_not_hide_another():
     random = np.random.default_rng(0)
     report = bench.examine(
