@@ -67,7 +67,7 @@ SLIDER = """<mujoco><option timestep="0.005" cone="{cone}" iterations="{iteratio
 <geom type="sphere" size="0.1" mass="1" friction=".5" condim="{condim}"/></body></worldbody></mujoco>"""
 
 
-def slider(steps=1, at_target=False, by_friction=False, **options):
+def slider(steps=2, at_target=False, by_friction=False, **options):
     import jax
 
     jax.config.update("jax_enable_x64", True)
