@@ -36,9 +36,7 @@ class EngineBackend(Backend):
     own_contact: ClassVar[bool] = False
     """Whether contacts are the engine's own, with at most the law's stiffness and damping, and not compared with the law."""
 
-    python: str | None = param(
-        None, "Python of the engine's environment; null: the one that `bench engines install` makes"
-    )
+    python: str | None = param(None, "Python of the engine's environment; null: the one that `bench engines install` makes")
 
     def compile(self, program: Program) -> Problem:
         """Return the program as a problem; the engine is started when it is first called."""
@@ -66,9 +64,7 @@ class EngineBackend(Backend):
         if not isinstance(scene, EngineTwin) or not isinstance(scene, MechanicalScene):
             return f"scene {scene.name} has no MJCF twin"
         if program.decision.names:
-            return (
-                f"{self.name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
-            )
+            return f"{self.name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
         if program.integrator is None or program.integrator.name != self.integrator:
             name = program.integrator.name if program.integrator else "none"
             return f"{self.name} uses its own integrator, which replaces {self.integrator}, not {name}"

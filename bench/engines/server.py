@@ -90,9 +90,7 @@ def call(model, name, arrays):
     for start in range(0, n_columns, width):
         part = [array[..., start : start + width] for array in arrays]
         missing = width - part[0].shape[-1]
-        padded = [
-            np.concatenate([x, np.repeat(x[..., -1:], missing, axis=-1)], axis=-1) if missing else x for x in part
-        ]
+        padded = [np.concatenate([x, np.repeat(x[..., -1:], missing, axis=-1)], axis=-1) if missing else x for x in part]
         results = function(model, *(np.ascontiguousarray(x) for x in padded))
         blocks.append([np.asarray(x, dtype=np.float64)[..., : width - missing] for x in results])
     return [np.concatenate(parts, axis=-1) for parts in zip(*blocks)], width

@@ -134,9 +134,7 @@ def test_an_engine_that_is_killed_is_started_again_and_the_call_repeated():
 
 def test_an_engine_that_dies_again_is_a_crash_with_its_signal_and_last_output():
     problem = toy(fault="exit").compile(program(BouncingBall()))
-    with pytest.raises(
-        Crashed, match="toy ended twice during jacobians: killed by SIGKILL; its last output: .*another"
-    ):
+    with pytest.raises(Crashed, match="toy ended twice during jacobians: killed by SIGKILL; its last output: .*another"):
         problem.grad(problem.program.theta0, noise(problem))
 
 
