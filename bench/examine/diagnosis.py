@@ -118,16 +118,24 @@ def grows(horizons: Sequence[Horizon], tolerance: float) -> bool:
     return last in wrong and (len(wrong) == 1 or last.error > GROWTH * wrong[0].error)
 
 
-def is_adaptive(stages: GradientStages, outcome: Check, lines: Sequence[LineScan]) -> bool:
+def may_be_adaptive(outcome: Check) -> bool:
+    """Return whether a gradient is wrong by so little that adaptive steps may be the reason."""
+    errors = [part.error for part in outcome.worst_parts if np.isfinite(part.error)]
+    return outcome.cause in SUSPICIOUS and bool(errors) and max(errors) <= NEAR
+
+
+def is_adaptive(
+    stages: GradientStages, outcome: Check, lines: Sequence[LineScan], points: int, halvings: int, most: int
+) -> bool:
     """Return whether small jumps of the cost are as large as the error of the gradient, as with adaptive steps.
 
     A solver with adaptive steps has another discretisation error on either side of each change of its number of steps.
     Its cost has a small jump there, and slopes between jumps that differ from the solution's slopes by about the height
     of a jump over the distance between jumps. Reverse mode through such a solver holds the steps fixed, so its gradient
-    differs by as much. Where few jumps are found, a line ten times as long is searched.
+    differs by as much. Where few jumps are found, a line ten times as long is searched, as :func:`scan` does with
+    ``points``, ``halvings`` and ``most``.
     """
-    errors = [part.error for part in outcome.worst_parts if np.isfinite(part.error)]
-    if stages.gradient is None or not errors or max(errors) > NEAR:
+    if stages.gradient is None:
         return False
     lines = [line for line in lines if np.isfinite(line.costs).all()]
     if lines and sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
@@ -140,7 +148,8 @@ def is_adaptive(stages: GradientStages, outcome: Check, lines: Sequence[LineScan
         noise = max(outcome.noise, stages.spread)
         lines = [
             replace(
-                scan(cost, np.zeros(1), np.ones(1), noise, reach, unit=stages.simulator.unit), direction=first.direction
+                scan(cost, np.zeros(1), np.ones(1), noise, reach, points, halvings, most, stages.simulator.unit),
+                direction=first.direction,
             )
         ]
     jumps = [jump for line in lines for jump in line.jumps]

@@ -36,6 +36,8 @@ LEAST_MISSED = 0.002
 """Largest error of the integral of the gradient, as a share of the cost's change, that is always accepted."""
 LINE_EFFORTS = ((PLACES, HALVINGS), (3, 10), (1, 10))
 """Places searched on a line and halvings of each, from the full search to the smallest."""
+EARLY_SHARE = 0.5
+"""Share of the remaining budget for the lines of a gradient that adaptive steps may explain."""
 FEWEST_POINTS = 17
 """Fewest points of a line scan."""
 HELD = 20_000_000
@@ -232,6 +234,8 @@ class _Examination:
         self.scale, self.levels, self.seed = setup.scale, setup.levels, setup.seed
         self.theta = self.layout.vector
         self.left_out: list[str] = []
+        self.is_adaptive = False
+        self._lines: list[LineScan] | None = None
         random = np.random.default_rng([setup.seed, 0x6578616D])
         w = random.standard_normal((simulator.noise, 1)) if simulator.noise else None
         self.stages = GradientStages(simulator, setup.scale, clock, setup.seed, w, bool(self.levels), random)
@@ -239,7 +243,7 @@ class _Examination:
     def run(self, gradient: str, twin: Any, twin_grad: Any, refined: Any) -> Report:
         """Run the checks that the budget allows, the decisive ones first, and return the report."""
         simulator, clock, stages, setup = self.simulator, self.clock, self.stages, self.setup
-        stages.run()
+        stages.run(self._is_adaptive)
         self.left_out += stages.left_out
         checked = stages.check
         other: dict[str, Any] = {}
@@ -257,11 +261,6 @@ class _Examination:
         can_go_on = not (stages.gradient is None and simulator.has_gradient) and not stages.is_failed
         lines = self._scan_lines(checked) if can_go_on else []
         smoothed = self._measure_noise(checked) if can_go_on else []
-        is_adaptive = False
-        if checked is not None and checked.cause in diagnosis.SUSPICIOUS and lines:
-            is_adaptive = bool(
-                self._attempt("the comparison along lines", lambda: diagnosis.is_adaptive(stages, checked, lines))
-            )
         if clock.is_terminated:
             self.left_out.append("everything after SIGTERM")
         return Report(
@@ -302,7 +301,7 @@ class _Examination:
             error=simulator.gradient_error if stages.is_failed else "",
             elsewhere=simulator.gradient_error if not stages.is_failed else "",
             n_failed=simulator.n_failed_gradients,
-            is_adaptive=is_adaptive,
+            is_adaptive=self.is_adaptive,
             printed=simulator.printed,
             notes=[*simulator.notes, *self._exceptions()],
             left_out=self.left_out,
@@ -323,20 +322,44 @@ class _Examination:
 
     # ------------------------------------------------------------------------------------------------ lines
 
-    def _scan_lines(self, checked: Check | None) -> list[LineScan]:
-        """Return scans of the cost for jumps and kinks, along random directions through theta."""
-        self.clock.start_stage("scanning lines")
-        spread = self.scale * RELATIVE if not self.levels else max(self.levels, key=lambda level: level[0])[1]
-        along = directions(2, spread, self.seed)
-        share = 0.5 if self.levels else 0.9
-        room = self.clock.affordable(share) / len(along)
+    def _is_adaptive(self, checked: Check) -> bool:
+        """Return whether small jumps of the cost are as large as the small error of a gradient, as with adaptive steps."""
+        if not diagnosis.may_be_adaptive(checked):
+            return False
+        self._lines = self._scan_lines(checked, EARLY_SHARE)
+
+        def decide() -> bool:
+            effort = self._effort(self.clock.affordable(0.9))
+            return effort is not None and diagnosis.is_adaptive(self.stages, checked, self._lines or [], *effort)
+
+        self.is_adaptive = bool(self._attempt("the comparison along lines", decide))
+        return self.is_adaptive
+
+    @staticmethod
+    def _effort(room: float) -> tuple[int, int, int] | None:
+        """Return points, halvings and places of a line scan with at most ``room`` costs; None if there are too few."""
         for most, halvings in LINE_EFFORTS:
             points = int(min(POINTS, room - most * (2 * halvings + 8)))
             if points >= FEWEST_POINTS:
-                break
-        else:
+                return points, halvings, most
+        return None
+
+    def _scan_lines(self, checked: Check | None, share: float = 0.0) -> list[LineScan]:
+        """Return scans of the cost for jumps and kinks, along random directions through theta.
+
+        They take at most ``share`` of the remaining budget, by default half of it before noise and all of it otherwise.
+        """
+        if self._lines is not None:
+            return self._lines
+        self.clock.start_stage("scanning lines")
+        spread = self.scale * RELATIVE if not self.levels else max(self.levels, key=lambda level: level[0])[1]
+        along = directions(2, spread, self.seed)
+        share = share or (0.5 if self.levels else 0.9)
+        effort = self._effort(self.clock.affordable(share) / len(along))
+        if effort is None:
             self.left_out.append("jumps and kinks on lines")
             return []
+        points, halvings, most = effort
         if points < POINTS:
             self.left_out.append(f"fine line scans: {points} points instead of {POINTS}, and {most} places searched")
         lines = []

@@ -29,8 +29,6 @@ SCAN = 7 * 65
 """Number of costs of a staircase search along one direction that is not clearly right."""
 ALL_STEPS, FEW_DRAWS, DRAWS = "all steps and random directions", "2 other thetas", "8 other thetas"
 """Names of the later stages."""
-WRONG_SHARE = 0.3
-"""Share of the remaining budget within which a wrong gradient is checked at 8 other thetas without 2 first."""
 SMALL = 0.6
 """Power of the unit roundoff: a relative difference between equal calls below it is a floor, not a fault."""
 MANY = 10_000
@@ -107,7 +105,7 @@ class GradientStages:
         """Largest difference between equal calls, of the cost, and of the gradient relative to its norm."""
         self.has_state = False
         """Whether the cost depends on the call before it, in a repeatable way."""
-        self._repeated = False
+        self._repeated = False  # whether calls were repeated within the budget
         self.is_hidden_single = False
         """Whether the cost has single precision, though it returns a float64."""
         self._share = 0.5 if has_sigma else 0.8
@@ -171,12 +169,15 @@ class GradientStages:
     @property
     def is_small_spread(self) -> bool:
         """Whether differences between equal calls are so small that they only limit the accuracy of the check."""
-        limit = self.simulator.unit**SMALL
-        size = abs(self.value) if math.isfinite(self.value) else 0.0
-        return not self.has_state and self.spread <= limit * size and self.gradient_spread <= limit
+        return self.spread <= self._floor and self.gradient_spread <= self.simulator.unit**SMALL
 
-    def run(self) -> None:
-        """Run all stages that the budget allows."""
+    @property
+    def _floor(self) -> float:
+        """Largest difference between equal calls of the cost that only limits the accuracy of the check."""
+        return float(self.simulator.unit**SMALL * (abs(self.value) if math.isfinite(self.value) else 0.0))
+
+    def run(self, is_explained: Callable[[Check], bool] = lambda check: False) -> None:
+        """Run all stages that the budget allows, until ``is_explained`` accepts the outcome of a wrong gradient."""
         try:
             self._start()
         except OutOfTime:
@@ -200,7 +201,7 @@ class GradientStages:
             return
         if self.check is None:
             return
-        self._check_in_stages(space)
+        self._check_in_stages(space, is_explained)
         self._locate(space)
         self._check_under_other_noise()
 
@@ -268,7 +269,9 @@ class GradientStages:
         last = after["other"][1:]  # the first of them followed the differences, so other thetas
         if self.spread > 0 and len(after["theta"]) > 1 and len(last) > 1:
             apart = abs(after["theta"][-1] - last[-1])
-            self.has_state = max(np.ptp(after["theta"]), np.ptp(last)) <= STATE * apart
+            is_alike = max(np.ptp(after["theta"]), np.ptp(last)) <= STATE * apart
+            # last digits that vary at random are alike by chance
+            self.has_state = bool(is_alike and self.spread > self._floor)
 
     def _has_hidden_single(self) -> bool:
         """Return whether a cost that returns float64 computes in float32: its values have single precision, or it reads
@@ -284,13 +287,18 @@ class GradientStages:
         if not self._repeated:
             return False
         self.clock.start_stage("precision")
-        first = np.float32(self.theta)
-        ulp = np.spacing(np.abs(first)).astype(np.float64) * np.where(np.arange(first.size) % 3 == 1, -1.0, 1.0)
-        at = first[:, None] + ulp[:, None] * np.array([0.0, IN_CELL])
-        if not _are_equal(self.costs(at)):
+        with np.errstate(all="ignore"):
+            rounded = self.theta.astype(np.float32)
+            first, ulp = rounded.astype(np.float64), np.spacing(np.abs(rounded)).astype(np.float64)
+        ulp = ulp * np.where(np.arange(first.size) % 3 == 1, -1.0, 1.0)
+
+        def costs(*units: float) -> np.ndarray:
+            return self.costs(first[:, None] + ulp[:, None] * np.array(units))
+
+        if not _are_equal(costs(0.0, IN_CELL)):
             return False
-        cells = self.costs(first[:, None] + ulp[:, None] * np.arange(CELLS))
-        inside = self.costs(first[:, None] + ulp[:, None] * np.array([[-IN_CELL], [CELLS // 2 - IN_CELL], [CELLS // 2 + IN_CELL]]).T)
+        cells = costs(*range(CELLS))
+        inside = costs(-IN_CELL, CELLS // 2 - IN_CELL, CELLS // 2 + IN_CELL)
         is_constant = _are_equal(np.r_[cells[0], inside[0]]) and _are_equal(np.r_[cells[CELLS // 2], inside[1:]])
         return is_constant and np.unique(cells).size >= DISTINCT_CELLS
 
@@ -333,7 +341,7 @@ class GradientStages:
         gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)
         return costs, gradients
 
-    def _check_in_stages(self, space: Subspace) -> None:
+    def _check_in_stages(self, space: Subspace, is_explained: Callable[[Check], bool]) -> None:
         self.clock.start_stage("checking the gradient")
         assert self.check is not None
         is_done: list[str] = []
@@ -342,16 +350,17 @@ class GradientStages:
             plan = dict(self._plan(space.size, self.check.trusted))
             is_wrong = any(part.verdict in FAULTS for part in self.check.parts)
             if name == ALL_STEPS and is_wrong:
+                if is_explained(self.check):
+                    return
                 continue  # the ratios at other thetas name the fault, and these stages also have all steps
             if not self.clock.can_afford(*self._cost_of(plan[name], space.size), share=self._share):
                 self.left_out.append(name)
                 if name != FEW_DRAWS:
                     break
                 continue
-            share = WRONG_SHARE if is_wrong else self._share
-            if name == FEW_DRAWS != names[-1] and self.clock.can_afford(
-                *self._cost_of(plan[names[-1]], space.size), share=share
-            ):
+            # a wrong gradient is named by few thetas first, so that the name does not depend on the time that is left
+            is_skipped = name == FEW_DRAWS != names[-1] and not is_wrong
+            if is_skipped and self.clock.can_afford(*self._cost_of(plan[names[-1]], space.size), share=self._share):
                 continue
             options = plan[name]
             self._refresh()
@@ -406,7 +415,11 @@ class GradientStages:
     def _without_small_spread(self, space: Subspace, outcome: Check) -> Check:
         """Return a check without the verdict ``nondeterministic`` where only the last digits of the gradient differ."""
         is_own = any(part.verdict == "nondeterministic" for part in outcome.parts)
-        if outcome.cause != "nondeterministic" or is_own or self._spread_of_gradients(space) > self.simulator.unit**SMALL:
+        if (
+            outcome.cause != "nondeterministic"
+            or is_own
+            or self._spread_of_gradients(space) > self.simulator.unit**SMALL
+        ):
             return outcome
         return recaused(outcome)
 

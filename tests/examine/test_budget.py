@@ -9,11 +9,14 @@ import time
 
 import numpy as np
 import pytest
+import simulators
 
 import bench
 from bench.errors import UserError
 from bench.model.simulator.clock import Clock, OutOfTime
 
+LOADED = ("memory overwritten", "0.2% off", "shared by one step")
+"""Cases that are examined with a slow cost."""
 THETA = [0.4, 0.3, 0.5]
 
 
@@ -65,6 +68,15 @@ def test_calls_give_the_same_report_whatever_the_time():
         return report.status, report.cause, report.costs, report.gradients, report.left_out, report.conclusion
 
     assert texts(0.0) == texts(0.005)
+
+
+@pytest.mark.parametrize("settings", [{"calls": 400}, {"budget": 3}])
+@pytest.mark.parametrize("case", [c for c in simulators.engine_cases() if c.name in LOADED], ids=lambda c: c.name)
+def test_verdicts_do_not_depend_on_load(case, settings):
+    """A cost that is four times slower, as on a loaded machine, gets the same verdict."""
+    fast = simulators.examined(case, **{"budget": None, **settings})
+    slow = simulators.examined(case, simulators.slowed(case.cost, 4.0), **{"budget": None, **settings})
+    assert (slow.status, slow.cause) == (fast.status, fast.cause)
 
 
 def test_sigma_that_was_not_measured_is_not_decided():

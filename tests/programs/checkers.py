@@ -1,8 +1,9 @@
 """Runs another gradient checker on the cases of `simulators.py`, and reports its complaints, calls and seconds.
 
-    python tests/programs/checkers.py gradcheck|check_grads|tesseract
+    python tests/programs/checkers.py gradcheck|check_grads|tesseract|gradcheck_tape
 
-prints a line per case and a summary. Each checker has its default steps and tolerances. A cost in the checker's own
+prints a line per case and a summary. `warp.autograd.gradcheck_tape` only checks Warp kernels, so it runs on the Warp programs of
+`engine_cases.py`, in an environment with Warp. Each checker has its default steps and tolerances. A cost in the checker's own
 library is passed unchanged; others are wrapped as a function with a custom gradient: `torch.autograd.Function`,
 `jax.custom_vjp`, or the endpoints `apply` and `jacobian` of a tesseract. A simulator's own noise is one fixed draw. Nothing
 of `bench` is imported, so that tesseract-core can have its own environment.
@@ -154,15 +155,33 @@ def complains(checker: str, case: simulators.Case) -> tuple[bool, int, float, st
     return found, counted.calls, time.perf_counter() - began, raised
 
 
+def check_tapes() -> None:
+    """Print whether `warp.autograd.gradcheck_tape` complains about the Warp programs of `engine_cases.py`."""
+    import engine_cases
+    from warp.autograd import gradcheck_tape
+
+    for fault in ("parameter", "state", "adjoint", ""):
+        tape = engine_cases.warp_rollout(fault)(engine_cases.SPRING)[2]
+        began = time.perf_counter()
+        with contextlib.redirect_stdout(io.StringIO()):
+            passes = gradcheck_tape(tape, raise_exception=False, show_summary=False)
+        took = time.perf_counter() - began
+        print(f"| warp | {fault or 'right'} | {'passes' if passes else 'complains'} | {took:.2f} |")
+
+
 def main(checker: str) -> None:
     """Print the table of one checker."""
+    if checker == "gradcheck_tape":
+        check_tapes()
+        return
     sums = {True: [0, 0], False: [0, 0]}
     calls, seconds = [], 0.0
     for library, cases in simulators.CASES.items():
         for case in cases():
             found, asked, took, raised = complains(checker, case)
-            sums[bool(case.causes)][0] += found
-            sums[bool(case.causes)][1] += 1
+            is_fault = bool(case.causes or case.warned)
+            sums[is_fault][0] += found
+            sums[is_fault][1] += 1
             calls.append(asked)
             seconds += took
             print(

@@ -9,7 +9,7 @@ says so. The table states the cause that was found, the seconds with first calls
 
 import ctypes
 import functools
-import importlib.util
+import itertools
 import json
 import os
 import resource
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-LIMIT = 600
+LIMIT = 1200
 """Seconds for one case."""
 HEAD = ("case", "library", "expected", "found", "named", "seconds", "of these first calls", "costs + gradients", "GB")
 MARK = "\x1eROW "
@@ -67,7 +67,7 @@ SLIDER = """<mujoco><option timestep="0.005" cone="{cone}" iterations="{iteratio
 <geom type="sphere" size="0.1" mass="1" friction=".5" condim="{condim}"/></body></worldbody></mujoco>"""
 
 
-def slider(steps=4, at_target=False, by_friction=False, **options):
+def slider(steps=2, at_target=False, by_friction=False, **options):
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -185,7 +185,7 @@ def newton_body(solver_name, free):
         if states[0].joint_q is not None and len(states[0].joint_q):
             newton.eval_ik(model, states[0], states[0].joint_q, states[0].joint_qd)
         with wp.Tape() as tape:
-            for before, after in zip(states, states[1:], strict=False):
+            for before, after in itertools.pairwise(states):
                 contacts = pipeline.contacts()
                 pipeline.collide(before, contacts)
                 before.clear_forces()
@@ -201,7 +201,8 @@ def newton_body(solver_name, free):
             slopes = [float(first.body_q.grad.numpy()[body][2]), float(first.body_qd.grad.numpy()[body][2])]
         return float((height - np.float32(0.3)) ** 2), slopes
 
-    return lambda x: rollout(x)[0], [0.12, -1.0], {"grad": lambda x: rollout(x)[1]}
+    # Newton compiles all collision kernels, which takes longer than the default of 300 s on a loaded machine
+    return lambda x: rollout(x)[0], [0.12, -1.0], {"grad": lambda x: rollout(x)[1], "compile_budget": 900}
 
 
 WRONG = ("wrong_adjoint", "missing_term", "wrong_factor", "disconnected")
@@ -211,45 +212,69 @@ case("Newton Featherstone, a free joint", "newton", "nan_gradient", *WRONG, solv
 )
 
 
-def warp_spring(overwritten, right=False):
-    """Return a spring of 20 steps in a Warp kernel that overwrites an array that its adjoint reads."""
+def warp_rollout(fault):
+    """Return a rollout of a spring, 20 steps in a Warp kernel: (cost, gradient, tape).
+
+    ``fault`` overwrites the ``state`` or the ``parameter`` that the adjoint reads, or doubles the ``adjoint`` of the sine.
+    """
     wp = _quiet_warp()
-    dt = wp.constant(wp.float64(0.05))
+    dt, factor = wp.constant(wp.float64(0.05)), wp.constant(wp.float64(2.0 if fault == "adjoint" else 1.0))
+
+    @wp.func
+    def sine(x: wp.float64):
+        return wp.sin(x)
+
+    @wp.func_grad(sine)
+    def adjoint_of_sine(x: wp.float64, slope: wp.float64):
+        wp.adjoint[x] += factor * wp.cos(x) * slope
+
+    array = wp.array(dtype=wp.float64)
 
     @wp.kernel
-    def step(x: wp.array(dtype=wp.float64), v: wp.array(dtype=wp.float64), k: wp.array(dtype=wp.float64), a: int, b: int):
-        v[b] = v[a] - dt * k[0] * wp.sin(x[a])
-        x[b] = x[a] + dt * v[b]
+    def step(k: array, x: array, v: array, after_x: array, after_v: array):
+        speed = v[0] - dt * k[0] * sine(x[0])
+        after_x[0] = x[0] + dt * speed
+        after_v[0] = speed
 
     @wp.kernel
-    def soften(k: wp.array(dtype=wp.float64)):
+    def soften(k: array):
         k[0] = k[0] * wp.float64(0.9)
 
+    def numbers(value):
+        return wp.array([value], dtype=wp.float64, requires_grad=True)
+
     def rollout(theta, steps=20):
-        x, v = (wp.array(np.r_[first, np.zeros(steps)], dtype=wp.float64, requires_grad=True) for first in theta[:2])
-        k = wp.array([theta[2]], dtype=wp.float64, requires_grad=True)
-        last = 0 if overwritten == "state" else steps
+        x, v, k = [numbers(theta[0])], [numbers(theta[1])], numbers(theta[2])
         with wp.Tape() as tape:
-            for t in range(steps):
-                at = (0, 0) if overwritten == "state" else (t, t + 1)
-                if overwritten == "parameter":
-                    wp.launch(soften, dim=1, inputs=[k])
-                wp.launch(step, dim=1, inputs=[x, v, k, *at])
-        end = x.numpy()[last]
-        seed = np.zeros(steps + 1)
-        seed[last] = 2 * end
-        tape.backward(grads={x: wp.array(seed, dtype=wp.float64)})
-        return float(end**2), [x.grad.numpy()[0], v.grad.numpy()[0], k.grad.numpy()[0]]
+            for _ in range(steps):
+                if fault == "parameter":
+                    wp.launch(soften, dim=1, inputs=[], outputs=[k])
+                after = (x[0], v[0]) if fault == "state" else (numbers(0.0), numbers(0.0))
+                wp.launch(step, dim=1, inputs=[k, x[-1], v[-1]], outputs=[*after])
+                x.append(after[0])
+                v.append(after[1])
+        end = x[-1].numpy()[0]
+        tape.backward(grads={x[-1]: wp.array([2 * end], dtype=wp.float64)})
+        return float(end**2), [one.grad.numpy()[0] for one in (x[0], v[0], k)], tape
 
+    return rollout
+
+
+SPRING = [0.7, 0.3, 9.0]
+
+
+def warp_spring(fault):
+    rollout = warp_rollout(fault)
     settings = {"grad": lambda x, steps=20: rollout(x, steps)[1]}
-    if not right:
+    if fault in ("state", "parameter"):
         settings["horizons"] = [1, 2, 5, 20]
-    return lambda x, steps=20: rollout(x, steps)[0], [0.7, 0.3, 9.0], settings
+    return lambda x, steps=20: rollout(x, steps)[0], SPRING, settings
 
 
-case("Warp, parameter overwritten between launches", "warp-lang", "overwritten", overwritten="parameter")(warp_spring)
-case("Warp, state overwritten in place", "warp-lang", "overwritten", overwritten="state")(warp_spring)
-case("Warp, an array entry per step", "warp-lang", overwritten="", right=True)(warp_spring)
+case("Warp, parameter overwritten between launches", "warp-lang", "overwritten", fault="parameter")(warp_spring)
+case("Warp, state overwritten in place", "warp-lang", "overwritten", fault="state")(warp_spring)
+case("Warp, adjoint of a function doubled", "warp-lang", *WRONG, fault="adjoint")(warp_spring)
+case("Warp, an array entry per step", "warp-lang", fault="")(warp_spring)
 
 
 @case("MuJoCo Warp, a tape around its steps", "mujoco-warp", *WRONG, "nan_gradient")
@@ -371,7 +396,7 @@ def dopri5(rtol=1e-6, adjoint=False, forgotten=False, is_refined=False):
     return solved(rtol), [2.0, 1.0, 0.5], {"grad": "torch", **({"refined": solved(1e-9)} if is_refined else {})}
 
 
-case("dopri5, rtol 1e-6", "torchdiffeq")(dopri5)
+case("dopri5, rtol 1e-6", "torchdiffeq", "adaptive", *RIGHT)(dopri5)
 case("dopri5, rtol 1e-3, with refined=", "torchdiffeq", "adaptive", rtol=1e-3, is_refined=True)(dopri5)
 case("odeint_adjoint used rightly", "torchdiffeq", *RIGHT, "adaptive", adjoint=True)(dopri5)
 case("dopri5, a detached parameter", "torchdiffeq", "disconnected", forgotten=True)(dopri5)
@@ -663,15 +688,12 @@ def record(name: str) -> None:
     cost, theta, settings = one.make()
     report = bench.examine(cost, theta, progress=False, name=name, **settings)
     print(report, file=sys.stderr)
-    is_right = one.expected == RIGHT or report.cause in RIGHT
-    found = bool(report.status) != (one.expected == RIGHT)
-    named = report.cause in one.expected
-    status = "right" if not report.status else report.derivative if report.gradient else "no derivative"
+    named = report.cause in one.expected and (report.cause in RIGHT) == (report.status == 0)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    said = report.cause if report.status or not is_right else f"right ({report.cause})"
+    said = report.cause if report.status else f"right ({report.cause})"
     row = [
-        name, f"{one.library} {metadata.version(one.library)}", "right" if one.expected == RIGHT else one.expected[0],
-        said if report.status else f"{status} ({report.cause})", "yes" if named and found else "no" if not named else "-",
+        name, f"{one.library} {metadata.version(one.library)}", "right" if one.expected[0] in RIGHT else one.expected[0],
+        said, "yes" if named else "no",
         duration(report.seconds + report.compile_s), duration(report.compile_s),
         f"{report.costs:,} + {report.gradients:,}", f"{memory:.2f}",
     ]  # fmt: skip
@@ -682,7 +704,7 @@ def run(name: str) -> list[str]:
     """Return the row of a case that runs in a process of its own."""
     one = CASES[name]
     rest = ["-"] * (len(HEAD) - 4)
-    expected = "right" if one.expected == RIGHT else one.expected[0]
+    expected = "right" if one.expected[0] in RIGHT else one.expected[0]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     words = [sys.executable, __file__, "--record", name]
     try:

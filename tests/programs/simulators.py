@@ -1,13 +1,16 @@
 """Runs `bench.examine` on planted faults and correct gradients in NumPy, torch and JAX simulators, and prints a table.
 
-    python tests/programs/simulators.py [numpy] [right] [torch] [jax]
+    python tests/programs/simulators.py [numpy] [right] [torch] [jax] [engines]
 
-prints a line per case: the cause that `bench.examine` reports, its exit status, calls and seconds. `checkers.py` runs other
-gradient checkers on the same cases.
+    python tests/programs/simulators.py slowed [numpy] [right] [engines]
+
+The first prints a line per case: the cause that `bench.examine` reports, its exit status, calls and seconds. `checkers.py` runs other
+gradient checkers on the same cases. The second compares each verdict with that of a cost that is four times slower.
 """
 
 from __future__ import annotations
 
+import functools
 import sys
 import time
 import warnings
@@ -432,15 +435,112 @@ def jax_cases():
     yield Case("kink beside theta", "jax", lambda x: jnp.sum(jnp.abs(x - 0.1003) * x), [1.0, 0.1], "jax")
 
 
-CASES = {"numpy": numpy_cases, "right": right_cases, "torch": torch_cases, "jax": jax_cases}
+def engine_cases():
+    """Yield the failures of engines that `mechanisms.py` imitates, and right gradients beside them."""
+    import mechanisms as m
+
+    start, random = [0.7, 0.3], np.random.default_rng(0)
+
+    def slope(x, steps=20):
+        return m.swinging(x, steps, slope=True)
+
+    def last_digits(x):
+        value = m.swinging(x)
+        return np.nextafter(value, value + random.integers(-1, 2))
+
+    def seeded(x):
+        seed = int(np.frombuffer(np.array(x).tobytes(), np.uint32).sum())
+        return m.swinging(x) + 0.38 * np.random.default_rng(seed).standard_normal()
+
+    def raising(x):
+        if abs(x[0] - start[0]) > 1e-3:
+            raise RuntimeError("no gradient here")
+        return 75300 * slope(x)
+
+    def shared(x, steps=20):
+        return m.swinging(x, steps, shared=True, slope=True)
+
+    def mixed(x):
+        return m.single(x, is_mixed=True)
+
+    solver, by = m.WarmStarted(), "wrong_factor"
+    grown = {"horizons": [1, 2, 5, 20]}
+    yield Case(
+        "adaptive steps", "numpy", lambda x: m.adaptive(x, 1e-3), [1.0, 1.0, 0.5], lambda x: m.frozen(x, rtol=1e-3),
+        ("adaptive",),
+    )  # fmt: skip
+    yield Case("memory overwritten", "numpy", m.swinging, start, shared, ("overwritten",), grown)
+    yield Case("warm start", "numpy", solver.cost, [1.0, 2.0], solver.gradient, ("nondeterministic",))
+    yield Case("float32 states", "numpy", mixed, start, m.single_gradient, warned="precision")
+    yield Case("float32 states, 55% off", "numpy", mixed, start, lambda x: 1.55 * m.single_gradient(x), (by,))
+    yield Case("last digits vary, factor 2", "numpy", last_digits, start, lambda x: 2 * slope(x), (by,))
+    yield Case("seed from theta", "numpy", seeded, start, slope, ("rough",))
+    yield Case(
+        "input without effect", "numpy", lambda x: m.swinging(x[:2]), [*start, 1.0], lambda x: np.r_[slope(x[:2]), 0.0],
+        ("no_effect",), {"allow_zero": False},
+    )  # fmt: skip
+    yield Case(
+        "no input moves the cost", "numpy", lambda x: 3.3 + 0 * x[0], start, lambda x: 0 * np.array(x), ("zero",)
+    )
+    yield Case("0.2% off", "numpy", m.swinging, start, lambda x: slope(x) * [1, 1.002], (by,))
+    yield Case("1e-5 off", "numpy", m.swinging, start, lambda x: slope(x) * (1 + 1e-5), warned="small error")
+    yield Case("raises elsewhere", "numpy", m.swinging, start, raising, (by, "wrong_adjoint"))
+    yield Case("last digits vary", "numpy", last_digits, start, slope)
+    yield Case(
+        "linear beside 1e6", "numpy", lambda x: 1e6 + 3e-4 * x[0] - 1e-9 * x[1], start,
+        lambda x: np.array([3e-4, -1e-9]),
+    )  # fmt: skip
+    yield Case("shared by one step", "numpy", lambda x: m.swinging(x, 1), start, lambda x: shared(x, 1))
 
 
-def examined(case):
+CASES = {
+    "numpy": numpy_cases,
+    "right": right_cases,
+    "torch": torch_cases,
+    "jax": jax_cases,
+    "engines": engine_cases,
+}
+
+
+def examined(case, cost=None, **settings):
+    """Return the report on a case, or on a slower cost of it."""
     from bench.examine import examine
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return examine(case.cost, case.theta, grad=case.grad, progress=False, budget=60, **case.settings)
+        settings = {"budget": 60, **case.settings, **settings}
+        return examine(cost or case.cost, case.theta, grad=case.grad, progress=False, **settings)
+
+
+def slowed(cost, factor):
+    """Return a cost that takes ``factor`` times as long, as on a loaded machine."""
+
+    @functools.wraps(cost)
+    def call(*arguments, **settings):
+        started = time.perf_counter()
+        value = cost(*arguments, **settings)
+        time.sleep((factor - 1.0) * (time.perf_counter() - started))
+        return value
+
+    return call
+
+
+def compare_speeds(libraries):
+    """Print the cases whose exit status or cause differs where every cost takes four times as long."""
+    different = total = 0
+    for library in libraries:
+        for case, again in zip(CASES[library](), CASES[library](), strict=True):
+            total += 1
+            for settings in ({"budget": 5}, {"budget": None, "calls": 400}):
+                fast = examined(case, **settings)
+                slow = examined(again, slowed(again.cost, 4.0), **settings)
+                if (fast.status, fast.cause) != (slow.status, slow.cause):
+                    different += 1
+                    print(
+                        f"{library} {case.name} {settings}: {fast.status} {fast.cause}, slower {slow.status} {slow.cause}"
+                    )
+    print(f"{different} of {2 * total} examinations differ")
+    return int(different > 0)
 
 
 def main(libraries):
@@ -468,6 +568,7 @@ def main(libraries):
 
 if __name__ == "__main__":
     started = time.perf_counter()
-    status = main(sys.argv[1:])
+    words = sys.argv[1:]
+    status = compare_speeds(words[1:] or ["numpy", "right", "engines"]) if words[:1] == ["slowed"] else main(words)
     print(f"{time.perf_counter() - started:.0f} s in all")
     sys.exit(status)
