@@ -1,4 +1,4 @@
-"""Brax's generalized pipeline, differentiated forward by JAX: all columns at once."""
+"""Brax's generalized pipeline, differentiated forward by JAX, all columns together."""
 
 import xml.etree.ElementTree as ElementTree
 

@@ -134,7 +134,9 @@ def test_an_engine_that_is_killed_is_started_again_and_the_call_repeated():
 
 def test_an_engine_that_dies_again_is_a_crash_with_its_signal_and_last_output():
     problem = toy(fault="exit").compile(program(BouncingBall()))
-    with pytest.raises(Crashed, match="toy ended twice during jacobians: killed by SIGKILL; its last output: .*another"):
+    with pytest.raises(
+        Crashed, match=r"toy ended twice during jacobians: killed by SIGKILL; its last output: .*another"
+    ):
         problem.grad(problem.program.theta0, noise(problem))
 
 
@@ -206,7 +208,7 @@ def test_a_missing_environment_is_one_message_with_its_command(tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("python", "reason"),
     [
-        ("/nowhere/python", "python=/nowhere/python: there is no such file; make"),
+        ("/nowhere/python", "python=/nowhere/python: the file does not exist; make"),
         (shutil.which("true"), "it is not a working Python"),
         ("/etc/passwd", "it cannot be started"),
     ],
