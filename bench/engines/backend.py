@@ -26,6 +26,8 @@ class EngineBackend(Backend):
 
     file: ClassVar[str]
     """The engine's file, relative to the folder of the backend's own file, such as ``engines/my_engine.py``."""
+    helpers: ClassVar[tuple[str, ...]] = ()
+    """Further files of the engine's folder that its file imports, by name."""
     libraries: ClassVar[tuple[str, ...]] = ()
     """Distributions that the engine needs. Rows have their versions."""
     laws: ClassVar[tuple[str, ...]] = ("penalty",)
@@ -102,8 +104,9 @@ class EngineBackend(Backend):
 
     @classmethod
     def files(cls) -> list[Path]:
-        """Return the files that run in the engine's Python: the engine's own, first, and the server's."""
-        return [Path(inspect.getfile(cls)).parent / cls.file, Path(server.__file__)]
+        """Return the files that run in the engine's Python: the engine's own, first, its helpers and the server's."""
+        own = Path(inspect.getfile(cls)).parent / cls.file
+        return [own, *(own.parent / name for name in cls.helpers), Path(server.__file__)]
 
     @classmethod
     def requirements(cls) -> Path:

@@ -11,6 +11,8 @@ description of a program, with
   the controls;
 - ``widths``, optional: the batch sizes B that it can compute, otherwise all;
 - ``device``, optional: the device that it computes on.
+
+The file may import its libraries, and other files of its folder.
 """
 
 import importlib.util
@@ -204,6 +206,8 @@ def serve(file: str, requests: int, answers: int) -> None:
 
 
 def _load(file: str) -> Any:
+    # last, so that a file named after its engine's library does not hide the library
+    sys.path.append(os.path.dirname(os.path.abspath(file)))
     spec = importlib.util.spec_from_file_location("bench_engine_model", file)
     assert spec is not None
     assert spec.loader is not None

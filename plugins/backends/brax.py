@@ -19,6 +19,7 @@ class Brax(EngineBackend):
 
     name = "brax"
     file = "../engines/brax.py"
+    helpers: ClassVar[tuple[str, ...]] = ("mujoco_twin.py",)
     libraries: ClassVar[tuple[str, ...]] = ("brax", "jax", "mujoco", "mujoco-mjx", "numpy")
 
     dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))

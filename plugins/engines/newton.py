@@ -14,7 +14,7 @@ class Model:
     """A twin as a batch of worlds, one model per width."""
 
     takes_forces = True
-    widths = (1, 64, 1024)
+    widths = (1, 64, 512)
 
     def __init__(self, program):
         self._program, self._batches = program, {}
