@@ -10,8 +10,7 @@ from bench.experiment.axes import table
 from bench.experiment.columns import COMMON, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
-from bench.report.problems import problem_names
-from bench.report.study_tables import label_columns
+from bench.report.problems import label_columns, problem_names
 from bench.report.style import PALETTE
 from bench.report.text import duration, number
 from bench.report.views import arrange, attempted
