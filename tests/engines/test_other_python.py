@@ -180,6 +180,30 @@ time.sleep(100)
         assert engine.wait(10) is None
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "limit", "status", "reason"),
+    [
+        ("loop", "timeout=4s", "timeout", "no result within 4 s"),
+        ("memory", "memory=1G", "crashed", "more than 1 GiB of memory"),
+    ],
+)
+def test_limits_of_a_cell_count_its_engine(tmp_path, fault, limit, status, reason):
+    """A cell whose engine hangs or takes too much memory is stopped with its engine, and the other cells run."""
+    backends = f"backends=[numpy,'toy[python={HERE},fault={fault}]']"
+    words = ["name=limits", *SETTINGS, backends, "estimators=[fobg]", "workers=1", limit, f"results_dir={tmp_path}"]
+    before = {child.pid for child in psutil.Process().children(recursive=True)}
+    assert main(words) in (0, 1)
+    rows = bench.load(tmp_path / "limits").set_index(bench.load(tmp_path / "limits")["backend"].str[:3])
+    assert rows.loc["num", "status"] == "ok"
+    assert rows.loc["toy", "status"] == status
+    assert reason in rows.loc["toy", "reason"]
+    assert {child.pid for child in psutil.Process().children(recursive=True)} <= before
+    assert not [
+        p for p in psutil.process_iter(["cmdline"]) if str(TOYS / "engines") in " ".join(p.info["cmdline"] or ())
+    ]
+
+
 def test_children_that_plugins_leave_are_killed_and_engines_are_not():
     problem = toy().compile(program(BouncingBall()))
     problem.value(problem.program.theta0, noise(problem))

@@ -49,4 +49,7 @@ class Model:
             os.kill(os.getpid(), signal.SIGKILL)
         if fault == "loop":
             time.sleep(1000)
+        if fault == "memory":
+            self.memory = np.ones(1 << 27)  # 1 GiB
+            time.sleep(1000)
         raise ValueError("the engine has a fault")
