@@ -23,6 +23,8 @@ from bench.plugins.scenes.pushing import Pushing
 
 import bench
 from bench.cli import main
+from bench.conformance import backends
+from bench.conformance.kit import Failed
 from bench.conformance.subjects import law_for
 from bench.engines import environments, process, twin
 from bench.engines.process import close_engines
@@ -267,6 +269,12 @@ def test_the_command_lists_engines_and_installs_requirements(tmp_path, monkeypat
 
 
 # ------------------------------------------------------------------------------------------------------- contracts
+
+
+def test_an_engine_that_ignores_a_contact_fails_the_kit():
+    assert "m/s" in backends.pressed_contact_pushes(toy())
+    with pytest.raises(Failed, match="the velocity away changes by 0"):
+        backends.pressed_contact_pushes(toy(fault="no_contact"))
 
 
 def test_files_of_engines_are_neither_imported_nor_listed():
