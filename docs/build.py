@@ -89,6 +89,7 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   at least five horizons, an exponential that is 20 times as likely as the power law, and a rate above 0.
 - `gradient_check.csv`: one line per check and step size. `gradient_components.csv`: one line per component of theta.
 - `twins.csv`: differences between an engine's model of a scene and the scene's own program, and their times.
+- `engines.csv`: one line per engine and scene: errors, statistics, times and memory of its gradients.
 - `optimise.csv`: one line per search. `summary.csv`: per method the score with its interval, the probability of beating the
   baseline, and the share of targets reached in time. `targets.csv`: per problem, method and target (the first regret over
   10, 100 and 1,000) the successes with Wilson's interval and the average runtime in rollouts. The runtime includes failed

@@ -41,6 +41,8 @@ def backend(request):
     marker = request.node.get_closest_marker("needs")
     needs = set(marker.args) if marker else set()
     chosen = entry.plugin()
+    if reason := chosen.unavailable_reason():
+        pytest.skip(reason)
     if "physics" in chosen.provides and "physics" not in needs:
         pytest.skip(f"{chosen.name} steps a model of its own")
     if "simulator" in chosen.provides:

@@ -31,6 +31,7 @@ from bench.conformance.subjects import (
     stepping,
     with_changed_column,
 )
+from bench.engines.backend import EngineBackend
 from bench.model import (
     Array,
     Backend,
@@ -47,9 +48,30 @@ from bench.model import (
     param,
 )
 from bench.model.backend import CAPABILITIES
+from bench.model.parameters import parameters
 
-GRADIENT = 1e-4
-"""Relative error allowed against central differences of step 1e-6, on columns where two steps agree to 2e-5."""
+
+@dataclass(frozen=True)
+class Precision:
+    """Tolerances and difference steps for a floating-point type."""
+
+    step: float
+    """Step of central differences."""
+    agreement: float
+    """Relative difference of differences with two steps up to which a column is smooth."""
+    gradient: float
+    """Relative error allowed in a gradient, on smooth columns."""
+    same: float
+    """Relative difference allowed between rollouts with the same operations in another order."""
+    digits: float
+    """Relative rounding error of a cost."""
+
+
+PRECISIONS = {
+    "float64": Precision(1e-6, 2e-5, 1e-4, SAME, 1e-11),
+    "float32": Precision(1e-2, 1e-2, 5e-2, 1e-3, 1e-5),
+}
+"""By the type that a backend computes in by default."""
 SCORE = 1e-5
 """Relative error allowed against differences of log p over a step of 1e-3: only rounding, as log p is linear in theta."""
 SINGLE = 1e-2
@@ -63,6 +85,8 @@ PRESSED = 1e-3
 """Penetration [m] at which the force of a contact with friction is compared."""
 PUSHED = 0.02
 """Relative error allowed in a contact force with friction: an impedance of 1e-4 causes 5e-4 at a friction of 0.5."""
+PUSHES = 1e-5
+"""Least change of velocity [m/s] by a contact that presses for 0.1 ms: a spring of 10 kN/m causes 1e-3."""
 SOLVED = 1e-9
 """Relative error allowed where equations are solved to 1e-12 in the unknown, at a condition number below 100."""
 
@@ -90,6 +114,8 @@ def programs_for(
 @verifies(Backend)
 def value_agrees(backend: Backend) -> str:
     """Verify that costs equal the plain backend's on every scene and law, within the twin's tolerance for engines."""
+    if isinstance(backend, EngineBackend) and backend.own_contact:
+        raise Skipped("has contacts of its own")
     plain = plain_backend()
     programs = programs_for(
         backend, list, [program for program in all_programs() if plain.incompatibility(program) is None]
@@ -100,10 +126,14 @@ def value_agrees(backend: Backend) -> str:
         value = backend.compile(program).value(theta, w)
         require(value.shape == (COLUMNS,), f"{describe(program)}: shape {value.shape}, not {(COLUMNS,)}")
         off = distance(value, plain.compile(program).value(theta, w))
-        allowed = _allowed(backend, program, SAME)
+        allowed = _allowed(backend, program, _precision(backend).same)
         require(off < allowed, f"{describe(program)}: costs differ by {off:.1e}, more than {allowed:g}")
         worst = max(worst, off)
     return f"to {worst:.0e} on {len(programs)} programs"
+
+
+def _precision(backend: Backend) -> Precision:
+    return PRECISIONS[type(backend)().dtype]
 
 
 def _allowed(backend: Backend, program: Program, exact: float) -> float:
@@ -119,6 +149,7 @@ def gradient_is_that_of_value(backend: Backend) -> str:
     """Verify gradients against central differences of the costs along random directions, except at kinks and jumps."""
     if "grad" not in backend.provides:
         raise Skipped("computes no gradients")
+    precision = _precision(backend)
     worst, judged, programs = 0.0, 0, programs_for(backend, representative_programs)
     for program in programs:
         theta, w = samples(program)
@@ -126,22 +157,25 @@ def gradient_is_that_of_value(backend: Backend) -> str:
         gradient = problem.grad(theta, w)
         require(gradient.shape == theta.shape, f"{describe(program)}: shape {gradient.shape}, not {theta.shape}")
         require(np.isfinite(gradient).all(), f"{describe(program)}: not finite")
-        off, smooth = _against_differences(problem, gradient, theta, w)
+        off, smooth = _against_differences(problem, gradient, theta, w, precision)
         require(smooth.any(), f"{describe(program)}: differences converge on no column")
         if program.surrogate and "surrogate" in backend.provides:
             require(
-                off.max() > GRADIENT, f"{describe(program)}: declares a surrogate gradient, but returns the derivative"
+                off.max() > precision.gradient,
+                f"{describe(program)}: declares a surrogate gradient, but returns the derivative",
             )
             continue
         off = np.where(smooth, off, 0.0)
-        require(off.max() < GRADIENT, f"{describe(program)}: differs from central differences by {off.max():.1e}")
+        require(
+            off.max() < precision.gradient, f"{describe(program)}: differs from central differences by {off.max():.1e}"
+        )
         # far from theta0, where an adjoint must not use values stored for theta0
         theta = program.theta0[:, None] + ELSEWHERE * (theta - program.theta0[:, None])
         with np.errstate(all="ignore"):
-            far_error, agree = _against_differences(problem, problem.grad(theta, w), theta, w)
+            far_error, agree = _against_differences(problem, problem.grad(theta, w), theta, w, precision)
         worse = np.where(agree, far_error, 0.0).max()
         require(
-            worse < GRADIENT,
+            worse < precision.gradient,
             f"{describe(program)}: differs from central differences by {worse:.1e} at 3 sigma from theta0",
         )
         worst, judged = max(worst, off.max()), judged + smooth.sum()
@@ -149,16 +183,17 @@ def gradient_is_that_of_value(backend: Backend) -> str:
 
 
 def _against_differences(
-    problem: Problem, gradient: np.ndarray, theta: np.ndarray, w: np.ndarray
+    problem: Problem, gradient: np.ndarray, theta: np.ndarray, w: np.ndarray, precision: Precision
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the relative error of directional derivatives, and whether two difference steps agree, both ``(B,)``."""
     e = rng("direction").standard_normal(theta.shape)
-    steps = (2e-6, 1e-6)
+    steps = (2 * precision.step, precision.step)
     wide, narrow = ((problem.value(theta + h * e, w) - problem.value(theta - h * e, w)) / (2 * h) for h in steps)
     slope = (gradient * e).sum(axis=0)
-    # rounding causes an error of about 1e-16 / 1e-6 of the cost in a difference: smaller gradients cannot be checked
-    scale = np.abs(narrow) + np.abs(gradient * e).sum(axis=0) + 1e-5 * np.abs(problem.value(theta, w)) + 1e-9
-    return np.abs(slope - narrow) / scale, np.abs(wide - narrow) < 2e-5 * scale
+    # rounding of the cost causes an error in a difference: smaller gradients cannot be checked
+    floor = precision.digits / precision.step * np.abs(problem.value(theta, w))
+    scale = np.abs(narrow) + np.abs(gradient * e).sum(axis=0) + floor + 1e-9
+    return np.abs(slope - narrow) / scale, np.abs(wide - narrow) < precision.agreement * scale
 
 
 @verifies(Backend)
@@ -257,6 +292,8 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
 @verifies(Backend)
 def single_precision_is_finite(backend: Backend) -> str:
     """Verify that float32 costs and gradients are close to float64, on continuous scenes without contacts."""
+    if (choices := parameters(type(backend))["dtype"].choices) is not None and set(choices) != {"float64", "float32"}:
+        raise Skipped(f"computes in {' and '.join(choices)} only")
     single = dataclasses.replace(backend, dtype="float32")
     worst = dict.fromkeys(sorted(backend.provides & {"value", "grad"}), 0.0)
     smooth = [p for p in programs_for(single, distinguishing_programs) if p.contact is None and p.continuous]
@@ -408,6 +445,8 @@ def frictional_contact_has_the_force_of_its_law(backend: Backend) -> str:
     """
     if "physics" not in backend.provides:
         raise Skipped("does not have its own physics")
+    if isinstance(backend, EngineBackend) and backend.own_contact:
+        raise Skipped("has contacts of its own")
     scene = _Pressed()
     laws = [law_for(scene, law) for law in available("contacts")]
     springs = [law for law in laws if isinstance(law, ForceLaw) and law.spring() is not None]
@@ -424,6 +463,56 @@ def frictional_contact_has_the_force_of_its_law(backend: Backend) -> str:
     forces = ", ".join(f"{f:.4g} ({e:.4g})" for f, e in zip(force[:-1], expected, strict=False))
     require(off < PUSHED, f"normal forces (and the law's) in N: {forces}")
     return f"to {off:.0e}; sliding at 1 m/s it pushes with {force[-1] / expected[-1]:.2g} times the law's force"
+
+
+@dataclass(frozen=True)
+class _PressedDown(_Pressed):
+    """The same ball without friction, on a vertical slide; theta is its velocity away from the plane [m/s]."""
+
+    name = "pressed_down"
+    n_q: ClassVar[int] = 1
+
+    def theta0(self) -> np.ndarray:
+        """Return a velocity of 0."""
+        return np.zeros(1)
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Return the ball's position, 1 mm into the plane, and its velocity theta."""
+        return State(0.0 * theta + 0.1 - PRESSED, theta)
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return the velocity away from the plane."""
+        return v[0]
+
+    def mjcf(self) -> str:
+        """Return MuJoCo's description of the ball and the plane."""
+        return """
+            <worldbody>
+              <geom name="ground" type="plane" size="1 1 1"/>
+              <body>
+                <joint name="z" type="slide" axis="0 0 1"/>
+                <geom name="ball" type="sphere" size="0.1" mass="1"/>
+              </body>
+            </worldbody>
+            <contact><pair geom1="ground" geom2="ball" condim="1"/></contact>"""
+
+
+@verifies(Backend)
+def pressed_contact_pushes(backend: Backend) -> str:
+    """Verify that a ball 1 mm inside a plane is pushed away: engines can ignore a contact without an error."""
+    if "physics" not in backend.provides:
+        raise Skipped("does not have its own physics")
+    scene = _PressedDown()
+    laws = [law_for(scene, law, {"damping": 0.0}) for law in available("contacts")]
+    runs = [p for p in (compose(scene, law, stepping()) for law in laws) if backend.incompatibility(p) is None]
+    if not runs:
+        raise Skipped("runs no contact without friction")
+    before = np.array([[-PUSHED]])
+    after = backend.compile(runs[0]).value(before, np.zeros((runs[0].n_noise, 1)))[0]
+    require(
+        after + PUSHED > PUSHES, f"the velocity away changes by {after + PUSHED:.1e} m/s in a step of {scene.dt:g} s"
+    )
+    return f"by {after + PUSHED:.1e} m/s in {scene.dt:g} s"
 
 
 @verifies(Backend)

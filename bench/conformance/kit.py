@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from bench.engines.backend import EngineBackend
 from bench.errors import unknown
 from bench.model import Plugin, registry
 from bench.model.identity import identity
@@ -63,6 +64,8 @@ def main(names: Sequence[str]) -> int:
         plugins += 1
         if entry.plugin is None or not entry.available:
             results = [CheckResult(entry.name, "available", "fail" if names else "skip", entry.reason)]
+        elif reason := missing_environment(entry.plugin):
+            results = [CheckResult(entry.name, "available", "fail" if names else "skip", reason)]
         else:
             results = check(entry.plugin)
         for result in results:
@@ -105,11 +108,12 @@ def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str,
     items, names = [], set()
     for plugin_class in plugins:
         modules = (requirement.partition("=")[0] for requirement in plugin_class.requires)
-        missing = [module for module in modules if not registry.installed(module)]
+        missing = [f"not installed: {module}" for module in modules if not registry.installed(module)]
+        missing += filter(None, [missing_environment(plugin_class)])
         for name, subject, function in _items(plugin_class):
             title = f"{name}-{function.__name__}"
             names |= {title, function.__name__}
-            marks: list[Any] = [pytest.mark.skip(reason=f"not installed: {', '.join(missing)}")] if missing else []
+            marks: list[Any] = [pytest.mark.skip(reason="; ".join(missing))] if missing else []
             reason = reasons.get(title, reasons.get(function.__name__))
             if reason is not None:
                 marks.append(pytest.mark.xfail(reason=reason, strict=True))
@@ -130,6 +134,13 @@ def variants(plugin_class: type[Plugin]) -> dict[str, Plugin]:
                 values = {name: choice}
                 instances[identity(plugin_class.name, values)] = build(plugin_class, values)
     return instances
+
+
+def missing_environment(plugin_class: type[Plugin]) -> str | None:
+    """Return why the environment of a plugin that is an engine cannot be used, or None."""
+    if not issubclass(plugin_class, EngineBackend):
+        return None
+    return build(plugin_class, {}).unavailable_reason()
 
 
 def _items(plugin_class: type[Plugin]) -> Iterator[tuple[str, Any, Check]]:

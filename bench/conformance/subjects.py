@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from bench.conformance.kit import Skipped, require
+from bench.conformance.kit import Skipped, missing_environment, require
 from bench.measure import jumps
 from bench.model import (
     Array,
@@ -48,8 +48,9 @@ COLUMNS = 6
 
 
 def available(kind: str) -> list[type[Any]]:
-    """Return the plugin classes of a kind whose required modules are installed."""
-    return [e.plugin for e in registry.entries()[kind].values() if e.plugin is not None and e.available]
+    """Return the plugin classes of a kind whose required modules, and environments of engines, are installed."""
+    classes = [e.plugin for e in registry.entries()[kind].values() if e.plugin is not None and e.available]
+    return [plugin for plugin in classes if missing_environment(plugin) is None]
 
 
 @cache

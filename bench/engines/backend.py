@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from bench.engines import environments, server, twin
-from bench.engines.process import EngineModel
 from bench.engines.problem import EngineProblem
+from bench.engines.process import EngineModel
 from bench.errors import Unavailable, Unsupported
 from bench.model import Backend, EngineTwin, MechanicalScene, Problem, Program, param
 from bench.model.parameters import values
@@ -26,6 +26,8 @@ class EngineBackend(Backend):
 
     file: ClassVar[str]
     """The engine's file, relative to the folder of the backend's own file, such as ``engines/my_engine.py``."""
+    helpers: ClassVar[tuple[str, ...]] = ()
+    """Further files of the engine's folder that its file imports, by name."""
     libraries: ClassVar[tuple[str, ...]] = ()
     """Distributions that the engine needs. Rows have their versions."""
     laws: ClassVar[tuple[str, ...]] = ("penalty",)
@@ -36,7 +38,12 @@ class EngineBackend(Backend):
     own_contact: ClassVar[bool] = False
     """Whether contacts are the engine's own, with at most the law's stiffness and damping, and not compared with the law."""
 
-    python: str | None = param(None, "Python of the engine's environment; null: the one that `bench engines install` makes")
+    has_friction: ClassVar[bool] = False
+    """Whether it runs contacts with friction."""
+
+    python: str | None = param(
+        None, "Python of the engine's environment; null: the one that `bench engines install` makes"
+    )
 
     def compile(self, program: Program) -> Problem:
         """Return the program as a problem; the engine is started when it is first called."""
@@ -64,14 +71,19 @@ class EngineBackend(Backend):
         if not isinstance(scene, EngineTwin) or not isinstance(scene, MechanicalScene):
             return f"scene {scene.name} has no MJCF twin"
         if program.decision.names:
-            return f"{self.name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
+            return (
+                f"{self.name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
+            )
         if program.integrator is None or program.integrator.name != self.integrator:
             name = program.integrator.name if program.integrator else "none"
             return f"{self.name} uses its own integrator, which replaces {self.integrator}, not {name}"
         if law is not None and law.name not in self.laws:
             return f"{self.name} uses its own contact model, which replaces {' and '.join(self.laws)}, not {law.name}"
         try:
-            return self.unsupported_twin(program, twin.read(scene.mjcf()))
+            model = twin.read(scene.mjcf())
+            if not self.has_friction and any(contact["friction"] for contact in model["contacts"]):
+                return f"{self.name} runs contacts without friction only"
+            return self.unsupported_twin(program, model)
         except Unsupported as error:
             return str(error)
 
@@ -92,8 +104,9 @@ class EngineBackend(Backend):
 
     @classmethod
     def files(cls) -> list[Path]:
-        """Return the files that run in the engine's Python: the engine's own, first, and the server's."""
-        return [Path(inspect.getfile(cls)).parent / cls.file, Path(server.__file__)]
+        """Return the files that run in the engine's Python: the engine's own, first, its helpers and the server's."""
+        own = Path(inspect.getfile(cls)).parent / cls.file
+        return [own, *(own.parent / name for name in cls.helpers), Path(server.__file__)]
 
     @classmethod
     def requirements(cls) -> Path:

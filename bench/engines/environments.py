@@ -58,7 +58,7 @@ def missing(engine: str, python: str | None, libraries: Sequence[str]) -> str | 
     make = f"make its environment with `python -m bench engines install {engine}`"
     try:
         if not Path(path).exists():
-            raise Unavailable("there is no such file" if python else "it is not installed")
+            raise Unavailable("the file does not exist" if python else "it is not installed")
         versions = library_versions(path, tuple(libraries))
     except Unavailable as error:
         where = f"python={path}" if python else f"engine {engine}"

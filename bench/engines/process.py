@@ -57,7 +57,7 @@ class EngineProcess:
     """The process of an engine's file in the Python ``python``. Output that it prints goes to a temporary file."""
 
     def __init__(self, python: str, file: Path) -> None:
-        self._output = tempfile.TemporaryFile()
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115, it is closed with the process
         (theirs_in, self._requests), (self._answers, theirs_out), (life, self._life) = (os.pipe() for _ in range(3))
         given = (theirs_in, theirs_out, life)
         for descriptor in (self._requests, self._answers):

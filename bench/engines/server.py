@@ -11,6 +11,8 @@ description of a program, with
   the controls;
 - ``widths``, optional: the batch sizes B that it can compute, otherwise all;
 - ``device``, optional: the device that it computes on.
+
+The file may import its libraries, and other files of its folder.
 """
 
 import importlib.util
@@ -23,6 +25,8 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -36,12 +40,12 @@ class Closed(Exception):
     """Raised when the other end of a pipe is closed."""
 
 
-def send(descriptor, header, arrays=()):
+def send(descriptor: int, header: dict[str, Any], arrays: Sequence[np.ndarray] = ()) -> None:
     """Write a message: a header that JSON can encode, and arrays."""
     arrays = [np.ascontiguousarray(array) for array in arrays]
     text = json.dumps({**header, "arrays": [[array.dtype.str, array.shape] for array in arrays]}).encode()
-    parts = [LENGTHS.pack(len(text), sum(array.nbytes for array in arrays)) + text]
-    parts += [memoryview(array.reshape(-1)).cast("B") for array in arrays if array.size]
+    parts: list[bytes | memoryview] = [LENGTHS.pack(len(text), sum(array.nbytes for array in arrays)) + text]
+    parts += [array.reshape(-1).view(np.uint8).data for array in arrays if array.size]
     try:
         for part in parts:
             view = memoryview(part)
@@ -51,7 +55,7 @@ def send(descriptor, header, arrays=()):
         raise Closed from error
 
 
-def receive(descriptor):
+def receive(descriptor: int) -> tuple[dict[str, Any], list[np.ndarray]]:
     """Return the header and the arrays of the next message."""
     length, n_bytes = LENGTHS.unpack(_read(descriptor, LENGTHS.size))
     header = json.loads(bytes(_read(descriptor, length)))
@@ -63,7 +67,7 @@ def receive(descriptor):
     return header, arrays
 
 
-def _read(descriptor, count):
+def _read(descriptor: int, count: int) -> bytearray:
     content = bytearray(count)
     view = memoryview(content)
     while view:
@@ -80,7 +84,7 @@ def _read(descriptor, count):
 # --------------------------------------------------------------------------------------------------------- calls
 
 
-def call(model, name, arrays):
+def call(model: Any, name: str, arrays: list[np.ndarray]) -> tuple[list[np.ndarray], int]:
     """Return the arrays that a call of the model results in, and the width of its batches."""
     function = {"step": _step, "rollout": _rollout, "jacobians": _jacobians}[name]
     n_columns = arrays[0].shape[-1]
@@ -90,17 +94,19 @@ def call(model, name, arrays):
     for start in range(0, n_columns, width):
         part = [array[..., start : start + width] for array in arrays]
         missing = width - part[0].shape[-1]
-        padded = [np.concatenate([x, np.repeat(x[..., -1:], missing, axis=-1)], axis=-1) if missing else x for x in part]
+        padded = [
+            np.concatenate([x, np.repeat(x[..., -1:], missing, axis=-1)], axis=-1) if missing else x for x in part
+        ]
         results = function(model, *(np.ascontiguousarray(x) for x in padded))
         blocks.append([np.asarray(x, dtype=np.float64)[..., : width - missing] for x in results])
-    return [np.concatenate(parts, axis=-1) for parts in zip(*blocks)], width
+    return [np.concatenate(parts, axis=-1) for parts in zip(*blocks, strict=True)], width
 
 
-def _step(model, x, u):
+def _step(model: Any, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
     return [model.step(x, u)]
 
 
-def _rollout(model, x, u):
+def _rollout(model: Any, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
     if hasattr(model, "rollout"):
         return [model.rollout(x, u)]
     states = [x]
@@ -109,9 +115,9 @@ def _rollout(model, x, u):
     return [np.stack(states)]
 
 
-def _jacobians(model, x, u):
+def _jacobians(model: Any, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
     if hasattr(model, "jacobians"):
-        return model.jacobians(x, u)
+        return list(model.jacobians(x, u))
     if not hasattr(model, "pull"):
         raise NotImplementedError("this engine has no derivatives")
     rows = []
@@ -119,13 +125,13 @@ def _jacobians(model, x, u):
         slope = np.zeros_like(x)
         slope[i] = 1.0
         rows.append([np.array(part, dtype=np.float64) for part in model.pull(x, u, slope)])
-    return [np.stack(parts) for parts in zip(*rows)]
+    return [np.stack(parts) for parts in zip(*rows, strict=True)]
 
 
 class _Forced:
     """A model of controls from a model of generalised forces: constant + by_state x + by_control u."""
 
-    def __init__(self, model, forces):
+    def __init__(self, model: Any, forces: dict[str, Any]) -> None:
         self._model = model
         self.widths, self.device = getattr(model, "widths", None), getattr(model, "device", "cpu")
         n = len(forces["constant"])
@@ -137,31 +143,35 @@ class _Forced:
                 self.jacobians = self._jacobians
                 break
 
-    def _force(self, x, u):
+    def _force(self, x: np.ndarray, u: np.ndarray) -> Any:
         return self._constant + self._by_state @ x + self._by_control @ u
 
-    def step(self, x, u):
+    def step(self, x: np.ndarray, u: np.ndarray) -> Any:
+        """Return the states after one step under the controls u."""
         return self._model.step(x, self._force(x, u))
 
-    def _jacobians(self, x, u):
+    def _jacobians(self, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
         a, b = (np.asarray(part, dtype=np.float64) for part in _jacobians(self._model, x, self._force(x, u)))
         by_state = a + np.einsum("ifb,fj->ijb", b, self._by_state)
-        return by_state, np.einsum("ifb,fj->ijb", b, self._by_control)
+        return [by_state, np.einsum("ifb,fj->ijb", b, self._by_control)]
 
 
 # ------------------------------------------------------------------------------------------------------ the server
 
 
-def serve(file, requests, answers):
+def serve(file: str, requests: int, answers: int) -> None:
     """Answer requests until the pipe is closed."""
-    models, first_calls, module = {}, set(), None
+    models: dict[int, Any] = {}
+    first_calls: set[tuple[int, str, int]] = set()
+    module: Any = None
     while True:
         try:
             header, arrays = receive(requests)
         except Closed:
             return
-        started, name, key = time.perf_counter(), header["call"], header.get("model")
-        answer, results = {}, []
+        started, name, key = time.perf_counter(), header["call"], int(header["model"])
+        answer: dict[str, Any] = {}
+        results: list[np.ndarray] = []
         try:
             if module is None:
                 module = _load(file)
@@ -187,29 +197,42 @@ def serve(file, requests, answers):
             places = " < ".join(f"{os.path.basename(f.filename)}:{f.lineno}" for f in reversed(frames))
             answer, results = {"error": f"{type(error).__name__}: {error}", "kind": kind, "places": places}, []
         answer["seconds"] = time.perf_counter() - started
-        scale = 2**20 if sys.platform == "darwin" else 2**10
-        answer["peak_memory_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale
+        answer["peak_memory_mb"] = _peak_memory_mb()
         try:
             send(answers, answer, results)
         except Closed:
             return
 
 
-def _load(file):
+def _peak_memory_mb() -> float:
+    """Return the largest resident memory of this process [MB]."""
+    try:  # getrusage counts the memory of the process that has started this one
+        with open("/proc/self/status") as status:
+            return int(status.read().partition("VmHWM:")[2].split()[0]) / 2**10
+    except (OSError, ValueError, IndexError):
+        scale = 2**20 if sys.platform == "darwin" else 2**10
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / scale
+
+
+def _load(file: str) -> Any:
+    # last, so that a file named after its engine's library does not hide the library
+    sys.path.append(os.path.dirname(os.path.abspath(file)))
     spec = importlib.util.spec_from_file_location("bench_engine_model", file)
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
 
 
-def _end_with(life):
+def _end_with(life: int) -> None:
     """End this process when the other end of the pipe ``life`` is closed, even during a call."""
     os.read(life, 1)
     os._exit(0)
 
 
-def main():
+def main() -> None:
     """Serve the engine's file; the arguments are the file and the descriptors of requests, answers and life."""
     file, requests, answers, life = sys.argv[1], *map(int, sys.argv[2:5])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the run, which ends its engines

@@ -7,7 +7,20 @@ from typing import Any
 
 from bench.errors import Unsupported
 
-KNOWN = {"option", "worldbody", "contact", "actuator", "tendon", "geom", "body", "joint", "inertial", "pair", "motor", "fixed"}
+KNOWN = {
+    "option",
+    "worldbody",
+    "contact",
+    "actuator",
+    "tendon",
+    "geom",
+    "body",
+    "joint",
+    "inertial",
+    "pair",
+    "motor",
+    "fixed",
+}
 """The elements of twins."""
 JOINT = {"name", "type", "axis", "damping", "stiffness"}
 """The attributes of their joints."""
@@ -55,7 +68,13 @@ def read(mjcf: str) -> dict[str, Any]:
         springs.append((float(joint.get("stiffness", "0")), float(joint.get("damping", "0")), 0.0, {index: 1.0}))
         radius = 0.0 if geom is None else float(geom.get("size", "0").split()[0])
         centre = [0.0, 0.0, 0.0] if geom is None else _numbers(geom.get("pos", "0 0 0"))
-        mass = float(inertial.get("mass", "0")) if inertial is not None else float(geom.get("mass", "0")) if geom is not None else 0.0
+        mass = (
+            float(inertial.get("mass", "0"))
+            if inertial is not None
+            else float(geom.get("mass", "0"))
+            if geom is not None
+            else 0.0
+        )
         ball = 0.4 * mass * radius**2
         inertia = _numbers(inertial.get("diaginertia", "0 0 0")) if inertial is not None else [ball, ball, ball]
         com = _numbers(inertial.get("pos", "0 0 0")) if inertial is not None else centre

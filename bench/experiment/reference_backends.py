@@ -23,7 +23,7 @@ def capable_backends(program: Program, for_references: bool = False) -> list[Bac
             continue
         with suppress(Exception):  # a backend that fails here cannot run the program
             backend = _default(entry.plugin)
-            if backend.incompatibility(program) is None:
+            if backend.incompatibility(program) is None and backend.unavailable_reason() is None:
                 backends.append(backend)
     return sorted(backends, key=lambda backend: backend.reference_rank or 0) if for_references else backends
 

@@ -167,7 +167,7 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
     """Yield (kind, full name) of each module in a package and its subfolders; the kind is the module's folder name."""
     for module in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
         name = f"{package.__name__}.{module.name}"
-        if module.name == ENGINES:
+        if module.name == ENGINES and package.__name__ != CORE:
             continue
         if module.name in KINDS:
             yield from ((module.name, path) for _, path in _modules(importlib.import_module(name)))

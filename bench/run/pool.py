@@ -32,6 +32,8 @@ from bench.run.worker import END_OF_OUTPUT, Channel, ConnectionLost, Handler, Ma
 
 TICK = 0.05
 """Seconds between checks of the items' time and memory."""
+CHILDREN_S = 1.0
+"""Seconds between searches for the processes that a worker has started, whose memory counts as the worker's."""
 AHEAD_S = 0.05
 """Seconds of work sent to a worker in advance, so that it does not wait while results are written."""
 MAX_AHEAD = 16
@@ -104,6 +106,10 @@ class _Worker:
     """Whether it has built its handler."""
     is_prepared: bool = False
     """Whether it has imported the libraries of the current item, so that the item's own time has begun."""
+    children: list[psutil.Process] = field(default_factory=list)
+    """The processes that it had started when they were last searched for."""
+    children_since: float = 0.0
+    """Monotonic time in seconds of that search."""
     pace: float = 1.0
     """Seconds that the last item took."""
     printed: bytes = b""
@@ -112,6 +118,18 @@ class _Worker:
     """Whether it handles no more items, since a plugin has changed its process."""
     fault: ConnectionLost | MalformedMessage | None = None
     """Fault that ended the connection to the worker."""
+
+    def resident_bytes(self) -> int:
+        """Return the resident memory of the worker and of the processes that it has started, such as engines."""
+        now = time.monotonic()
+        if now > self.children_since + CHILDREN_S:
+            # a search through all processes, so not at each check
+            self.children, self.children_since = self.usage.children(recursive=True), now
+        total = int(self.usage.memory_info().rss)
+        for child in self.children:
+            with suppress(psutil.Error):
+                total += int(child.memory_info().rss)
+        return total
 
     @property
     def capacity(self) -> int:
@@ -372,7 +390,7 @@ class Pool:
         if timeout is not None and time.monotonic() - worker.since > timeout + (0 if worker.is_prepared else START_S):
             return "timeout", f"no result within {timeout:g} s"
         with suppress(psutil.Error):
-            if memory is not None and worker.usage.memory_info().rss > memory:
+            if memory is not None and worker.resident_bytes() > memory:
                 return "memory", f"stopped for using more than {memory / 2**30:.3g} GiB of memory"
             if worker.usage.status() == psutil.STATUS_STOPPED:
                 return "stopped", "stopped by a signal"

@@ -6,6 +6,8 @@ from typing import Any, ClassVar
 from bench.engines.backend import EngineBackend
 from bench.model import Program, param
 
+from ..contacts.penalty import Penalty
+
 
 @dataclass(frozen=True)
 class Brax(EngineBackend):
@@ -17,6 +19,7 @@ class Brax(EngineBackend):
 
     name = "brax"
     file = "../engines/brax.py"
+    helpers: ClassVar[tuple[str, ...]] = ("mujoco_twin.py",)
     libraries: ClassVar[tuple[str, ...]] = ("brax", "jax", "mujoco", "mujoco-mjx", "numpy")
 
     dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
@@ -25,6 +28,6 @@ class Brax(EngineBackend):
     def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
         """Return why Brax cannot run the program: a damper that pulls; or None."""
         law = program.contact
-        if law is not None and law.damping and law.damping_mode != "clipped":
+        if isinstance(law, Penalty) and law.damping and law.damping_mode != "clipped":
             return f"brax's contacts never pull: it supports damping_mode=clipped only, not {law.damping_mode}"
         return None

@@ -6,6 +6,8 @@ from typing import Any, ClassVar
 from bench.engines.backend import EngineBackend
 from bench.model import Program, param
 
+from ..contacts.penalty import Penalty
+
 
 @dataclass(frozen=True)
 class Newton(EngineBackend):
@@ -24,6 +26,6 @@ class Newton(EngineBackend):
     def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
         """Return why the solver cannot run the twin: a contact damper that acts while bodies part; or None."""
         law = program.contact
-        if law is not None and law.damping and law.damping_mode != "approach":
+        if isinstance(law, Penalty) and law.damping and law.damping_mode != "approach":
             return f"newton's contact damper acts on approach only: it supports damping_mode=approach, not {law.damping_mode}"
         return None

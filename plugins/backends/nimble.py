@@ -1,10 +1,10 @@
 """nimblephysics: the scene's twin with rigid contact by a complementarity problem, in a Python of its own."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from bench.engines.backend import EngineBackend
-from bench.model import Program, param
+from bench.model import param
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,3 @@ class Nimble(EngineBackend):
     own_contact = True
 
     dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
-
-    def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
-        """Return why the engine cannot run the twin: friction; or None."""
-        if any(contact["friction"] for contact in model["contacts"]):
-            return "nimble's twins have no friction"
-        return None

@@ -6,6 +6,8 @@ from typing import Any, ClassVar
 from bench.engines.backend import EngineBackend
 from bench.model import Program, param
 
+from ..contacts.penalty import Penalty
+
 
 @dataclass(frozen=True)
 class Taichi(EngineBackend):
@@ -18,11 +20,9 @@ class Taichi(EngineBackend):
     dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
 
     def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
-        """Return why the kernel cannot run the twin: hinges, linked bodies or friction; or None."""
+        """Return why the kernel cannot run the twin: hinges, linked bodies or damped contacts; or None."""
         if any(body["joint"] != "slide" or body["parent"] >= 0 for body in model["bodies"]):
             return "taichi's kernel has bodies on slides only, each attached to the world"
-        if any(contact["friction"] for contact in model["contacts"]):
-            return "taichi's kernel has no friction"
-        if program.contact is not None and program.contact.damping:
+        if isinstance(program.contact, Penalty) and program.contact.damping:
             return "taichi's kernel has contacts without damping"
         return None

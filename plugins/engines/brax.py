@@ -1,12 +1,10 @@
-"""Brax's generalized pipeline, differentiated forward by JAX: all columns at once."""
-
-import xml.etree.ElementTree as ElementTree
+"""Brax's generalized pipeline, differentiated forward by JAX, all columns together."""
 
 import jax
-import mujoco
 import numpy as np
 from brax.generalized import pipeline
 from brax.io import mjcf
+from mujoco_twin import mujoco_model
 
 jax.config.update("jax_enable_x64", True)
 
@@ -15,10 +13,10 @@ class Model:
     """A twin as a Brax system, compiled for each width."""
 
     takes_forces = True
-    widths = (64, 2048)
+    widths = (64, 512)
 
     def __init__(self, program):
-        n, system = len(program["bodies"]), mjcf.load_model(_mujoco_model(program))
+        n, system = len(program["bodies"]), mjcf.load_model(mujoco_model(program))
         if program["contacts"]:
             _check_contacts(system)
 
@@ -37,32 +35,6 @@ class Model:
     def jacobians(self, x, u):
         """Return the derivatives of one step."""
         return [np.asarray(part) for part in self._jacobians(x, u)]
-
-
-def _mujoco_model(program):
-    """Return the twin as a MuJoCo model, with a motor of gear 1 per joint in place of its motors, springs and dampers."""
-    root = ElementTree.fromstring(f'<mujoco><option gravity="0 0 0"/>{program["mjcf"]}</mujoco>')
-    for tag in ("actuator", "tendon"):
-        for node in root.findall(tag):
-            root.remove(node)
-    motors = ElementTree.SubElement(root, "actuator")
-    for joint in root.iter("joint"):
-        joint.attrib.pop("damping", None)
-        joint.attrib.pop("stiffness", None)
-        ElementTree.SubElement(motors, "motor", joint=joint.get("name"))
-    if root.find(".//geom") is None:  # Brax's validation fails without any
-        ElementTree.SubElement(root.find("worldbody"), "geom", size="0.1", contype="0", conaffinity="0")
-    model = mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
-    model.opt.timestep = program["dt"]
-    if model.npair:
-        law, impedance = program["contact"], program["backend"]["impedance"]
-        bodies = model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2])]
-        friction = model.pair_friction[:, 0]
-        # a contact is four edges of a friction pyramid, which together push with 2 / (mu^2 (1 + mu^2)) times one spring
-        inverse_mass = model.body_invweight0[bodies, 0].sum(axis=0) * friction**2 * (1 + friction**2) / 2
-        model.pair_solref[:] = -np.array([law["stiffness"], law["damping"]]) * inverse_mass[:, None]
-        model.pair_solimp[:, :2] = impedance
-    return model
 
 
 def _check_contacts(system):

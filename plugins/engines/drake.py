@@ -26,7 +26,11 @@ class Model:
         for i, body in enumerate(program["bodies"]):
             com, mass = np.array(body["com"]), body["mass"]
             inertia = drake.RotationalInertia(*body["inertia"]).ShiftFromCenterOfMass(mass, -com) if mass else None
-            unit = drake.UnitInertia(*(np.diag(inertia.CopyToFullMatrix3()) / mass)) if mass else drake.UnitInertia(0, 0, 0)
+            unit = (
+                drake.UnitInertia(*(np.diag(inertia.CopyToFullMatrix3()) / mass))
+                if mass
+                else drake.UnitInertia(0, 0, 0)
+            )
             link = plant.AddRigidBody(f"body{i}", drake.SpatialInertia(mass, com, unit, skip_validity_check=True))
             parent = links[body["parent"]] if body["parent"] >= 0 else plant.world_body()
             kind = drake.PrismaticJoint if body["joint"] == "slide" else drake.RevoluteJoint
@@ -48,7 +52,7 @@ class Model:
 
     def step(self, x, u):
         """Return the states after one step."""
-        return np.stack([self._plant.after(*column) for column in zip(x.T, u.T)], axis=-1)
+        return np.stack([self._plant.after(*column) for column in zip(x.T, u.T, strict=True)], axis=-1)
 
     def jacobians(self, x, u):
         """Return the derivatives of one step."""

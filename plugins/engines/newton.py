@@ -14,7 +14,7 @@ class Model:
     """A twin as a batch of worlds, one model per width."""
 
     takes_forces = True
-    widths = (1, 64, 1024)
+    widths = (1, 64, 512)
 
     def __init__(self, program):
         self._program, self._batches = program, {}
@@ -62,7 +62,9 @@ class _Batch:
         touching = {body for contact in self._program["contacts"] for body in contact["bodies"]}
         for i, body in enumerate(self._program["bodies"]):
             inertia = wp.mat33(np.diag(body["inertia"]))
-            links.append(builder.add_link(mass=body["mass"], com=wp.vec3(*body["com"]), inertia=inertia, lock_inertia=True))
+            links.append(
+                builder.add_link(mass=body["mass"], com=wp.vec3(*body["com"]), inertia=inertia, lock_inertia=True)
+            )
             parent = links[body["parent"]] if body["parent"] >= 0 else -1
             add = builder.add_joint_prismatic if body["joint"] == "slide" else builder.add_joint_revolute
             joint = add(

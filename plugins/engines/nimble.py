@@ -28,7 +28,9 @@ class Model:
         for i, given in enumerate(program["bodies"]):
             is_root = given["parent"] < 0
             skeleton = nimble.dynamics.Skeleton() if is_root else skeleton
-            create = getattr(skeleton, f"create{'Prismatic' if given['joint'] == 'slide' else 'Revolute'}JointAndBodyNodePair")
+            create = getattr(
+                skeleton, f"create{'Prismatic' if given['joint'] == 'slide' else 'Revolute'}JointAndBodyNodePair"
+            )
             joint, body = create() if is_root else create(links[given["parent"]])
             axis = np.array(given["axis"])
             joint.setAxis(axis / np.linalg.norm(axis))

@@ -23,6 +23,8 @@ from bench.plugins.scenes.pushing import Pushing
 
 import bench
 from bench.cli import main
+from bench.conformance import backends
+from bench.conformance.kit import Failed
 from bench.conformance.subjects import law_for
 from bench.engines import environments, process, twin
 from bench.engines.process import close_engines
@@ -134,7 +136,9 @@ def test_an_engine_that_is_killed_is_started_again_and_the_call_repeated():
 
 def test_an_engine_that_dies_again_is_a_crash_with_its_signal_and_last_output():
     problem = toy(fault="exit").compile(program(BouncingBall()))
-    with pytest.raises(Crashed, match="toy ended twice during jacobians: killed by SIGKILL; its last output: .*another"):
+    with pytest.raises(
+        Crashed, match=r"toy ended twice during jacobians: killed by SIGKILL; its last output: .*another"
+    ):
         problem.grad(problem.program.theta0, noise(problem))
 
 
@@ -178,6 +182,30 @@ time.sleep(100)
         assert engine.wait(10) is None
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "limit", "status", "reason"),
+    [
+        ("loop", "timeout=4s", "timeout", "no result within 4 s"),
+        ("memory", "memory=1G", "crashed", "more than 1 GiB of memory"),
+    ],
+)
+def test_limits_of_a_cell_count_its_engine(tmp_path, fault, limit, status, reason):
+    """A cell whose engine hangs or takes too much memory is stopped with its engine, and the other cells run."""
+    backends = f"backends=[numpy,'toy[python={HERE},fault={fault}]']"
+    words = ["name=limits", *SETTINGS, backends, "estimators=[fobg]", "workers=1", limit, f"results_dir={tmp_path}"]
+    before = {child.pid for child in psutil.Process().children(recursive=True)}
+    assert main(words) in (0, 1)
+    rows = bench.load(tmp_path / "limits").set_index(bench.load(tmp_path / "limits")["backend"].str[:3])
+    assert rows.loc["num", "status"] == "ok"
+    assert rows.loc["toy", "status"] == status
+    assert reason in rows.loc["toy", "reason"]
+    assert {child.pid for child in psutil.Process().children(recursive=True)} <= before
+    assert not [
+        p for p in psutil.process_iter(["cmdline"]) if str(TOYS / "engines") in " ".join(p.info["cmdline"] or ())
+    ]
+
+
 def test_children_that_plugins_leave_are_killed_and_engines_are_not():
     problem = toy().compile(program(BouncingBall()))
     problem.value(problem.program.theta0, noise(problem))
@@ -206,7 +234,7 @@ def test_a_missing_environment_is_one_message_with_its_command(tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("python", "reason"),
     [
-        ("/nowhere/python", "python=/nowhere/python: there is no such file; make"),
+        ("/nowhere/python", "python=/nowhere/python: the file does not exist; make"),
         (shutil.which("true"), "it is not a working Python"),
         ("/etc/passwd", "it cannot be started"),
     ],
@@ -243,10 +271,19 @@ def test_the_command_lists_engines_and_installs_requirements(tmp_path, monkeypat
 # ------------------------------------------------------------------------------------------------------- contracts
 
 
+def test_an_engine_that_ignores_a_contact_fails_the_kit():
+    assert "m/s" in backends.pressed_contact_pushes(toy())
+    with pytest.raises(Failed, match="the velocity away changes by 0"):
+        backends.pressed_contact_pushes(toy(fault="no_contact"))
+
+
 def test_files_of_engines_are_neither_imported_nor_listed():
     names = {name for table in registry.entries().values() for name in table}
     assert {"newton", "drake", "toy"} <= names
-    assert not [name for name in sys.modules if ".engines." in name and not name.startswith("bench.engines.")]
+    assert not [
+        name for name in sys.modules if name.startswith("bench.plugins.engines.") or name == "bench_engine_model"
+    ]
+    assert not [name for name in sys.modules if name.startswith("bench_folder_") and ".engines." in name]
     assert not {"warp", "pydrake", "brax", "taichi"} & set(sys.modules)
 
 

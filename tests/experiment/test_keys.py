@@ -25,14 +25,14 @@ CELLS = {
                  "estimators=[fobg]"],
     "adam": [*OPTIMISE, "optimizers=[adam]"],
     "cem": [*OPTIMISE, "optimizers=[cem]"],
-    **{study: [f"study={study}", *PUSH] for study in ("gradient_check", "growth", "stability", "three_errors", "twins")},
+    **{study: [f"study={study}", *PUSH] for study in ("engines", "gradient_check", "growth", "stability", "three_errors", "twins")},
     "solver": ["study=solver", "scenes=[pushing]", "contacts=[penalty]", "backends=[mujoco]"],
     "identify": ["study=identify", "scenes=[spring_record]", "integrators=[rk4]", "backends=[numpy]"],
 }  # fmt: skip
 """One cell of every kind whose keys are compared."""
 BIAS = "fobg windowed total_propagation callable"
-REFERENCED = f"{BIAS} three_errors"
-ESTIMATED = f"{BIAS} adam cem gradient_check growth stability three_errors twins"
+REFERENCED = f"{BIAS} engines three_errors"
+ESTIMATED = f"{BIAS} engines adam cem gradient_check growth stability three_errors twins"
 MOVED = {
     "measure/__init__": "",
     "measure/adequacy": "identify",
@@ -47,16 +47,16 @@ MOVED = {
     "measure/gradcheck/verdicts": "gradient_check",
     "measure/identification": "identify",
     "measure/jumps": f"{REFERENCED} gradient_check",
-    "measure/noise": f"{BIAS} adam cem gradient_check growth solver three_errors twins identify",
+    "measure/noise": f"{BIAS} engines adam cem gradient_check growth solver three_errors twins identify",
     "measure/performance": "identify",
     "measure/quadrature": REFERENCED,
     "measure/reference": REFERENCED,
     "measure/smoothed": REFERENCED,
     "measure/solve": "adam cem",
     "measure/statistics": REFERENCED,
-    "measure/timing": f"{BIAS} solver twins",
+    "measure/timing": f"{BIAS} engines solver twins",
     "model/__init__": "",
-    "model/adjoint": "windowed total_propagation",
+    "model/adjoint": "engines windowed total_propagation",
     "model/estimator": ESTIMATED,
     "model/known_solutions": "windowed adam cem identify",
     "model/optimizer": "adam cem identify",
@@ -69,13 +69,14 @@ MOVED = {
     "model/simulator/tree": "callable",
     "run/references": REFERENCED,
     "studies/bias_variance/measure": BIAS,
+    "studies/engines/measure": "engines",
     "studies/gradient_check/measure": "gradient_check",
     "studies/growth/measure": "growth",
     "studies/identify/measure": "identify",
     "studies/optimise/measure": "adam cem",
     "studies/solver/measure": "solver",
     "studies/stability/measure": "stability",
-    "studies/three_errors/measure": "three_errors",
+    "studies/three_errors/measure": "engines three_errors",
     "studies/twins/measure": "twins",
 }
 """Files, each with the cells whose keys its code is in. A file that is not listed must be in all keys, or harmless."""

@@ -13,5 +13,5 @@ class Toy(EngineBackend):
     file = "engines/toy.py"
     libraries = ("numpy",)
 
-    fault: str = param("", "what happens when Jacobians are computed: exit, loop or raise")
+    fault: str = param("", "no_contact, or what happens when Jacobians are computed: exit, loop, memory or raise")
     marker: str = param("", "file of a fault that happens once, in the third call; empty: it happens in each call")

@@ -1,0 +1,130 @@
+"""What the study of engines shows: which engine's gradient can be used on which scene, its errors and its costs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pandas as pd
+
+from bench.experiment.axes import table
+from bench.experiment.columns import COMMON, Column, text
+from bench.experiment.experiment import Experiment
+from bench.experiment.views import Chart, Style, Table, Views
+from bench.report.problems import label_columns, problem_names
+from bench.report.style import PALETTE
+from bench.report.text import duration, number
+from bench.report.views import arrange, attempted
+from bench.report.writer import reasons
+
+ACCURATE = 0.02
+"""Relative program error up to which a gradient counts as the derivative of its program. Differences of float32 costs
+have two digits."""
+SAME = 0.1
+"""Relative model error up to which a gradient counts as the gradient of the model."""
+USELESS = 1.0
+"""Relative RMSE from which on an estimate is no better than the zero estimate."""
+ENGINE = ("scene", "contact", "integrator", "backend")
+"""Parts of the grid that identify a line of the table."""
+SHOWN = (
+    "program_error_rel", "model_error_rel", "rmse_rel", "zeroth_rmse_rel", "nan_share", "value_s", "gradient_s", "first_s",
+    "pipe_share", "memory_mb",
+)  # fmt: skip
+LEVELS = {
+    "right": Style(PALETTE[2], letter="+", meaning="derivative of its program, and near the model's gradient"),
+    "own": Style(PALETTE[0], letter="o", meaning="derivative of its program, which is not near the model"),
+    "noisy": Style(PALETTE[4], letter="~", meaning="derivative of its program, but averages are no better than 0"),
+    "wrong": Style(PALETTE[3], letter="x", meaning="not the derivative of its program, or not finite"),
+    "none": Style("0.85", letter="-", meaning="no gradient, or the engine cannot run the scene"),
+}
+NOTES = (
+    "Program error: distance of the gradient from differences of the engine's own cost. Model error: distance from rigid "
+    "contact's gradient where it has a closed form, otherwise from the gradient of the scene's own program. RMSE: of "
+    "`samples` averaged gradients, or costs with scores, relative to the engine's own grad J_sigma. Times are of a batch "
+    "of 64 rollouts. Pipe: share of the gradients' time that is spent outside the engine's process.",
+)
+
+
+def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
+    """Return the findings, the table with a line per scene and engine, and the grid of usable gradients."""
+    arranged = arrange(experiment, rows)
+    tried = attempted(arranged.rows)
+    labels = label_columns(arranged, ENGINE, always=("scene", "contact", "backend"), rows=tried)
+    own = [experiment.columns.by_name[name] for name in SHOWN]
+    lines = Table(
+        "engines", tried, [*(COMMON.get(name, Column(name)) for name in labels), *own, COMMON["status"]],
+        "gradients of physics engines", NOTES, terminal=True, data=table(experiment, rows),
+    )  # fmt: skip
+    measured = arranged.rows[arranged.rows["status"].isin(("ok", "nonfinite"))]
+    if measured.empty:
+        return Views(["No cell gave a result: the table has the reason of each."], [lines], remarks=reasons(rows))
+    measured = measured.assign(
+        engine=problem_names(arranged, ["backend"], always=["backend"], rows=measured),
+        level=[level(row) for _, row in measured.iterrows()],
+    )
+    findings = [usable(measured), models(measured), costs(measured)]
+    findings = [finding for finding in findings if finding]
+    return Views(findings, [lines], [_chart(measured, findings[0])], remarks=reasons(rows))
+
+
+def level(row: pd.Series) -> str:
+    """Return the level of a row's gradient, a key of :data:`LEVELS`."""
+    if not row["gradient"].__len__():
+        return "none"
+    if row["status"] != "ok" or row["nan_share"] > 0 or not row["program_error_rel"] <= ACCURATE:
+        return "wrong"
+    if row["rmse_rel"] >= USELESS:
+        return "noisy"
+    return "right" if row["model_error_rel"] <= SAME else "own"
+
+
+def usable(measured: pd.DataFrame) -> str:
+    """Return on how many scenes each engine's gradient is the derivative of its program and better than 0 on average."""
+    texts = []
+    for engine, part in measured.groupby("engine", sort=False):
+        good = part["level"].isin(("right", "own"))
+        texts.append(f"{engine} {int(good.sum())} of {len(part)}")
+    return (
+        "Scenes on which a gradient is the derivative of its engine's program, and averages of it are better than 0: "
+        f"{', '.join(texts)}."
+    )
+
+
+def models(measured: pd.DataFrame) -> str:
+    """Return the gradients that match rigid contact where it has a closed form, and the largest distance."""
+    rigid = measured[(measured["model"] == "rigid contact") & measured["model_error_rel"].notna()]
+    if rigid.empty:
+        return ""
+    near = rigid[rigid["model_error_rel"] <= SAME]
+    worst = rigid.loc[rigid["model_error_rel"].idxmax()]
+    names = ", ".join(f"{row['engine']} on {row['scene']}" for _, row in near.iterrows()) or "none"
+    return (
+        f"Gradients within {number(SAME, 1)} of rigid contact's: {names}. The largest relative distance is "
+        f"{number(worst['model_error_rel'])} ({worst['engine']} on {worst['scene']})."
+    )
+
+
+def costs(measured: pd.DataFrame) -> str:
+    """Return the times of a batch of gradients by engine, and the largest share of the pipe."""
+    timed = measured[measured["gradient_s"].notna()]
+    if timed.empty:
+        return ""
+    texts = [
+        f"{engine} {duration(part['gradient_s'].min())} to {duration(part['gradient_s'].max())}"
+        for engine, part in timed.groupby("engine", sort=False)
+    ]
+    pipe = timed["pipe_share"].max()
+    share = f" Pipes take up to {number(100 * pipe)}% of a gradient." if pipe == pipe else ""
+    return f"64 gradients take: {', '.join(texts)}.{share}"
+
+
+def _chart(measured: pd.DataFrame, title: str) -> Chart:
+    """Return the grid of engines and scenes, coloured by level, with the model error of each gradient."""
+    frame = measured.assign(
+        row=measured.index,
+        cell=[f"{LEVELS[row['level']].letter} {number(row['model_error_rel'])}" for _, row in measured.iterrows()],
+    )
+    return Chart(
+        "engines", title, frame, [replace(COMMON["scene"], label="")], [text("engine", label="")], "grid",
+        level="level", cell="cell", styles=LEVELS, height=0.3, across=1,
+        text="A cell per engine and scene, with the model error of its gradient. An empty cell: the engine does not run it.",
+    )  # fmt: skip
