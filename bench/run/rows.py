@@ -32,8 +32,8 @@ MAX_TEXT = 1_000_000
 """Length of the longest string, in characters."""
 COUNTS = {"samples": 1, "repeats": 1, "seed": 0, "horizon": 0}
 """Columns of whole numbers, each with its smallest value."""
-IDENTIFYING = ("samples", "repeats", "seed")
-"""Counts of every row with parameters."""
+NEEDED = ("status", "samples", "repeats", "seed")
+"""Columns with a value in every row with parameters."""
 NOT_NEGATIVE = (
     "variance",
     "rmse",
@@ -83,8 +83,9 @@ def valid_rows(table: pd.DataFrame, columns: Columns, path: Path) -> pd.DataFram
             reasons.setdefault(int(place), f"{name}={value} {_rule(name, columns)}")
     if "parameters" in table:
         is_described = ~table["parameters"].isin(["", "{}", None])
-        for name in IDENTIFYING:
-            missing = is_described & table[name].isna() if name in table else is_described
+        for name in NEEDED:
+            is_missing = table[name].isna() | (table[name].astype(str) == "") if name in table else True
+            missing = is_described & is_missing
             for place in np.flatnonzero(missing):
                 reasons.setdefault(int(place), f"{name} is missing")
     if not reasons:
@@ -132,7 +133,7 @@ def _fault(row: dict[str, Any], columns: Columns) -> str:
             return f"{printable(name)[:60]}={printable(repr(value))[:60]} {fault}"
     if row.get("parameters") in (None, "", "{}"):
         return ""
-    return next((f"{name} is missing" for name in IDENTIFYING if _is_missing(row.get(name))), "")
+    return next((f"{name} is missing" for name in NEEDED if _is_missing(row.get(name)) or row[name] == ""), "")
 
 
 def _fault_of_number(name: str, value: float | None) -> str:

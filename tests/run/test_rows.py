@@ -78,8 +78,8 @@ def test_a_spoilt_small_row_is_left_out_and_its_file_is_kept(tmp_path, capsys, n
     assert kept.read_text() == text
 
 
-@pytest.mark.parametrize("name", ["samples", "repeats", "seed"])
-def test_rows_without_a_column_of_counts_are_left_out(tmp_path, capsys, name):
+@pytest.mark.parametrize("name", ["status", "samples", "repeats", "seed"])
+def test_rows_without_a_column_that_every_run_writes_are_left_out(tmp_path, capsys, name):
     table([row(seed=i) for i in range(3)]).drop(columns=name).to_parquet(tmp_path / "rows.parquet")
     (tmp_path / "pending").mkdir()
     small = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in row(seed=5).items()}

@@ -200,6 +200,12 @@ def test_a_leader_is_an_estimator_and_its_backend_where_that_is_one():
 
 
 def test_a_sweep_of_samples_in_which_a_scene_fails_has_its_report(tmp_path):
-    words = ["scenes=[callable,quadratic]", "estimators=[sphere_smoothing]", "backends=[numpy]", "sweep.samples=[4,5]", "repeats=3"]
+    words = [
+        "scenes=[callable,quadratic]",
+        "estimators=[sphere_smoothing]",
+        "backends=[numpy]",
+        "sweep.samples=[4,5]",
+        "repeats=3",
+    ]
     assert main([*words, "workers=0", "timing=false", "--quiet", "name=failed", f"results_dir={tmp_path}"]) == 0
     assert (tmp_path / "failed" / "report.html").exists()
