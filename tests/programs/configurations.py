@@ -382,7 +382,7 @@ class Ledger:
         missing = [item.cell.key for item in planned if item.cell.key not in mine]
         if missing and not stopped:
             self.fault("lost", words, f"{len(missing)} cells of {len(planned)} have no row")
-        if any(item.runs for item in planned) and not stopped and "retry=[error]" not in words:
+        if any(item.runs for item in planned) and not stopped and not experiment.execution.retry:
             self.fault("not stored", words)
         rows = {item.cell.key: mine[item.cell.key] for item in planned if item.cell.key in mine}
         self.rows.update(row["status"] for row in rows.values())
