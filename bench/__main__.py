@@ -8,6 +8,7 @@ import threading
 import traceback
 
 from bench.cli import main
+from bench.interrupts import out_of_memory
 from bench.model import guard
 
 
@@ -16,8 +17,11 @@ def command() -> None:
     pid = os.getpid()
     try:
         status = main()
-    except Exception:  # a bug of this package
-        traceback.print_exc()
+    except Exception as error:
+        if message := out_of_memory(error):
+            print(message, file=sys.stderr)
+        else:  # a bug of this package
+            traceback.print_exc()
         status = 1
     guard.exit_if_forked(pid)
     guard.kill_children()

@@ -1,10 +1,11 @@
-"""Ends the command with a one-line message if Ctrl-C is pressed during imports."""
+"""Ends the command with a one-line message if Ctrl-C is pressed, or memory runs out, during imports."""
 
 from __future__ import annotations
 
 import os
 import signal
 import sys
+from types import TracebackType
 
 
 def exit_on_interrupt() -> None:
@@ -13,8 +14,25 @@ def exit_on_interrupt() -> None:
     This is safe: no run is active and no file is half written during imports. The signal handlers of a program that
     imports ``bench`` as a library remain unchanged.
     """
-    if _is_command() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if not _is_command():
+        return
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _exit)
+    sys.excepthook = _show
+
+
+def out_of_memory(error: BaseException) -> str:
+    """Return a message if an error means that the process may not have the memory it needs; else an empty string."""
+    if not isinstance(error, MemoryError) and "failed to map segment" not in str(error):
+        return ""
+    return "bench: not enough memory: give the process more (ulimit -v limits its address space; 4 GB suffice for most runs)"
+
+
+def _show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    if message := out_of_memory(error):
+        os.write(2, f"{message}\n".encode())
+    else:
+        sys.__excepthook__(kind, error, trace)
 
 
 def _is_command() -> bool:

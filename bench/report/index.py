@@ -5,7 +5,6 @@ All texts come from stored files, which may be foreign: they are shown literally
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from html import escape
@@ -19,7 +18,7 @@ from bench.errors import UserError
 from bench.report.text import counted
 from bench.report.web import shell
 from bench.run.files import write_whole
-from bench.run.rows import read_parquet
+from bench.run.rows import read_object, read_parquet
 
 YEAR_3000 = 32503680000.0
 """Seconds since 1970 that no run has stored."""
@@ -56,7 +55,7 @@ def write(folder: Path) -> Path:
 
 def _card(folder: Path, place: Path) -> str:
     """Return the HTML of one experiment: chart, question, finding, state, one button, and its files folded away."""
-    record, stored = _mapping(place / "run.json"), _mapping(place / "findings.json")
+    record, stored = read_object(place / "run.json"), read_object(place / "findings.json")
     name = _text(stored, "experiment") or _text(record, "experiment") or place.name
     question = _text(stored, "question") or _text(record, "question")
     findings = stored.get("findings")
@@ -133,15 +132,6 @@ def _state(path: Path, record: dict[str, Any]) -> tuple[str, str]:
         look = "" if status in GOOD else ' class="bad"'
         texts.append(f"<span{look}>{escape(str(count))} {escape(str(status))}</span>")
     return ", ".join(texts), when
-
-
-def _mapping(path: Path) -> dict[str, Any]:
-    """Return the content of a JSON file if it is an object, else an empty mapping."""
-    try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _text(content: dict[str, Any], key: str) -> str:

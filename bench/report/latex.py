@@ -101,14 +101,17 @@ def _in_latex(one: TableCell) -> str:
 
 
 def _fitting(block: Block) -> Iterable[Block]:
-    """Split a block by columns into blocks that are no wider than the page."""
-    rest = block.columns
-    while rest:
-        count = len(rest)
-        while count > 1 and width(Block(block.title, block.head, block.names, rest[:count])) > WIDTH:
-            count -= 1
-        yield Block(block.title, block.head, block.names, rest[:count])
-        rest = rest[count:]
+    """Split a block by columns into blocks that are no wider than the page, or have one column."""
+    names = min(NAME, _name_width(block))
+    start, used = 0, names
+    for end, column in enumerate(block.columns):
+        needed = _column_width(*column)
+        if end > start and used + needed > WIDTH:
+            yield Block(block.title, block.head, block.names, block.columns[start:end])
+            start, used = end, names
+        used += needed
+    if block.columns:
+        yield Block(block.title, block.head, block.names, block.columns[start:])
 
 
 def _floats(blocks: Sequence[Block]) -> list[list[Block]]:
@@ -127,13 +130,14 @@ def _floats(blocks: Sequence[Block]) -> list[list[Block]]:
 
 def width(block: Block) -> float:
     """Return the width of a block in points as set by LaTeX in Computer Modern."""
-    total = min(NAME, _name_width(block)) + 2 * COLUMN_GAP * len(block.columns)
-    for head, cells in block.columns:
-        texts = [(head, 8.0), *((one.interval, 5.0) for one in cells)]
-        # bold characters are wider: factor 1.2 covers the widest bold digits
-        texts += ((f"{one.value or 'oo'}{one.note or '?'}", 9.6 if one.bold else 8.0) for one in cells)
-        total += max(_set(text, size) for text, size in texts)
-    return total
+    return min(NAME, _name_width(block)) + sum(_column_width(*column) for column in block.columns)
+
+
+def _column_width(head: str, cells: Sequence[TableCell]) -> float:
+    texts = [(head, 8.0), *((one.interval, 5.0) for one in cells)]
+    # bold characters are wider: factor 1.2 covers the widest bold digits
+    texts += ((f"{one.value or 'oo'}{one.note or '?'}", 9.6 if one.bold else 8.0) for one in cells)
+    return 2 * COLUMN_GAP + max(_set(text, size) for text, size in texts)
 
 
 def _name_width(block: Block) -> float:

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 
 import pandas as pd
 
 from bench.report.text import one_line
 
+BLOCK = 4096
+"""Rows of a block."""
 WHOLE = ("horizon", "samples", "repeats", "dim", "seed")
 """Columns of whole numbers, which pandas would write with a decimal point."""
 
 
 def csv(table: pd.DataFrame) -> str:
     """Return a table as CSV with all digits of every number."""
+    return "".join(csv_blocks(table))
+
+
+def csv_blocks(table: pd.DataFrame) -> Iterator[str]:
+    """Yield :func:`csv` in blocks of lines, so that a long table is never in memory as one string."""
     whole = [name for name in WHOLE if name in table and (table[name].dropna() % 1 == 0).all()]
-    return str(table.astype(dict.fromkeys(whole, "Int64")).to_csv(index=False, lineterminator="\n"))
+    for start in range(0, max(len(table), 1), BLOCK):
+        block = table.iloc[start : start + BLOCK].astype(dict.fromkeys(whole, "Int64"))
+        yield str(block.to_csv(index=False, header=start == 0, lineterminator="\n"))
 
 
 def plain_markdown(table: pd.DataFrame, heads: Mapping[str, str] = MappingProxyType({})) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from types import MappingProxyType
 
 import numpy as np
@@ -21,6 +22,8 @@ LEAST_WIDTH = 20
 """Least width of a table in characters, where the terminal states less."""
 LEAST_TEXT = 14
 """Width to which a column of text is wrapped before a column is left out, in characters."""
+MOST_NAMES = 24
+"""Most names of columns that are listed as left out."""
 KEPT = ("status",)
 """Columns that are left out last, after the first column."""
 
@@ -97,6 +100,7 @@ def layout(
     columns = {name: [_text(value, name in numeric, labels) for value in table[name]] for name in keys}
     names = {key: heads.get(name, name) for key, name in zip(keys, given, strict=True)}
 
+    @cache
     def least(name: str) -> int:
         natural = _widest(columns[name])
         if name not in aligned:
@@ -115,13 +119,19 @@ def layout(
     first_out = [name for name in least_important if name in visible[1:]]
     others = [name for name in reversed(visible[1:]) if name not in first_out]
     queue = [*first_out, *sorted(others, key=lambda name: name in KEPT)]
+    kept, used = set(visible), total(visible)
     omitted: list[str] = []
-    while total(visible) > width and queue:
-        omitted.append(queue.pop(0))
-        visible.remove(omitted[-1])
+    for name in queue:
+        if used <= width:
+            break
+        omitted.append(name)
+        kept.remove(name)
+        used -= least(name) + GAP
     for name in reversed(omitted):  # a narrow column may fit where a wide one did not
-        again = [other for other in columns if other in (*visible, name)]
-        visible = again if total(again) <= width else visible
+        if used + least(name) + GAP <= width:
+            kept.add(name)
+            used += least(name) + GAP
+    visible = [name for name in columns if name in kept]
     widths = _widths([(least(name), _widest([names[name], *columns[name]])) for name in visible], width)
 
     def lines(cells: Sequence[str]) -> list[str]:
@@ -138,10 +148,12 @@ def layout(
         ]
 
     facts = [f"{names[name]}: {columns[name][0]}" for name in constant if columns[name][0]]
-    dropped = [names[name] for name in columns if name not in (*visible, *constant)]
+    dropped = [names[name] for name in columns if name not in kept and name not in constant]
     remarks = [*labels.key, *notes]
     if dropped:
-        remarks.append(f"Left out to fit {width} characters: {', '.join(dropped)}. The CSV file has all columns.")
+        more = f" and {len(dropped) - MOST_NAMES} more" if len(dropped) > MOST_NAMES else ""
+        left_out = ", ".join(dropped[:MOST_NAMES]) + more
+        remarks.append(f"Left out to fit {width} characters: {left_out}. The CSV file has all columns.")
     return Layout(
         title=_wrapped([*title.splitlines(), *(["; ".join(facts)] if facts else [])], width),
         header=lines([names[name] for name in visible]),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from bench.report.cores import run_tasks
 from bench.report.draw import draw
 from bench.report.figures import save, styled
 from bench.report.latex import latex
-from bench.report.tables import csv, escape_markdown
+from bench.report.tables import csv_blocks, escape_markdown
 from bench.report.text import counted, one_line
 from bench.run.files import write_all
 
@@ -50,11 +50,11 @@ def _findings(experiment: Experiment, views: Views) -> str:
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
-def table_files(tables: Sequence[Table], experiment: str) -> Iterator[tuple[str, str]]:
+def table_files(tables: Sequence[Table], experiment: str) -> Iterator[tuple[str, str | Iterable[str]]]:
     """Yield the name and the content of each file of tables with one name; the CSV has the first."""
     first = tables[0]
-    makers = {
-        "csv": lambda: csv(first.frame if first.data is None else first.data),
+    makers: dict[str, Callable[[], str | Iterable[str]]] = {
+        "csv": lambda: csv_blocks(first.frame if first.data is None else first.data),
         "md": lambda: markdown(tables, experiment),
         "tex": lambda: latex([table for table in tables if "tex" in table.files], experiment),
     }

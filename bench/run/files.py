@@ -58,7 +58,7 @@ def remove_stale(directory: Path) -> None:
                     path.unlink()
 
 
-def write_whole(path: Path, content: bytes) -> None:
+def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write a file completely or not at all; raises :class:`StorageError` if it cannot be written."""
     try:
         replace_file(path, content)
@@ -66,12 +66,13 @@ def write_whole(path: Path, content: bytes) -> None:
         raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
 
 
-def write_all(directory: Path, contents: Mapping[str, str] | Iterable[tuple[str, str]]) -> list[Path]:
-    """Write files, given as their names with their texts, to a directory; returns the paths."""
+def write_all(directory: Path, contents: Mapping[str, str] | Iterable[tuple[str, str | Iterable[str]]]) -> list[Path]:
+    """Write files, given as their names with their texts, whole or in blocks, to a directory; returns the paths."""
     paths = []
     for name, text in contents.items() if isinstance(contents, Mapping) else contents:
         paths.append(directory / name)
-        write_whole(paths[-1], text.encode())
+        blocks = [text] if isinstance(text, str) else text
+        write_whole(paths[-1], (block.encode() for block in blocks))
     return paths
 
 
@@ -83,12 +84,12 @@ def make_directory(path: Path) -> None:
         raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
 
 
-def replace_file(path: Path, content: bytes) -> None:
+def replace_file(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write like :func:`write_whole`, but raise FileNotFoundError if the directory has been removed meanwhile."""
     part = temporary(path)
     try:
         with open(part, "wb") as file:
-            file.write(content)
+            file.writelines([content] if isinstance(content, bytes) else content)
             file.flush()
             # the content must be on disk before the name points to it, or a power cut leaves an empty file
             flush_to_disk(file.fileno())
@@ -99,6 +100,9 @@ def replace_file(path: Path, content: bytes) -> None:
     except OSError as error:
         part.unlink(missing_ok=True)
         raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
+    except BaseException:  # of code that makes the content
+        part.unlink(missing_ok=True)
+        raise
 
 
 def link_exclusively(path: Path, name: Path) -> None:

@@ -32,6 +32,8 @@ MAX_TEXT = 1_000_000
 """Length of the longest string, in characters."""
 COUNTS = {"samples": 1, "repeats": 1, "seed": 0, "horizon": 0}
 """Columns of whole numbers, each with its smallest value."""
+NEEDED = ("status", "samples", "repeats", "seed")
+"""Columns with a value in every row with parameters."""
 NOT_NEGATIVE = (
     "variance",
     "rmse",
@@ -44,6 +46,8 @@ NOT_NEGATIVE = (
     "compile_s",
 )
 """Columns whose numbers are at least 0."""
+TABLES = ("machine", "versions", "config", "counts")
+"""Entries of ``run.json`` that are tables."""
 LARGEST = 2.0**53
 """Larger counts are not exact as float64, so no run has written them."""
 
@@ -78,11 +82,12 @@ def valid_rows(table: pd.DataFrame, columns: Columns, path: Path) -> pd.DataFram
             value = printable(repr(table[name].iloc[place]))[:60]
             reasons.setdefault(int(place), f"{name}={value} {_rule(name, columns)}")
     if "parameters" in table:
-        for name in ("samples", "repeats", "seed"):
-            if name in table and table[name].dtype.kind == "f":
-                missing = table[name].isna() & table["parameters"].map(lambda text: text not in ("", "{}", None))
-                for place in np.flatnonzero(missing):
-                    reasons.setdefault(int(place), f"{name} is missing")
+        is_described = ~table["parameters"].isin(["", "{}", None])
+        for name in NEEDED:
+            is_missing = table[name].isna() | (table[name].astype(str) == "") if name in table else True
+            missing = is_described & is_missing
+            for place in np.flatnonzero(missing):
+                reasons.setdefault(int(place), f"{name} is missing")
     if not reasons:
         return table
     _report(path, reasons, len(table))
@@ -126,7 +131,9 @@ def _fault(row: dict[str, Any], columns: Columns) -> str:
             fault = "" if check(value) else _rule(name, columns)
         if fault:
             return f"{printable(name)[:60]}={printable(repr(value))[:60]} {fault}"
-    return ""
+    if row.get("parameters") in (None, "", "{}"):
+        return ""
+    return next((f"{name} is missing" for name in NEEDED if _is_missing(row.get(name)) or row[name] == ""), "")
 
 
 def _fault_of_number(name: str, value: float | None) -> str:
@@ -274,12 +281,23 @@ def _refuse(name: str) -> Any:
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Return the content of ``run.json``, or an empty dictionary if it is missing or not the record of a run."""
+    """Return the content of ``run.json`` without entries of a wrong type; empty if it is missing or no record."""
+    record = read_object(folder / "run.json")
+    record = {name: value for name, value in record.items() if name not in TABLES or isinstance(value, dict)}
+    load = record.get("machine", {}).get("load_average")
+    if load is not None and not (isinstance(load, list) and all(map(_is_number, load))):
+        record["machine"] = record["machine"] | {"load_average": None}
+    return record
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file, with ? for lone surrogates, which cannot be written; empty if it has none."""
     try:
-        record = json.loads((folder / "run.json").read_text())
+        content = json.loads(path.read_text())
+        content = json.loads(json.dumps(content, ensure_ascii=False).encode(errors="replace"))
     except (OSError, ValueError, RecursionError):
         return {}
-    return record if isinstance(record, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def recorded_sweep(folder: Path) -> dict[str, Any]:

@@ -1,4 +1,7 @@
-"""Runs random valid and spoilt configurations: ``python tests/programs/configurations.py COUNT [SEED]``.
+"""Runs random valid and spoilt configurations: ``python tests/programs/configurations.py COUNT [SEED] [files]``.
+
+With ``files``, most settings of a configuration are an experiment file of the user's, some replaced on the command line,
+and its sweep is nested up to three levels, with ranges. Otherwise all are words of the command line.
 
 Studies, plugins, parameters within their bounds, sweeps and settings are drawn from the declarations in the registry. Then
 one word of every fourth configuration is spoilt. Each configuration is run in this process, with few samples, into a folder
@@ -15,6 +18,7 @@ import contextlib
 import io
 import os
 import random
+import re
 import shutil
 import sys
 import tempfile
@@ -171,6 +175,60 @@ def drawn(dice: random.Random) -> list[str]:
     return [*words, f"name={study}_{dice.randrange(2)}"]
 
 
+def nested(dice: random.Random, depth: int = 0) -> str:
+    """Return a random sweep of seeds, counts and sigma as YAML, with tables in tables up to three levels."""
+    parts, count = [], dice.randint(1, 2)
+    for axis in dice.sample(["seed", "samples", "repeats", "sigma"], 2):
+        low = dice.randint(2, 90 if axis in ("seed", "sigma") else 5)
+        numbers = [str(low + k if axis != "sigma" else (low + k) / 100) for k in range(count)]
+        parts.append(f"{axis}: [{', '.join(numbers)}]")
+    if depth == 2 or dice.random() < 0.4:
+        return "{" + ", ".join(parts[: dice.randint(1, 2)]) + "}"
+    shape = dice.choice(["product", "zip", "union"])
+    if shape == "zip":
+        return "{zip: {" + ", ".join(parts) + "}}"
+    if shape == "product":
+        return "{product: " + nested(dice, depth + 1) + dice.choice(["", f", {parts[0]}"]) + "}"
+    return "{union: [" + ", ".join(nested(dice, depth + 1) for _ in range(dice.randint(1, 2))) + "]}"
+
+
+def in_file(dice: random.Random, words: list[str], folder: Path) -> list[str]:
+    """Write most words after :data:`TINY` to an experiment file; return the words of the command line.
+
+    The sweep is replaced by a nested one, or on the command line by a range.
+    """
+    kept, lines = [], ["# @package _global_"]
+    settings: dict[str, Any] = {}
+    for word in words[len(TINY) : -1]:
+        key, _, given = word.partition("=")
+        if key.partition(".")[0] == "sweep":
+            continue
+        if dice.random() < 0.2:
+            kept.append(word)
+            continue
+        value: Any = items(given) if key in registry.kinds() and given.startswith("[") else given
+        with contextlib.suppress(yaml.YAMLError):
+            value = yaml.safe_load(re.sub(r":(?=\S)", ": ", given)) if isinstance(value, str) else value
+        table, *path = key.split(".")
+        place = settings
+        for name in (table, *path)[:-1]:
+            place = place.setdefault(name, {}) if isinstance(place.get(name, {}), dict) else {}
+        place[(table, *path)[-1]] = value
+    lines.append(yaml.safe_dump(settings, allow_unicode=True) if settings else "")
+    if dice.random() < 0.5:
+        lines.append(f"sweep: {nested(dice)}")
+    elif dice.random() < 0.5:
+        start = dice.randrange(9)
+        kept.append(f"sweep.seed=range({start},{start + dice.randint(1, 3)})")
+    text = "\n".join(lines)
+    if dice.random() < SPOILT / 2:
+        cut = dice.randrange(len(text))
+        text = text[:cut] + dice.choice("[]{}:,'\t#&*!%\n") + text[cut + 1 :]
+    (folder / "experiment").mkdir(parents=True, exist_ok=True)
+    (folder / "experiment" / "mine.yaml").write_text(text)
+    return [*TINY, "experiment=mine", "--config-dir", str(folder), *kept, words[-1]]
+
+
 def spoil(dice: random.Random, words: list[str]) -> list[str]:
     """Return the words with one random word spoilt, other than :data:`TINY` and the folder's name."""
     place = dice.randrange(len(TINY), len(words) - 1)
@@ -191,6 +249,11 @@ def spoil(dice: random.Random, words: list[str]) -> list[str]:
 
 def turn(given: str) -> str:
     """Return a bracketed list of identity strings in reverse order; any other string unchanged."""
+    return f"[{','.join(reversed(items(given)))}]" if given.startswith("[") else given
+
+
+def items(given: str) -> list[str]:
+    """Return the items of a bracketed list, which may have brackets themselves."""
     parts, depth = [""], 0
     for letter in given[1:-1]:
         depth += (letter == "[") - (letter == "]")
@@ -198,7 +261,7 @@ def turn(given: str) -> str:
             parts.append("")
         else:
             parts[-1] += letter
-    return f"[{','.join(reversed(parts))}]" if given.startswith("[") else given
+    return parts
 
 
 # ------------------------------------------------------------------------------------------------------------- running
@@ -251,8 +314,10 @@ class Ledger:
         self.folder = place / "0"
 
     def fault(self, kind: str, words: list[str], more: object = "") -> None:
-        """Count a fault, and print it."""
+        """Count a fault, and print it with any experiment file."""
         self.faults[kind] += 1
+        if "--config-dir" in words:
+            print(Path(words[words.index("--config-dir") + 1], "experiment", "mine.yaml").read_text())
         print(f"{kind}: {words[len(TINY) :]!r}: {str(more)[:1500]}", flush=True)
 
     def command(self, words: list[str], folder: Path, charts: bool = False) -> tuple[Any, str]:
@@ -317,7 +382,7 @@ class Ledger:
         missing = [item.cell.key for item in planned if item.cell.key not in mine]
         if missing and not stopped:
             self.fault("lost", words, f"{len(missing)} cells of {len(planned)} have no row")
-        if any(item.runs for item in planned) and not stopped and "retry=[error]" not in words:
+        if any(item.runs for item in planned) and not stopped and not experiment.execution.retry:
             self.fault("not stored", words)
         rows = {item.cell.key: mine[item.cell.key] for item in planned if item.cell.key in mine}
         self.rows.update(row["status"] for row in rows.values())
@@ -357,7 +422,7 @@ class Ledger:
         self.held, self.folder = {}, self.place / str(int(self.folder.name) + 1)
 
 
-def search(count: int, seed: int) -> Ledger:
+def search(count: int, seed: int, files: bool = False) -> Ledger:
     """Draw and run ``count`` configurations, and return their rows and faults."""
     backend = registry.find("backends", "numpy").plugin
     assert backend is not None
@@ -371,6 +436,8 @@ def search(count: int, seed: int) -> Ledger:
                 if ledger.dice.random() < SPOILT:
                     words = spoil(ledger.dice, words)
                     ledger.done["spoilt"] += 1
+                if files:
+                    words = in_file(ledger.dice, words, Path(place) / "conf")
                 try:
                     ledger.check(words, charts=ledger.dice.random() < WRITTEN)
                 except (UserError, ValueError, OSError):
@@ -382,13 +449,13 @@ def search(count: int, seed: int) -> Ledger:
         backend.reference_rank = before  # type: ignore[attr-defined]
 
 
-def show(count: int, seed: int) -> int:
+def show(count: int, seed: int, files: bool = False) -> int:
     """Run ``count`` configurations, print the counts, and return the exit status."""
     started = time.process_time()
-    ledger = search(count, seed)
+    ledger = search(count, seed, files)
     valid = sum(number for status, number in ledger.statuses.items() if status in (0, 1))
     print(
-        f"{count} configurations of seed {seed}: {valid} valid, statuses {dict(ledger.statuses)}, {dict(ledger.done)}; "
+        f"{count} configurations of seed {seed}{' in files' * files}: {valid} valid, statuses {dict(ledger.statuses)}, {dict(ledger.done)}; "
         f"rows {dict(ledger.rows)}; faults {dict(ledger.faults) or 'none'}; {time.process_time() - started:.0f} s"
     )
     return 1 if ledger.faults else 0
@@ -396,4 +463,4 @@ def show(count: int, seed: int) -> int:
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    sys.exit(show(int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0))
+    sys.exit(show(int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0, "files" in sys.argv))

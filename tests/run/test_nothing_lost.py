@@ -13,8 +13,10 @@ import psutil
 import pytest
 from trees import hearing_signals
 
+from bench import __main__
 from bench.cli import main
 from bench.errors import StorageError, UserError
+from bench.interrupts import out_of_memory
 from bench.run import files
 from bench.run.files import TEMPORARY, remove_stale, temporary
 from bench.run.pool import Pool, ResourceLimits, _Worker
@@ -512,3 +514,13 @@ def test_two_studies_that_start_at_once_in_an_empty_folder_do_not_mix(tmp_path):
     assert not (tmp_path / "mine" / "pending").exists()
     with pytest.raises(UserError, match="holds rows of study bias_variance"):
         second.prepare()
+
+
+@pytest.mark.parametrize("error", [MemoryError(), ImportError("x.so: failed to map segment from shared object")])
+def test_too_little_memory_for_imports_is_one_line(error, capfd, monkeypatch):
+    monkeypatch.setattr("bench.__main__.main", lambda: (_ for _ in ()).throw(error))
+    with pytest.raises(SystemExit) as end:
+        __main__.command()
+    assert end.value.code == 1
+    assert capfd.readouterr().err.startswith("bench: not enough memory: ")
+    assert out_of_memory(ImportError("no module")) == ""

@@ -11,6 +11,7 @@ from helpers import row, table
 from bench.cli import main
 from bench.errors import StorageError
 from bench.report import index
+from bench.report.web import document
 from bench.run import rows
 from bench.run.store import Store
 from bench.studies.bias_variance.columns import COLUMNS
@@ -77,6 +78,18 @@ def test_a_spoilt_small_row_is_left_out_and_its_file_is_kept(tmp_path, capsys, n
     assert kept.read_text() == text
 
 
+@pytest.mark.parametrize("name", ["status", "samples", "repeats", "seed"])
+def test_rows_without_a_column_that_every_run_writes_are_left_out(tmp_path, capsys, name):
+    table([row(seed=i) for i in range(3)]).drop(columns=name).to_parquet(tmp_path / "rows.parquet")
+    (tmp_path / "pending").mkdir()
+    small = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in row(seed=5).items()}
+    (tmp_path / "pending" / "a.json").write_text(json.dumps([{k: v for k, v in small.items() if k != name}]))
+    assert Store(tmp_path, COLUMNS).load().empty
+    said = capsys.readouterr().err
+    assert f"row 1: {name} is missing; 3 of 3 rows are left out" in said
+    assert f"row 1: {name} is missing; 1 of 1 rows are left out" in said
+
+
 def test_a_table_with_rows_that_are_left_out_is_kept_when_it_is_replaced(tmp_path, capsys):
     table([row(seed=0), row(seed=1) | {"status": "fine"}]).to_parquet(tmp_path / "rows.parquet")
     before = (tmp_path / "rows.parquet").read_bytes()
@@ -105,7 +118,8 @@ RECORDS = {
     "list": [], "counts": {"counts": "x"}, "counts_list": {"counts": [1]}, "counts_text": {"counts": {"ok": "x"}},
     "config": {"config": [1]}, "sweep": {"config": {"sweep": [1]}}, "zip": {"config": {"sweep": {"zip": 3}}},
     "question": {"question": ["a"]}, "finished": {"finished": 5}, "experiment": {"experiment": {"a": 1}},
-    "machine": {"machine": "x"}, "versions": {"versions": 3},
+    "machine": {"machine": "x"}, "versions": {"versions": 3}, "load": {"machine": {"load_average": ["x", None]}},
+    "load_text": {"machine": {"load_average": 1}}, "surrogate": {"machine": {"processor": "\ud800"}, "question": "\ud800"},
 }  # fmt: skip
 
 
@@ -115,6 +129,7 @@ def test_an_odd_record_of_a_run_hides_no_experiment(tmp_path, name):
     (tmp_path / "a" / "run.json").write_text(json.dumps(RECORDS[name]))
     assert "1 experiment" in index.write(tmp_path).read_text()
     assert rows.recorded_sweep(tmp_path / "a") == {}
+    document._made(rows.read_record(tmp_path / "a")).encode()
 
 
 @pytest.mark.parametrize("stored_at", [["yesterday"], [1e308], pd.date_range("2020", periods=1), [None]])

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from helpers import described_by
 
+from bench.cli import main
 from bench.experiment import config
 from bench.measure.statistics import UNEXPLAINED
 from bench.report.views import Curve, arrange
@@ -196,3 +197,15 @@ def test_a_leader_is_an_estimator_and_its_backend_where_that_is_one():
     assert finding(ways).startswith("a is first to 10% error on 2 of 2 problems")
     nobody = entries(("a on x", "b on x", 0.5), ("-", "-", 0.0))
     assert finding(nobody) == "Nobody is certainly first to 10%, and nobody is certainly first to 1%."
+
+
+def test_a_sweep_of_samples_in_which_a_scene_fails_has_its_report(tmp_path):
+    words = [
+        "scenes=[callable,quadratic]",
+        "estimators=[sphere_smoothing]",
+        "backends=[numpy]",
+        "sweep.samples=[4,5]",
+        "repeats=3",
+    ]
+    assert main([*words, "workers=0", "timing=false", "--quiet", "name=failed", f"results_dir={tmp_path}"]) == 0
+    assert (tmp_path / "failed" / "report.html").exists()

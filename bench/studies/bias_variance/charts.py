@@ -338,7 +338,7 @@ def _costs_matrix(shown: Arranged, best: pd.DataFrame) -> Chart | None:
             for method, way in time_to_accuracy.methods(problem, target, cost).items():
                 name = time_to_accuracy.estimator_of(method)
                 needed[name] = min(way.cost if math.isfinite(way.cost) else math.inf, needed.get(name, math.inf))
-            lowest = min(needed.values())
+            lowest = min(needed.values(), default=math.inf)
             for name, value in needed.items():
                 factor = value / lowest if math.isfinite(value) else math.nan
                 lines.append({
