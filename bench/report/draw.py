@@ -453,16 +453,17 @@ def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> Non
                     transform=panel.get_xaxis_transform(), ha="center", va="center", color="#9c4400", fontsize=SIZE - 0.5,
                 )  # fmt: skip
         elif low < mark.at < high:
-            dash = next(dashes)
+            # a mark without a name is a quiet line, not to be taken for a series
+            dash, shade = (next(dashes), "#595959") if mark.name else ("-", "#c0c0c0")
             if mark.axis == "x":
-                panel.axvline(mark.at, zorder=1, color="#595959", linewidth=0.9, linestyle=dash)
+                panel.axvline(mark.at, zorder=1, color=shade, linewidth=0.9, linestyle=dash)
                 if mark.name:
                     panel.text(
                         mark.at, 0.985, plain(f" {mark.name}"), transform=panel.get_xaxis_transform(), va="top",
                         fontsize=SIZE - 0.5, color="#404040",
                     )  # fmt: skip
             else:
-                panel.axhline(mark.at, zorder=1, color="#595959", linewidth=0.9, linestyle=dash)
+                panel.axhline(mark.at, zorder=1, color=shade, linewidth=0.9, linestyle=dash)
                 if mark.name:
                     panel.text(
                         0.005, mark.at, plain(mark.name), transform=panel.get_yaxis_transform(), va="bottom",

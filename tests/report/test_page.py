@@ -223,13 +223,13 @@ def test_unsteady_times_are_marked(browser, tmp_path):
     ]
 
 
-def test_status_reason_and_time_are_in_sight_on_a_laptop(browser, tmp_path):
+def test_errors_time_and_status_are_in_sight_on_a_laptop(browser, tmp_path):
     path = tmp_path / "report.html"
     path.write_text(page(stiffness_rows()))
     browser.size(1280, 900)
     browser.open(path)
     heads = "[...document.querySelectorAll('#table th')]"
-    for name in ("status", "reason", "time"):
+    for name in ("rel. RMSE", "rel. bias", "time", "status"):
         right = browser.do(f"{heads}.find((h) => h.textContent.trim() === '{name}').getBoundingClientRect().right")
         assert right <= 1280, name
     browser.size(*WIDE)

@@ -13,7 +13,6 @@ import psutil
 import pytest
 from trees import hearing_signals
 
-from bench import __main__
 from bench.cli import main
 from bench.errors import StorageError, UserError
 from bench.interrupts import out_of_memory
@@ -516,11 +515,11 @@ def test_two_studies_that_start_at_once_in_an_empty_folder_do_not_mix(tmp_path):
         second.prepare()
 
 
-@pytest.mark.parametrize("error", [MemoryError(), ImportError("x.so: failed to map segment from shared object")])
-def test_too_little_memory_for_imports_is_one_line(error, capfd, monkeypatch):
-    monkeypatch.setattr("bench.__main__.main", lambda: (_ for _ in ()).throw(error))
-    with pytest.raises(SystemExit) as end:
-        __main__.command()
-    assert end.value.code == 1
-    assert capfd.readouterr().err.startswith("bench: not enough memory: ")
+@pytest.mark.parametrize("error", ["MemoryError()", "ImportError('x.so: failed to map segment from shared object')"])
+def test_too_little_memory_for_imports_is_one_line(error):
+    code = f"import bench.__main__ as m\ndef fail(): raise {error}\nm.main = fail\nm.command()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("bench: not enough memory: ")
+    assert len(done.stderr.splitlines()) == 1
     assert out_of_memory(ImportError("no module")) == ""
