@@ -472,8 +472,8 @@ def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> Non
     for note in chart.notes:
         if note.panel in (None, name):
             panel.annotate(
-                plain_lines(note.text), (note.x, note.y), (-6, 0), textcoords="offset points", fontsize=SIZE - 0.5,
-                va="center", ha="right",
+                plain_lines(note.text), (note.x, note.y), (-6, 4), textcoords="offset points", fontsize=SIZE - 0.5,
+                va="top", ha="right",
             )  # fmt: skip
 
 

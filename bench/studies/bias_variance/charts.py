@@ -199,7 +199,9 @@ def _along(
     names = _main_series(frame, methods, comparisons)
     total = frame["series"].nunique()
     panels = [problem.title() for problem in drawn]
-    ours, of_ours = (table[table["problem"].isin(panels)] for table in (own, compared))
+    named = split_by_problem(shown, axis, ("scene", "contact"))  # as the table of methods names the same problems
+    titles = {p.title(): name.title() for p, name in zip(split_by_problem(shown, axis), named, strict=True)}
+    ours, of_ours = (table[table["problem"].isin([titles[panel] for panel in panels])] for table in (own, compared))
     printed = findings(ours, of_ours, shown.marks(axis))[0] if 0 < len(of_ours) < len(compared) else title
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
     marks, remarks = _unstable(shown, axis, frame[frame["panel"].isin(panels) & frame["first"]], names)
