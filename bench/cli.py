@@ -11,6 +11,7 @@ import signal
 import sys
 import textwrap
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ from typing import TYPE_CHECKING
 
 from bench.errors import INTERRUPTED, UserError, printable, unknown
 
+FEW = 3
+"""Most files of a command that are listed one by one."""
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -265,9 +268,15 @@ def _show(experiment: Experiment, rows: pd.DataFrame, views: Views, paths: Seque
 
 
 def _print_written(paths: Sequence[Path]) -> None:
-    print("\nWritten:")
+    """Print where the files of a command are: each of a few files, or the folders of many, and the page."""
+    if len(paths) <= FEW:
+        print("\nWritten:", *map(printable, paths), sep="\n  ")
+        return
+    counts = Counter(path.parent for path in paths)
+    print("\nWritten: " + ", ".join(f"{count} files in {printable(folder)}" for folder, count in counts.items()))
     for path in paths:
-        print(f"  {printable(path)}")
+        if path.name == "report.html":
+            print(f"Page: {printable(path)}")
 
 
 def _report(words: list[str]) -> int:

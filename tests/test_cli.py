@@ -32,7 +32,7 @@ def test_run_then_report_then_plan(tmp_path, capsys):
     assert (table["status"] == "ok").all()
     assert json.loads((directory / "run.json").read_text())["counts"] == {"ok": 4}
     printed = capsys.readouterr().out
-    assert "bias_variance.csv" in printed
+    assert f"Page: {directory / 'report.html'}" in printed
 
     for path in directory.iterdir():
         if path.name != "rows.parquet":

@@ -600,14 +600,14 @@ class Findings:
         good = abs(part.uncertainty / part.difference) if part.difference else math.nan
         text = f"{name}: program {_as_text(part.program)}, differences {_as_text(part.difference)}"
         if math.isfinite(part.error):
-            ratio = abs(part.program) / abs(part.difference) if part.difference else math.inf
-            off = (
-                f"{number(ratio, 3)} times too large"
-                if 2 < ratio < math.inf
-                else f"{number(100 * abs(part.program - part.difference) / abs(part.difference)) if part.difference else '-'}%"
-            )
-            text = f"{name} off by {off}: program {_as_text(part.program)}, differences {_as_text(part.difference)}"
-            text = text.replace("off by", "is" if 2 < ratio < math.inf else "off by", 1)
+            ratio = part.program / part.difference if part.difference else math.inf
+            share = number(100 * abs(ratio - 1)) if part.difference else "-"
+            how = f"off by {share}%"
+            if 2 < ratio < math.inf:
+                how = f"is {number(ratio, 3)} times too large"
+            elif ratio < 0:
+                how = f"has the wrong sign and {number(-ratio, 3)} times the size"
+            text = f"{name} {how}: program {_as_text(part.program)}, differences {_as_text(part.difference)}"
         return text + (f", good to {number(good, 1)}" if math.isfinite(good) else "")
 
     # ---------------------------------------------------------------------------------------------- tables
