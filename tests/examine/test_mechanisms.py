@@ -441,10 +441,10 @@ def grad(p):
     y = np.tanh(mix @ p["first"])
     return {"first": (1 - y * y) * mix, "bias": 0.01 * np.cos(p["bias"]), "second": 0 * p["second"]}
 
-started = time.perf_counter()
-report = bench.examine(cost, theta, grad=grad, progress=False)
+started = time.process_time()
+report = bench.examine(cost, theta, grad=grad, progress=False, budget=240)
 print(report.status, report.cause, "second, along" in report.conclusion)
-print(time.perf_counter() - started, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
+print(time.process_time() - started, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6)
 """
 
 
@@ -455,7 +455,7 @@ def test_a_million_inputs_take_less_than_a_gigabyte_and_the_wrong_array_is_named
     assert first == "1 disconnected True"
     seconds, gigabytes = map(float, second.split())
     assert gigabytes < 1.0
-    assert seconds < 125.0  # 60 s, and as much again where other programs use the processors
+    assert seconds < 125.0  # of processor time: 60 s, and as much again on a slow machine
 
 
 def test_groups_cover_every_number_once():
