@@ -20,8 +20,6 @@ from typing import TYPE_CHECKING
 
 from bench.errors import INTERRUPTED, UserError, printable, unknown
 
-FEW = 3
-"""Most files of a command that are listed one by one."""
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -29,6 +27,8 @@ if TYPE_CHECKING:
     from bench.experiment.views import Views
     from bench.run.execute import Finished
 
+FEW = 3
+"""Most files of a command that are listed one by one."""
 SETTINGS = """\
 Settings:
   scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..]

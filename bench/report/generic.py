@@ -1,7 +1,8 @@
-"""The views of a study that has none of its own: a table of its numbers, and a chart of any two of them."""
+"""Tables that several studies share, and the views of a study that has none of its own."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pandas as pd
@@ -10,9 +11,28 @@ from bench.experiment import axes
 from bench.experiment.columns import COMMON, IDENTITY, Column
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
-from bench.report.problems import titled
+from bench.report.problems import label_columns, titled
 from bench.report.text import counted
-from bench.report.views import arrange
+from bench.report.views import Arranged, arrange, attempted
+
+ENGINE = ("scene", "contact", "integrator", "backend")
+"""Parts of the grid that identify a line of a table of engines."""
+
+
+def engine_table(
+    experiment: Experiment,
+    rows: pd.DataFrame,
+    shown: Arranged,
+    numbers: Sequence[Column],
+    title: str,
+    notes: Sequence[str],
+    always: Sequence[str] = ("scene", "contact", "backend"),
+) -> Table:
+    """Return the table of the cells that were run, a line per scene and engine with some ``numbers``."""
+    tried = attempted(shown.rows)
+    labels = label_columns(shown, ENGINE, always=always, rows=tried)
+    columns = [*(COMMON.get(name, Column(name)) for name in labels), *numbers, COMMON["status"]]
+    return Table(experiment.study.name, tried, columns, title, notes, terminal=True, data=axes.table(experiment, rows))
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:

@@ -185,13 +185,14 @@ def _along(
     whole: Sequence[str],
 ) -> Chart | None:
     """Return the chart of errors along an axis: print draws the main estimators on the main problems, the page all."""
-    problems = [p for p in split_by_problem(shown, axis) if attempted(p.rows)["x"].nunique() > 1]
+    every = split_by_problem(shown, axis)
+    problems = [p for p in every if attempted(p.rows)["x"].nunique() > 1]
     if not problems:
         return None
     own, compared = (table[table["axis"] == axis.column] for table in (methods, comparisons))
-    title = (findings(own, compared, shown.marks(axis)) if 0 < len(compared) < len(comparisons) else whole)[0]
+    title = whole[0]
     if 0 < len(compared) < len(comparisons):
-        title = f"Along {axis.column}: {title}"
+        title = f"Along {axis.column}: {findings(own, compared, shown.marks(axis))[0]}"
     frame = pd.concat([_lines(problem) for problem in problems], ignore_index=True)
     if shown.rows["seed"].nunique() > 1:
         frame = frame.drop(columns="row")  # a median over seeds is not a cell
@@ -200,7 +201,7 @@ def _along(
     total = frame["series"].nunique()
     panels = [problem.title() for problem in drawn]
     named = split_by_problem(shown, axis, ("scene", "contact"))  # as the table of methods names the same problems
-    titles = {p.title(): name.title() for p, name in zip(split_by_problem(shown, axis), named, strict=True)}
+    titles = {p.title(): name.title() for p, name in zip(every, named, strict=True)}
     ours, of_ours = (table[table["problem"].isin([titles[panel] for panel in panels])] for table in (own, compared))
     printed = findings(ours, of_ours, shown.marks(axis))[0] if 0 < len(of_ours) < len(compared) else title
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []

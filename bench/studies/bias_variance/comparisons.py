@@ -163,11 +163,12 @@ def not_excluded(comparisons: pd.DataFrame, methods: pd.DataFrame) -> dict[str, 
 
 
 def _first_and_tied(comparisons: pd.DataFrame, methods: pd.DataFrame, most: float) -> dict[str, list[str]]:
-    known = methods.set_index(["setting", "method"])[["estimator", "error"]]
+    places = zip(methods["setting"], methods["method"], strict=True)
+    known = dict(zip(places, zip(methods["estimator"], methods["error"], strict=True), strict=True))
     result = {}
     for row in comparisons[["setting", "first", "value", "tied"]].to_dict("records"):
-        lines = [known.loc[(row["setting"], name)] for name in (row["first"], *row["tied"]) if name]
-        near = [line["estimator"] for line in lines if not line["error"] > most * row["value"]]
+        lines = [known[row["setting"], name] for name in (row["first"], *row["tied"]) if name]
+        near = [estimator for estimator, error in lines if not error > most * row["value"]]
         result[row["setting"]] = list(dict.fromkeys(near))
     return result
 

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pandas as pd
 
-from bench.experiment.axes import table
-from bench.experiment.columns import COMMON, Column, text
+from bench.experiment.columns import COMMON, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Style, Table, Views
-from bench.report.problems import label_columns, problem_names
+from bench.experiment.views import Chart, Style, Views
+from bench.report.generic import engine_table
+from bench.report.problems import problem_names
 from bench.report.style import PALETTE
 from bench.report.text import duration, number
-from bench.report.views import arrange, attempted
+from bench.report.views import arrange
 from bench.report.writer import reasons
 
 ACCURATE = 0.02
@@ -23,8 +23,6 @@ SAME = 0.1
 """Relative model error up to which a gradient counts as the gradient of the model."""
 USELESS = 1.0
 """Relative RMSE from which on an estimate is no better than the zero estimate."""
-ENGINE = ("scene", "contact", "integrator", "backend")
-"""Parts of the grid that identify a line of the table."""
 SHOWN = (
     "program_error_rel", "model_error_rel", "rmse_rel", "zeroth_rmse_rel", "nan_share", "value_s", "gradient_s", "first_s",
     "pipe_share", "memory_mb",
@@ -47,13 +45,8 @@ NOTES = (
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the findings, the table with a line per scene and engine, and the grid of usable gradients."""
     arranged = arrange(experiment, rows)
-    tried = attempted(arranged.rows)
-    labels = label_columns(arranged, ENGINE, always=("scene", "contact", "backend"), rows=tried)
     own = [experiment.columns.by_name[name] for name in SHOWN]
-    lines = Table(
-        "engines", tried, [*(COMMON.get(name, Column(name)) for name in labels), *own, COMMON["status"]],
-        "gradients of physics engines", NOTES, terminal=True, data=table(experiment, rows),
-    )  # fmt: skip
+    lines = engine_table(experiment, rows, arranged, own, "gradients of physics engines", NOTES)
     measured = arranged.rows[arranged.rows["status"].isin(("ok", "nonfinite"))]
     if measured.empty:
         return Views(["No cell gave a result: the table has the reason of each."], [lines], remarks=reasons(rows))
@@ -68,7 +61,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
 
 def level(row: pd.Series) -> str:
     """Return the level of a row's gradient, a key of :data:`LEVELS`."""
-    if not row["gradient"].__len__():
+    if len(row["gradient"]) == 0:
         return "none"
     if row["status"] != "ok" or row["nan_share"] > 0 or not row["program_error_rel"] <= ACCURATE:
         return "wrong"

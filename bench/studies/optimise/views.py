@@ -248,7 +248,7 @@ def _quality(runs: RunSet, default: float) -> Chart | None:
     frame = points.assign(art=points["art"].mask(missed), missed=missed, scene=scenes)
     others = [Column("bias_share", label="share of bias in the error", log=False), Column("cosine", log=False)]
     return Chart(
-        "quality_runtime", title.rstrip("."), frame, [ERROR, *others], [replace(RUNTIME, low="", high="")], "points", panel="scene_class",
+        "quality_runtime", title, frame, [ERROR, *others], [replace(RUNTIME, low="", high="")], "points", panel="scene_class",
         shape="scene", panel_notes=remarks, failed="missed", across=2, height=1.9, own_scales=False,
         subtitle="average runtime: expected rollouts per search that reaches a tenth of the first regret; a cross: never reached",
         text="A point per problem and method. Methods that never reach the target have no point.",

@@ -7,21 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from bench.experiment.axes import table
-from bench.experiment.columns import COMMON, Column
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Mark, Table, Views
-from bench.report.problems import label_columns, problem_names
+from bench.experiment.views import Chart, Mark, Views
+from bench.report.generic import engine_table
+from bench.report.problems import problem_names
 from bench.report.text import counted, number
-from bench.report.views import arrange, attempted
+from bench.report.views import arrange
 from bench.report.writer import reasons
 
 FLOOR = 1e-16
 """Smallest relative error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 CONVERGED = 1e-6
 """Relative error up to which a gradient counts as that of the converged program."""
-ENGINE = ("scene", "contact", "integrator", "backend")
-"""Parts of the grid that identify a line of the table."""
 SHOWN = ("gradient_error_rel", "gradient_cosine", "wrong_signs", "gradient_s", "compile_s")
 NOTES = (
     "Gradients at theta without noise, compared with the gradient of the same program with a converged solver. The residual "
@@ -32,14 +29,10 @@ NOTES = (
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the findings, the table with a line per scene, engine and iterations, and the chart of errors."""
     arranged = arrange(experiment, rows)
-    tried = attempted(arranged.rows)
-    labels = label_columns(arranged, ENGINE, always=("scene", "backend"), rows=tried)
     known = experiment.columns.by_name
     own = [replace(known[name], digits=3) for name in ("solver_residual", *SHOWN)]
-    lines = Table(
-        "solver", tried, [*(COMMON.get(name, Column(name)) for name in labels), *own, COMMON["status"]],
-        "gradients along the iterations of the constraint solver", NOTES, terminal=True, data=table(experiment, rows),
-    )  # fmt: skip
+    title = "gradients along the iterations of the constraint solver"
+    lines = engine_table(experiment, rows, arranged, own, title, NOTES, always=("scene", "backend"))
     good = arranged.rows[arranged.rows["status"] == "ok"]
     if good.empty:
         return Views(["No cell gave a result: the table has the reason of each."], [lines], remarks=reasons(rows))

@@ -6,22 +6,20 @@ from dataclasses import replace
 
 import pandas as pd
 
-from bench.experiment.axes import table
-from bench.experiment.columns import COMMON, Column
+from bench.experiment.columns import Column
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Mark, Style, Table, Views
-from bench.report.problems import label_columns, problem_names
+from bench.experiment.views import Chart, Mark, Style, Views
+from bench.report.generic import engine_table
+from bench.report.problems import problem_names
 from bench.report.style import PALETTE
 from bench.report.text import counted, duration, number
-from bench.report.views import arrange, attempted
+from bench.report.views import arrange
 from bench.report.writer import reasons
 
 FLOOR = 1e-17
 """Smallest difference that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 DIFFERENT = 1e-6
 """Relative difference of states above which a twin counts as different. Accumulated rounding errors are smaller."""
-ENGINE = ("scene", "contact", "integrator", "backend")
-"""Parts of the grid that identify a line of the table."""
 COLOURS = (PALETTE[2], PALETTE[0], PALETTE[3], PALETTE[4])
 SHOWN = (
     "state_difference", "state_difference_rel", "cost_difference_rel", "gradient_difference_rel", "gradient_cosine",
@@ -37,13 +35,8 @@ NOTES = (
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the finding, the table with a line per scene and engine, and the chart of differences."""
     shown = arrange(experiment, rows)
-    tried = attempted(shown.rows)
-    labels = label_columns(shown, ENGINE, always=("scene", "contact", "backend"), rows=tried)
     own = [replace(experiment.columns.by_name[name], digits=3) for name in SHOWN]
-    lines = Table(
-        "twins", tried, [*(COMMON.get(name, Column(name)) for name in labels), *own, COMMON["status"]],
-        "engines compared with the scenes' own programs", NOTES, terminal=True, data=table(experiment, rows),
-    )  # fmt: skip
+    lines = engine_table(experiment, rows, shown, own, "engines compared with the scenes' own programs", NOTES)
     good = shown.rows[shown.rows["status"] == "ok"]
     if good.empty:
         return Views(["No cell gave a result: the table has the reason of each."], [lines], remarks=reasons(rows))
