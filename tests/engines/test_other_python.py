@@ -30,7 +30,7 @@ from bench.engines import environments, process, twin
 from bench.engines.process import close_engines
 from bench.errors import Crashed, Unsupported
 from bench.experiment.keys import fingerprint
-from bench.model import compose, guard, registry
+from bench.model import compose, registry
 
 TOYS = Path(__file__).parent / "toys"
 HERE = sys.executable
@@ -207,14 +207,25 @@ def test_limits_of_a_cell_count_its_engine(tmp_path, fault, limit, status, reaso
 
 
 def test_children_that_plugins_leave_are_killed_and_engines_are_not():
-    problem = toy().compile(program(BouncingBall()))
-    problem.value(problem.program.theta0, noise(problem))
-    left = subprocess.Popen(["sleep", "100"])
-    guard.kill_children()
-    assert not psutil.pid_exists(left.pid)
-    left.wait(5)
-    (engine,) = process._running.values()
-    assert engine.process.poll() is None
+    """In a process of its own, since all other children end too, such as the browser of other tests."""
+    code = f"""
+import subprocess, sys
+import psutil
+sys.path[:0] = {[str(Path(__file__).parent)]!r}
+from bench.model import guard
+from test_other_python import BouncingBall, noise, process, program, registry, toy, TOYS
+registry.add_folder(TOYS)
+problem = toy().compile(program(BouncingBall()))
+problem.value(problem.program.theta0, noise(problem))
+left = subprocess.Popen(["sleep", "100"])
+guard.kill_children()
+assert not psutil.pid_exists(left.pid)
+left.wait(5)
+(engine,) = process._running.values()
+assert engine.process.poll() is None
+"""
+    done = subprocess.run([HERE, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 # ---------------------------------------------------------------------------------------------------- environments
