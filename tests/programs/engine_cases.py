@@ -12,7 +12,6 @@ import functools
 import itertools
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -682,6 +681,7 @@ case("Taichi kernels, state overwritten", "taichi", *WRONG, "nan_gradient", over
 def record(name: str) -> None:
     """Run one case and print its row."""
     import bench
+    from bench.measure.timing import peak_memory_mb
     from bench.report.text import duration
 
     one = CASES[name]
@@ -689,7 +689,7 @@ def record(name: str) -> None:
     report = bench.examine(cost, theta, progress=False, name=name, **settings)
     print(report, file=sys.stderr)
     named = report.cause in one.expected and (report.cause in RIGHT) == (report.status == 0)
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    memory = peak_memory_mb() * 2**20 / 1e9
     said = report.cause if report.status else f"right ({report.cause})"
     row = [
         name, f"{one.library} {metadata.version(one.library)}", "right" if one.expected[0] in RIGHT else one.expected[0],
