@@ -179,7 +179,8 @@ class _Head:
     def __init__(self, chart: Chart, width: float) -> None:
         self._width = width
         self._title = _fill(chart.title.rstrip("."), 0.97 * width / BOLD)
-        self._subtitle = _fill(chart.subtitle, 0.97 * width) if chart.subtitle else ""
+        subtitle = ", ".join(filter(None, [chart.subtitle, _grey(chart)]))
+        self._subtitle = _fill(subtitle, 0.97 * width) if subtitle else ""
         self._lines = self._title.count("\n") + 1
         self.height = (
             0.08 + LINE * 1.1 * self._lines + (LINE * (self._subtitle.count("\n") + 1) if self._subtitle else 0)
@@ -192,6 +193,14 @@ class _Head:
         if self._subtitle:
             below = top - LINE * 1.1 * self._lines / height
             figure.text(left, below, plain_lines(self._subtitle), ha="left", va="top", color=GREY)
+
+
+def _grey(chart: Chart) -> str:
+    """Return what the grey area of a chart means; nothing where no panel has one."""
+    column = {"lines": chart.y[0], "points": chart.y[0], "dots": chart.x[0]}.get(chart.kind)
+    if not column or not column.above_one or not _is_log(column, chart.frame[column.name]):
+        return ""
+    return f"grey: {column.above_one}" if _log_range(column, chart.frame)[1] > 1 else ""
 
 
 def plain_lines(text: str) -> str:

@@ -19,7 +19,7 @@ from bench.report.writer import reasons
 FLOOR = 1e-17
 """Smallest difference that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 DIFFERENT = 1e-6
-"""Relative difference of states above which a twin counts as different. Accumulated rounding errors are smaller."""
+"""Relative difference above which a twin's states or gradient count as different. Accumulated rounding is smaller."""
 COLOURS = (PALETTE[2], PALETTE[0], PALETTE[3], PALETTE[4])
 SHOWN = (
     "state_difference", "state_difference_rel", "cost_difference_rel", "gradient_difference_rel", "gradient_cosine",
@@ -49,18 +49,20 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
 
 
 def agreement(good: pd.DataFrame) -> list[str]:
-    """Return on how many problems the engines follow the scenes' own programs, and where they differ most."""
-    worst = good.groupby("problem", sort=False)["state_difference_rel"].max()
-    same = int((worst <= DIFFERENT).sum())
+    """Return on how many problems the engines agree with the scenes' own programs, and where they differ most."""
+    states, gradients = (
+        good.groupby("problem", sort=False)[f"{name}_difference_rel"].max(skipna=False) for name in ("state", "gradient")
+    )
+    same = int(((states <= DIFFERENT) & (gradients <= DIFFERENT)).sum())
     engines = " and ".join(dict.fromkeys(good["engine"]))
     texts = [
-        f"{engines} follow the scene's own program within {number(DIFFERENT, 1)} of its states on {same} of "
-        f"{counted(len(worst), 'problem')}."
+        f"{engines} agree with the states and the gradient of the scene's own program within {number(DIFFERENT, 1)} on "
+        f"{same} of {counted(len(states), 'problem')}."
     ]
-    if same < len(worst):
+    if same < len(states):
         place = good.loc[good["gradient_difference_rel"].idxmax()]
         texts.append(
-            f"The largest difference is on {place['problem']}: {number(worst[place['problem']])} of the states and "
+            f"The largest difference is on {place['problem']}: {number(states[place['problem']])} of the states and "
             f"{number(place['gradient_difference_rel'])} of the gradient."
         )
     return texts
