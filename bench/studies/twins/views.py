@@ -51,7 +51,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
 def agreement(good: pd.DataFrame) -> list[str]:
     """Return on how many problems the engines agree with the scenes' own programs, and where they differ most."""
     states, gradients = (
-        good.groupby("problem", sort=False)[f"{name}_difference_rel"].max(skipna=False) for name in ("state", "gradient")
+        good.groupby("problem", sort=False)[f"{name}_difference_rel"].max(skipna=False)
+        for name in ("state", "gradient")
     )
     same = int(((states <= DIFFERENT) & (gradients <= DIFFERENT)).sum())
     engines = " and ".join(dict.fromkeys(good["engine"]))
