@@ -309,7 +309,7 @@ def _plan(words: list[str]) -> int:
 
 
 def _list(words: list[str]) -> int:
-    """List all plugins, or those of the given kinds or names with their parameters."""
+    """List all plugins, or of the given kinds and names also their parameters."""
     from bench.api import described, matching_plugins
     from bench.experiment.words import parse_words
     from bench.model.identity import text_of
@@ -509,6 +509,11 @@ VERBS = {
     "index": Verb(
         _main_of("bench.report.index"), "index [DIR]", "a page over all experiments of a results folder, with the state of each",
         "DIR is results by default. Written to DIR/index.html. Nothing is simulated.\n",
+    ),
+    "aggregate": Verb(
+        _main_of("bench.compare.curves"), "aggregate FILE.csv [axis=step|seconds] [better=higher|lower] [out=DIR]", "learning curves of any origin: which method is ahead over all tasks",
+        "FILE has the columns task, method, seed, return, and step or seconds. Written to out=DIR (runs/aggregate):\n"
+        "aggregate.csv and .md, curves.png and profile.png with their data.\n",
     ),
     "history": Verb(
         _main_of("bench.compare.history"), "history DIR DIR ... [out=DIR]", "errors and failures over versions, as one small chart",

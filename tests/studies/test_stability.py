@@ -32,7 +32,15 @@ HORIZON, DT = 40, 0.05
 
 def experiment(tmp_path, *words):
     return config.load(
-        ["study=stability", "name=map", f"results_dir={tmp_path}", "estimators=[fobg]", "backends=[implicit]", *words]
+        [
+            "study=stability",
+            "name=map",
+            f"results_dir={tmp_path}",
+            "estimators=[fobg]",
+            "backends=[implicit]",
+            "workers=0",
+            *words,
+        ]
     )
 
 
