@@ -15,6 +15,8 @@ CONVERGED = 1e-8
 """Share of the first gradient below which a gradient counts as 0, because differences of costs no longer show it."""
 FAR = 1e6
 """Multiple of the problem's theta0 beyond which theta counts as diverged, and the cost as unbounded below."""
+SIDEWAYS = 1e-3
+"""First step away from a saddle, in units of theta."""
 ROUNDING = 1e-13
 """Relative difference of two costs that rounding explains."""
 
@@ -29,6 +31,8 @@ class Solved:
     curvature: float
     certified: bool
     """Whether the gradient is 0 to rounding and no curvature is below -1e-8 times the largest."""
+    starts_at_saddle: bool = False
+    """Whether the gradient is 0 to rounding at the start, where a curvature is negative."""
 
 
 def solve(problem: Problem, theta: np.ndarray | None = None, steps: int = 40) -> Solved:
@@ -36,15 +40,24 @@ def solve(problem: Problem, theta: np.ndarray | None = None, steps: int = 40) ->
 
     L-BFGS is followed by at most ``steps`` damped Newton steps. The Hessian comes from central differences of
     gradients, 2 d per step. The damping grows tenfold while a step does not lower the cost, and falls tenfold after a
-    step that does (Nocedal, Wright 2006, ch. 10 to 11). A cost without a lower bound is returned as -inf.
+    step that does (Nocedal, Wright 2006, ch. 10 to 11). A saddle at the start is left along its direction of least
+    curvature, to the side with the lower cost. A cost without a lower bound is returned as -inf.
     """
     theta = np.array(problem.program.theta0 if theta is None else theta, dtype=np.float64)
     still = np.zeros((problem.program.n_noise, 1))
-    first = max(float(np.linalg.norm(problem.grad(theta, still)[:, 0])), 1e-300)
 
     def value_and_gradient(x: np.ndarray) -> tuple[float, np.ndarray]:
         return float(problem.value(x, still)[0]), problem.grad(x, still)[:, 0]
 
+    cost, gradient = value_and_gradient(theta)
+    values, vectors = _curvatures(problem, theta)
+    is_flat = _is_stationary(cost, gradient, values)
+    is_saddle = is_flat and float(values.min()) < -1e-8 * float(np.abs(values).max())
+    if is_saddle:
+        step = SIDEWAYS * max(1.0, float(np.abs(theta).max())) * vectors[:, np.argmin(values)]
+        theta = min(theta + step, theta - step, key=lambda x: value_and_gradient(x)[0])
+        gradient = value_and_gradient(theta)[1]
+    first = max(float(np.linalg.norm(gradient)), 1e-300)
     near = minimize(
         value_and_gradient, theta, jac=True, method="L-BFGS-B", options={"maxiter": 50 * steps, "maxcor": 30}
     )
@@ -72,8 +85,15 @@ def solve(problem: Problem, theta: np.ndarray | None = None, steps: int = 40) ->
     lowest = float(values.min())
     if np.abs(theta).max() > FAR * (1.0 + np.abs(problem.program.theta0).max()):
         return Solved(-np.inf, theta, norm, lowest, False)
-    certified = norm <= CONVERGED * first and lowest >= -1e-8 * float(np.abs(values).max())
-    return Solved(cost, theta, norm, lowest, certified)
+    is_small = norm <= CONVERGED * first or (is_flat and not is_saddle)
+    certified = is_small and lowest >= -1e-8 * float(np.abs(values).max())
+    return Solved(cost, theta, norm, lowest, certified, is_saddle)
+
+
+def _is_stationary(cost: float, gradient: np.ndarray, values: np.ndarray) -> bool:
+    """Return whether rounding of the cost exceeds what a step along the gradient ``(d,)`` can gain, |g|^2 / (2 curvature)."""
+    steepest = float(np.abs(values).max())
+    return bool(gradient @ gradient <= 2 * steepest * ROUNDING * abs(cost)) and np.isfinite(steepest)
 
 
 def _curvatures(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

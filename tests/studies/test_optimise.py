@@ -256,6 +256,25 @@ def test_a_cost_without_lower_bound_has_no_optimum():
     assert found.cost == -math.inf
 
 
+@pytest.mark.parametrize(
+    ("start", "least", "saddle"),
+    [((0.0, 0.0), -0.25, True), ((0.5, 0.0), -0.25, False), ((2**-0.5, 0.0), -0.25, False)],
+)
+def test_a_saddle_at_the_start_is_left_and_named(tmp_path, start, least, saddle):
+    """x^4 - x^2 + y^2 has a saddle at 0 and minima of -1/4 at x = +-1/sqrt(2)."""
+    file = tmp_path / "well.py"
+    file.write_text(
+        "def cost(p):\n    return p[0] ** 4 - p[0] ** 2 + p[1] ** 2\n"
+        "def slope(p):\n    return [4 * p[0] ** 3 - 2 * p[0], 2 * p[1]]\n"
+        f"theta = {list(start)}\n"
+    )
+    problem = bench.problem(f"callable[cost={file}:cost,grad=slope,sigma=0.1]", backend="callable")
+    found = solve(problem)
+    assert found.starts_at_saddle == saddle
+    assert found.certified
+    assert found.cost == pytest.approx(least, rel=1e-9)
+
+
 # ------------------------------------------------------------------------------------------------------ a search
 
 WORDS = [

@@ -251,6 +251,8 @@ def known_optimum(cell: Cell, problem: Problem, session: Session, settings: Sett
         return np.nan, "unknown"
     digits = f"|gradient| {solution.gradient:.0e}, least curvature {solution.curvature:.1g}"
     how = f"local optimum by Newton's method, {digits}" if solution.certified else f"lowest cost found, {digits}"
+    if solution.starts_at_saddle:
+        how += ", from a saddle at the start"
     make_directory(path.parent)
     write_whole(path, json.dumps({"cost": solution.cost, "how": how}).encode())
     return solution.cost, how
