@@ -134,7 +134,7 @@ def costs(sets: int) -> Iterator[Line]:
     from bench.studies.bias_variance.time_to_accuracy import lead, required_cost
 
     for heavy in (False, True):
-        for sizes, how in (((16, 64, 256, 1024), "measured"), ((16, 64), "extrapolated")):
+        for sizes, how in (((16, 64, 256, 1024), "measured"), ((16, 128), "extrapolated")):
             random = np.random.default_rng([4, len(sizes), heavy])
             single, ratio, errors = [], [], []
             for _ in range(sets):
@@ -144,13 +144,18 @@ def costs(sets: int) -> Iterator[Line]:
                     way.append(required_cost(Curve("e", "", {"b": True}, rows, {"b": 1.0}, frozenset(), 0), 0.1, TIME))
                     low, high = rmse_interval(rows.iloc[0])
                     errors.append(within((float(low), float(high)), std / math.sqrt(sizes[0])))
+                # no statement is made where the bias is not known to be below the error asked for
                 cost = way[0].cost
-                single.append(within((cost * math.exp(-way[0].down), cost * math.exp(way[0].up)), 1e-3 * 225))
+                if math.isfinite(cost):
+                    single.append(within((cost * math.exp(-way[0].down), cost * math.exp(way[0].up)), 1e-3 * 225))
                 factor = lead(*way)
-                ratio.append(within(factor[1:], (2.5 / 1.5) ** 2))
+                if math.isfinite(factor[0]):
+                    ratio.append(within(factor[1:], (2.5 / 1.5) ** 2))
             tail = "t5" if heavy else "normal"
-            yield f"cost of an error of 10%, {how}, {tail} noise", share(single), 0.95, "coverage"
-            yield f"factor between two costs, {how}, {tail} noise", share(ratio), 0.95, "coverage"
+            label = f"cost of an error of 10%, {how}, {tail} noise, stated in {len(single) / sets:.0%} of sets"
+            yield label, share(single), 0.95, "coverage"
+            label = f"factor between two costs, {how}, {tail} noise, stated in {len(ratio) / sets:.0%} of sets"
+            yield label, share(ratio), 0.95, "coverage"
             yield f"relative RMSE, {tail} noise", share(errors), 0.95, "coverage"
 
 
@@ -208,16 +213,16 @@ def examine(sets: int) -> Iterator[Line]:
         for k in range(sets):
             found = measure_smoothed(Cost(height, at), np.zeros(dim), sigma, np.ones(dim), None, Clock(math.inf), k)
             inside.append(within((found.bias_low, found.bias_high), bias))
-            gradient.append(float(np.sum((found.gradient - truth) ** 2)) / found.error**2)
+            gradient.append((float(np.sum((found.gradient - truth) ** 2)), found.error**2))
             pairs.append(found.pairs)
             remarks.append(bool(found.remark))
         label = f"jump {height:g} at {at / sigma:.0f} sigma" if height else "smooth cost"
         yield (
             f"bias under noise, {label}, d = {dim}, {np.mean(pairs):.0f} pairs, {np.mean(remarks):.0%} with a remark",
-            share(inside), 0.95, "coverage",
+            share(inside), 0.95 if height < 2.0 else math.nan, "coverage",
         )  # fmt: skip
-        # with 31 degrees of freedom, the mean of error^2 / stated^2 is 31 / 29
-        yield f"gradient under noise, {label}, d = {dim}: RMS error / stated", math.sqrt(np.mean(gradient)), 1.2, "difference"
+        ratio = float(np.divide(*np.mean(gradient, axis=0)))
+        yield f"gradient under noise, {label}, d = {dim}: RMS error / stated", math.sqrt(ratio), 1.2, "difference"
 
 
 # ----------------------------------------------------------------------------------------------------- identify
@@ -246,7 +251,7 @@ def identify(sets: int) -> Iterator[Line]:
     t, sigma = scene.dt * np.arange(1, scene.horizon + 1), 0.01
     truth = np.log(model.values)
     clean = _swing(truth, t)
-    yield "record, against the closed form", float(np.abs(model.record(model.values[:, None])[:, 0] - clean).max()), 1e-5, "difference"
+    yield "record, against the closed form, in units of the noise", float(np.abs(model.record(model.values[:, None])[:, 0] - clean).max() / sigma), 0.01, "difference"
     for rho in (0.0, 0.5, 0.9):
         random = np.random.default_rng([6, int(10 * rho)])
         e = random.standard_normal((t.size, sets))
@@ -388,7 +393,7 @@ def references(sets: int) -> Iterator[Line]:
     }
     noise = np.random.default_rng(8).standard_normal((1000, max(400, 10 * sets)))
     for name, (law, kappa) in laws.items():
-        _, found = _reference("hopper", law, "fused", 1 << 13)
+        _, found = _reference("hopper", law, "jax" if kappa else "fused", (1 << 10) if kappa else (1 << 13))
         own_mean, error = _by_differences(lambda t, w, kappa=kappa: _hop(t, w, kappa), np.array([100.0, 400.0]), 1.0, noise)
         allowed = 4 * math.hypot(found.known().standard_error, float(np.linalg.norm(error)))
         yield _compared(f"hopper, {name}", found, own_mean, allowed)
@@ -411,7 +416,11 @@ def references(sets: int) -> Iterator[Line]:
 def _compared(name: str, found, own: np.ndarray, allowed: float) -> Line:
     apart = float(np.linalg.norm(found.gradient - own))
     size = float(np.linalg.norm(own))
-    label = f"{name} ({found.method}): error {apart / size:.1e} of the norm, allowed {allowed / size:.1e}; error / allowed"
+    stated = found.known().standard_error
+    label = (
+        f"{name} ({found.method}): error {apart / size:.1e} of the norm, stated {stated / size:.1e}, allowed "
+        f"{allowed / size:.1e}; error / allowed"
+    )
     return label, apart / allowed, 1.0, "difference"
 
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from bench.measure import gradcheck
 
+MOST = 2000
+"""Most iterations, since far from the given theta an iteration may run in a circle."""
 COSTS = {
     "square": (lambda x, t: (x - 2.0) ** 2 + 0.1 * (t * t).sum(axis=0), lambda x, t: (2.0 * (x - 2.0), 0.2 * t)),
     "linear": (lambda x, t: x, lambda x, t: (1.0, 0.0 * t)),
@@ -21,35 +23,41 @@ COSTS = {
 }
 
 
-def verdicts(rate, tolerance, count):
-    """Return the counts of verdicts for an iteration that moves x by ``rate`` times the residual."""
+def problem(rate, tolerance, value, slopes):
+    """Return cost and gradient for an iteration that moves x by ``rate`` times the residual."""
 
     def solve(thetas):
-        """Return the solutions ``(B,)`` for the columns ``(2, B)``, each of which stops on its own."""
+        """Return the solutions ``(B,)`` for the columns ``(2, B)``, each of which stops on its own; NaN where one does not."""
         x, is_moving = np.zeros(thetas.shape[1]), np.ones(thetas.shape[1], dtype=bool)
-        while is_moving.any():
+        for _ in range(MOST):
             change = rate * (thetas[0] * np.cos(x) + thetas[1] - x)
             x = np.where(is_moving, x + change, x)
             is_moving &= np.abs(change) > tolerance
-        return x
+            if not is_moving.any():
+                break
+        return np.where(is_moving, np.nan, x)
 
+    def cost(thetas):
+        values = np.full(thetas.shape[1], np.nan)
+        converges = np.abs(thetas[0]) < 1.2
+        values[converges] = value(solve(thetas[:, converges]), thetas[:, converges])
+        return values
+
+    def gradient(t):
+        x = float(solve(t[:, None])[0])
+        by_x, direct = slopes(x, t)
+        return by_x * np.array([np.cos(x), 1.0]) / (1.0 + t[0] * np.sin(x)) + direct
+
+    return cost, gradient
+
+
+def verdicts(rate, tolerance, count):
+    """Return the counts of verdicts at ``count`` random thetas per cost."""
     random, found = np.random.default_rng(0), Counter()
-    for name, (value, slopes) in COSTS.items():
+    for name, pair in COSTS.items():
         for _ in range(count):
             theta = np.array([random.uniform(0.2, 0.8), random.uniform(-1.0, 1.0)])
-
-            def cost(thetas, value=value):
-                values = np.full(thetas.shape[1], np.nan)
-                converges = np.abs(thetas[0]) < 1.2
-                values[converges] = value(solve(thetas[:, converges]), thetas[:, converges])
-                return values
-
-            def gradient(t, slopes=slopes):
-                x = float(solve(t[:, None])[0])
-                by_x, direct = slopes(x, t)
-                return by_x * np.array([np.cos(x), 1.0]) / (1.0 + t[0] * np.sin(x)) + direct
-
-            result = gradcheck.check(cost, gradient, theta)
+            result = gradcheck.check(*problem(rate, tolerance, *pair), theta)
             found[result.cause] += 1
             if result.cause not in gradcheck.TRUSTED:
                 print(f"blamed: {name} at {theta.tolist()}: {result.sentence()}", flush=True)
