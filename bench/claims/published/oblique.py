@@ -80,7 +80,9 @@ class ObliqueCollision(Claim):
             series[name] = costs.tolist()
             figures.append(Figure(f"cost at the end, {LABELS[name]}", end, costs[-1], spread=SHARE * float(end)))
         # the optimum is a bound: within 3% of it, or 10% above it
-        figures.append(Figure("end over the optimum, steps from the impact", "1.012", series["event"][-1] / OPTIMUM, spread=0.018))
+        figures.append(
+            Figure("end over the optimum, steps from the impact", "1.012", series["event"][-1] / OPTIMUM, spread=0.018)
+        )
         return Outcome(
             figures,
             reservation=(

@@ -111,7 +111,12 @@ class RecurrentVariances(Claim):
         axes.set_yscale("log")
         bars(axes, series["steps"], series["first"], fmt="o-", color=estimator_colour("fobg"), label="pathwise")
         bars(
-            axes, series["steps"], series["zeroth"], fmt="s-", color=estimator_colour("reinforce"), label="likelihood ratio"
+            axes,
+            series["steps"],
+            series["zeroth"],
+            fmt="s-",
+            color=estimator_colour("reinforce"),
+            label="likelihood ratio",
         )
 
 
