@@ -62,8 +62,8 @@ def bootstrap(
 ) -> Interval:
     """Return the bootstrap percentile interval of a statistic, resampling each stratum along its first axis.
 
-    Resamples in which the statistic is NaN are ignored. The interval is NaN if all are. With ``expanded``, the quantiles
-    are those of :func:`_tail`, for statistics such as means; else 2.5% and 97.5%.
+    Resamples in which the statistic is NaN are ignored. The interval is NaN if all are. With ``expanded``, :func:`_tail`
+    gives the quantiles, for statistics such as means; else they are 2.5% and 97.5%.
     """
     rng = np.random.default_rng(seed)
     values = np.array(

@@ -30,7 +30,7 @@ CASES = {
     "neither": ("impulse[time_of_impact=false]", "semi_implicit_euler", "0.36158"),
 }
 """Law, integrator and published end by case."""
-LABELS = {"event": "steps from the impact", "time": "time of impact alone", "neither": "neither"}
+LABELS = {"event": "steps from the impact", "time": "time of impact only", "neither": "neither"}
 
 
 def oblique() -> MechanicalScene:
@@ -60,7 +60,7 @@ class ObliqueCollision(Claim):
     lesson = "Time of impact"
     statement = (
         "500 steps of descent through an oblique collision end at .31517, near the optimum .311417, where the velocity's "
-        "derivative is corrected too, at .39494 with the time of impact alone, and at .36158 with neither."
+        "derivative is corrected too, at .39494 with only the time of impact, and at .36158 with neither."
     )
     source = "Zhong, Han, Brikis 2023, arXiv 2305.00092"
     learned = "Where the normal turns with the place of impact, the right position with a wrong velocity is worse than neither."

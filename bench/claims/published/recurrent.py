@@ -83,12 +83,12 @@ class RecurrentVariances(Claim):
 
     def measure(self) -> Outcome:
         """Sample both at each horizon, in ten draws."""
-        figures, found = [], {}
+        figures, variances = [], {}
         for steps, published in PUBLISHED.items():
             at = problem(Recurrent(horizon=steps))
             draws = np.array([_variances(at, np.random.default_rng([22, steps, i])) for i in range(DRAWS)])
             means, errors = draws.mean(axis=0), draws.std(axis=0, ddof=1) / DRAWS**0.5
-            found[steps] = list(zip(means.tolist(), errors.tolist(), strict=True))
+            variances[steps] = list(zip(means.tolist(), errors.tolist(), strict=True))
             for k, name in enumerate(("pathwise", "likelihood ratio")):
                 what = f"{name} variance, T = {steps}"
                 if k == 0 and steps in HEAVY:
@@ -100,9 +100,9 @@ class RecurrentVariances(Claim):
         return Outcome(
             figures,
             series={
-                "steps": list(found),
-                "first": [pair[0] for pair in found.values()],
-                "zeroth": [pair[1] for pair in found.values()],
+                "steps": list(variances),
+                "first": [pair[0] for pair in variances.values()],
+                "zeroth": [pair[1] for pair in variances.values()],
             },
         )
 
