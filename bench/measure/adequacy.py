@@ -1,4 +1,4 @@
-"""Tests whether a fitted model explains a record: size, correlation and structure of the residuals.
+"""Tests whether a fitted model explains a record: size, outliers, correlation and structure of the residuals.
 
 Under a right model with independent normal noise, the residuals of a fit are normal numbers projected out of the
 columns of the Jacobian, to first order. All tests use simulated residuals of that law as their quantiles, so that the
@@ -109,11 +109,11 @@ def pool(residuals: np.ndarray, jacobians: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _statistics(residuals: np.ndarray, directions: np.ndarray, channels: int) -> np.ndarray:
-    """Return the statistics of residuals ``(n, m)``, ``(k, n)``: size, correlation, slow changes, and each term's."""
+    """Return the statistics of residuals ``(n, m)``, ``(k, n)``: size, the largest, correlation, slow changes, each term's."""
     n, m = residuals.shape
     series = residuals.reshape(n, m // channels, channels)
     length = series.shape[1]
-    parts = [np.square(residuals).sum(axis=1)]
+    parts = [np.square(residuals).sum(axis=1), np.abs(residuals).max(axis=1)]
     if length >= FEWEST:
         power = np.square(series).sum(axis=1)
         correlations = np.zeros((n, channels))
@@ -132,11 +132,13 @@ def _words(
     tests = len(own) - len(names)
     if k == 0:
         return f"the residuals are {float(np.sqrt(np.square(residual).mean())):.3g} times the stated noise"
+    if k == 1:
+        return f"the largest residual is {float(np.abs(residual).max()):.2g} times the stated noise"
     if k < tests:
         rho = float(np.mean([np.corrcoef(c[1:], c[:-1])[0, 1] for c in series.T]))
         return (
             f"the residuals are correlated ({rho:.2g} between steps)"
-            if k == 1
+            if k == 2
             else "the residuals change slowly over time"
         )
     name, size = names[k - tests], float(directions[k - tests] @ residual)

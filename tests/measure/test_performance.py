@@ -41,3 +41,17 @@ def test_spearman_is_scipys_with_and_without_ties(seed):
 def test_spearman_is_nan_where_it_is_not_defined():
     assert math.isnan(performance.spearman(np.ones(5), np.arange(5.0)))
     assert math.isnan(performance.spearman(np.arange(2.0), np.arange(2.0)))
+
+
+def test_average_runtime_of_few_searches_is_covered():
+    """A plain percentile interval of 8 searches contains the mean in 87.5% of these sets."""
+    random, inside = np.random.default_rng([1, 8]), 0
+    for k in range(400):
+        spent = np.exp(0.5 * random.standard_normal(8))
+        low, high = performance.runtime_interval(spent, np.ones(8, dtype=bool), seed=k)
+        inside += low <= math.exp(0.125) <= high
+    assert inside / 400 > 0.91
+
+
+def test_bootstrap_of_single_values_is_their_statistic():
+    assert performance.bootstrap([np.array([2.0]), np.array([4.0])], lambda p: float(np.mean(p)), 0, 10) == (3.0, 3.0)

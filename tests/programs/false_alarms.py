@@ -1,14 +1,18 @@
 """Counts false alarms: how often the gradient check reports a fault in correct gradients of smooth scenes.
 
-    python tests/programs/false_alarms.py 5000
+    python tests/programs/false_alarms.py 5000 [FIRST [FILE]]
 
-runs 5,000 checks at random thetas and horizons up to 3,000, and prints the counts of verdicts, every reported fault, and the
-seconds per check. The first check of a program includes its compilation.
+runs the checks FIRST to 4,999 at random thetas and horizons up to 3,000, and prints the counts of verdicts by horizon, every
+reported fault, and the seconds per check. A check's number determines its program and theta, so ranges can run apart or in
+turn. With FILE, each check is a line of that CSV file, and checks in it are not run again. The first check of a program
+includes its compilation. Short horizons are checked more often, because a check takes as long as its horizon.
 """
 
+import csv
+import pathlib
 import sys
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 
 import numpy as np
 
@@ -20,49 +24,96 @@ SCENES = (
     "pendulum", "double_pendulum", "cartpole", "mass_spring", "double_integrator", "stiff_decay", "quadratic",
     "rosenbrock", "cubic",
 )  # fmt: skip
-HORIZONS = (1, 30, 300, 1000, 2000, 3000)
+HORIZONS = {1: 8, 30: 8, 300: 5, 1000: 2, 2000: 1, 3000: 1}
+"""Numbers of steps, and how many checks of a cycle have each."""
+ELSE = 16
+"""Checks of a cycle for each scene without time steps."""
 INTEGRATORS = ("semi_implicit_euler", "rk4")
 SPREAD = 0.3
 """Standard deviation of theta around the scene's theta0, relative to each component (absolute where theta0 is 0)."""
 
 
 def programs():
-    """Yield name and program of every smooth scene, at every horizon and with every integrator if it has time steps."""
+    """Yield name, program, horizon and weight of every smooth scene, at every horizon and with every integrator."""
     for name in SCENES:
         entry = registry.entries()["scenes"].get(name)
         if entry is None:
             continue
-        stepped = hasattr(entry.plugin, "n_q")
-        for horizon in HORIZONS if stepped else (None,):
-            for integrator in INTEGRATORS if stepped else (None,):
+        is_stepped = hasattr(entry.plugin, "n_q")
+        for horizon, weight in HORIZONS.items() if is_stepped else ((None, ELSE),):
+            for integrator in INTEGRATORS if is_stepped else (None,):
                 values = {} if horizon is None else {"horizon": horizon}
                 method = None if integrator is None else registry.make("integrators", integrator, {})
-                yield f"{name} {horizon} {integrator}", compose(registry.make("scenes", name, values), None, method)
+                program = compose(registry.make("scenes", name, values), None, method)
+                yield f"{name} {horizon} {integrator}", program, horizon or 0, weight
 
 
-def run(count, only=None):
-    """Run ``count`` checks; returns counts by verdict, false alarms ``(name, seed, sentence)``, and seconds per check."""
-    chosen = [(name, program) for name, program in programs() if only is None or only(name)]
-    verdicts, blamed, seconds = Counter(), [], []
+def run(count, only=None, first=0, done=(), report=lambda line: None):
+    """Run the checks ``first`` to ``count - 1`` that are not in ``done``, program by program.
+
+    Returns lines ``(number, name, horizon, verdict, seconds, sentence)``; ``report`` is called with each.
+    """
+    chosen = [entry for entry in programs() if only is None or only(entry[0])]
+    cycle = [place for place, entry in enumerate(chosen) for _ in range(entry[3])]
+    lines = []
     unit, search = float(np.finfo(np.float64).eps), measure.SwitchSearch(2, 16, 2.0, 1e-4)
-    for place, (name, program) in enumerate(chosen):
-        problem = registry.make("backends", "jax", {}).compile(program)
+    for place, (name, program, horizon, _) in enumerate(chosen):
+        numbers = [n for n in range(first, count) if cycle[n % len(cycle)] == place and n not in done]
+        problem = registry.make("backends", "jax", {}).compile(program) if numbers else None
         theta0 = program.theta0
-        for seed in range(place, count, len(chosen)):
+        for number in numbers:
             scale = np.where(theta0 == 0.0, 1.0, np.abs(theta0))
-            theta = theta0 + SPREAD * scale * np.random.default_rng(seed).standard_normal(theta0.size)
+            theta = theta0 + SPREAD * scale * np.random.default_rng(number).standard_normal(theta0.size)
             started = time.perf_counter()
-            found = measure.start(problem, theta, unit, search, seed)
-            seconds.append(time.perf_counter() - started)
-            verdicts[found.cause] += 1
-            if found.cause in FAULTS:
-                blamed.append((name, seed, found.sentence()))
-                print("blamed:", *blamed[-1], flush=True)
-    return verdicts, blamed, seconds
+            result = measure.start(problem, theta, unit, search, number)
+            seconds = time.perf_counter() - started
+            lines.append((number, name, horizon, result.cause, seconds, result.sentence()))
+            report(lines[-1])
+            if result.cause in FAULTS:
+                print("blamed:", number, name, result.sentence(), flush=True)
+    return lines
+
+
+def summary(lines):
+    """Return counts of verdicts by horizon, the number of faults reported, and seconds per check, as text."""
+    by_horizon = defaultdict(Counter)
+    for _, _, horizon, verdict, _, _ in lines:
+        by_horizon[horizon][verdict] += 1
+    text = [
+        f"{'no steps' if not horizon else f'{horizon} steps'}: {counts.total()} checks, "
+        + ", ".join(f"{n} {verdict}" for verdict, n in counts.most_common())
+        for horizon, counts in sorted(by_horizon.items())
+    ]
+    seconds = [line[4] for line in lines]
+    blamed = sum(line[3] in FAULTS for line in lines)
+    text.append(f"{len(lines)} checks: {blamed} gradients of right programs blamed")
+    text.append(f"seconds of a check: median {np.median(seconds):.3f}, largest {max(seconds):.1f}")
+    return "\n".join(text)
+
+
+def main(count=100, first=0, path=None):
+    """Run checks, print the summary of all of them, and store each line in the file ``path`` as it is ready."""
+    if path is None:
+        print(summary(run(count, first=first)))
+        return
+    file = pathlib.Path(path)
+    lines = []
+    if file.exists():
+        with file.open(newline="") as stream:
+            whole = [row for row in csv.reader(stream) if len(row) == 6]  # the last may be cut
+        lines = [(int(n), name, int(h), verdict, float(s), text) for n, name, h, verdict, s, text in whole]
+    with file.open("w", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerows(lines)
+
+        def report(line):
+            writer.writerow(line)
+            stream.flush()
+
+        done = {line[0] for line in lines}
+        lines += run(count, first=first, done=done, report=report)
+    print(summary(lines))
 
 
 if __name__ == "__main__":
-    verdicts, blamed, seconds = run(int(sys.argv[1]) if len(sys.argv) > 1 else 100)
-    print(f"{sum(verdicts.values())} checks: " + ", ".join(f"{n} {name}" for name, n in verdicts.most_common()))
-    print(f"{len(blamed)} gradients of right programs blamed")
-    print(f"seconds of a check: median {np.median(seconds):.3f}, largest {max(seconds):.1f}")
+    main(*map(int, sys.argv[1:3]), *sys.argv[3:4])

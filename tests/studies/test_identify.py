@@ -244,7 +244,13 @@ def test_a_record_of_the_model_is_explained(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "least", "most"),
-    [("right", 0.0, 0.13), ("0.004 v|v|", 0.95, 1.0), ("offset 0.5 sigma", 0.95, 1.0), ("noise AR 0.9", 0.95, 1.0)],
+    [
+        ("right", 0.0, 0.13),
+        ("0.004 v|v|", 0.95, 1.0),
+        ("offset 0.5 sigma", 0.95, 1.0),
+        ("noise AR 0.9", 0.95, 1.0),
+        ("drift 0.5 sigma", 0.8, 1.0),
+    ],
 )
 def test_wrong_models_are_noticed_and_the_right_one_is_not_blamed(name, least, most):
     clean, noise = next((record, noise) for label, record, noise in wrong_models.cases() if label == name)
@@ -253,6 +259,24 @@ def test_wrong_models_are_noticed_and_the_right_one_is_not_blamed(name, least, m
     assert together <= 0.5 if name == "right" else together == 1.0 or "noise" in name
     if "noise" in name:
         assert inside < 0.6 < 0.8 < wide
+
+
+def test_one_outlier_is_noticed():
+    from bench.measure import adequacy
+
+    residual = np.random.default_rng(0).standard_normal(200)
+    line = np.linspace(-1.0, 1.0, 200)[:, None]
+    residual -= line[:, 0] * (line[:, 0] @ residual) / (line[:, 0] @ line[:, 0])
+    assert adequacy.judge(residual, line, 1).is_explained
+    residual[100] = 6.0
+    verdict = adequacy.judge(residual, line, 1)
+    assert not verdict.is_explained
+    assert "the largest residual is 6 times the stated noise" in verdict.sentence()
+
+
+def test_faults_of_a_sensor_are_named(tmp_path):
+    for fault, word in (("gain 0.99", "a gain of sensor 0"), ("drift 2 sigma", "a drift of sensor 0")):
+        assert word in own_record(tmp_path, fault)["reason"]
 
 
 def test_small_terms_are_noticed_in_many_records_together():

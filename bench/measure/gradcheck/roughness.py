@@ -20,8 +20,8 @@ APART = 3.0
 """Least ratio of an edge to the variation of increments on the treads."""
 STOPPED = 513
 """Points of a scan for jumps of a solver that stops early."""
-REACHES = (1.0, 0.5, 0.25)
-"""Distances of the scans on either side of theta, in units of the input's scale."""
+REACHES = (1.0, 0.5, 0.25, 0.1, 0.05, 0.02)
+"""Distances of the scans on either side of theta, in units of the input's scale. Jumps too dense for a wide scan show on a narrow one."""
 SIXTH, IMPULSE, CLEAR = 6, 10.0, 50.0
 """Order of the differences that show jumps, the largest of a unit jump, and the ratio to their median of a jump."""
 STOPS = 3

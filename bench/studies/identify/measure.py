@@ -337,15 +337,22 @@ def _together(
 def missing_terms(cell: Cell, model: Model, theta: np.ndarray, sigma: float) -> dict[str, np.ndarray]:
     """Return the change of the standardised record ``(m,)`` per unit of effects that the model lacks, by name.
 
-    The effects are an offset of each sensor, and accelerations of each coordinate: constant, and quadratic, cubic and
-    signed in its velocity and position. They are computed at ``theta (p,)`` by central differences.
+    The effects are an offset, gain, drift and delay of each sensor, and accelerations of each coordinate: constant, and
+    quadratic, cubic and signed in its velocity and position. They are computed at ``theta (p,)`` by central differences.
     """
     scene = model.program.scene
     channels, columns = len(model.measured), theta[:, None]
     plain = model.record(columns)[:, 0]
     terms = {}
+    times = np.array(model.steps, dtype=float)
+    table = plain.reshape(-1, channels)
+    faults = {"an offset": np.ones_like(table), "a gain": table}
+    if len(times) > 1:
+        faults["a drift"] = np.repeat((2.0 * times / times[-1] - 1.0)[:, None], channels, axis=1)
+        faults["a delay"] = -np.gradient(table, times, axis=0)
     for c, coordinate in enumerate(model.measured):
-        terms[f"an offset of sensor {coordinate}"] = np.tile(np.eye(channels)[c], plain.size // channels) / sigma
+        for name, effect in faults.items():
+            terms[f"{name} of sensor {coordinate}"] = (effect * np.eye(channels)[c]).ravel() / sigma
     states = model.simulate(columns, model.initial_states(columns), np.zeros(1, dtype=int), scene.horizon)[:, :, 0]
     size = max(float(np.abs(np.diff(states[:, scene.n_q :], axis=0)).max()) / scene.dt, 1e-12)
     for i in range(scene.n_q if len(states[0]) == 2 * scene.n_q else 0):
