@@ -49,8 +49,11 @@ def build(backend: Any, program: Program) -> Any:
     assert isinstance(scene, MechanicalScene)
     assert isinstance(scene, EngineTwin)
     model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/>{scene.mjcf()}</mujoco>')
-    if (model.nq, model.nv, model.nu) != (scene.n_q, scene.n_q, scene.n_u):
-        raise ValueError(f"the twin of {scene.name} has {model.nq} coordinates and {model.nu} motors")
+    expected = (scene.n_q, scene.n_q if scene.n_v is None else scene.n_v, scene.n_u)
+    if (model.nq, model.nv, model.nu) != expected:
+        raise ValueError(
+            f"the twin of {scene.name} has (n_q, n_v, n_u) = {(model.nq, model.nv, model.nu)}, and the scene {expected}"
+        )
     option = model.opt
     option.timestep = scene.dt
     option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{backend.integrator.upper()}")

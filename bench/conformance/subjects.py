@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from bench.conformance.kit import Skipped, missing_environment, require
+from bench.engines.backend import EngineBackend
 from bench.measure import jumps
 from bench.model import (
     Array,
@@ -57,15 +58,19 @@ def available(kind: str) -> list[type[Any]]:
 def plain_backend() -> Backend:
     """Return the reference backend of all comparisons, which needs no library and compiles nothing."""
     for plugin in available("backends"):
-        is_plain = not plugin.requires and not plugin.compiles and "simulator" not in plugin.provides
+        is_plain = not plugin.requires and not plugin.compiles and not {"simulator", "physics"} & plugin.provides
         if is_plain and {"value", "grad", "score"} <= plugin.provides:
             return cast(Backend, plugin())
     raise Skipped("no backend is registered that needs no library")
 
 
 def able_backend(program: Program) -> Backend:
-    """Return the plain backend if it can run the program, else the first backend that can, compiling ones last."""
-    others = sorted((plugin() for plugin in available("backends")), key=lambda backend: backend.compiles)
+    """Return the plain backend if it can run the program, else the first backend that can.
+
+    Backends that compile come later, and engines in a Python of their own last.
+    """
+    others = [plugin() for plugin in available("backends")]
+    others.sort(key=lambda backend: (isinstance(backend, EngineBackend), backend.compiles))
     for backend in (plain_backend(), *others):
         if backend.incompatibility(program) is None:
             return cast(Backend, backend)

@@ -27,16 +27,20 @@ class Trajectory(NamedTuple):
 
 
 class Jacobians(NamedTuple):
-    """Derivatives of the step map x_{k+1} = F(x_k, u_k), x = (q, v), along rollouts."""
+    """Derivatives of the step map x_{t+1} = F(x_t, u_t), x = (q, v), along rollouts.
+
+    They are derivatives by changes of the state, of length k: n, or less if q is on a manifold, as in a
+    :class:`~bench.model.manifold.JointScene`.
+    """
 
     states: np.ndarray
     """``(horizon + 1, n, B)``."""
     controls: np.ndarray
     """``(horizon, n_u, B)``."""
     a: np.ndarray
-    """dF/dx, ``(horizon, n, n, B)``."""
+    """dF/dx, ``(horizon, k, k, B)``."""
     b: np.ndarray
-    """dF/du, ``(horizon, n, n_u, B)``."""
+    """dF/du, ``(horizon, k, n_u, B)``."""
 
 
 @dataclass

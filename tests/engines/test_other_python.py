@@ -23,7 +23,7 @@ from bench.plugins.scenes.pushing import Pushing
 
 import bench
 from bench.cli import main
-from bench.conformance import backends
+from bench.conformance import backends, subjects
 from bench.conformance.kit import Failed
 from bench.conformance.subjects import law_for
 from bench.engines import environments, process, twin
@@ -319,3 +319,19 @@ def test_programs_that_an_engine_does_not_run_are_refused():
     damped = compose(BouncingBall(), law_for(BouncingBall(), Penalty, {"damping": 1.0}), SemiImplicitEuler())
     newton = registry.usable("backends", "newton")()
     assert "supports damping_mode=approach, not clipped" in newton.incompatibility(damped)
+
+
+# ------------------------------------------------------------------------------------------------------------- kit
+
+
+def test_the_kit_compares_with_numpy_although_engines_are_installed(monkeypatch):
+    """An engine requires no library of this Python and compiles nothing here, but it is not the scene's own program."""
+    installed = subjects.available
+    engine = type(toy())
+    monkeypatch.setattr(subjects, "available", lambda kind: [engine] * (kind == "backends") + installed(kind))
+    subjects.plain_backend.cache_clear()
+    try:
+        assert subjects.plain_backend() == Numpy()
+        assert subjects.able_backend(program(BouncingBall())) == Numpy()
+    finally:
+        subjects.plain_backend.cache_clear()
