@@ -14,6 +14,7 @@ from bench.errors import Unsupported
 from bench.model import blocks
 from bench.model.program import Program
 
+NOT_DEFINED = "{0} computes no {1}: define {0}._{2}, or leave '{2}' out of the backend's `provides`"
 NO_EXPLICIT = "{} does not differentiate by theta at given actions, which the score of this program needs"
 
 
@@ -212,11 +213,11 @@ class Problem(ABC):
     @abstractmethod
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...
 
-    @abstractmethod
-    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        raise Unsupported(NOT_DEFINED.format(type(self).__name__, "gradients", "grad"))
 
-    @abstractmethod
-    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...
+    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        raise Unsupported(NOT_DEFINED.format(type(self).__name__, "scores", "score"))
 
     def _explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         raise Unsupported(NO_EXPLICIT.format(type(self).__name__))
