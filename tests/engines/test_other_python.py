@@ -30,7 +30,7 @@ from bench.engines import environments, process, twin
 from bench.engines.process import close_engines
 from bench.errors import Crashed, Unsupported
 from bench.experiment.keys import fingerprint
-from bench.model import LoopOps, compose, registry
+from bench.model import LoopOps, Problem, compose, registry
 
 TOYS = Path(__file__).parent / "toys"
 HERE = sys.executable
@@ -429,3 +429,21 @@ def test_the_kit_compares_with_numpy_although_engines_are_installed(monkeypatch)
         assert subjects.able_backend(program(BouncingBall())) == Numpy()
     finally:
         subjects.plain_backend.cache_clear()
+
+
+def test_a_problem_without_what_its_backend_does_not_provide_says_so():
+    class CostOnly(Problem):
+        """Costs only."""
+
+        def _value(self, theta, w):
+            return (theta + 0.0 * w[:1]).sum(axis=0)
+
+    problem = CostOnly(compose(Cartpole(), None, SemiImplicitEuler()))
+    w = noise(problem)
+    assert problem.value(problem.program.theta0, w).shape == (5,)
+    with pytest.raises(Unsupported, match=r"CostOnly computes no gradients: define CostOnly\._grad"):
+        problem.grad(problem.program.theta0, w)
+    with pytest.raises(
+        Unsupported, match=r"CostOnly computes no scores: define CostOnly\._score, or leave 'score' out"
+    ):
+        problem.score(problem.program.theta0, w)
