@@ -30,13 +30,13 @@ SHOWN = (
     "pipe_share", "memory_mb",
 )  # fmt: skip
 LEVELS = {
-    "right": Style(PALETTE[2], letter="+", meaning="derivative of its program, and near the model's gradient"),
+    "right": Style(PALETTE[3], letter="+", meaning="derivative of its program, and near the model's gradient"),
     "own": Style(PALETTE[0], letter="o", meaning="derivative of its program, which is not near the model"),
-    "noisy": Style(PALETTE[4], letter="~", meaning="derivative of its program, but averages are no better than 0"),
+    "noisy": Style(PALETTE[5], letter="~", meaning="derivative of its program, but averages are no better than 0"),
     "open": Style(
-        PALETTE[6], letter="?", meaning="derivative of its program; whether averages are better than 0 is open"
+        PALETTE[4], letter="?", meaning="derivative of its program; whether averages are better than 0 is open"
     ),
-    "wrong": Style(PALETTE[3], letter="x", meaning="not the derivative of its program, or not finite"),
+    "wrong": Style(PALETTE[2], letter="x", meaning="not the derivative of its program, or not finite"),
     "none": Style("0.85", letter="-", meaning="no gradient, or the engine cannot run the scene"),
 }
 NOTES = (
