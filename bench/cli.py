@@ -364,14 +364,16 @@ def _check(words: list[str]) -> int:
     from bench import conformance
     from bench.experiment.words import parse_words
     from bench.model import registry
+    from bench.model.simulator.clock import parse_duration
 
-    names, _, _ = parse_words(words, "check", {})
+    names, settings, _ = parse_words(words, "check", {"limit": f"{conformance.kit.LIMIT_S:g}"})
+    limit = parse_duration(settings["limit"], "limit")
     _refer("check", names)
     plugins = {name for table in registry.entries().values() for name in table}
     for name in names:
         if name not in plugins:
             raise unknown("plugin", name, plugins)
-    return conformance.main(names)
+    return conformance.main(names, limit)
 
 
 def _examine(words: list[str]) -> int:
@@ -475,8 +477,9 @@ VERBS = {
         "--again makes it from the start. The environments are in $BENCH_ENGINES, otherwise in the user's cache.\n", "Experiments",
     ),
     "check": Verb(
-        _check, "check [NAME ...] [plugins=DIR]", "plugins: does each do what it declares?",
-        "Runs the conformance kit on some plugins, or all. Exit status 1 when a check fails.\n\n" + FAMILY, "Is it right?",
+        _check, "check [NAME ...] [limit=15m] [plugins=DIR]", "plugins: does each do what it declares?",
+        "Runs the conformance kit on some plugins, or all. A check that takes longer than `limit` fails. Exit "
+        "status 1 when a check fails.\n\n" + FAMILY, "Is it right?",
     ),
     "gradcheck": Verb(
         _gradcheck, "gradcheck SCENE ... [key=value ...]", "scenes: is each gradient the derivative of its program?",

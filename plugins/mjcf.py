@@ -1,4 +1,7 @@
-"""Builds MuJoCo models from scenes' MJCF twins, for both engine backends."""
+"""Builds MuJoCo models from scenes' MJCF twins, for backends of MuJoCo's engines, built in or a user's own.
+
+A backend's ``unsupported_reason`` may call :func:`unsupported_reason` and then inspect the model of :func:`build`.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,11 @@ end of the step.
 
 
 def unsupported_reason(backend: Any, program: Program) -> str | None:
-    """Return why an engine cannot run the program, or None."""
+    """Return why an engine cannot run the program, or None: no twin, another integrator, another contact law.
+
+    The backend has parameters ``integrator``, ``solver``, ``cone``, ``iterations``, ``ls_iterations``, ``lean`` and
+    ``impedance``.
+    """
     scene, law = program.scene, program.contact
     if not isinstance(scene, EngineTwin):
         return f"scene {scene.name} has no MJCF twin"
@@ -38,19 +45,22 @@ def unsupported_reason(backend: Any, program: Program) -> str | None:
 def build(backend: Any, program: Program) -> Any:
     """Return the twin as a ``mujoco.MjModel`` with the scene's time step, the law's springs and the backend's solver.
 
-    Raises :class:`Unsupported` for programs that the backend does not support.
+    Raises :class:`Unsupported` with the reason of :func:`unsupported_reason`. The backend's own reasons, which may need
+    the model, are not asked for.
     """
     import mujoco
 
-    reason = backend.unsupported_reason(program)
-    if reason:
+    if reason := unsupported_reason(backend, program):
         raise Unsupported(reason)
     scene, law = program.scene, program.contact
     assert isinstance(scene, MechanicalScene)
     assert isinstance(scene, EngineTwin)
     model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/>{scene.mjcf()}</mujoco>')
-    if (model.nq, model.nv, model.nu) != (scene.n_q, scene.n_q, scene.n_u):
-        raise ValueError(f"the twin of {scene.name} has {model.nq} coordinates and {model.nu} motors")
+    expected = (scene.n_q, scene.n_q if scene.n_v is None else scene.n_v, scene.n_u)
+    if (model.nq, model.nv, model.nu) != expected:
+        raise ValueError(
+            f"the twin of {scene.name} has (n_q, n_v, n_u) = {(model.nq, model.nv, model.nu)}, and the scene {expected}"
+        )
     option = model.opt
     option.timestep = scene.dt
     option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{backend.integrator.upper()}")

@@ -42,6 +42,7 @@ from bench.model import (
     MechanicalScene,
     Problem,
     Program,
+    Rollout,
     State,
     Unsupported,
     compose,
@@ -211,15 +212,38 @@ def score_is_that_of_actions(backend: Backend) -> str:
             require(off < ROUNDED, f"{describe(program)}: differs from w / sigma by {off:.1e}")
             continue
         e, h, ops = rng("direction").standard_normal(theta.shape), 1e-3, NewtonOps()
-        ahead, behind = (program.log_probability(ops, theta, theta + s * h * e, w) for s in (1, -1))
+        ahead, behind = (
+            _along_own_states(backend, problem, theta, w).log_probability(ops, theta, theta + s * h * e, w)
+            for s in (1, -1)
+        )
         off = distance((score * e).sum(axis=0), (ahead - behind) / (2 * h))
-        allowed = _allowed(backend, program, SCORE)
-        require(off < allowed, f"{describe(program)}: differs from differences of log p by {off:.1e}")
-        many = problem.score(program.theta0, rng("scores").standard_normal((program.n_noise, 4096)))
-        z = np.abs(many.mean(axis=1)) / (many.std(axis=1) / 64)
+        require(off < SCORE, f"{describe(program)}: differs from differences of log p by {off:.1e}")
+        count = 64 if isinstance(backend, EngineBackend) else 4096
+        many = problem.score(program.theta0, rng("scores").standard_normal((program.n_noise, count)))
+        z = np.abs(many.mean(axis=1)) / (many.std(axis=1) / np.sqrt(count))
         require(z.max() < LIMIT, f"{describe(program)}: the mean is {z.max():.1f} standard errors from zero")
         details.append(f"{describe(program)} to {off:.0e}, mean within {z.max():.1f} standard errors of 0")
     return "; ".join(details) or "w / sigma"
+
+
+class _Replayed(Rollout):
+    """A program whose states are given."""
+
+    def __init__(self, program: Rollout, states: np.ndarray) -> None:
+        super().__init__(program.scene, program.contact, program.integrator, program.decision)
+        self._next = iter(states[1:])
+
+    def step(self, ops: Any, state: State, u: Array) -> State:
+        """Return the next given state."""
+        return State(*np.split(next(self._next), [self.scene.n_q]))
+
+
+def _along_own_states(backend: Backend, problem: Problem, theta: np.ndarray, w: np.ndarray) -> Program:
+    """Return the program, for a physics engine with the engine's states: actions follow from these."""
+    has_states = type(problem).trajectory is not Problem.trajectory
+    if "physics" not in backend.provides or not has_states or not isinstance(problem.program, Rollout):
+        return problem.program
+    return _Replayed(problem.program, problem.trajectory(theta, w).states)
 
 
 @verifies(Backend)

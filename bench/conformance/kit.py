@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
+import sys
+import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,6 +14,7 @@ from functools import partial
 from typing import Any
 
 from bench.engines.backend import EngineBackend
+from bench.engines.process import close_engines
 from bench.errors import unknown
 from bench.model import Plugin, registry
 from bench.model.identity import identity
@@ -33,7 +39,15 @@ class Skipped(Exception):
     """Raised when a check does not apply to the plugin."""
 
 
+class OutOfTime(BaseException):
+    """Raised in a check that has reached its time limit. A BaseException, since a plugin may catch Exception."""
+
+
 Check = Callable[[Any], str]
+LIMIT_S = 900.0
+"""Default time limit of a check. The longest of the built-in plugins' checks take minutes."""
+GRACE_S = 30.0
+"""Time after the limit in which compiled code may return, before the process ends."""
 _CHECKS: dict[type[Plugin], list[Check]] = {}
 
 
@@ -53,8 +67,11 @@ def require(condition: Any, message: str) -> None:
         raise Failed(message)
 
 
-def main(names: Sequence[str]) -> int:
-    """Check the named plugins, or all of them, print a line per check, and return the exit status."""
+def main(names: Sequence[str], limit: float = LIMIT_S) -> int:
+    """Check the named plugins, or all of them, print a line per check, and return the exit status.
+
+    A check that is not finished within ``limit`` seconds fails. On a terminal, a line shows the running check.
+    """
     started = time.perf_counter()
     tally = dict.fromkeys(("pass", "fail", "skip"), 0)
     plugins = 0
@@ -63,11 +80,11 @@ def main(names: Sequence[str]) -> int:
             continue
         plugins += 1
         if entry.plugin is None or not entry.available:
-            results = [CheckResult(entry.name, "available", "fail" if names else "skip", entry.reason)]
+            results = iter([CheckResult(entry.name, "available", "fail" if names else "skip", entry.reason)])
         elif reason := missing_environment(entry.plugin):
-            results = [CheckResult(entry.name, "available", "fail" if names else "skip", reason)]
+            results = iter([CheckResult(entry.name, "available", "fail" if names else "skip", reason)])
         else:
-            results = check(entry.plugin)
+            results = _results(entry.plugin, limit=limit)
         for result in results:
             tally[result.outcome] += 1
             print(f"{result.outcome}  {result.plugin:<38} {result.check:<38} {result.detail}", flush=True)
@@ -82,13 +99,64 @@ def check(plugin_class: type[Plugin], only: Collection[str] = ()) -> list[CheckR
 
     ``only`` contains the names of the checks to run; empty runs all.
     """
-    results = [
-        _outcome(function, subject, name)
-        for name, subject, function in _items(plugin_class)
-        if not only or function.__name__ in only
-    ]
-    summary = something_was_checked.__name__
-    return [result for result in results if result.check != summary or result.outcome == "fail"]
+    return list(_results(plugin_class, only))
+
+
+def _results(
+    plugin_class: type[Plugin], only: Collection[str] = (), limit: float | None = None
+) -> Iterator[CheckResult]:
+    """Yield the results of :func:`check` one by one; with a limit [s], checks that reach it fail and progress is shown."""
+    items = [item for item in _items(plugin_class) if not only or item[2].__name__ in only]
+    shows = limit is not None and sys.stderr.isatty()
+    for index, (name, subject, function) in enumerate(items):
+        if shows:
+            print(
+                f"\r\033[Kcheck {index + 1} of {len(items)}: {name} {function.__name__}",
+                end="",
+                file=sys.stderr,
+                flush=True,
+            )
+        started = time.perf_counter()
+        try:
+            with _time_limit(limit, f"fail  {name} {function.__name__}"):
+                result = _outcome(function, subject, name)
+        except OutOfTime:
+            close_engines()  # an interrupted call leaves its answer in the pipe
+            text = (
+                f"not finished within {limit:g} s (limit=DURATION), stopped after {time.perf_counter() - started:.1f} s"
+            )
+            result = CheckResult(name, function.__name__, "fail", text)
+        if shows:
+            print("\r\033[K", end="", file=sys.stderr, flush=True)
+        if result.check != something_was_checked.__name__ or result.outcome == "fail":
+            yield result
+
+
+@contextlib.contextmanager
+def _time_limit(limit: float | None, label: str) -> Iterator[None]:
+    """Raise :class:`OutOfTime` in the block after ``limit`` seconds; end the process if compiled code does not return."""
+    if limit is None or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: Any) -> None:
+        raise OutOfTime
+
+    def end() -> None:
+        sys.stdout.flush()
+        print(f"{label}: compiled code did not return within {limit + GRACE_S:g} s: the run ends here", flush=True)
+        os._exit(1)
+
+    before, last = signal.signal(signal.SIGALRM, stop), threading.Timer(limit + GRACE_S, end)
+    last.daemon = True
+    last.start()
+    signal.setitimer(signal.ITIMER_REAL, limit)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+        last.cancel()
 
 
 def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str, str] | None = None) -> Any:

@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from bench.conformance.kit import Skipped, missing_environment, require
+from bench.engines.backend import EngineBackend
 from bench.measure import jumps
 from bench.model import (
     Array,
@@ -55,21 +56,51 @@ def available(kind: str) -> list[type[Any]]:
 
 @cache
 def plain_backend() -> Backend:
-    """Return the reference backend of all comparisons, which needs no library and compiles nothing."""
-    for plugin in available("backends"):
-        is_plain = not plugin.requires and not plugin.compiles and "simulator" not in plugin.provides
+    """Return the reference backend of all comparisons, which needs no library and compiles nothing; built in if possible."""
+    for plugin in sorted(available("backends"), key=lambda plugin: not plugin.__module__.startswith("bench.plugins.")):
+        is_plain = not plugin.requires and not plugin.compiles and not {"simulator", "physics"} & plugin.provides
         if is_plain and {"value", "grad", "score"} <= plugin.provides:
             return cast(Backend, plugin())
     raise Skipped("no backend is registered that needs no library")
 
 
 def able_backend(program: Program) -> Backend:
-    """Return the plain backend if it can run the program, else the first backend that can, compiling ones last."""
-    others = sorted((plugin() for plugin in available("backends")), key=lambda backend: backend.compiles)
+    """Return the plain backend if it can run the program, else the first backend that can.
+
+    Backends that compile come later, and engines in a Python of their own last.
+    """
+    others = backends()
+    others.sort(key=lambda backend: (isinstance(backend, EngineBackend), backend.compiles))
     for backend in (plain_backend(), *others):
-        if backend.incompatibility(program) is None:
-            return cast(Backend, backend)
+        if can_run(backend, program):
+            return backend
     raise Skipped("no available backend can run it")
+
+
+def backends() -> list[Backend]:
+    """Return the available backends; those that cannot be built fail their own checks."""
+    built = []
+    for plugin in available("backends"):
+        with contextlib.suppress(Exception):
+            built.append(cast(Backend, plugin()))
+    return built
+
+
+def can_run(backend: Backend, program: Program) -> bool:
+    """Return whether the backend can run the program; False if its answer is an error, which fails its own checks."""
+    with contextlib.suppress(Exception):
+        return backend.incompatibility(program) is None
+    return False
+
+
+@cache
+def works(backend: Backend) -> bool:
+    """Return whether the backend runs any of three programs of other kinds: one that does not fails its own checks."""
+    for program in [p for p in distinguishing_programs(all_programs()) if can_run(backend, p)][:3]:
+        with contextlib.suppress(Exception):
+            backend.compile(program).value(*samples(program))
+            return True
+    return False
 
 
 @cache
@@ -98,10 +129,8 @@ def programs(scene: Scene) -> list[Program]:
         return [compose(scene, None, stepping())]
     composed = [compose(scene, law_for(scene, law), stepping()) for law in sound_laws()]
     if isinstance(scene, EngineScene):
-        engines = [plugin() for plugin in available("backends") if "physics" in plugin.provides]
-        composed = [
-            program for program in composed if any(engine.incompatibility(program) is None for engine in engines)
-        ]
+        engines = [backend for backend in backends() if "physics" in backend.provides]
+        composed = [program for program in composed if any(can_run(engine, program) for engine in engines)]
         if not composed:
             raise Skipped("no available physics engine can run it")
     return composed

@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 
+from bench.engines.node import StepNode
 from bench.engines.process import EngineModel, Reply
 from bench.model import Jacobians, LoopOps, Problem, Program, State, Trajectory, adjoint_gradient, rollout, slopes
 
@@ -37,11 +38,11 @@ class EngineProblem(Problem):
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
         """Return the engine's states and the controls."""
-        return Trajectory(*self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w))
+        return Trajectory(*self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w)[:2])
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """Return states, controls and the engine's step Jacobians; NaN from the first state on that is not finite."""
-        states, controls = self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w)
+        states, controls, carries = self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w)
         horizon, n_u, count = controls.shape
         n = states.shape[1]
         x = np.moveaxis(states[:-1], 1, 0).reshape(n, horizon * count)
@@ -49,12 +50,17 @@ class EngineProblem(Problem):
         valid = np.isfinite(x).all(axis=0) & np.isfinite(u).all(axis=0)
         a, b = np.full((n, n, horizon * count), np.nan), np.full((n, n_u, horizon * count), np.nan)
         if valid.any():
-            a[..., valid], b[..., valid] = self._call("jacobians", x[:, valid], u[:, valid]).arrays
+            carried = [np.moveaxis(c[:-1], 1, 0).reshape(c.shape[1], -1)[:, valid] for c in carries]
+            a[..., valid], b[..., valid] = self.call("jacobians", x[:, valid], u[:, valid], *carried)
         by_state, by_control = a.reshape(n, n, horizon, count), b.reshape(n, n_u, horizon, count)
         return Jacobians(states, controls, np.moveaxis(by_state, 2, 0), np.moveaxis(by_control, 2, 0))
 
+    def step_node(self) -> StepNode:
+        """Return the engine's step with its vector-Jacobian product, for programs in NumPy, torch and JAX."""
+        return EngineStep(self)
+
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._cost(*self._rollout(theta, w))
+        return self._cost(*self._rollout(theta, w)[:2])
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
@@ -67,7 +73,7 @@ class EngineProblem(Problem):
         program, scene = self._rolled, self._rolled.scene
         theta = np.broadcast_to(theta, (self.dim, w.shape[1]))
         with np.errstate(all="ignore"):
-            states, controls = self._rollout(theta, w)
+            states, controls, _ = self._rollout(theta, w)
             _, _, scanned = program.start(_OPS, theta, w)
             noise = np.asarray(scanned[-1]) / (scene.sigma * (scene.horizon // scene.controls))
             result = np.empty_like(theta)
@@ -87,8 +93,15 @@ class EngineProblem(Problem):
                 result[i] = (noise * change).sum(axis=(0, 1)) / (2 * step[i])
         return np.where(np.isfinite(states).all(axis=(0, 1)), result, np.nan)
 
-    def _rollout(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return states ``(T + 1, n, B)`` and controls ``(T, n_u, B)``."""
+    def start(self, x: np.ndarray) -> list[np.ndarray]:
+        """Return the first values ``(k, B)`` of an engine's numbers beside the states x, or an empty list without them."""
+        if self._model.has_carry is False:
+            return []
+        carry = self.call("start", x)
+        return carry if self._model.has_carry else []
+
+    def _rollout(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+        """Return states ``(T + 1, n, B)`` and controls ``(T, n_u, B)``, and the carries ``(T + 1, k, B)`` if it has some."""
         program, horizon = self._rolled, self._rolled.scene.horizon
         with np.errstate(all="ignore"):
             moved, state, scanned = program.start(_OPS, theta, w)
@@ -99,12 +112,15 @@ class EngineProblem(Problem):
             first = np.concatenate(state)
             if self._is_open_loop():
                 controls = np.stack([control(t, state) for t in range(horizon)])
-                return self._call("rollout", first, controls).arrays[0], controls
-            states, applied = [first], []
+                states, *carries = self.call("rollout", first, controls, *self.start(first))
+                return states, controls, carries
+            path, applied = [[first, *self.start(first)]], []
             for t in range(horizon):
-                applied.append(control(t, State(*np.split(states[-1], [program.scene.n_q]))))
-                states.append(self._call("step", states[-1], applied[-1]).arrays[0])
-            return np.stack(states), np.stack(applied)
+                x, *carry = path[-1]
+                applied.append(control(t, State(*np.split(x, [program.scene.n_q]))))
+                path.append(self.call("step", x, applied[-1], *carry))
+            states, *carries = [np.stack(parts) for parts in zip(*path, strict=True)]
+            return states, np.stack(applied), carries
 
     def _is_open_loop(self) -> bool:
         scene = self._rolled.scene
@@ -119,6 +135,10 @@ class EngineProblem(Problem):
             for x, u in zip(states[:-1], controls, strict=True):
                 total = total + scene.stage_cost(np, x[:n_q], x[n_q:], u)
         return np.where(np.isfinite(states).all(axis=(0, 1)), total, np.nan)
+
+    def call(self, name: str, *arrays: np.ndarray) -> list[np.ndarray]:
+        """Return the arrays of the engine's answer to ``step``, ``rollout``, ``jacobians`` or ``pull``."""
+        return self._call(name, *arrays).arrays
 
     def _call(self, name: str, *arrays: np.ndarray) -> Reply:
         started = time.perf_counter()
@@ -135,3 +155,24 @@ class EngineProblem(Problem):
         self.n_calls += 1
         self.peak_memory_mb = max(self.peak_memory_mb, reply.peak_memory_mb)
         return reply
+
+
+class EngineStep(StepNode):
+    """The step of an engine in another Python. A backward pass repeats the step, under the engine's tape of that step."""
+
+    def __init__(self, problem: EngineProblem) -> None:
+        self._problem = problem
+
+    def start(self, x: np.ndarray) -> np.ndarray:
+        """Return the engine's carry at states x, ``(k, B)``; k is 0 for most engines."""
+        return next(iter(self._problem.start(x)), np.empty((0, x.shape[1])))
+
+    def step(self, x: np.ndarray, u: np.ndarray, carry: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the states and the carry after one step."""
+        after, *carried = self._problem.call("step", x, u, *[carry] * bool(len(carry)))
+        return after, next(iter(carried), carry)
+
+    def pull(self, x: np.ndarray, u: np.ndarray, carry: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of the sum of ``slope`` times the next states by x and by u."""
+        by_state, by_control = self._problem.call("pull", x, u, *[carry] * bool(len(carry)), slope)
+        return by_state, by_control

@@ -116,11 +116,13 @@ class EngineModel:
         self._name, self._python, self._file, self._description = name, python, file, description
         self._key = next(_keys)
         self.device = "cpu"
+        self.has_carry: bool | None = None
+        """Whether steps read and write numbers beside the states; None before the first call."""
         self.build_s = 0.0
         """Seconds of the last start of the engine, with its imports, and of building the model."""
 
     def call(self, name: str, *arrays: np.ndarray) -> Reply:
-        """Return the result of ``step``, ``rollout`` or ``jacobians``.
+        """Return the result of ``start``, ``step``, ``rollout``, ``jacobians`` or ``pull``.
 
         Raises :class:`Crashed` if the engine's process ends during the call, also in a second process.
         """
@@ -144,7 +146,7 @@ class EngineModel:
                 answer, _ = process.call({"call": "build", "model": self._key, "description": self._description}, [])
                 self._raise(answer)
                 process.models[self._key] = self.device = answer["device"]
-                self.build_s = answer["seconds"]
+                self.build_s, self.has_carry = answer["seconds"], answer["has_carry"]
             answer, results = process.call({"call": name, "model": self._key}, list(arrays))
             self._raise(answer)
             if not answer.get("is_unknown"):

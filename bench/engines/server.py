@@ -5,8 +5,12 @@ description of a program, with
 
 - ``step(x, u)``: the states ``(n, B)`` after one step from states x and controls ``u (m, B)``;
 - ``jacobians(x, u)``: its derivatives ``(n, n, B)`` by x and ``(n, m, B)`` by u, or ``pull(x, u, slope)``: the derivatives
-  ``(n, B)`` by x and ``(m, B)`` by u of the sum of ``slope * step(x, u)``; neither if the engine has no derivatives;
+  ``(n, B)`` by x and ``(m, B)`` by u of the sum of ``slope * step(x, u)``, which repeats the step under a tape of its own;
+  one is made from the other; neither if the engine has no derivatives;
 - ``rollout(x, u)``, optional: the states ``(T + 1, n, B)`` under controls ``(T, m, B)``, otherwise T steps;
+- ``start(x)``, optional, for engines with numbers beside (q, v) that a step reads and writes, such as caches: their first
+  values ``(k, B)``. Then ``step(x, u, carry)`` returns states and carry, ``rollout(x, u, carry)`` states and carries
+  ``(T + 1, k, B)``, and derivatives get the carry before ``slope`` and are derivatives at constant carry;
 - ``takes_forces``, optional: whether u are the generalised forces ``(n_q, B)`` of motors, springs and dampers, in place of
   the controls;
 - ``widths``, optional: the batch sizes B that it can compute, otherwise all;
@@ -86,7 +90,8 @@ def _read(descriptor: int, count: int) -> bytearray:
 
 def call(model: Any, name: str, arrays: list[np.ndarray]) -> tuple[list[np.ndarray], int]:
     """Return the arrays that a call of the model results in, and the width of its batches."""
-    function = {"step": _step, "rollout": _rollout, "jacobians": _jacobians}[name]
+    functions = {"start": _start, "step": _step, "rollout": _rollout, "jacobians": _jacobians, "pull": _pull}
+    function = functions[name]
     n_columns = arrays[0].shape[-1]
     widths = sorted(getattr(model, "widths", None) or [n_columns])
     width = next((width for width in widths if width >= n_columns), widths[-1])
@@ -97,35 +102,53 @@ def call(model: Any, name: str, arrays: list[np.ndarray]) -> tuple[list[np.ndarr
         padded = [
             np.concatenate([x, np.repeat(x[..., -1:], missing, axis=-1)], axis=-1) if missing else x for x in part
         ]
+        valid = np.all([np.isfinite(x).reshape(-1, width).all(axis=0) for x in padded], axis=0)
+        if not valid.all():  # engines raise errors or hang where numbers are not finite
+            padded = [np.where(valid, x, 0.0) for x in padded]
         results = function(model, *(np.ascontiguousarray(x) for x in padded))
-        blocks.append([np.asarray(x, dtype=np.float64)[..., : width - missing] for x in results])
+        kept = [np.where(valid, np.asarray(x, dtype=np.float64), np.nan) for x in results]
+        blocks.append([x[..., : width - missing] for x in kept])
     return [np.concatenate(parts, axis=-1) for parts in zip(*blocks, strict=True)], width
 
 
-def _step(model: Any, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
-    return [model.step(x, u)]
+def _start(model: Any, x: np.ndarray) -> list[np.ndarray]:
+    return [model.start(x) if hasattr(model, "start") else np.empty((0, x.shape[1]))]
 
 
-def _rollout(model: Any, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
+def _step(model: Any, x: np.ndarray, u: np.ndarray, *carry: np.ndarray) -> list[np.ndarray]:
+    after = model.step(x, u, *carry)
+    return list(after) if carry else [after]
+
+
+def _rollout(model: Any, x: np.ndarray, u: np.ndarray, *carry: np.ndarray) -> list[np.ndarray]:
     if hasattr(model, "rollout"):
-        return [model.rollout(x, u)]
-    states = [x]
+        path = model.rollout(x, u, *carry)
+        return list(path) if carry else [path]
+    path = [[x, *carry]]
     for control in u:
-        states.append(np.asarray(model.step(states[-1], control), dtype=np.float64))
-    return [np.stack(states)]
+        x, *carried = path[-1]
+        path.append([np.array(part, dtype=np.float64) for part in _step(model, x, control, *carried)])
+    return [np.stack(parts) for parts in zip(*path, strict=True)]
 
 
-def _jacobians(model: Any, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
+def _jacobians(model: Any, x: np.ndarray, u: np.ndarray, *carry: np.ndarray) -> list[np.ndarray]:
     if hasattr(model, "jacobians"):
-        return list(model.jacobians(x, u))
+        return list(model.jacobians(x, u, *carry))
     if not hasattr(model, "pull"):
         raise NotImplementedError("this engine has no derivatives")
     rows = []
     for i in range(len(x)):
         slope = np.zeros_like(x)
         slope[i] = 1.0
-        rows.append([np.array(part, dtype=np.float64) for part in model.pull(x, u, slope)])
+        rows.append([np.array(part, dtype=np.float64) for part in model.pull(x, u, *carry, slope)])
     return [np.stack(parts) for parts in zip(*rows, strict=True)]
+
+
+def _pull(model: Any, x: np.ndarray, u: np.ndarray, *rest: np.ndarray) -> list[np.ndarray]:
+    if hasattr(model, "pull"):
+        return list(model.pull(x, u, *rest))
+    *carry, slope = rest
+    return [np.einsum("ijb,ib->jb", part, slope) for part in _jacobians(model, x, u, *carry)]
 
 
 class _Forced:
@@ -138,20 +161,24 @@ class _Forced:
         self._constant = np.reshape(np.array(forces["constant"], dtype=np.float64), (n, 1))
         self._by_state = np.reshape(np.array(forces["by_state"], dtype=np.float64), (n, 2 * n))
         self._by_control = np.reshape(np.array(forces["by_control"], dtype=np.float64), (n, -1))
-        for name in ("jacobians", "pull"):
-            if hasattr(model, name):
-                self.jacobians = self._jacobians
-                break
+        if hasattr(model, "jacobians") or hasattr(model, "pull"):
+            self.jacobians, self.pull = self._jacobians, self._pull
+        if hasattr(model, "start"):
+            self.start = model.start
 
     def _force(self, x: np.ndarray, u: np.ndarray) -> Any:
         return self._constant + self._by_state @ x + self._by_control @ u
 
-    def step(self, x: np.ndarray, u: np.ndarray) -> Any:
+    def step(self, x: np.ndarray, u: np.ndarray, *carry: np.ndarray) -> Any:
         """Return the states after one step under the controls u."""
-        return self._model.step(x, self._force(x, u))
+        return self._model.step(x, self._force(x, u), *carry)
 
-    def _jacobians(self, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
-        a, b = (np.asarray(part, dtype=np.float64) for part in _jacobians(self._model, x, self._force(x, u)))
+    def _pull(self, x: np.ndarray, u: np.ndarray, *rest: np.ndarray) -> list[np.ndarray]:
+        by_state, by_force = (np.asarray(part) for part in _pull(self._model, x, self._force(x, u), *rest))
+        return [by_state + self._by_state.T @ by_force, self._by_control.T @ by_force]
+
+    def _jacobians(self, x: np.ndarray, u: np.ndarray, *carry: np.ndarray) -> list[np.ndarray]:
+        a, b = (np.asarray(part, dtype=np.float64) for part in _jacobians(self._model, x, self._force(x, u), *carry))
         by_state = a + np.einsum("ifb,fj->ijb", b, self._by_state)
         return [by_state, np.einsum("ifb,fj->ijb", b, self._by_control)]
 
@@ -180,6 +207,7 @@ def serve(file: str, requests: int, answers: int) -> None:
                 if getattr(models[key], "takes_forces", False):
                     models[key] = _Forced(models[key], header["description"]["forces"])
                 answer["device"] = str(getattr(models[key], "device", "cpu"))
+                answer["has_carry"] = hasattr(models[key], "start")
                 while len(models) > KEPT:
                     del models[next(iter(models))]
             elif key not in models:

@@ -32,6 +32,7 @@ from bench.model.estimator import (
 )
 from bench.model.integrator import Integrator
 from bench.model.known_solutions import Identified, KnownOptimum, KnownValue
+from bench.model.manifold import JointScene
 from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
@@ -92,6 +93,7 @@ __all__ = [
     "ImpulseLaw",
     "Integrator",
     "Jacobians",
+    "JointScene",
     "KnownOptimum",
     "KnownValue",
     "LoopOps",

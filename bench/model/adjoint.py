@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.model.manifold import difference, n_changes, retract
 from bench.model.ops import LoopOps, State
 from bench.model.problem import Jacobians, Problem
 from bench.model.program import Program, Rollout, rollout
@@ -15,26 +16,29 @@ DIFFERENCE_STEP = 1e-6
 """Step of central differences relative to max(1, |x|), for an error of about 1e-10."""
 
 Cut = Callable[[int, np.ndarray, np.ndarray], np.ndarray]
-"""Signature (t, state, adjoint) -> the adjoint ``(n, B)`` to propagate backwards from step t >= 1."""
+"""Signature (t, state, adjoint) -> the adjoint ``(k, B)`` to propagate backwards from step t >= 1."""
 
 
 class Slopes(NamedTuple):
-    """Derivatives along B rollouts of T steps; n is the length of the state x = (q, v), m of the control."""
+    """Derivatives along B rollouts of T steps.
+
+    n is the length of the state x = (q, v), k of its changes (n unless q is on a manifold), m of the control.
+    """
 
     states: np.ndarray
     """``(T + 1, n, B)``."""
     a: np.ndarray
-    """d next state / d state at constant control, ``(T, n, n, B)``."""
+    """d next state / d state at constant control, ``(T, k, k, B)``."""
     b: np.ndarray
-    """d next state / d control, ``(T, n, m, B)``."""
+    """d next state / d control, ``(T, k, m, B)``."""
     cost: np.ndarray
     """Stage costs and terminal cost, ``(T + 1, B)``."""
     cost_x: np.ndarray
-    """d cost / d state at constant control, ``(T + 1, n, B)``."""
+    """d cost / d state at constant control, ``(T + 1, k, B)``."""
     cost_u: np.ndarray
     """d stage cost / d control, ``(T, m, B)``."""
     feedback_x: np.ndarray | None
-    """d feedback / d state, ``(T, m, n, B)``; None without feedback."""
+    """d feedback / d state, ``(T, m, k, B)``; None without feedback."""
     theta: np.ndarray
     """Theta plus its noise, ``(d, B)``."""
 
@@ -67,10 +71,16 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
     def back(x: np.ndarray) -> np.ndarray | None:
         return scene.feedback(np, repeated, *_split(program, x))
 
+    def by_state(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
+        if n_changes(scene) == len(x):
+            return _central_differences(function, x)
+        still = np.zeros((n_changes(scene), x.shape[1]))
+        return _central_differences(lambda change: function(retract(scene, np, x, change)), still)
+
     last = path.states[-1]
     cost = np.concatenate([stage(before, controls).reshape(horizon, count), end(last)[None]])
-    by_x = _unflatten(_central_differences(lambda x: stage(x, controls)[None], before)[0], horizon)
-    cost_x = np.concatenate([by_x, _central_differences(lambda x: end(x)[None], last)])
+    by_x = _unflatten(by_state(lambda x: stage(x, controls)[None], before)[0], horizon)
+    cost_x = np.concatenate([by_x, by_state(lambda x: end(x)[None], last)])
     cost_u = (
         _unflatten(_central_differences(lambda u: stage(before, u)[None], controls)[0], horizon)
         if m
@@ -78,7 +88,7 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
     )
     feedback_x = None
     if back(before) is not None:
-        feedback_x = np.stack([_unflatten(row, horizon) for row in _central_differences(back, before)], axis=1)  # type: ignore[arg-type]
+        feedback_x = np.stack([_unflatten(row, horizon) for row in by_state(back, before)], axis=1)  # type: ignore[arg-type]
     return Slopes(path.states, path.a, path.b, cost, cost_x, cost_u, feedback_x, noisy)
 
 
@@ -92,7 +102,7 @@ def gradient(problem: Problem, path: Slopes, cut: Cut | None = None) -> np.ndarr
 
 
 def by_actions(path: Slopes, cut: Cut | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cost's derivatives by action ``(T, m, B)``, with later feedback, and by initial state ``(n, B)``."""
+    """Return the cost's derivatives by action ``(T, m, B)``, with later feedback, and by initial state ``(k, B)``."""
     horizon = len(path.a)
     adjoint, by_control = path.cost_x[-1], np.empty_like(path.cost_u)
     for t in range(horizon - 1, -1, -1):
@@ -106,7 +116,7 @@ def by_actions(path: Slopes, cut: Cut | None = None) -> tuple[np.ndarray, np.nda
 
 
 def by_theta(problem: Problem, path: Slopes, by_control: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
-    """Return the gradient ``(d, B)`` from derivatives by action ``(T, m, B)`` and by initial state ``(n, B)``."""
+    """Return the gradient ``(d, B)`` from derivatives by action ``(T, m, B)`` and by initial state ``(k, B)``."""
     program = rollout(problem.program)
     scene, horizon = program.scene, len(path.a)
     if scene.open_loop:
@@ -122,7 +132,13 @@ def by_theta(problem: Problem, path: Slopes, by_control: np.ndarray, adjoint: np
 
     if path.feedback_x is not None:
         result = result + _theta_differences(back, path.theta, flat)
-    start = _theta_differences(lambda theta: np.concatenate(scene.initial_state(np, theta)), path.theta, adjoint)
+    first = path.states[0]
+
+    def initial(theta: np.ndarray) -> np.ndarray:
+        x = np.concatenate(scene.initial_state(np, theta))
+        return x if n_changes(scene) == len(first) else difference(scene, np, x, first)
+
+    start = _theta_differences(initial, path.theta, adjoint)
     return np.asarray(result + start)
 
 

@@ -14,6 +14,7 @@ from bench.errors import Unsupported
 from bench.model import blocks
 from bench.model.program import Program
 
+NOT_DEFINED = "{0} computes no {1}: define {0}._{2}, or leave '{2}' out of the backend's `provides`"
 NO_EXPLICIT = "{} does not differentiate by theta at given actions, which the score of this program needs"
 
 
@@ -27,16 +28,20 @@ class Trajectory(NamedTuple):
 
 
 class Jacobians(NamedTuple):
-    """Derivatives of the step map x_{k+1} = F(x_k, u_k), x = (q, v), along rollouts."""
+    """Derivatives of the step map x_{t+1} = F(x_t, u_t), x = (q, v), along rollouts.
+
+    They are derivatives by changes of the state, of length k: n, or less if q is on a manifold, as in a
+    :class:`~bench.model.manifold.JointScene`.
+    """
 
     states: np.ndarray
     """``(horizon + 1, n, B)``."""
     controls: np.ndarray
     """``(horizon, n_u, B)``."""
     a: np.ndarray
-    """dF/dx, ``(horizon, n, n, B)``."""
+    """dF/dx, ``(horizon, k, k, B)``."""
     b: np.ndarray
-    """dF/du, ``(horizon, n, n_u, B)``."""
+    """dF/du, ``(horizon, k, n_u, B)``."""
 
 
 @dataclass
@@ -208,11 +213,11 @@ class Problem(ABC):
     @abstractmethod
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...
 
-    @abstractmethod
-    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        raise Unsupported(NOT_DEFINED.format(type(self).__name__, "gradients", "grad"))
 
-    @abstractmethod
-    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...
+    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        raise Unsupported(NOT_DEFINED.format(type(self).__name__, "scores", "score"))
 
     def _explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         raise Unsupported(NO_EXPLICIT.format(type(self).__name__))

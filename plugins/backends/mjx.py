@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.model import Array, Backend, Ops, Problem, Program, Rollout, State, param, rollout
+from bench.model import Array, Backend, JointScene, Ops, Problem, Program, Rollout, State, param, rollout
+from bench.model.manifold import difference, n_changes, retract
 
 from .. import mjcf, mjx_solver
 from .jax import Jax, JaxProblem
@@ -105,6 +106,35 @@ class MjxProblem(JaxProblem):
     """A program stepped by MJX, in smaller blocks, since padding columns are expensive."""
 
     grain = 16
+
+    def _linearised(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+        """Return states, controls and step Jacobians, by changes of the state if positions are on a manifold."""
+        import jax
+        import jax.numpy as jnp
+
+        scene = rollout(self.program).scene
+        if not isinstance(scene, JointScene):
+            return super()._linearised(parameters, theta, w)
+        states, controls = self._trajectory(parameters, theta, w)
+        program, *_ = rollout(self.program.bind(parameters)).resolved(self._ops, theta, w)
+        still = jnp.zeros((n_changes(scene), theta.shape[1]), states.dtype)
+
+        def derivatives(at: tuple[Array, Array, Array]) -> list[Array]:
+            x, u, after = at
+
+            def step(change: Array, u: Array) -> Array:
+                moved = retract(scene, jnp, x, change)
+                state = program.step(self._ops, State(moved[: scene.n_q], moved[scene.n_q :]), u)
+                return difference(scene, jnp, jnp.concatenate(state), after)
+
+            def by(function: Callable[[Array], Array], point: Array) -> Array:
+                basis = jnp.eye(len(point), dtype=point.dtype)[:, :, None] + jnp.zeros_like(point)
+                return jax.vmap(lambda e: jax.jvp(function, (point,), (e,))[1], out_axes=1)(basis)
+
+            return [by(lambda change: step(change, u), still), by(lambda u: step(still, u), u)]
+
+        a, b = jax.lax.map(derivatives, (states[:-1], controls, states[1:]))
+        return states, controls, a, b
 
     def solver_residual(self, w: np.ndarray) -> float:
         """Return the largest relative residual of the constraint solver along rollouts from theta0 with ``w (n_w, B)``."""

@@ -24,6 +24,7 @@ from bench.model import (
     param,
     rollout,
 )
+from bench.model.manifold import difference, retract
 
 from .. import mjcf
 from .numpy import NumpyOps, NumpyProblem
@@ -128,7 +129,7 @@ class MujocoProblem(NumpyProblem):
         for t in range(horizon):
             controls_.append(control(t))
             states.append(self._engine.rollout(states[-1], controls_[-1][None])[1])
-            state = State(*np.split(states[-1], 2))
+            state = State(*np.split(states[-1], [self._rolled.scene.n_q]))
         return np.stack(states), np.stack(controls_)
 
 
@@ -163,13 +164,13 @@ class Engine:
     def jacobians(
         self, states: np.ndarray, controls: np.ndarray, eps: float, central: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return each step's derivatives by state ``(T, n, n, B)`` and by control ``(T, n, n_u, B)``.
+        """Return each step's derivatives by state ``(T, k, k, B)`` and by control ``(T, k, n_u, B)``, k = 2 n_v.
 
         Central differences are the mean of forward and backward ones. Where these disagree, a contact switches within
         ``eps``, and shorter differences replace them.
         """
         horizon, n_u, batch = controls.shape
-        n = states.shape[1]
+        n = 2 * self._model.nv
         a, b = np.full((batch, horizon, n, n), np.nan), np.full((batch, horizon, n, n_u), np.nan)
         points = np.ascontiguousarray(np.moveaxis(states[:-1], -1, 0))
         inputs = np.ascontiguousarray(np.moveaxis(controls, -1, 0))
@@ -233,10 +234,11 @@ class Recorded(Rollout):
         t, xp = next(self._times), ops.xp
         after = xp.asarray(self._states[t + 1])
         if self._a is not None and self._b is not None and self._controls is not None:
-            moved = xp.concat([state.q, state.v]) - xp.asarray(self._states[t])
-            after = after + xp.sum(xp.asarray(self._a[t]) * moved[None], axis=1)
+            moved = difference(self.scene, xp, xp.concat([state.q, state.v]), xp.asarray(self._states[t]))
+            change = xp.sum(xp.asarray(self._a[t]) * moved[None], axis=1)
             pushed = u - xp.asarray(self._controls[t])
-            after = after + xp.sum(xp.asarray(self._b[t]) * pushed[None], axis=1)
+            change = change + xp.sum(xp.asarray(self._b[t]) * pushed[None], axis=1)
+            after = retract(self.scene, xp, after, change)
         n_q = state.q.shape[0]
         return State(after[:n_q], after[n_q:])
 

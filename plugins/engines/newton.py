@@ -28,6 +28,10 @@ class Model:
         """Return the derivatives of one step, by one backward pass per component of the state."""
         return self._batch(x).jacobians(x, u)
 
+    def pull(self, x, u, slope):
+        """Return the derivatives of the sum of slope times the next states, by one backward pass."""
+        return self._batch(x).pull(x, u, slope)
+
     def _batch(self, x):
         width = x.shape[1]
         if width not in self._batches:
@@ -104,11 +108,21 @@ class _Batch:
         a, b = np.empty((2 * n, 2 * n, self._width)), np.empty((2 * n, n, self._width))
         for i in range(2 * n):
             tape.zero()
-            seed = np.zeros((self._width, 2, n), np.float32)
-            seed[:, i // n, i % n] = 1.0
-            seeds = [wp.array(np.ascontiguousarray(seed[:, k].reshape(-1))) for k in (0, 1)]
-            tape.backward(grads={self._after.joint_q: seeds[0], self._after.joint_qd: seeds[1]})
-            a[i] = self._read(self._before.joint_q.grad, self._before.joint_qd.grad)
-            b[i] = self._read(self._control.joint_f.grad)
+            slope = np.zeros((2 * n, self._width))
+            slope[i] = 1.0
+            a[i], b[i] = self._back(tape, slope)
         tape.zero()
         return a, b
+
+    def pull(self, x, u, slope):
+        tape = self._run(x, u)
+        tape.zero()
+        result = self._back(tape, slope)
+        tape.zero()
+        return result
+
+    def _back(self, tape, slope):
+        seeds = [wp.array(np.float32(slope[rows].T.reshape(-1))) for rows in np.split(np.arange(2 * self._n), 2)]
+        tape.backward(grads={self._after.joint_q: seeds[0], self._after.joint_qd: seeds[1]})
+        by_state = self._read(self._before.joint_q.grad, self._before.joint_qd.grad)
+        return by_state, self._read(self._control.joint_f.grad)

@@ -20,6 +20,7 @@ from bench.model import (
     per_repeat,
     slopes,
 )
+from bench.model.manifold import slope_by_changes
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ class Windowed(Estimator):
         def cut(t: int, states: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
             if not ends[t].any():
                 return adjoint
-            return np.where(ends[t], value(t, states), adjoint)
+            by_change = slope_by_changes(problem.program.scene, states, value(t, states))  # type: ignore[arg-type]
+            return np.where(ends[t], by_change, adjoint)
 
         return np.asarray(per_repeat(adjoint_gradient(problem, path, cut), noise).mean(axis=1))
 

@@ -1,6 +1,8 @@
 """Every registered plugin passes the conformance kit, and the kit catches the faults planted here."""
 
 import contextlib
+import re
+import sys
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -18,8 +20,8 @@ from bench.plugins.scenes.mass_spring import MassSpring
 from bench.plugins.scenes.pushing import Pushing
 from bench.plugins.scenes.quadratic import Quadratic
 
-from bench import conformance
-from bench.conformance import Skipped, check, main, parametrize
+from bench import cli, conformance
+from bench.conformance import Skipped, check, kit, main, parametrize, subjects
 from bench.conformance.kit import variants
 from bench.conformance.subjects import all_programs, available, distinguishing_programs, sound_scenes
 from bench.conformance.subjects import programs as programs_of
@@ -820,3 +822,78 @@ def test_item_that_nothing_applies_fails():
 def test_plugin_of_another_kind_needs_no_checks_of_its_own():
     study = next(plugin for plugin in PLUGINS if plugin.kind == "studies")
     assert {result.outcome for result in check(study)} == {"pass"}
+
+
+# ------------------------------------------------------------------------------------- time limit, broken neighbours
+
+SLOW_BACKEND = """
+import time
+from dataclasses import dataclass
+from bench.plugin import Backend
+
+@dataclass(frozen=True)
+class Endless(Backend):
+    \"\"\"Never returns.\"\"\"
+    name = "endless"
+    def compile(self, program):
+        time.sleep(1000)
+"""
+BROKEN_BACKEND = """
+from dataclasses import dataclass
+from bench.plugin import Backend
+
+@dataclass(frozen=True)
+class ABroken(Backend):
+    \"\"\"Raises whatever is asked.\"\"\"
+    name = "a_broken"
+    provides = frozenset({"value", "grad", "score"}) | PROVIDES
+    def compile(self, program):
+        raise ZeroDivisionError("compile")
+    def unsupported_reason(self, program):
+        raise ZeroDivisionError("reason")
+"""
+
+
+def test_a_check_ends_at_the_time_limit_and_the_others_run(capsys, tmp_path, monkeypatch):
+    (tmp_path / "endless.py").write_text(SLOW_BACKEND)
+    with folder_of_plugins(tmp_path):
+        endless = registry.usable("backends", "endless")
+        monkeypatch.setattr(kit, "_CHECKS", {Plugin: kit._CHECKS[Plugin][:2], Backend: kit._CHECKS[Backend][:1]})
+        assert main(["endless"], limit=0.5) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert endless.name in lines[0]
+    assert any(
+        line.startswith("fail  endless") and "not finished within 0.5 s (limit=DURATION)" in line for line in lines
+    )
+    assert any(line.startswith("pass  endless") for line in lines)
+
+
+def test_progress_goes_to_a_terminal_only(capsys, monkeypatch):
+    main(["linear"])
+    assert not capsys.readouterr().err
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    main(["linear"])
+    assert re.search(r"check 1 of \d+: linear is_frozen_dataclass", capsys.readouterr().err)
+
+
+def test_a_limit_that_is_no_duration_is_refused():
+    with pytest.raises(UserError, match="limit=soon is not a duration"):
+        cli._check(["linear", "limit=soon"])
+
+
+@pytest.mark.parametrize("provides", ["{'physics'}", "set()"])
+def test_a_broken_backend_does_not_fail_the_checks_of_a_scene(tmp_path, provides):
+    (tmp_path / "a_broken.py").write_text(BROKEN_BACKEND.replace("PROVIDES", provides))
+    for cached in (subjects.plain_backend, subjects.all_programs, subjects.sound_laws):
+        cached.cache_clear()
+    try:
+        with folder_of_plugins(tmp_path):
+            assert registry.usable("backends", "a_broken")
+            for name in ("linear", "double_integrator", "tossed_box"):
+                results = check(registry.usable("scenes", name))
+                assert [r for r in results if r.outcome == "fail"] == []
+            broken = check(registry.usable("backends", "a_broken"))
+            assert any(r.outcome == "fail" and "ZeroDivisionError" in r.detail for r in broken)
+    finally:
+        for cached in (subjects.plain_backend, subjects.all_programs, subjects.sound_laws):
+            cached.cache_clear()

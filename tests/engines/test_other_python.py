@@ -23,14 +23,14 @@ from bench.plugins.scenes.pushing import Pushing
 
 import bench
 from bench.cli import main
-from bench.conformance import backends
+from bench.conformance import backends, subjects
 from bench.conformance.kit import Failed
 from bench.conformance.subjects import law_for
 from bench.engines import environments, process, twin
 from bench.engines.process import close_engines
 from bench.errors import Crashed, Unsupported
 from bench.experiment.keys import fingerprint
-from bench.model import compose, registry
+from bench.model import LoopOps, Problem, compose, registry
 
 TOYS = Path(__file__).parent / "toys"
 HERE = sys.executable
@@ -74,7 +74,7 @@ def test_calls_are_counted_and_compilation_is_charged_once():
     first = problem.usage.compile_s
     problem.grad(problem.program.theta0, noise(problem))
     assert problem.usage.compile_s == first > 0
-    assert problem.n_calls == 4
+    assert problem.n_calls == 5  # the first asks whether the engine has a carry
     assert problem.engine_s > 0
     assert problem.pipe_s > 0
     assert problem.peak_memory_mb > 10
@@ -319,3 +319,131 @@ def test_programs_that_an_engine_does_not_run_are_refused():
     damped = compose(BouncingBall(), law_for(BouncingBall(), Penalty, {"damping": 1.0}), SemiImplicitEuler())
     newton = registry.usable("backends", "newton")()
     assert "supports damping_mode=approach, not clipped" in newton.incompatibility(damped)
+
+
+# ----------------------------------------------------------------------------------------------- carries and nodes
+
+
+def counted(scene, theta, w):
+    """Return the states of the toy that counts its steps, computed here."""
+    own = Numpy().compile(program(scene)).trajectory(theta, w)
+    q, v = np.split(own.states[0], 2)
+    states, law = [np.concatenate([q, v])], law_for(scene, Penalty, {})
+    for t, u in enumerate(own.controls if own.controls.shape[1] else np.zeros((scene.horizon, 1, w.shape[1]))):
+        force = law.stiffness * np.maximum(0.0, -scene.gap(np, q)) + u + t
+        v = v + scene.dt * (force / 1.0 - scene.gravity)
+        q = q + scene.dt * v
+        states.append(np.concatenate([q, v]))
+    return np.stack(states)
+
+
+def test_an_engine_has_numbers_beside_the_state():
+    scene = BouncingBall(horizon=60)
+    problem = toy(counts=True).compile(program(scene))
+    theta, w = problem.program.theta0, noise(problem)
+    np.testing.assert_allclose(problem.trajectory(theta, w).states, counted(scene, theta, w), rtol=1e-12)
+    assert (
+        np.abs(problem.trajectory(theta, w).states - toy().compile(program(scene)).trajectory(theta, w).states).max()
+        > 0.01
+    )
+    e = 1e-6 * np.eye(problem.dim)
+    differences = [(problem.value(theta + h, w) - problem.value(theta - h, w)) / 2e-6 for h in e]
+    np.testing.assert_allclose(problem.grad(theta, w), differences, atol=1e-5 * np.abs(differences).max())
+
+
+def node_case(**values):
+    problem = toy(**values).compile(program(BounceOnce(horizon=60, dt=1 / 60)))
+    start = problem.program.start(LoopOps(), problem.program.theta0[:, None], np.zeros((problem.program.n_noise, 1)))[1]
+    return problem.step_node(), np.concatenate(start)
+
+
+@pytest.mark.parametrize("counts", [False, True])
+def test_a_step_node_is_differentiated_by_torch(counts):
+    torch = pytest.importorskip("torch")
+    node, first = node_case(counts=counts)
+    step, x = node.torch(), torch.tensor(first, requires_grad=True)
+    state, carry = x, torch.tensor(node.start(first))
+    u = torch.zeros((1, 1), dtype=torch.float64, requires_grad=True)
+    for _ in range(60):
+        state, carry = step(state, u, carry)
+    state[0].sum().backward()
+    for tensor, at in ((x, 0), (u, 1)):
+        expected = final_height_slope(node, first, at)
+        np.testing.assert_allclose(tensor.grad.numpy(), expected, atol=1e-5 * np.abs(expected).max())
+
+
+def final_height_slope(node, first, at):
+    """Return central differences of the last height by the first state (at 0) or the constant control (at 1)."""
+
+    def last(x, u):
+        carry = node.start(x)
+        for _ in range(60):
+            x, carry = node.step(x, u, carry)
+        return x[0, 0]
+
+    result = []
+    for i in range(2 if at == 0 else 1):
+        h = 1e-6 * np.eye(2)[:, [i]] if at == 0 else np.full((1, 1), 1e-6)
+        sides = [last(first + s * h, np.zeros((1, 1))) if at == 0 else last(first, s * h) for s in (1, -1)]
+        result.append([(sides[0] - sides[1]) / 2e-6])
+    return np.array(result)
+
+
+def test_a_step_node_is_differentiated_by_jax_in_a_compiled_scan():
+    jax = pytest.importorskip("jax")
+    node, first = node_case(counts=True)
+    step = node.jax()
+
+    def height(x, u):
+        def advance(state, _):
+            return step(state[0], u, state[1]), None
+
+        (state, _), _ = jax.lax.scan(advance, (x, jax.numpy.asarray(node.start(first))), None, 60)
+        return state[0, 0]
+
+    with jax.enable_x64(True):
+        by_x, by_u = jax.jit(jax.grad(height, (0, 1)))(jax.numpy.asarray(first), jax.numpy.zeros((1, 1)))
+    for gradient, at in ((by_x, 0), (by_u, 1)):
+        expected = final_height_slope(node, first, at)
+        np.testing.assert_allclose(gradient, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_a_state_that_is_not_finite_does_not_reach_the_engine():
+    node, first = node_case()
+    after, _ = node.step(np.concatenate([first, np.nan * first], axis=1), np.zeros((1, 2)), np.empty((0, 2)))
+    assert np.isfinite(after[:, 0]).all()
+    assert np.isnan(after[:, 1]).all()
+
+
+# ------------------------------------------------------------------------------------------------------------- kit
+
+
+def test_the_kit_compares_with_numpy_although_engines_are_installed(monkeypatch):
+    """An engine requires no library of this Python and compiles nothing here, but it is not the scene's own program."""
+    installed = subjects.available
+    engine = type(toy())
+    monkeypatch.setattr(subjects, "available", lambda kind: [engine] * (kind == "backends") + installed(kind))
+    subjects.plain_backend.cache_clear()
+    try:
+        assert subjects.plain_backend() == Numpy()
+        assert subjects.able_backend(program(BouncingBall())) == Numpy()
+    finally:
+        subjects.plain_backend.cache_clear()
+
+
+def test_a_problem_without_what_its_backend_does_not_provide_says_so():
+    class CostOnly(Problem):
+        """Costs only."""
+
+        def _value(self, theta, w):
+            return (theta + 0.0 * w[:1]).sum(axis=0)
+
+    problem = CostOnly(compose(Cartpole(), None, SemiImplicitEuler()))
+    w = noise(problem)
+    assert problem.value(problem.program.theta0, w).shape == (5,)
+    with pytest.raises(Unsupported, match=r"CostOnly computes no gradients: define CostOnly\._grad"):
+        problem.grad(problem.program.theta0, w)
+    with pytest.raises(
+        Unsupported, match=r"CostOnly computes no scores: define CostOnly\._score, or leave 'score' out"
+    ):
+        problem.score(problem.program.theta0, w)

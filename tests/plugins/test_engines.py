@@ -1,5 +1,6 @@
 """Physics engines: their twins are the scenes' programs, their gradients are right, and what they cannot do is refused."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -37,7 +38,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget
 from bench.measure import noise
 from bench.measure.reference import certify
-from bench.model import EngineScene, EngineTwin, compose, registry
+from bench.model import EngineScene, EngineTwin, Unsupported, compose, registry
 from bench.plugins import mjcf
 from bench.studies.bias_variance import BiasVariance
 
@@ -342,3 +343,22 @@ def test_engine_scene_that_jax_cannot_trace_fails_its_check():
     assert "parameters traced" in scenes.start_and_costs_are_traceable(Quadruped())
     with pytest.raises(Failed, match="JAX cannot trace it"):
         scenes.start_and_costs_are_traceable(Concrete())
+
+
+def test_a_backend_whose_refusals_need_the_model_builds_it():
+    @dataclasses.dataclass(frozen=True)
+    class Small(Mujoco):
+        """Runs one body only."""
+
+        name = "small"
+
+        def unsupported_reason(self, program):
+            reason = mjcf.unsupported_reason(self, program)
+            if reason is None and mjcf.build(self, program).nbody > 2:
+                return "one body only"
+            return reason
+
+    assert Small().unsupported_reason(program(Hopper())) == "one body only"
+    assert Small().unsupported_reason(program(BounceOnce())) is None
+    with pytest.raises(Unsupported, match="not rk4"):
+        mjcf.build(Small(), compose(BounceOnce(), program(BounceOnce()).contact, Rk4()))

@@ -59,7 +59,11 @@ def test_the_table_and_the_grid_are_written(results):
     [
         ("right", {}),
         ("own", {"model_error_rel": 0.5}),
-        ("noisy", {"rmse_rel": 1.5}),
+        ("noisy", {"rmse_rel": 2.0}),
+        ("open", {"rmse_rel": 1.1}),
+        ("open", {"rmse_rel": 0.6}),
+        ("open", {"reference_se": 0.6}),
+        ("noisy", {"rmse_rel": 20.0, "reference_se": 3.0}),
         ("wrong", {"program_error_rel": 0.5}),
         ("wrong", {"program_error_rel": np.nan}),
         ("wrong", {"nan_share": 0.1}),
@@ -70,7 +74,7 @@ def test_the_table_and_the_grid_are_written(results):
 def test_levels_of_a_gradient(expected, changes):
     good = {
         "status": "ok", "gradient": [1.0], "program_error_rel": 1e-6, "model_error_rel": 0.01, "rmse_rel": 0.2,
-        "nan_share": 0.0,
+        "nan_share": 0.0, "repeats": 8, "reference_se": 0.02, "reference_norm": 1.0,
     }  # fmt: skip
     assert level(pd.Series(good | changes)) == expected
     assert expected in LEVELS

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pandas as pd
+from scipy.special import chdtri
 
 from bench.experiment.columns import COMMON, text
 from bench.experiment.experiment import Experiment
@@ -28,10 +30,13 @@ SHOWN = (
     "pipe_share", "memory_mb",
 )  # fmt: skip
 LEVELS = {
-    "right": Style(PALETTE[2], letter="+", meaning="derivative of its program, and near the model's gradient"),
+    "right": Style(PALETTE[3], letter="+", meaning="derivative of its program, and near the model's gradient"),
     "own": Style(PALETTE[0], letter="o", meaning="derivative of its program, which is not near the model"),
-    "noisy": Style(PALETTE[4], letter="~", meaning="derivative of its program, but averages are no better than 0"),
-    "wrong": Style(PALETTE[3], letter="x", meaning="not the derivative of its program, or not finite"),
+    "noisy": Style(PALETTE[5], letter="~", meaning="derivative of its program, but averages are no better than 0"),
+    "open": Style(
+        PALETTE[4], letter="?", meaning="derivative of its program; whether averages are better than 0 is open"
+    ),
+    "wrong": Style(PALETTE[2], letter="x", meaning="not the derivative of its program, or not finite"),
     "none": Style("0.85", letter="-", meaning="no gradient, or the engine cannot run the scene"),
 }
 NOTES = (
@@ -65,20 +70,34 @@ def level(row: pd.Series) -> str:
         return "none"
     if row["status"] != "ok" or row["nan_share"] > 0 or not row["program_error_rel"] <= ACCURATE:
         return "wrong"
-    if row["rmse_rel"] >= USELESS:
+    low, high = rmse_interval(row)
+    if low >= USELESS:
         return "noisy"
+    if not high < USELESS:
+        return "open"
     return "right" if row["model_error_rel"] <= SAME else "own"
+
+
+def rmse_interval(row: pd.Series) -> tuple[float, float]:
+    """Return a 95% interval of a row's relative RMSE, from the spread over its repeats and its reference's error.
+
+    It is that of the standard deviation of normal numbers, and wide: the error counts as one number per repeat.
+    """
+    free = max(int(row["repeats"]) - 1, 1)
+    low, high = (math.sqrt(free / float(chdtri(free, tail))) for tail in (0.025, 0.975))
+    reach = 2.0 * row["reference_se"] / row["reference_norm"]
+    return low * row["rmse_rel"] / (1.0 + reach), high * row["rmse_rel"] / (1.0 - reach) if reach < 1 else math.inf
 
 
 def usable(measured: pd.DataFrame) -> str:
     """Return on how many scenes each engine's gradient is the derivative of its program and better than 0 on average."""
     texts = []
     for engine, part in measured.groupby("engine", sort=False):
-        good = part["level"].isin(("right", "own"))
-        texts.append(f"{engine} {int(good.sum())} of {len(part)}")
+        good, undecided = int(part["level"].isin(("right", "own")).sum()), int((part["level"] == "open").sum())
+        texts.append(f"{engine} {good} of {len(part)}" + (f" ({undecided} open)" if undecided else ""))
     return (
-        "Scenes on which a gradient is the derivative of its engine's program, and averages of it are better than 0: "
-        f"{', '.join(texts)}."
+        "Scenes on which a gradient is the derivative of its engine's program, and averages of it are better than 0 (95% "
+        f"interval): {', '.join(texts)}."
     )
 
 

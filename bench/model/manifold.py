@@ -1,0 +1,120 @@
+"""States whose positions are on a manifold, such as unit quaternions, and changes of states in tangent coordinates.
+
+A change of q is a vector of length ``n_v``: 3 numbers for a rotation, which a quaternion describes by 4. Step Jacobians
+and derivatives by states are derivatives by changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.model.ops import Array
+from bench.model.scene import EngineScene, MechanicalScene
+
+SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}
+"""Lengths of the positions and of the velocities of a joint."""
+STEP = 1e-4
+"""Change for central differences of retractions, whose errors are of second order."""
+
+
+@dataclass(frozen=True)
+class JointScene(EngineScene):
+    """A role: an engine's scene with free or ball joints, whose orientations are unit quaternions (w, x, y, z).
+
+    The conventions are MuJoCo's: a free joint has position and quaternion, and velocities in m/s (world axes) and rad/s
+    (body axes).
+    """
+
+    joints: ClassVar[tuple[str, ...]]
+    """The twin's joints in order, each ``free``, ``ball``, ``slide`` or ``hinge``. They set ``n_q`` and ``n_v``."""
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if strange := [joint for joint in getattr(cls, "joints", ()) if joint not in SIZES]:
+            raise TypeError(f"{cls.__name__} has the joint {strange[0]!r}: allowed are {', '.join(SIZES)}")
+        if hasattr(cls, "joints"):
+            cls.n_q, cls.n_v = (sum(SIZES[joint][i] for joint in cls.joints) for i in (0, 1))
+
+    def retract(self, xp: Any, q: Array, change: Array) -> Array:
+        """Return the positions ``(n_q, B)`` at a change ``(n_v, B)`` from q; exact to second order in the change."""
+        parts, at, by = [], 0, 0
+        for joint in self.joints:
+            if joint == "free":
+                parts.append(q[at : at + 3] + change[by : by + 3])
+                at, by = at + 3, by + 3
+            if joint in ("free", "ball"):
+                half = change[by : by + 3] / 2
+                moved = _times(xp, q[at : at + 4], [1.0 + 0.0 * half[0], *half])
+                parts.append(moved / xp.sqrt(xp.sum(moved * moved, axis=0)))
+                at, by = at + 4, by + 3
+            else:
+                parts.append(q[at : at + 1] + change[by : by + 1])
+                at, by = at + 1, by + 1
+        return xp.concat(parts)
+
+    def difference(self, xp: Any, q: Array, start: Array) -> Array:
+        """Return the change ``(n_v, B)`` from the positions ``start`` to q ``(n_q, B)``; exact to second order."""
+        parts, at = [], 0
+        for joint in self.joints:
+            if joint == "free":
+                parts.append(q[at : at + 3] - start[at : at + 3])
+                at += 3
+            if joint in ("free", "ball"):
+                w, x, y, z = start[at : at + 4]
+                turn = _times(xp, xp.stack([w, -x, -y, -z]), q[at : at + 4])
+                parts.append(2 * turn[1:] / turn[:1])
+                at += 4
+            else:
+                parts.append(q[at : at + 1] - start[at : at + 1])
+                at += 1
+        return xp.concat(parts)
+
+
+def _times(xp: Any, a: Any, b: Any) -> Array:
+    """Return the product of quaternions ``(4, B)``."""
+    (s, x, y, z), (t, u, v, w) = a, b
+    return xp.stack([
+        s * t - x * u - y * v - z * w, s * u + x * t + y * w - z * v, s * v - x * w + y * t + z * u, s * w + x * v - y * u + z * t,
+    ])  # fmt: skip
+
+
+def n_velocities(scene: MechanicalScene) -> int:
+    """Return the length of v."""
+    return scene.n_q if scene.n_v is None else scene.n_v
+
+
+def n_changes(scene: MechanicalScene) -> int:
+    """Return the length of a change of the state (q, v)."""
+    return n_velocities(scene) + (n_velocities(scene) if isinstance(scene, JointScene) else scene.n_q)
+
+
+def retract(scene: MechanicalScene, xp: Any, x: Array, change: Array) -> Array:
+    """Return the state ``(n, B)`` at a change ``(n_changes, B)`` from the state x ``(n, B)``."""
+    if not isinstance(scene, JointScene):
+        return x + change
+    n_q, n_v = scene.n_q, n_velocities(scene)
+    return xp.concat([scene.retract(xp, x[:n_q], change[:n_v]), x[n_q:] + change[n_v:]])
+
+
+def difference(scene: MechanicalScene, xp: Any, x: Array, start: Array) -> Array:
+    """Return the change ``(n_changes, B)`` from the state ``start`` to the state x, both ``(n, B)``."""
+    if not isinstance(scene, JointScene):
+        return x - start
+    n_q = scene.n_q
+    return xp.concat([scene.difference(xp, x[:n_q], start[:n_q]), x[n_q:] - start[n_q:]])
+
+
+def slope_by_changes(scene: MechanicalScene, x: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return the derivative by changes ``(n_changes, B)`` of a function of states x whose derivative is ``slope (n, B)``."""
+    if not isinstance(scene, JointScene):
+        return slope
+    rows = []
+    for i in range(n_changes(scene)):
+        change = np.zeros((n_changes(scene), x.shape[1]))
+        change[i] = STEP
+        moved = retract(scene, np, x, change) - retract(scene, np, x, -change)
+        rows.append((moved * slope).sum(axis=0) / (2 * STEP))
+    return np.stack(rows)
