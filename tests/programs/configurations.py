@@ -37,6 +37,7 @@ from exact import by_key, differences
 from bench.cli import main
 from bench.errors import UserError
 from bench.experiment import config
+from bench.experiment.views import Views
 from bench.model import registry
 from bench.model.parameters import Parameter, parameters
 from bench.report import finish
@@ -330,7 +331,7 @@ class Ledger:
 
         config.load = loaded
         if not charts:
-            finish.write = lambda *_: (None, [])
+            finish.write = lambda *_: (Views(()), [])
         try:
             with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
                 return main(["run", *words, f"results_dir={folder}"]), err.getvalue().strip()
