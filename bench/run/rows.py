@@ -57,7 +57,6 @@ _reported: set[str] = set()
 
 def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFrame:
     """Return the table in a Parquet file, or some of its columns; raises ValueError if it claims more rows or bytes than a run writes."""
-    import pandas as pd
     import pyarrow.parquet
 
     # read once: pandas opens a path twice, and the file may be replaced in between
