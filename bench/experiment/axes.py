@@ -211,16 +211,23 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
 
     Rows whose plugins are not installed keep their identity strings.
     """
+    import pandas as pd
+
     names = [name for axis in axes for name in axis.names]
     read = cache(lambda text: _labels(json.loads(text), names))
+    codes, distinct = pd.factorize(rows["parameters"]) if "parameters" in rows else ([], [])
     lines = []
-    for given in parse(rows):
+    for given in parse(pd.DataFrame({"parameters": distinct})):
         estimator = {axis: part for axis, part in given.items() if axis == "estimator"}
         problem = {axis: part for axis, part in given.items() if axis != "estimator"}
         lines.append(read(json.dumps(problem)) | read(json.dumps(estimator)))
-    changed = {name for line in lines for name in line}
+    changed = dict.fromkeys(name for line in lines for name in line)
+    columns = {name: [line.get(name) for line in lines] for name in changed}
     return rows.assign(
-        **{name: [line.get(name, old) for line, old in zip(lines, rows[name], strict=True)] for name in changed}
+        **{
+            name: [old if (new := texts[code]) is None else new for code, old in zip(codes, rows[name], strict=True)]
+            for name, texts in columns.items()
+        }
     )
 
 

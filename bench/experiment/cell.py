@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
-from bench.experiment.keys import PROGRAM, REFERENCE, fingerprint, hashed, module_hash
+from bench.experiment.keys import PROGRAM, REFERENCE, fingerprint, hash_of_text, hashed, module_hash
 from bench.experiment.reference_backends import capable_backends
 from bench.model import (
     Backend,
@@ -64,6 +64,8 @@ _ranked: dict[str, tuple[Backend, ...]] = {}
 """Cache of the backends that can compute references, best first, by program key."""
 _program_keys: dict[tuple[str, ...], str] = {}
 """Cache of the keys of programs, by all that decides them."""
+_rest: dict[tuple[Any, ...], tuple[str, str]] = {}
+"""Cache of what keys are hashes of apart from counts, as JSON before and after them, by all that decides it."""
 _reference_keys: dict[tuple[str, ...], str] = {}
 """Cache of the keys of references, by all that decides them."""
 
@@ -118,14 +120,18 @@ class Cell:
     @cached_property
     def key(self) -> str:
         """Hash of everything that decides the cell's numbers, except library versions, which have a column."""
-        counts = [self.samples, self.repeats, self.seed, self.timing]
-        reference = None if self.budget is None else [self.reference_key, module_hash(REFERENCE)]
-        # a study may use this backend besides the cell's own
-        best = fingerprint(next(iter(self.ranked_backends), None))
-        return hashed(
-            {axis: fingerprint(part) for axis, part in self.parts.items()}, counts, reference, best, self._budget(),
-            self._theta(), fingerprint(self.study), module_hash(PROGRAM),
-        )  # fmt: skip
+        parts = {axis: fingerprint(part) for axis, part in self.parts.items()}
+        counts = json.dumps([self.samples, self.repeats, self.seed, self.timing])
+        theta = "" if self.decision is OWN else repr(self.decision)
+        given = (*parts.items(), theta, repr(self.budget), fingerprint(self.study))
+        if given not in _rest:
+            reference = None if self.budget is None else [self.reference_key, module_hash(REFERENCE)]
+            # a study may use this backend besides the cell's own
+            best = fingerprint(next(iter(self.ranked_backends), None))
+            after = [reference, best, self._budget(), self._theta(), fingerprint(self.study), module_hash(PROGRAM)]
+            _rest[given] = (json.dumps(parts), json.dumps(after)[1:])
+        before, rest = _rest[given]
+        return hash_of_text(f"[{before}, {counts}, {rest}")
 
     @cached_property
     def program_key(self) -> str:

@@ -70,7 +70,12 @@ def _completed_json(text: str, folders: tuple[Path, ...]) -> str:
 
 def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the column ``parameters`` completed, so that rows stored before and after a change agree."""
-    return rows.assign(parameters=rows["parameters"].map(completed_json)) if "parameters" in rows else rows
+    if "parameters" not in rows:
+        return rows
+    texts = {text: completed_json(text) for text in rows["parameters"].unique()}
+    if all(text is new or text == new for text, new in texts.items()):
+        return rows
+    return rows.assign(parameters=rows["parameters"].map(texts))
 
 
 def defaults_of(axis: str, given: Mapping[str, Any]) -> dict[str, Any]:

@@ -69,7 +69,12 @@ def fingerprint(plugin: Plugin | None) -> str:
 
 def hashed(*parts: Any) -> str:
     """Return a hash of JSON-like values, as 32 hexadecimal digits."""
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
+    return hash_of_text(json.dumps(parts))
+
+
+def hash_of_text(text: str) -> str:
+    """Return a hash of a string, as 32 hexadecimal digits."""
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def code(*modules: str) -> dict[str, Path]:

@@ -20,53 +20,75 @@ from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, registry
 from bench.model.identity import changed, identity
 from bench.model.parameters import build
-from bench.report.cells import records
 
 HEAD = "python -m bench name=one_cell"
 
 
 def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     """Return, per row, the words after :data:`HEAD` that rerun its cell, shell-quoted; empty if a plugin is missing."""
-    folders = plugin_folders(experiment.plugins)
-    revive = CellBuilder()
-    lines: list[list[str]] = []
-    for given, row in zip(parse(rows), records(rows[["key", *COUNTS]]), strict=True):
+    folders = [shlex.quote(word) for word in plugin_folders(experiment.plugins)]
+    builder = PluginBuilder()
+    codes, distinct = pd.factorize(rows["parameters"]) if "parameters" in rows else ([0] * len(rows), [""])
+    parsed = parse(pd.DataFrame({"parameters": distinct}))
+    every = [_Commands(builder, given, folders, experiment.timing) for given in parsed]
+    facts = zip(codes, rows["key"], *(rows[name].tolist() for name in COUNTS), strict=True)
+    return [every[code].words(key, counts) for code, key, *counts in facts]
+
+
+class _Commands:
+    """The commands of rows with the same parameters, which differ in counts and in whether they are timed."""
+
+    def __init__(
+        self, builder: PluginBuilder, given: Mapping[str, Any], folders: Sequence[str], is_timed: bool
+    ) -> None:
+        self._folders, self._is_timed = folders, is_timed
+        self._settings: dict[bool, tuple[list[str], list[str]]] = {}
         try:
-            cell = revive.cell(given, row, experiment.timing)
+            self._cell: Cell | None = builder.cell(given)
         except (UserError, KeyError):
-            lines.append([])
-        else:
-            lines.append([shlex.quote(word) for word in [*folders, *cell_settings(cell)]])
-    return lines
+            self._cell = None
+
+    def words(self, key: str, counts: Sequence[float]) -> list[str]:
+        """Return the words that rerun the cell of a row, given its key and counts.
+
+        The parameters do not contain whether the cell was timed, but its key depends on it. The experiment's choice is
+        used if neither choice gives the row's key, because its plugins have changed since.
+        """
+        if self._cell is None:
+            return []
+        numbers = {name: int(value) for name, value in zip(COUNTS, counts, strict=True)}
+        other = dataclasses.replace(self._cell, **numbers, timing=not self._is_timed)
+        try:
+            is_timed = not self._is_timed if other.key == key else self._is_timed
+        except (UserError, KeyError):
+            return []
+        if is_timed not in self._settings:
+            before, after = _settings_around_counts(dataclasses.replace(self._cell, timing=is_timed))
+            self._settings[is_timed] = [*map(shlex.quote, before)], [*map(shlex.quote, after)]
+        before, after = self._settings[is_timed]
+        return [*self._folders, *before, *(f"{name}={number}" for name, number in numbers.items()), *after]
 
 
-class CellBuilder:
-    """Builds cells from rows; each plugin is built once and shared."""
+class PluginBuilder:
+    """Builds the plugins of rows; each is built once and shared."""
 
     def __init__(self) -> None:
         self._known: dict[str, Plugin] = {}
 
-    def cell(self, given: Mapping[str, Any], row: Mapping[Any, Any], timing: bool) -> Cell:
-        """Return the cell of a row's parameters and counts; raises :class:`UserError` if a plugin is not installed.
-
-        The parameters do not contain whether the cell was timed, but its key depends on it. ``timing`` is used if
-        neither choice gives the row's key, because its plugins have changed since.
-        """
+    def cell(self, given: Mapping[str, Any]) -> Cell:
+        """Return a cell of a row's parameters, with counts of 0; raises :class:`UserError` if a plugin is not installed."""
         study = self._plugin("study", given["study"])
         assert study is not None
         theta, budget = given["theta"], given["reference"]
-        cell = Cell(
+        return Cell(
             {axis: self._plugin(axis, part) for axis, part in given.items() if axis not in NOT_PLUGINS},
-            **{name: int(row[name]) for name in COUNTS},
+            **dict.fromkeys(COUNTS, 0),
             study=study,
             decision=Decision()
             if theta is None
             else Decision(tuple(theta["names"]), theta["at"] and tuple(theta["at"])),
-            timing=timing,
             budget=None if budget is None else Budget(**budget),
         )
-        other = dataclasses.replace(cell, timing=not timing)
-        return other if other.key == row["key"] else cell
 
     def _plugin(self, axis: str, part: Mapping[str, Any] | None) -> Plugin | None:
         if part is None:
@@ -80,17 +102,22 @@ class CellBuilder:
 
 def cell_settings(cell: Cell) -> list[str]:
     """Return the settings, as command-line words, of an experiment with only this cell, which has the same key."""
-    parts = [f"study={_identity(cell.study)}", *plugin_settings(cell)]
-    parts += [f"{name}={getattr(cell, name)}" for name in ("samples", "repeats", "seed")]
-    parts += theta_settings(cell)
+    before, after = _settings_around_counts(cell)
+    return [*before, *(f"{name}={getattr(cell, name)}" for name in COUNTS), *after]
+
+
+def _settings_around_counts(cell: Cell) -> tuple[list[str], list[str]]:
+    """Return the settings of :func:`cell_settings` before and after those of the counts."""
+    before = [f"study={_identity(cell.study)}", *plugin_settings(cell)]
+    after = theta_settings(cell)
     if cell.budget is not None:
         default = Budget()
         for name in ("samples", "tolerance"):
             if getattr(cell.budget, name) != getattr(default, name):
-                parts.append(f"reference.{name}={getattr(cell.budget, name)!r}")
+                after.append(f"reference.{name}={getattr(cell.budget, name)!r}")
     if isinstance(cell.study, Study) and cell.timing != cell.study.timed:
-        parts.append(f"timing={str(cell.timing).lower()}")
-    return parts
+        after.append(f"timing={str(cell.timing).lower()}")
+    return before, after
 
 
 def plugin_settings(cell: Cell, without: Collection[str] = ()) -> list[str]:

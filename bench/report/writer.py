@@ -13,7 +13,7 @@ import pandas as pd
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.report import terminal
-from bench.report.cells import TableCell, cell, parts, readable, records
+from bench.report.cells import TableCell, parts, readable, text_rows
 from bench.report.cores import run_tasks
 from bench.report.draw import draw
 from bench.report.figures import save, styled
@@ -77,10 +77,7 @@ def markdown(tables: Sequence[Table], experiment: str) -> str:
                 blocks.append(f"**{e(heading)}**")
             head = "| " + " | ".join(e(column.heading) for column in table.columns) + " |"
             rule = "|" + "".join("--:|" if column.kind == "number" else "---|" for column in table.columns)
-            lines = [
-                "| " + " | ".join(_in_markdown(cell(column, row)) for column in table.columns) + " |"
-                for row in records(part)
-            ]
+            lines = ["| " + " | ".join(row) + " |" for row in text_rows(table.columns, part, _in_markdown)]
             blocks.append("\n".join([head, rule, *lines]))
         blocks += [note if note.startswith("    ") else e(note) for note in table.notes]  # a command is a block of code
     return "\n\n".join(blocks) + "\n"

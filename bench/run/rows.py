@@ -57,19 +57,33 @@ _reported: set[str] = set()
 
 def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFrame:
     """Return the table in a Parquet file, or some of its columns; raises ValueError if it claims more rows or bytes than a run writes."""
-    import pandas as pd
     import pyarrow.parquet
 
     # read once: pandas opens a path twice, and the file may be replaced in between
     content = io.BytesIO(path.read_bytes())
-    metadata = pyarrow.parquet.ParquetFile(content).metadata
+    file = pyarrow.parquet.ParquetFile(content)
+    metadata = file.metadata
     size = sum(metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups))
     if metadata.num_rows > MAX_ROWS or size > MAX_BYTES:
         raise ValueError(f"{metadata.num_rows} rows and {size} bytes are more than a run writes")
+    texts = [field.name for field in file.schema_arrow if str(field.type) in ("string", "large_string")]
     content.seek(0)
+    table = pyarrow.parquet.read_table(content, columns=columns and list(columns), read_dictionary=texts)
     # a column is freed as soon as it is converted
-    freed = {"split_blocks": True, "self_destruct": True}
-    return pd.read_parquet(content, columns=columns and list(columns), to_pandas_kwargs=freed)
+    frame = table.to_pandas(split_blocks=True, self_destruct=True)
+    return frame.assign(**{name: _shared(frame[name]) for name in texts if name in frame})
+
+
+def _shared(values: pd.Series) -> pd.Series:
+    """Return a categorical column as strings, of which equal ones are one object: most columns have few distinct strings."""
+    import numpy as np
+    import pandas as pd
+
+    if not isinstance(values.dtype, pd.CategoricalDtype):
+        return values
+    distinct = np.array([*values.cat.categories, math.nan], dtype=object)  # the code of a missing string is -1
+    dtype = pd.StringDtype("python", na_value=math.nan)
+    return pd.Series(pd.array(distinct[values.cat.codes.to_numpy()], dtype=dtype), index=values.index)
 
 
 def valid_rows(table: pd.DataFrame, columns: Columns, path: Path) -> pd.DataFrame:

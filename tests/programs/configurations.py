@@ -1,7 +1,8 @@
-"""Runs random valid and spoilt configurations: ``python tests/programs/configurations.py COUNT [SEED] [files]``.
+"""Runs random valid and spoilt configurations: ``python tests/programs/configurations.py COUNT [SEED] [files | calls]``.
 
 With ``files``, most settings of a configuration are an experiment file of the user's, some replaced on the command line,
-and its sweep is nested up to three levels, with ranges. Otherwise all are words of the command line.
+and its sweep is nested up to three levels, with ranges. With ``calls``, each is a call of ``bench.run``, with
+nested dictionaries, tuples, NumPy numbers and arrays as values. Otherwise all are words of the command line.
 
 Studies, plugins, parameters within their bounds, sweeps and settings are drawn from the declarations in the registry. Then
 one word of every fourth configuration is spoilt. Each configuration is run in this process, with few samples, into a folder
@@ -31,12 +32,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from exact import by_key, differences
 
+from bench import api
 from bench.cli import main
 from bench.errors import UserError
 from bench.experiment import config
+from bench.experiment.views import Views
 from bench.model import registry
 from bench.model.parameters import Parameter, parameters
 from bench.report import finish
@@ -229,6 +233,42 @@ def in_file(dice: random.Random, words: list[str], folder: Path) -> list[str]:
     return [*TINY, "experiment=mine", "--config-dir", str(folder), *kept, words[-1]]
 
 
+def as_settings(dice: random.Random, words: list[str]) -> dict[str, Any]:
+    """Return words as keyword arguments of ``bench.run``, some values as tuples, NumPy numbers and arrays."""
+    settings: dict[str, Any] = {}
+    for word in words:
+        key, equals, given = word.partition("=")
+        if not equals:
+            continue
+        value: Any = items(given) if key in registry.kinds() and given.startswith("[") else given
+        with contextlib.suppress(yaml.YAMLError):
+            value = yaml.safe_load(re.sub(r":(?=\S)", ": ", given)) if isinstance(value, str) else value
+        place, path = settings, key.split(".")
+        if path[0] == "sweep" and path[1:2] not in ([], ["zip"], ["union"]):
+            path = ["sweep", ".".join(path[1:])]
+        for name in path[:-1]:
+            if not isinstance(place.setdefault(name, {}), dict):
+                place[name] = {}
+            place = place[name]
+        place[path[-1]] = of_python(dice, value)
+    return settings
+
+
+def of_python(dice: random.Random, value: Any) -> Any:
+    """Return a value as a Python program may have it: a tuple, a NumPy number or an array, or unchanged."""
+    if isinstance(value, dict):
+        return {name: of_python(dice, inner) for name, inner in value.items()}
+    if isinstance(value, list) and value and all(type(one) is float for one in value):
+        return dice.choice([value, tuple(value), np.array(value)])
+    if isinstance(value, list):
+        return dice.choice([value, tuple(value)])
+    if type(value) is float:
+        return dice.choice([value, np.float64(value)])
+    if type(value) is int and abs(value) < 2**63:
+        return dice.choice([value, np.int64(value)])
+    return value
+
+
 def spoil(dice: random.Random, words: list[str]) -> list[str]:
     """Return the words with one random word spoilt, other than :data:`TINY` and the folder's name."""
     place = dice.randrange(len(TINY), len(words) - 1)
@@ -303,7 +343,8 @@ def is_refusal(said: str) -> bool:
 class Ledger:
     """Runs configurations, and records their rows and faults."""
 
-    def __init__(self, place: Path, seed: int) -> None:
+    def __init__(self, place: Path, seed: int, calls: bool = False) -> None:
+        self.calls = calls
         self.place, self.dice = place, random.Random(seed)
         self.statuses: Counter[Any] = Counter()
         self.rows: Counter[str] = Counter()
@@ -330,14 +371,25 @@ class Ledger:
 
         config.load = loaded
         if not charts:
-            finish.write = lambda *_: (None, [])
+            finish.write = lambda *_: (Views(()), [])
         try:
             with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+                if self.calls:
+                    return self.call(words, folder, err)
                 return main(["run", *words, f"results_dir={folder}"]), err.getvalue().strip()
         except BaseException:
             return None, f"{err.getvalue()} {traceback.format_exc()}"
         finally:
             finish.write, config.load = write, load
+
+    def call(self, words: list[str], folder: Path, err: io.StringIO) -> tuple[int, str]:
+        """Call ``bench.run`` with the settings of ``words``; returns what the command would."""
+        settings = as_settings(random.Random(repr(words)), words)
+        try:
+            rows = api.run(**settings, results_dir=folder)
+        except UserError as error:
+            return 2, f"{err.getvalue()}bench: {error}".strip()
+        return int((rows["status"] == "error").any()), err.getvalue().strip()
 
     def stored(self, name: str, folder: Path) -> dict[str, dict[str, Any]]:
         """Return the rows stored under ``name`` in a folder, by key, as :func:`exact.bits`."""
@@ -422,7 +474,7 @@ class Ledger:
         self.held, self.folder = {}, self.place / str(int(self.folder.name) + 1)
 
 
-def search(count: int, seed: int, files: bool = False) -> Ledger:
+def search(count: int, seed: int, how: str = "") -> Ledger:
     """Draw and run ``count`` configurations, and return their rows and faults."""
     backend = registry.find("backends", "numpy").plugin
     assert backend is not None
@@ -430,13 +482,13 @@ def search(count: int, seed: int, files: bool = False) -> Ledger:
     backend.reference_rank = -1  # type: ignore[attr-defined]  # compiling for each structure would take most of the time
     try:
         with tempfile.TemporaryDirectory() as place:
-            ledger = Ledger(Path(place), seed)
+            ledger = Ledger(Path(place), seed, how == "calls")
             for number in range(count):
                 words = drawn(ledger.dice)
                 if ledger.dice.random() < SPOILT:
                     words = spoil(ledger.dice, words)
                     ledger.done["spoilt"] += 1
-                if files:
+                if how == "files":
                     words = in_file(ledger.dice, words, Path(place) / "conf")
                 try:
                     ledger.check(words, charts=ledger.dice.random() < WRITTEN)
@@ -449,13 +501,13 @@ def search(count: int, seed: int, files: bool = False) -> Ledger:
         backend.reference_rank = before  # type: ignore[attr-defined]
 
 
-def show(count: int, seed: int, files: bool = False) -> int:
+def show(count: int, seed: int, how: str = "") -> int:
     """Run ``count`` configurations, print the counts, and return the exit status."""
     started = time.process_time()
-    ledger = search(count, seed, files)
+    ledger = search(count, seed, how)
     valid = sum(number for status, number in ledger.statuses.items() if status in (0, 1))
     print(
-        f"{count} configurations of seed {seed}{' in files' * files}: {valid} valid, statuses {dict(ledger.statuses)}, {dict(ledger.done)}; "
+        f"{count} configurations of seed {seed}{f' as {how}' * bool(how)}: {valid} valid, statuses {dict(ledger.statuses)}, {dict(ledger.done)}; "
         f"rows {dict(ledger.rows)}; faults {dict(ledger.faults) or 'none'}; {time.process_time() - started:.0f} s"
     )
     return 1 if ledger.faults else 0
@@ -463,4 +515,6 @@ def show(count: int, seed: int, files: bool = False) -> int:
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    sys.exit(show(int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0, "files" in sys.argv))
+    sys.exit(
+        show(int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0, sys.argv[3] if len(sys.argv) > 3 else "")
+    )

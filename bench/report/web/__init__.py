@@ -9,7 +9,7 @@ import pandas as pd
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Views
 from bench.report import reproduce
-from bench.report.web.document import assemble
+from bench.report.web.document import blocks
 from bench.run.files import write_whole
 from bench.run.rows import read_record
 
@@ -18,6 +18,6 @@ def write(experiment: Experiment, rows: pd.DataFrame, views: Views) -> list[Path
     """Write ``report.html`` from rows and what the study shows of them, with the facts of ``run.json``; return its path."""
     rows = rows.reset_index(drop=True)
     path = experiment.directory / "report.html"
-    text = assemble(experiment, rows, views, reproduce.commands(experiment, rows), read_record(path.parent))
-    write_whole(path, text.encode())
+    text = blocks(experiment, rows, views, reproduce.commands(experiment, rows), read_record(path.parent))
+    write_whole(path, (block.encode() for block in text))
     return [path]

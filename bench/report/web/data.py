@@ -26,6 +26,7 @@ DARK = {"#000000": "#ffffff"}
 """Replacements for colours on a dark page; all other colours are visible on both backgrounds."""
 DIGITS = 6
 """Significant digits of the numbers in a page."""
+FORMAT = f".{DIGITS}g"
 MOST = 24
 """Largest number of distinct values of a column that is offered as a filter."""
 IN_SIGHT, FIRST = 5, 3
@@ -204,11 +205,15 @@ def encode(values: pd.Series) -> Any:
     if pd.api.types.is_bool_dtype(values) or not pd.api.types.is_numeric_dtype(values):
         codes, unique = pd.factorize(values.astype(str))
         return {"values": list(unique), "index": codes.tolist()}
-    return [_short(value) for value in values.tolist()]
+    codes, unique = pd.factorize(values)
+    if 2 * len(unique) > len(values):
+        return [_short(value) for value in values.tolist()]
+    short = [*map(_short, unique.tolist()), None]  # the code of a missing number is -1, the last place
+    return [short[code] for code in codes.tolist()]
 
 
 def _short(value: float) -> float | int | None:
     if value is None or not math.isfinite(value):
         return None
-    value = float(f"{value:.{DIGITS}g}")
+    value = float(format(value, FORMAT))
     return int(value) if value.is_integer() and abs(value) < 1e15 else value

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+import uuid
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from html import escape
 from importlib.util import find_spec
@@ -30,6 +31,17 @@ def assemble(
     record: Mapping[str, Any],
 ) -> str:
     """Return the page as HTML. ``commands`` are the words that run each row's cell, ``record`` is ``run.json``."""
+    return "".join(blocks(experiment, rows, views, commands, record))
+
+
+def blocks(
+    experiment: Experiment,
+    rows: pd.DataFrame,
+    views: Views,
+    commands: Sequence[Sequence[str]],
+    record: Mapping[str, Any],
+) -> Iterator[str]:
+    """Yield :func:`assemble` in blocks, so that a long page is never in memory as one string."""
     counts = (rows if views.rows is None else views.rows)["status"].value_counts()
     statuses = "".join(f'<li class="{escape(str(s))}"><b>{n}</b> {escape(str(s))}</li>' for s, n in counts.items())
     data = page_data(experiment, rows, views, commands)
@@ -41,11 +53,25 @@ def assemble(
         "counts": f"<li><b>{counts.sum()}</b> cells</li>{statuses}",
         "answers": _answers(views),
         "made": _made(record),
-        "data": in_script(json.dumps(data, separators=(",", ":"), allow_nan=False)),
+        "data": (place := uuid.uuid4().hex),
     }
     template = (HERE / "page.html").read_text()
     body = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
-    return shell.document(experiment.name, body, [plotly(), shell.script("page.js")])
+    before, after = shell.document(experiment.name, body, [plotly(), shell.script("page.js")]).split(place)
+    yield before
+    yield from map(in_script, json_blocks(data))
+    yield after
+
+
+def json_blocks(value: Any) -> Iterator[str]:
+    """Yield a value as JSON: the items of nested dictionaries one by one."""
+    if isinstance(value, dict) and value:
+        for number, (name, inner) in enumerate(value.items()):
+            yield f"{',' if number else '{'}{json.dumps(name)}:"
+            yield from json_blocks(inner)
+        yield "}"
+    else:
+        yield json.dumps(value, separators=(",", ":"), allow_nan=False)
 
 
 def in_script(text: str) -> str:
