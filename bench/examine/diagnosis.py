@@ -19,7 +19,9 @@ from bench.model.simulator.simulator import Simulator
 SUSPICIOUS = ("wrong_factor", "missing_term", "wrong_adjoint")
 """Causes that adaptive steps imitate."""
 NEAR = 0.05
-"""Largest relative error of a gradient for which adaptive steps are considered."""
+"""Largest relative error of a gradient that small jumps may explain."""
+FAR, FAR_JUMPS = 0.25, 0.5
+"""Largest relative error that larger jumps may explain, and their largest total height, as a share of the cost's change."""
 EXPLAINED = 10.0
 """Largest error of a gradient on a line, in multiples of the jumps' total height over the length of the line."""
 SMALL_JUMPS = 0.05
@@ -118,53 +120,66 @@ def grows(horizons: Sequence[Horizon], tolerance: float) -> bool:
     return last in wrong and (len(wrong) == 1 or last.error > GROWTH * wrong[0].error)
 
 
+def relative_error(outcome: Check) -> float:
+    """Return the norm of gradient minus differences over that of the differences, in units of each input's scale.
+
+    A discretisation changes all components by an amount of one size, which is large beside a small component.
+    """
+    parts = [part for part in outcome.parts if np.isfinite([part.program, part.difference]).all()]
+    single = [part for part in parts if part.component is not None]
+    scale = np.array([part.sample.scale for part in single])
+    differences = np.array([part.difference for part in single]) * scale
+    apart = np.array([part.program for part in single]) * scale - differences
+    size = float(np.linalg.norm(differences))
+    errors = [(float(np.linalg.norm(apart)), size)]
+    # a group or a direction has length 1 in these units
+    whole = [part for part in parts if part.component is None]
+    errors += [(abs(part.program - part.difference), max(abs(part.difference), size)) for part in whole]
+    return max(error / size if size > 0 else float("inf") for error, size in errors)
+
+
 def may_be_adaptive(outcome: Check) -> bool:
     """Return whether a gradient is wrong by so little that adaptive steps may be the reason."""
-    errors = [part.error for part in outcome.worst_parts if np.isfinite(part.error)]
-    return outcome.cause in SUSPICIOUS and bool(errors) and max(errors) <= NEAR
+    return outcome.cause in SUSPICIOUS and relative_error(outcome) <= NEAR
 
 
 def is_adaptive(
     stages: GradientStages, outcome: Check, lines: Sequence[LineScan], points: int, halvings: int, most: int
 ) -> bool:
-    """Return whether small jumps of the cost are as large as the error of the gradient, as with adaptive steps.
+    """Return whether the jumps of the cost explain the error of the gradient, as with adaptive steps.
 
     A solver with adaptive steps has another discretisation error on either side of each change of its number of steps.
     Its cost has a small jump there, and slopes between jumps that differ from the solution's slopes by about the height
-    of a jump over the distance between jumps. Reverse mode through such a solver holds the steps fixed, so its gradient
-    differs by as much. Where few jumps are found, a line ten times as long is searched, as :func:`scan` does with
-    ``points``, ``halvings`` and ``most``.
+    of a jump over the distance between jumps. Reverse mode through such a solver holds the steps fixed, and an adjoint
+    that is solved separately has steps of its own, so these gradients differ by as much. Where few jumps are found
+    beside a small error, a line ten times as long is searched, as :func:`scan` does with ``points``, ``halvings`` and
+    ``most``. A larger error counts where the jumps on the first lines change the cost by more than the error does.
     """
-    if stages.gradient is None:
-        return False
     lines = [line for line in lines if np.isfinite(line.costs).all()]
-    if lines and sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
-        first = lines[0]
-        reach = LONGER * float(first.at[-1])
-
-        def cost(t: np.ndarray) -> np.ndarray:
-            return stages.costs(stages.theta[:, None] + first.direction[:, None] * t)
-
-        noise = max(outcome.noise, stages.spread)
-        lines = [
-            replace(
-                scan(cost, np.zeros(1), np.ones(1), noise, reach, points, halvings, most, stages.simulator.unit),
-                direction=first.direction,
-            )
-        ]
-    jumps = [jump for line in lines for jump in line.jumps]
-    if len(jumps) < FEWEST_JUMPS:
+    error = relative_error(outcome)
+    if stages.gradient is None or not lines or error > FAR:
         return False
-    votes = []
+
+    def along(line: LineScan, t: np.ndarray) -> np.ndarray:
+        return stages.costs(stages.theta[:, None] + line.direction[:, None] * t)
+
+    if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS and error <= NEAR:
+        first, noise = lines[0], max(outcome.noise, stages.spread)
+        reach, unit = LONGER * float(first.at[-1]), stages.simulator.unit
+        longer = scan(lambda t: along(first, t[0]), np.zeros(1), np.ones(1), noise, reach, points, halvings, most, unit)
+        lines = [replace(longer, direction=first.direction)]
+    if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
+        return False
+    rows = []
     for line in lines:
-        height = sum(jump.size for jump in line.jumps)
-        length = float(line.at[-1] - line.at[0])
         step = 1e-3 * float(line.at[1] - line.at[0])
-        costs = stages.costs(stages.theta[:, None] + line.direction[:, None] * np.array([-step, step]))
+        costs = along(line, np.array([-step, step]))
         apart = abs(float((costs[1] - costs[0]) / (2 * step) - line.direction @ stages.gradient))
-        is_small = height < SMALL_JUMPS * float(np.abs(np.diff(line.costs)).sum())
-        votes.append(is_small and apart <= EXPLAINED * height / length)
-    return any(votes)
+        rows.append((sum(jump.size for jump in line.jumps), np.abs(np.diff(line.costs)).sum(), apart * np.ptp(line.at)))
+    heights, changes, errors = np.array(rows).T
+    if error <= NEAR and ((heights < SMALL_JUMPS * changes) & (errors <= EXPLAINED * heights)).any():
+        return True
+    return bool(heights.sum() < FAR_JUMPS * changes.sum() and (errors <= heights).all())
 
 
 def _simulator(stages: GradientStages, cost: Callable[..., Any], grad: Any) -> Simulator:

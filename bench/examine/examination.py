@@ -234,7 +234,8 @@ class _Examination:
         self.scale, self.levels, self.seed = setup.scale, setup.levels, setup.seed
         self.theta = self.layout.vector
         self.left_out: list[str] = []
-        self.is_adaptive = False
+        self.is_adaptive: bool | None = None
+        """Whether adaptive steps explain the error; None before that is known."""
         self._lines: list[LineScan] | None = None
         random = np.random.default_rng([setup.seed, 0x6578616D])
         w = random.standard_normal((simulator.noise, 1)) if simulator.noise else None
@@ -259,7 +260,9 @@ class _Examination:
             growth = self._attempt("horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons))
             other["growth"] = growth or []
         can_go_on = not (stages.gradient is None and simulator.has_gradient) and not stages.is_failed
-        lines = self._scan_lines(checked) if can_go_on else []
+        self._lines = lines = self._scan_lines(checked) if can_go_on else []
+        if checked is not None and checked.cause in diagnosis.SUSPICIOUS and can_go_on and self.is_adaptive is None:
+            self.is_adaptive = self._compare_along_lines(checked)
         smoothed = self._measure_noise(checked) if can_go_on else []
         if clock.is_terminated:
             self.left_out.append("everything after SIGTERM")
@@ -301,7 +304,8 @@ class _Examination:
             error=simulator.gradient_error if stages.is_failed else "",
             elsewhere=simulator.gradient_error if not stages.is_failed else "",
             n_failed=simulator.n_failed_gradients,
-            is_adaptive=self.is_adaptive,
+            is_adaptive=bool(self.is_adaptive),
+            is_unexplained=self.is_adaptive is None and checked is not None and diagnosis.may_be_adaptive(checked),
             printed=simulator.printed,
             notes=[*simulator.notes, *self._exceptions()],
             left_out=self.left_out,
@@ -323,17 +327,23 @@ class _Examination:
     # ------------------------------------------------------------------------------------------------ lines
 
     def _is_adaptive(self, checked: Check) -> bool:
-        """Return whether small jumps of the cost are as large as the small error of a gradient, as with adaptive steps."""
+        """Return whether adaptive steps explain the small error of a gradient, and keep the answer."""
         if not diagnosis.may_be_adaptive(checked):
             return False
         self._lines = self._scan_lines(checked, EARLY_SHARE)
+        self.is_adaptive = self._compare_along_lines(checked)
+        return bool(self.is_adaptive)
 
-        def decide() -> bool:
+    def _compare_along_lines(self, checked: Check) -> bool | None:
+        """Return whether the jumps on the lines explain the gradient's error; None where the budget ends before."""
+
+        def decide() -> bool | None:
             effort = self._effort(self.clock.affordable(0.9))
-            return effort is not None and diagnosis.is_adaptive(self.stages, checked, self._lines or [], *effort)
+            if effort is None or not self._lines:
+                return None
+            return diagnosis.is_adaptive(self.stages, checked, self._lines, *effort)
 
-        self.is_adaptive = bool(self._attempt("the comparison along lines", decide))
-        return self.is_adaptive
+        return None if self._lines == [] else self._attempt("the comparison along lines", decide)
 
     @staticmethod
     def _effort(room: float) -> tuple[int, int, int] | None:

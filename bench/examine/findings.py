@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.examine.diagnosis import SUSPICIOUS, Horizon, grows
+from bench.examine.diagnosis import NEAR, SUSPICIOUS, Horizon, grows, may_be_adaptive
 from bench.examine.gradient import recaused
 from bench.examine.lines import ALIKE, LineScan
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
@@ -64,8 +64,9 @@ NOT_SHOWN = ("undecided", "unsettled", "nonfinite", "adaptive", "zero", "spread"
 """Causes that decide neither for nor against a gradient: exit status 3."""
 DIFFERENT = 1e-6
 """Relative difference of two costs that must agree, in double precision."""
-REFINED = 0.1
-"""Least distance between the differences of the cost and of a refined cost, relative to the gradient's error, of a discretisation gap."""
+REFINED, REFINED_FAR = 0.1, 0.3
+"""Least distance between the differences of the cost and of a refined cost, relative to the gradient's error, of a discretisation
+gap: for a small error, and for a larger one."""
 CLEAR_ORDER = 1.5
 """Order of a Taylor remainder below which it shows a wrong gradient."""
 SHOWN = 8
@@ -149,7 +150,9 @@ class Findings:
     n_failed: int
     """Number of gradient calls that raised an exception."""
     is_adaptive: bool
-    """Whether small jumps of the cost are as large as the error of the gradient."""
+    """Whether the jumps of the cost explain the error of the gradient."""
+    is_unexplained: bool
+    """Whether the error is so small that adaptive steps may explain it, and the budget ended before that was known."""
     printed: Printed
     notes: Sequence[str]
     left_out: Sequence[str]
@@ -237,11 +240,11 @@ class Findings:
             return "nondeterministic"
         if self.wrong_checks:
             cause = self.wrong_checks[0].cause
-            if cause in SUSPICIOUS and (self.is_adaptive or self.is_discretisation_gap):
+            if cause in SUSPICIOUS and (self.is_adaptive if self.refined is None else self.is_discretisation_gap):
                 return "adaptive"
             if cause in (*SUSPICIOUS, "unsettled", "disconnected") and self.is_overwritten:
                 return "overwritten"
-            return cause
+            return "undecided" if cause in SUSPICIOUS and self.is_unexplained and self.refined is None else cause
         if not check.components or not self.is_complete:
             return "undecided"
         if any(line.steps for line in self.lines) or self.tread:
@@ -255,16 +258,17 @@ class Findings:
 
     @property
     def is_discretisation_gap(self) -> bool:
-        """Whether the differences of the cost are as far from the refined cost's as the gradient is from them."""
+        """Whether the differences of the cost and of the refined cost are as far apart as the gradient is from the former."""
         if self.refined is None or self.check is None:
             return False
-        cost = {part.name: part for part in self.check.components}
+        cost = {part.name: part for part in self.check.components if math.isfinite(part.error)}
         pairs = [(cost[part.name], part) for part in self.refined.components if part.name in cost]
-        pairs = [(a, b) for a, b in pairs if a.verdict in FAULTS and math.isfinite(a.error)]
-        if not pairs:
-            return False
-        own, other = max(pairs, key=lambda pair: pair[0].error)
-        return abs(own.difference - other.difference) > REFINED * abs(own.program - own.difference)
+        own, other, program, scale = np.array(
+            [(a.difference, b.difference, a.program, a.sample.scale) for a, b in pairs] or [(0.0, 0.0, 0.0, 1.0)]
+        ).T
+        error, apart = (float(np.linalg.norm(scale * (one - own))) for one in (program, other))
+        is_small = error <= NEAR * float(np.linalg.norm(scale * own))
+        return apart > (REFINED if is_small else REFINED_FAR) * error
 
     @property
     def is_overwritten(self) -> bool:
@@ -377,6 +381,9 @@ class Findings:
             return f"{text} ({', '.join(self.zeros[:6])})"
         if cause == "rough":
             return f"{text} (by {number(self.settled.noise if self.settled else math.nan)})"
+        if cause == "undecided" and self.wrong_checks:
+            small = "the gradient is off by so little that adaptive steps may explain it, and the budget ended before that was known"
+            return f"{cause}: {small} ({self._worst_size(self.wrong_checks[0])})"
         if cause == "undecided":
             return f"{text}: {self._n_checked()}"
         return self.sentence(self.wrong_checks[0])
@@ -735,7 +742,8 @@ class Findings:
             f"calls={int(2 * self.calls)}" if math.isfinite(self.calls) else f"budget={max(2 * self.budget, 60.0):.0f}s"
         )
         if cause in ("undecided", "unmeasured") or (cause == "unsettled" and self.left_out):
-            return f"{self._again(longer)}: the rest needs more calls"
+            refined = ", or refined=COST, the cost at a tighter tolerance" if cause == "undecided" and self.wrong_checks else ""
+            return f"{self._again(longer)}: the rest needs more calls{refined}"
         if cause in ("kink", "jump"):
             return f"choose a theta beside the {cause}, or {self._again(f'expect={cause}')} if it is known"
         if cause == "adaptive":
@@ -754,7 +762,10 @@ class Findings:
         if cause in SUSPICIOUS or cause == "disconnected":
             parts = self._named_parts(self.wrong_checks[0]) if self.wrong_checks else []
             names = ", ".join(self.located.get(part.name, self.label(part)) for part in parts[:3]) or "the cost"
-            adapts = "; refined=COST if its steps adapt to theta" if any(line.jumps for line in self.lines) else ""
+            has_jumps, is_near = any(line.jumps for line in self.lines), may_be_adaptive(self.wrong_checks[0])
+            adapts = "; refined=COST if its steps adapt to theta" if has_jumps else ""
+            if is_near and not has_jumps:
+                adapts = "; refined=COST if the gradient is of the equations, with a discretisation of its own"
             return (
                 f"follow {names} through the cost: cut it into parts until the ratio is 1; "
                 f"horizons=1,2,5 if it takes steps=T{adapts}"
