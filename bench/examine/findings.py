@@ -742,7 +742,11 @@ class Findings:
             f"calls={int(2 * self.calls)}" if math.isfinite(self.calls) else f"budget={max(2 * self.budget, 60.0):.0f}s"
         )
         if cause in ("undecided", "unmeasured") or (cause == "unsettled" and self.left_out):
-            refined = ", or refined=COST, the cost at a tighter tolerance" if cause == "undecided" and self.wrong_checks else ""
+            refined = (
+                ", or refined=COST, the cost at a tighter tolerance"
+                if cause == "undecided" and self.wrong_checks
+                else ""
+            )
             return f"{self._again(longer)}: the rest needs more calls{refined}"
         if cause in ("kink", "jump"):
             return f"choose a theta beside the {cause}, or {self._again(f'expect={cause}')} if it is known"
