@@ -8,7 +8,6 @@ import signal
 import sys
 from types import TracebackType
 
-
 LEAST_BYTES = 576 << 20
 """Address space below which the C library may end the process during the imports, with a message of its own."""
 

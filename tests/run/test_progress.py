@@ -95,10 +95,10 @@ def test_times_are_as_coarse_as_their_estimate():
 
 
 def test_a_run_says_after_5_s_which_reference_it_computes(monkeypatch, capsys):
-    now = 100.0
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    clock = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
     lines = progress.Lines("mine", planned(0, 12))
-    for now in (101.0, 104.9, 105.1, 106.0, 115.0, 115.2):
+    for clock[0] in (101.0, 104.9, 105.1, 106.0, 115.0, 115.2):
         lines.working("reference of callable callable (2 of 12 references done)")
     said = capsys.readouterr().err.splitlines()
     assert said == ["mine: 0/12 cells; now reference of callable callable (2 of 12 references done)"] * 2
