@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import sys
 from types import TracebackType
+
+LEAST_BYTES = 576 << 20
+"""Address space below which the C library may end the process during the imports, with a message of its own."""
 
 
 def exit_on_interrupt() -> None:
@@ -16,6 +20,10 @@ def exit_on_interrupt() -> None:
     """
     if not _is_command():
         return
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if 0 <= limit < LEAST_BYTES:
+        _show(MemoryError, MemoryError(), None)
+        os._exit(1)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _exit)
     sys.excepthook = _show

@@ -427,7 +427,7 @@ CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
     "ray": {"address": (str, True), "cells": (int, False), "cpus": (float, False), "wait": (float, False)},
     "slurm": {
         "cluster": (str, False), **dict.fromkeys(("cells", "minutes", "cpus", "parallel"), (int, False)),
-        **dict.fromkeys(("partition", "constraint", "account", "qos"), (str, True)),
+        "wait": (float, True), **dict.fromkeys(("partition", "constraint", "account", "qos"), (str, True)),
     },
 }  # fmt: skip
 """Settings by launcher: the type of each, and whether it may be null."""
@@ -444,7 +444,8 @@ def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
         for key, (kind, may_be_null) in types.items():
             value = given.get(key)
             settings[name][key] = None if value is None and may_be_null else coerce(kind, value, f"{name}.{key}")
-            if kind is not str and not settings[name][key] >= 1:
+            number = settings[name][key]
+            if kind is not str and number is not None and not number >= 1:
                 raise UserError(f"{name}.{key}={value} must be at least 1")
     n_cores, ray = os.cpu_count() or 1, settings["ray"]
     if launcher == "ray" and not (ray["address"] or os.environ.get("RAY_ADDRESS")) and ray["cpus"] > n_cores:

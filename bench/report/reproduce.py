@@ -56,8 +56,8 @@ class _Commands:
         """
         if self._cell is None:
             return []
-        numbers = {name: int(value) for name, value in zip(COUNTS, counts, strict=True)}
-        other = dataclasses.replace(self._cell, **numbers, timing=not self._is_timed)
+        samples, repeats, seed = map(int, counts)
+        other = dataclasses.replace(self._cell, samples=samples, repeats=repeats, seed=seed, timing=not self._is_timed)
         try:
             is_timed = not self._is_timed if other.key == key else self._is_timed
         except (UserError, KeyError):
@@ -66,7 +66,7 @@ class _Commands:
             before, after = _settings_around_counts(dataclasses.replace(self._cell, timing=is_timed))
             self._settings[is_timed] = [*map(shlex.quote, before)], [*map(shlex.quote, after)]
         before, after = self._settings[is_timed]
-        return [*self._folders, *before, *(f"{name}={number}" for name, number in numbers.items()), *after]
+        return [*self._folders, *before, f"samples={samples}", f"repeats={repeats}", f"seed={seed}", *after]
 
 
 class PluginBuilder:
@@ -82,7 +82,9 @@ class PluginBuilder:
         theta, budget = given["theta"], given["reference"]
         return Cell(
             {axis: self._plugin(axis, part) for axis, part in given.items() if axis not in NOT_PLUGINS},
-            **dict.fromkeys(COUNTS, 0),
+            samples=0,
+            repeats=0,
+            seed=0,
             study=study,
             decision=Decision()
             if theta is None

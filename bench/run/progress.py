@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     import rich.console
     import rich.progress
 
-LINE_S = 10.0
-"""Seconds between lines where the output is not a terminal."""
+FIRST_LINE_S, LINE_S = 5.0, 10.0
+"""Seconds before the first line and between lines where the output is not a terminal."""
 FEWEST_CELLS, FEWEST_SECONDS = 6, 5.0
 """Cells that have to be finished, and seconds of cells, before a remaining time is estimated."""
 STEADY = 2.0
@@ -112,12 +112,12 @@ class Lines(Progress):
 
     def __init__(self, name: str, planned: Sequence[Planned]) -> None:
         super().__init__(name, planned)
-        self._printed_at = self._started
+        self._printed_at = self._started + FIRST_LINE_S - LINE_S
         if self._n_stored:
             print(f"{name}: {self._n_stored} of {self._n_cells} cells are stored", file=sys.stderr)
 
     def show(self) -> None:
-        """Print a line, unless the last one is less than 10 s old."""
+        """Print a line, unless the last one is less than 10 s old, or the run is younger than 5 s."""
         if time.monotonic() - self._printed_at > LINE_S:
             self._printed_at = time.monotonic()
             parts = [f"{self._counts()} cells", self._remaining(), self._current and f"now {self._current}"]

@@ -103,11 +103,17 @@ class _Run:
     def _answers(self, tasks: list[Task], launcher: Launcher) -> Iterator[list[Answer]]:
         with guard.capture_output("a plugin"), guard.protect_process():
             groups = group_by_program(tasks)
+        n_done = 0
         for answers in launcher.run(groups):
             guard.raise_pending_interrupt()
+            n_done += len(answers)
             if answers:
                 yield answers
-            self._on_progress("; ".join(str(item) for item in launcher.current))
+            current = "; ".join(str(item) for item in launcher.current)
+            is_reference = tasks[
+                0
+            ].reference  # references count as no cells, so the counts of cells stand still meanwhile
+            self._on_progress(f"{current} ({n_done} of {len(tasks)} references done)" if is_reference else current)
 
     def _finish(self, results: list[Result], stored: bool = False) -> None:
         """Store rows, unless the machine that measured them has, and report them; raises :class:`Stopped` if due."""

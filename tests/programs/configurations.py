@@ -326,7 +326,7 @@ class Interrupted:
         runner._Run._finish = self._real  # type: ignore[method-assign]
 
 
-REMARKS = (" is given twice: ", " has no effect: ", "bench: sweep: ")
+REMARKS = (" is given twice: ", " has no effect: ", "bench: sweep: ", ", which was undone")
 """What only remarks on settings contain; a refused command may print some before its error."""
 
 
@@ -389,6 +389,8 @@ class Ledger:
             rows = api.run(**settings, results_dir=folder)
         except UserError as error:
             return 2, f"{err.getvalue()}bench: {error}".strip()
+        except runner.Stopped:
+            return 1, err.getvalue().strip()
         return int((rows["status"] == "error").any()), err.getvalue().strip()
 
     def stored(self, name: str, folder: Path) -> dict[str, dict[str, Any]]:
@@ -430,7 +432,7 @@ class Ledger:
         experiment, name = self.loaded[0], words[-1].removeprefix("name=")
         with contextlib.redirect_stderr(io.StringIO()):
             planned = plan.plan(experiment, store_of(experiment))
-        mine, stopped = self.held.get(name, {}), "on_error=stop" in words and status == 1
+        mine, stopped = self.held.get(name, {}), experiment.execution.stop and status == 1
         missing = [item.cell.key for item in planned if item.cell.key not in mine]
         if missing and not stopped:
             self.fault("lost", words, f"{len(missing)} cells of {len(planned)} have no row")

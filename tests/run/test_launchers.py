@@ -4,6 +4,7 @@ import ast
 import importlib
 import importlib.util
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -228,6 +229,41 @@ def test_a_job_on_another_kind_of_machine_measures_nothing(tmp_path):
         jobs.read_message(tasks[0], said[0][1], "another kind")
 
 
+FAKE = {
+    "sbatch": "echo Submitted batch job 4242",
+    "srun": "exit 1",
+    "sacct": "echo 'JobID|State|NodeList'; for i in 0 1 2 3; do echo 4242_$i'|PENDING|None assigned'; done",
+    "scancel": 'echo "$@" >> "$CANCELLED"',
+}
+"""Commands of a Slurm cluster on which no job starts."""
+
+
+def test_a_run_says_which_job_does_not_start_and_gives_up_after_the_limit(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("submitit")
+    for name, text in FAKE.items():
+        path = tmp_path / "bin" / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(f"#!/bin/sh\n{text}\n")
+        path.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    monkeypatch.setenv("CANCELLED", str(tmp_path / "cancelled"))
+    monkeypatch.setattr(waiting, "SILENT_S", 0.2)
+    monkeypatch.setattr(importlib.import_module("bench.run.launchers.slurm"), "TICK", 0.1)
+    slurm = ["launcher=slurm", "slurm.wait=1", "slurm.cells=1", "timing=false", "name=never", f"results_dir={tmp_path}"]
+    assert main([*WORDS, "estimators=[fobg]", "sweep.seed=[0,1]", *slurm]) == 2
+    said = capsys.readouterr().err
+    assert "none of 2 jobs has started (job 4242_0 is pending): waiting, for at most 1 s (slurm.wait)" in said
+    assert "gave up after 1 s (slurm.wait); squeue shows the reason, and slurm.wait=null waits without a limit" in said
+    assert "Traceback" not in said
+    assert "4242" in (tmp_path / "cancelled").read_text()
+
+
+def test_a_job_may_wait_without_a_limit_but_not_for_less_than_a_second():
+    assert config.load([*WORDS[:-1], "launcher=slurm"]).execution.cluster["wait"] is None
+    with pytest.raises(UserError, match=r"slurm.wait=0 must be at least 1"):
+        config.load([*WORDS[:-1], "launcher=slurm", "slurm.wait=0"])
+
+
 # --------------------------------------------------------------------------------------------------------------- slow
 
 
@@ -256,6 +292,32 @@ def test_jobs_of_submitit_give_the_rows_of_a_local_run(tmp_path):
     assert not (tmp_path / "sent" / "jobs").exists()
     again = bench("plan", *words, "name=sent")
     assert "6 cells, 6 stored" in again.stdout
+
+
+@pytest.mark.slow
+def test_an_interrupt_prints_no_traceback_of_submitit(tmp_path):
+    pytest.importorskip("submitit")
+    words = [
+        "scenes=[heaviside]",
+        "backends=[numpy]",
+        "estimators=[reinforce]",
+        "samples=20000",
+        "repeats=64",
+        "timing=false",
+    ]
+    words += ["sweep.seed=range(0,400)", "launcher=slurm", "slurm.cluster=local", "slurm.cells=100", "slurm.parallel=2"]
+    run = subprocess.Popen(
+        [sys.executable, "-m", "bench", *words, "name=cut", f"results_dir={tmp_path}", "--quiet"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    until = time.monotonic() + 60
+    while not list(tmp_path.glob("cut/pending/*.json")) and run.poll() is None and time.monotonic() < until:
+        time.sleep(0.1)
+    os.killpg(run.pid, signal.SIGINT)  # as a terminal does
+    said = run.communicate(timeout=60)[1]
+    assert run.returncode == 130
+    assert "Traceback" not in said
+    assert "Continue with: python -m bench" in said
 
 
 @pytest.mark.cluster

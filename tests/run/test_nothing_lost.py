@@ -523,3 +523,12 @@ def test_too_little_memory_for_imports_is_one_line(error):
     assert done.stderr.startswith("bench: not enough memory: ")
     assert len(done.stderr.splitlines()) == 1
     assert out_of_memory(ImportError("no module")) == ""
+
+
+def test_an_address_space_in_which_libraries_abort_is_refused_in_one_line():
+    limit = f"import resource, os, sys; resource.setrlimit(resource.RLIMIT_AS, ({450 << 20},) * 2); "
+    code = limit + "os.execv(sys.executable, [sys.executable, '-m', 'bench', 'list'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("bench: not enough memory: ")
+    assert len(done.stderr.splitlines()) == 1

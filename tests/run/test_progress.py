@@ -9,7 +9,9 @@ import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
+from bench.experiment import config
 from bench.run import progress
+from bench.run.execute import execute
 from bench.run.progress import progress_line, remaining_seconds
 
 LONG = "pushing, penalty[stiffness=1e4], jax, alpha_order[delta=0.95,gamma=4,sharing=shared]"
@@ -90,3 +92,33 @@ def test_refused_cells_take_no_time(monkeypatch):
 def test_times_are_as_coarse_as_their_estimate():
     texts = [progress._rounded(seconds) for seconds in (0.2, 23.0, 94.0, 260.0, 9000.0)]
     assert texts == ["5 s", "25 s", "95 s", "4 min", "2.5 h"]
+
+
+def test_a_run_says_after_5_s_which_reference_it_computes(monkeypatch, capsys):
+    clock = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    lines = progress.Lines("mine", planned(0, 12))
+    for clock[0] in (101.0, 104.9, 105.1, 106.0, 115.0, 115.2):
+        lines.working("reference of callable callable (2 of 12 references done)")
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["mine: 0/12 cells; now reference of callable callable (2 of 12 references done)"] * 2
+
+
+def test_references_are_counted_while_they_are_computed(tmp_path, monkeypatch):
+    lines = []
+    monkeypatch.setattr(progress.Progress, "working", lambda self, text: lines.append(text))
+    words = [
+        "scenes=[pushing]",
+        "backends=[numpy]",
+        "estimators=[reinforce]",
+        "samples=8",
+        "scene.pushing.horizon=2",
+        "repeats=4",
+        "workers=0",
+    ]
+    words += ["timing=false", "sweep.sigma=[0.1,0.2]", "reference.samples=256", "reference.tolerance=9"]
+    execute(config.load([*words, f"results_dir={tmp_path}"]), quiet=True)
+    counted = [line for line in lines if line.startswith("reference of pushing")]
+    assert counted[0].endswith("(0 of 2 references done)")
+    assert any(line.endswith("(1 of 2 references done)") for line in counted)
+    assert not any("references done" in line for line in lines if not line.startswith("reference"))

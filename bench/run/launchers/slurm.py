@@ -12,7 +12,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -84,13 +84,21 @@ class SlurmLauncher:
         """Yield answers when a job has ended, one per task, and empty lists while the caller has to wait."""
         n_jobs = 1 if self._timed else self._settings["parallel"]
         waiting = deque(split(groups, self._settings["cells"], n_jobs))
-        patience = Patience(None)
+        patience = self._patience()
         while waiting or self._jobs:
             self._submit([waiting.popleft() for _ in range(min(len(waiting), n_jobs - len(self._jobs)))])
             answers = [answer for job, tasks in list(self._jobs) for answer in self._collect(job, tasks, waiting)]
-            if not answers and self._jobs and all(job.state in PENDING for job, _ in self._jobs):
-                patience.wait(f"none of {len(self._jobs)} jobs has started (job {self._jobs[0][0].job_id} is pending)")
+            if answers or any(job.state not in PENDING for job, _ in self._jobs):
+                patience = self._patience()
+            elif self._jobs:
+                patience.wait(
+                    f"none of {len(self._jobs)} jobs has started (job {self._jobs[0][0].job_id} is pending)",
+                    "squeue shows the reason, and slurm.wait=null waits without a limit",
+                )
             yield answers
+
+    def _patience(self) -> Patience:
+        return Patience(self._settings["wait"], "slurm.wait")
 
     def _submit(self, chunks: list[list[Task]]) -> None:
         if not chunks:
@@ -102,7 +110,8 @@ class SlurmLauncher:
             ) for tasks in chunks
         ]  # fmt: skip
         try:
-            with self._executor.batch():  # one array of jobs, which a scheduler handles better than many jobs
+            # one array of jobs, which a scheduler handles better than many jobs
+            with _errors_to(self._folder / "controller.txt"), self._executor.batch():
                 jobs = [self._executor.submit(_run_job, description) for description in descriptions]
         except Exception as error:
             raise UserError(f"the cluster accepts no jobs: {printable(error)[:300]}") from None
@@ -139,6 +148,24 @@ class SlurmLauncher:
             else:
                 answers.append(Answer(task, {**row}, float(row["wall_s"]), "", row["machine"], stored=True))
         return answers + self._losses.requeue(unanswered, waiting, reason)
+
+
+@contextmanager
+def _errors_to(path: Path) -> Iterator[None]:
+    """Let the processes that are started meanwhile write to a file what they write to stderr.
+
+    submitit's own processes on this machine would print a traceback on Ctrl-C.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    sys.stderr.flush()
+    before, file = os.dup(2), os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    try:
+        os.dup2(file, 2)
+        yield
+    finally:
+        os.dup2(before, 2)
+        os.close(before)
+        os.close(file)
 
 
 def parameters(experiment: Experiment, timed: bool, cluster: str = "slurm") -> dict[str, Any]:
