@@ -9,6 +9,7 @@ from trees import ROOT
 
 import bench
 import bench.model
+from bench.experiment import cell as cell_module
 from bench.experiment import config, grid, keys
 from bench.experiment.cell import Cell
 from bench.experiment.keys import HARMLESS, PROGRAM, REFERENCE, code, plugin_code
@@ -101,6 +102,7 @@ def keys_of(cells: dict[str, Cell]) -> dict[str, str]:
     keys.module_hash.cache_clear()
     keys.plugin_hash.cache_clear()
     keys._fingerprints.clear()
+    cell_module._rest.clear()
     return {name: replace(cell).key for name, cell in cells.items()}
 
 
