@@ -134,7 +134,7 @@ def _differences_of_neighbours(turns: np.ndarray) -> np.ndarray:
     """Return how far changes of slope differ from the mean of their neighbours, so that no smooth bend hides a small jump."""
     padded = np.pad(turns, 1, mode="edge")
     apart = np.abs(turns - (padded[:-2] + padded[2:]) / 2)
-    return np.where(np.isfinite(apart), apart, np.abs(turns))  # beside costs that are not numbers
+    return np.asarray(np.where(np.isfinite(apart), apart, np.abs(turns)))  # beside costs that are not numbers
 
 
 def _locate_breaks(
