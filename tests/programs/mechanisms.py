@@ -37,7 +37,7 @@ def integrate(slope, state, end, rtol):
 
 
 def adaptive(x, rtol=1e-4, end=3.0):
-    """Return y(end)^2 + v(end) of van der Pol's equation, by steps that adapt to theta, as those of dopri5 do.
+    """Return y(end)^2 + v(end) of van der Pol's equation, by steps that adapt to theta, as in dopri5.
 
     theta is damping, first position and first speed.
     """
