@@ -19,8 +19,6 @@ HALVINGS = 14
 """Number of halvings of an interval."""
 PLACES = 6
 """Most places searched on a line: those where the change of slope stands out most from its neighbours."""
-WINDOW = 7
-"""Number of neighbouring changes of slope whose median a place is compared with."""
 TREADS = 4
 """Fewest equal jumps on one line that count as a staircase."""
 ALIKE = 0.01
@@ -120,7 +118,7 @@ def scan(
     noise = max(
         noise, unit * float(np.abs(finite).max(initial=0.0)), LEAST * float(np.ptp(finite)) if finite.size else 0.0
     )
-    turns = np.abs(_without_trend(np.diff(f, 2)))
+    turns = _differences_of_neighbours(np.diff(f, 2))
     order = np.argsort(np.nan_to_num(turns, nan=-1.0, posinf=-1.0))[::-1]
     places: list[int] = []
     for index in order:
@@ -132,12 +130,11 @@ def scan(
     return LineScan(direction, t, f, tuple(sorted(breaks, key=lambda b: b.at)), steps)
 
 
-def _without_trend(turns: np.ndarray) -> np.ndarray:
-    """Return changes of slope less the median of their neighbours, so that a smooth bend hides no small jump."""
-    padded = np.pad(turns, WINDOW // 2, mode="reflect", reflect_type="odd")
-    neighbours = np.lib.stride_tricks.sliding_window_view(padded, WINDOW)
-    # where a neighbour is not a number, the change of slope itself
-    return np.asarray(turns - np.nan_to_num(np.median(neighbours, axis=1), nan=0.0, posinf=0.0, neginf=0.0))
+def _differences_of_neighbours(turns: np.ndarray) -> np.ndarray:
+    """Return how far changes of slope differ from the mean of their neighbours, so that no smooth bend hides a small jump."""
+    padded = np.pad(turns, 1, mode="edge")
+    apart = np.abs(turns - (padded[:-2] + padded[2:]) / 2)
+    return np.asarray(np.where(np.isfinite(apart), apart, np.abs(turns)))  # beside costs that are not numbers
 
 
 def _locate_breaks(

@@ -52,6 +52,65 @@ def test_adaptive_steps_are_no_missing_term():
     assert adaptive(expect="adaptive").status == 0
 
 
+def separate(rtol, calls=3000, forgotten=0.0, **settings):
+    """Return the report on an adjoint equation that is solved separately, less a share of one of its terms."""
+
+    def grad(x):
+        return mechanisms.separate(x, rtol, forgotten=forgotten)
+
+    start = [1.0, 1.0, 0.5]
+    return bench.examine(
+        lambda x: mechanisms.adaptive(x, rtol), start, grad=grad, progress=False, calls=calls, **settings
+    )
+
+
+@pytest.mark.parametrize("rtol", [1e-3, 1e-4, 1e-5])
+def test_a_separately_solved_adjoint_is_a_discretisation_gap(rtol):
+    report = separate(rtol)
+    assert (report.status, report.cause) == (3, "adaptive"), str(report)
+    assert separate(rtol, refined=mechanisms.refined).cause == "adaptive"
+
+
+def test_the_error_of_a_separately_solved_adjoint_shrinks_with_the_tolerance():
+    sizes = [separate(rtol, calls=30).size for rtol in (1e-3, 1e-4, 1e-5)]
+    assert sizes[0] > 5 * sizes[1] > 25 * sizes[2] > 0
+
+
+def test_an_adjoint_equation_without_a_term_is_wrong_beside_adaptive_steps():
+    for settings in ({}, {"refined": mechanisms.refined}):
+        report = separate(1e-4, forgotten=0.03, **settings)
+        assert (report.status, report.cause) == (1, "missing_term"), str(report)
+
+
+def test_a_small_error_is_not_decided_where_the_budget_ends_before_the_search_for_jumps():
+    report = separate(1e-4, calls=120)
+    assert (report.status, report.cause) == (3, "undecided"), str(report)
+    assert "adaptive steps may explain it" in report.conclusion
+    assert "0.10%" in report.conclusion
+    assert "refined=COST" in report.advice
+    assert separate(1e-4, forgotten=0.5, calls=120).status == 1
+
+
+def test_the_refined_cost_decides_against_jumps_of_another_size():
+    """Jumps as large as the error do not explain it where a refined cost has the same slopes."""
+
+    def cost(x):
+        return swing(x) + 1e-4 * np.floor(x[0] * 300 + 0.4)
+
+    def wrong(x):
+        return slope(x) * [1.02, 1.0]
+
+    guessed = bench.examine(cost, START, grad=wrong, **QUICK)
+    assert (guessed.status, guessed.cause) == (3, "adaptive"), str(guessed)
+    assert bench.examine(cost, START, grad=wrong, refined=swing, **QUICK).status == 1
+
+
+def test_a_small_jump_on_a_curved_line_is_found():
+    """The largest changes of slope on the line are those of its bends, 40 times the jump."""
+    line = lines.scan(lambda x: np.cos(x[0]) + 1e-4 * (x[0] > 1.2345), np.zeros(1), np.ones(1), 1e-16)
+    assert [one.at for one in line.jumps] == pytest.approx([1.2345], abs=1e-5)
+
+
 def test_adaptive_steps_are_considered_before_a_small_error_is_named():
     """700 calls, as a solver of 50 ms has in a minute on a loaded machine."""
     assert adaptive(calls=700).cause == "adaptive"

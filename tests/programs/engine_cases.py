@@ -158,7 +158,7 @@ def featherstone_right():
 
 
 def newton_body(solver_name, free):
-    """Return a rigid ball on the ground, by height and speed, in one of Newton's solvers."""
+    """Return a rigid ball on the ground, by height and speed, after 30 steps of one of Newton's solvers."""
     wp = _quiet_warp()
     import newton
 
@@ -174,9 +174,9 @@ def newton_body(solver_name, free):
     model = builder.finalize(requires_grad=True)
     pipeline = newton.CollisionPipeline(model, requires_grad=True)
 
-    def rollout(x, steps=30):
+    def rollout(x):
         solver = getattr(newton.solvers, f"Solver{solver_name}")(model)
-        states = [model.state() for _ in range(steps + 1)]
+        states = [model.state() for _ in range(31)]
         q, qd = states[0].body_q.numpy(), states[0].body_qd.numpy()
         q[body][2], qd[body][2] = x[0], x[1]
         states[0].body_q.assign(q)
@@ -206,9 +206,7 @@ def newton_body(solver_name, free):
 
 WRONG = ("wrong_adjoint", "missing_term", "wrong_factor", "disconnected")
 case("Newton XPBD, a rigid body at the ground", "newton", *WRONG, solver_name="XPBD", free=True)(newton_body)
-case("Newton Featherstone, a free joint", "newton", "nan_gradient", *WRONG, solver_name="Featherstone", free=True)(
-    newton_body
-)
+case("Newton Featherstone, a free joint", "newton", solver_name="Featherstone", free=True)(newton_body)
 
 
 def warp_rollout(fault):

@@ -13,30 +13,55 @@ TABLE = ((0.5,), (0.0, 0.75), (2 / 9, 1 / 3, 4 / 9))
 ERROR = (2 / 9 - 7 / 24, 1 / 3 - 1 / 4, 4 / 9 - 1 / 3, -1 / 8)
 
 
-def adaptive(x, rtol=1e-4, end=3.0):
-    """Return y(end)^2 + v(end) of van der Pol's equation, with steps chosen by an error estimate, as dopri5 does.
+def integrate(slope, state, end, rtol):
+    """Return the state at time ``end`` of ``d state / dt = slope(*state)``, with steps chosen by an error estimate.
 
     The steps depend on real parts only, so a complex step gives the derivative with the steps held fixed, as reverse
-    mode through an adaptive solver does. theta is damping, first position and first speed.
+    mode through an adaptive solver does.
     """
-
-    def slope(y, v):
-        return v, x[0] * (1 - y * y) * v - y
-
-    y, v, t, dt = x[1], x[2], 0.0, 0.1
+    state, t, dt = tuple(state), 0.0, 0.1
     while t < end:
         dt = min(dt, end - t)
-        slopes = [slope(y, v)]
+        slopes = [slope(*state)]
         for row in TABLE:
-            at = [z + dt * sum(a * k[i] for a, k in zip(row, slopes, strict=True)) for i, z in enumerate((y, v))]
+            at = tuple(z + dt * sum(a * k[i] for a, k in zip(row, slopes, strict=True)) for i, z in enumerate(state))
             slopes.append(slope(*at))
-        errors = [dt * sum(e * k[i] for e, k in zip(ERROR, slopes, strict=True)).real for i in range(2)]
-        sizes = [max(abs(a.real), abs(b.real)) for a, b in zip((y, v), at, strict=True)]
-        ratio = np.sqrt(sum((e / (rtol * 1e-2 + rtol * s)) ** 2 for e, s in zip(errors, sizes, strict=True)) / 2)
+        errors = [dt * sum(e * k[i] for e, k in zip(ERROR, slopes, strict=True)).real for i in range(len(state))]
+        sizes = [max(abs(a.real), abs(b.real)) for a, b in zip(state, at, strict=True)]
+        squares = [(e / (rtol * 1e-2 + rtol * s)) ** 2 for e, s in zip(errors, sizes, strict=True)]
+        ratio = np.sqrt(sum(squares) / len(state))
         if ratio <= 1.0:
-            t, (y, v) = t + dt, at
+            t, state = t + dt, at
         dt *= min(5.0, max(0.2, 0.9 / max(ratio, 1e-10) ** (1 / ORDER)))
+    return state
+
+
+def adaptive(x, rtol=1e-4, end=3.0):
+    """Return y(end)^2 + v(end) of van der Pol's equation, by steps that adapt to theta, as in dopri5.
+
+    theta is damping, first position and first speed.
+    """
+    y, v = integrate(lambda y, v: (v, x[0] * (1 - y * y) * v - y), x[1:], end, rtol)
     return y * y + v
+
+
+def separate(x, rtol=1e-4, end=3.0, forgotten=0.0):
+    """Return the gradient of :func:`adaptive` by the adjoint equation, which is solved backward with steps of its own.
+
+    The position is solved backward too, as ``odeint_adjoint`` of torchdiffeq does. ``forgotten`` is the share of a term
+    of the adjoint equation that is left out.
+    """
+    y, v = integrate(lambda y, v: (v, x[0] * (1 - y * y) * v - y), x[1:], end, rtol)
+
+    def backward(y, v, by_y, by_v, by_x):
+        slope = x[0] * (1 - y * y) * v - y
+        return (
+            -v, -slope, -by_v * (2 * x[0] * y * v * (1 - forgotten) + 1), by_y + by_v * x[0] * (1 - y * y),
+            by_v * (1 - y * y) * v,
+        )  # fmt: skip
+
+    _, _, by_y, by_v, by_x = integrate(backward, (y, v, 2 * y, 1.0, 0.0), end, rtol)
+    return np.array([by_x, by_y, by_v])
 
 
 def frozen(x, **settings):
