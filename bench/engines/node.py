@@ -38,7 +38,7 @@ class StepNode(ABC):
         def numpy(tensor: Any) -> np.ndarray:
             return np.asarray(tensor.detach().cpu().numpy(), dtype=np.float64)
 
-        class Step(torch.autograd.Function):  # type: ignore[misc]
+        class Step(torch.autograd.Function):
             """A step in torch."""
 
             @staticmethod
@@ -46,22 +46,23 @@ class StepNode(ABC):
                 """Return the states and the carry after one step."""
                 context.save_for_backward(x, u, carry)
                 after, carried = node.step(*(numpy(part) for part in (x, u, carry)))
-                results = tuple(torch.as_tensor(part, dtype=x.dtype, device=x.device) for part in (after, carried))
-                context.mark_non_differentiable(results[1])
-                return results
+                state, beside = (torch.as_tensor(part, dtype=x.dtype, device=x.device) for part in (after, carried))
+                context.mark_non_differentiable(beside)
+                return state, beside
 
             @staticmethod
             def backward(context: Any, slope: Any, _: Any) -> tuple[Any, Any, None]:
                 """Return the derivatives by states and controls."""
-                saved = context.saved_tensors
-                parts = node.pull(*(numpy(part) for part in saved), numpy(slope))
+                x, u, carry = context.saved_tensors
+                parts = node.pull(numpy(x), numpy(u), numpy(carry), numpy(slope))
                 by_state, by_control = (
                     torch.as_tensor(part, dtype=like.dtype, device=like.device)
-                    for part, like in zip(parts, saved[:2], strict=True)
+                    for part, like in zip(parts, (x, u), strict=True)
                 )
                 return by_state, by_control, None
 
-        return lambda x, u, carry: Step.apply(x, u, carry)  # type: ignore[no-any-return]
+        apply: Callable[[Any, Any, Any], tuple[Any, Any]] = Step.apply
+        return apply
 
     def jax(self) -> Callable[[Any, Any, Any], tuple[Any, Any]]:
         """Return a function of JAX arrays (x, u, carry) that returns (x, carry), with reverse-mode derivatives by x and u.

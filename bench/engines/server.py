@@ -29,7 +29,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -90,7 +90,13 @@ def _read(descriptor: int, count: int) -> bytearray:
 
 def call(model: Any, name: str, arrays: list[np.ndarray]) -> tuple[list[np.ndarray], int]:
     """Return the arrays that a call of the model results in, and the width of its batches."""
-    functions = {"start": _start, "step": _step, "rollout": _rollout, "jacobians": _jacobians, "pull": _pull}
+    functions: dict[str, Callable[..., list[np.ndarray]]] = {
+        "start": _start,
+        "step": _step,
+        "rollout": _rollout,
+        "jacobians": _jacobians,
+        "pull": _pull,
+    }
     function = functions[name]
     n_columns = arrays[0].shape[-1]
     widths = sorted(getattr(model, "widths", None) or [n_columns])

@@ -32,7 +32,7 @@ from bench.model.estimator import (
 )
 from bench.model.integrator import Integrator
 from bench.model.known_solutions import Identified, KnownOptimum, KnownValue
-from bench.model.manifold import JointScene
+from bench.model.manifold import JointScene, difference, n_changes, retract, slope_by_changes
 from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
@@ -123,13 +123,17 @@ __all__ = [
     "columns",
     "compose",
     "cores",
+    "difference",
     "first_order",
     "halves",
     "load_simulator",
+    "n_changes",
     "param",
     "per_repeat",
+    "retract",
     "rollout",
     "simulator_files",
+    "slope_by_changes",
     "slopes",
     "stopped",
     "zeroth_order",

@@ -9,8 +9,21 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.model import Array, Backend, JointScene, Ops, Problem, Program, Rollout, State, param, rollout
-from bench.model.manifold import difference, n_changes, retract
+from bench.model import (
+    Array,
+    Backend,
+    JointScene,
+    Ops,
+    Problem,
+    Program,
+    Rollout,
+    State,
+    difference,
+    n_changes,
+    param,
+    retract,
+    rollout,
+)
 
 from .. import mjcf, mjx_solver
 from .jax import Jax, JaxProblem

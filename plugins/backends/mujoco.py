@@ -21,10 +21,11 @@ from bench.model import (
     State,
     Trajectory,
     cores,
+    difference,
     param,
+    retract,
     rollout,
 )
-from bench.model.manifold import difference, retract
 
 from .. import mjcf
 from .numpy import NumpyOps, NumpyProblem

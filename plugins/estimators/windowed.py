@@ -18,9 +18,9 @@ from bench.model import (
     columns,
     param,
     per_repeat,
+    slope_by_changes,
     slopes,
 )
-from bench.model.manifold import slope_by_changes
 
 
 @dataclass(frozen=True)

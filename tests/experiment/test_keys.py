@@ -58,6 +58,7 @@ MOVED = {
     "measure/timing": f"{BIAS} engines solver twins",
     "model/__init__": "",
     "model/adjoint": "engines windowed total_propagation",
+    "model/manifold": "engines windowed total_propagation solver",
     "model/estimator": ESTIMATED,
     "model/known_solutions": "windowed adam cem identify",
     "model/optimizer": "adam cem identify",

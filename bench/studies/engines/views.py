@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pandas as pd
 from scipy.special import chdtri
 
-from bench.experiment.columns import COMMON, text
+from bench.experiment.columns import text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Views
 from bench.report.generic import engine_table
@@ -61,7 +60,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     )
     findings = [usable(measured), models(measured), costs(measured)]
     findings = [finding for finding in findings if finding]
-    return Views(findings, [lines], [_chart(measured, findings[0])], remarks=reasons(rows))
+    return Views(findings, [lines], [_chart(measured, headline(measured))], remarks=reasons(rows))
 
 
 def level(row: pd.Series) -> str:
@@ -86,19 +85,39 @@ def rmse_interval(row: pd.Series) -> tuple[float, float]:
     free = max(int(row["repeats"]) - 1, 1)
     low, high = (math.sqrt(free / float(chdtri(free, tail))) for tail in (0.025, 0.975))
     reach = 2.0 * row["reference_se"] / row["reference_norm"]
-    return low * row["rmse_rel"] / (1.0 + reach), high * row["rmse_rel"] / (1.0 - reach) if reach < 1 else math.inf
+    down = math.hypot(math.log(low), math.log1p(reach))  # independent errors of logarithms
+    up = math.hypot(math.log(high), math.log1p(-reach)) if reach < 1 else math.inf
+    return row["rmse_rel"] * math.exp(-down), row["rmse_rel"] * math.exp(up)
 
 
 def usable(measured: pd.DataFrame) -> str:
     """Return on how many scenes each engine's gradient is the derivative of its program and better than 0 on average."""
-    texts = []
+    return (
+        "Cells in which a gradient is the derivative of its engine's program, and averages of it are better than 0 (95% "
+        f"interval): {_counts(measured)}."
+    )
+
+
+def _counts(measured: pd.DataFrame) -> str:
+    """Return the counts of usable and of open gradients, with the engines that have them."""
+    engines: dict[str, list[str]] = {}
     for engine, part in measured.groupby("engine", sort=False):
         good, undecided = int(part["level"].isin(("right", "own")).sum()), int((part["level"] == "open").sum())
-        texts.append(f"{engine} {good} of {len(part)}" + (f" ({undecided} open)" if undecided else ""))
-    return (
-        "Scenes on which a gradient is the derivative of its engine's program, and averages of it are better than 0 (95% "
-        f"interval): {', '.join(texts)}."
-    )
+        count = f"{good} of {len(part)}" + (f" and {undecided} open" if undecided else "")
+        engines.setdefault(count, []).append(str(engine))
+    return "; ".join(f"{count}: {', '.join(names)}" for count, names in engines.items())
+
+
+def headline(measured: pd.DataFrame) -> str:
+    """Return the title of the chart: the engines with usable gradients."""
+    good = measured[measured["level"].isin(("right", "own"))]
+    counts = [
+        f"{engine} {len(part)} of {int((measured['engine'] == engine).sum())}"
+        for engine, part in good.groupby("engine", sort=False)
+    ]
+    rest = measured["engine"].nunique() - len(counts)
+    others = f", the other {rest} none" if rest and counts else ""
+    return f"Gradients that can be used: {', '.join(counts) or 'none'}{others}"
 
 
 def models(measured: pd.DataFrame) -> str:
@@ -120,23 +139,34 @@ def costs(measured: pd.DataFrame) -> str:
     timed = measured[measured["gradient_s"].notna()]
     if timed.empty:
         return ""
-    texts = [
-        f"{engine} {duration(part['gradient_s'].min())} to {duration(part['gradient_s'].max())}"
-        for engine, part in timed.groupby("engine", sort=False)
-    ]
+    texts = [f"{engine} {_range(part['gradient_s'])}" for engine, part in timed.groupby("engine", sort=False)]
     pipe = timed["pipe_share"].max()
     share = f" Pipes take up to {number(100 * pipe)}% of a gradient." if pipe == pipe else ""
     return f"64 gradients take: {', '.join(texts)}.{share}"
 
 
+def _range(seconds: pd.Series) -> str:
+    """Return the shortest and longest duration, or one if they are the same text."""
+    return " to ".join(dict.fromkeys(duration(value) for value in (seconds.min(), seconds.max())))
+
+
 def _chart(measured: pd.DataFrame, title: str) -> Chart:
     """Return the grid of engines and scenes, coloured by level, with the model error of each gradient."""
+    several = measured["contact"].nunique() > 1
+    places = [
+        f"{row['scene']}, rigid" if several and row["contact"] == "impulse" else row["scene"]
+        for _, row in measured.iterrows()
+    ]
     frame = measured.assign(
         row=measured.index,
-        cell=[f"{LEVELS[row['level']].letter} {number(row['model_error_rel'])}" for _, row in measured.iterrows()],
+        place=places,
+        cell=[
+            f"{LEVELS[row['level']].letter} {number(row['model_error_rel'])}" if row["level"] != "none" else "-"
+            for _, row in measured.iterrows()
+        ],
     )
     return Chart(
-        "engines", title, frame, [replace(COMMON["scene"], label="")], [text("engine", label="")], "grid",
+        "engines", title, frame, [text("place", label="")], [text("engine", label="")], "grid",
         level="level", cell="cell", styles=LEVELS, height=0.3, across=1,
-        text="A cell per engine and scene, with the model error of its gradient. An empty cell: the engine does not run it.",
+        text="A cell per engine and scene (rigid: with the law `impulse`), with the model error of its gradient. An empty cell: the engine does not run it.",
     )  # fmt: skip
