@@ -109,7 +109,7 @@ def cell_settings(cell: Cell) -> list[str]:
 
 
 def _settings_around_counts(cell: Cell) -> tuple[list[str], list[str]]:
-    """Return the settings of :func:`cell_settings` before and after those of the counts."""
+    """Return the settings of :func:`cell_settings` before the counts and after them."""
     before = [f"study={_identity(cell.study)}", *plugin_settings(cell)]
     after = theta_settings(cell)
     if cell.budget is not None:
