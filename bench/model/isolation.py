@@ -204,6 +204,8 @@ class State:
         self._threads: list[int] = []
         self._earlier: list[str] = []
         """Changes found before an import changed the state further."""
+        self._before: dict[Setting, Any] = {}
+        """The settings before the present import."""
         self.adopt()
         _ImportWatch.install()
         _ImportWatch.states.append(self)
@@ -222,15 +224,30 @@ class State:
         self._add_new()
 
     def before_import(self) -> None:
-        """Note the changes up to now, since the state after an import is adopted."""
-        self._earlier += [phrase for phrase in self.changes() if phrase not in self._earlier]
-        if self._earlier:
-            self.restore()
+        """Note the state, and undo replaced functions, since the functions after an import are adopted."""
+        self._before = {item: item.read() for item in self._settings}
+        replaced = self._replaced_functions()
+        threads = ["the threads of linear algebra"] if self._n_threads() != self._threads else []
+        self._earlier += [phrase for phrase in (*threads, *replaced) if phrase not in self._earlier]
+        if replaced:
+            self._restore_functions()
 
     def after_import(self) -> None:
-        """Adopt the settings as an import has left them, and add new modules."""
+        """Adopt what an import has changed, and add new modules.
+
+        A setting that differed before the import is not adopted: it may be one of a block, such as ``numpy.errstate``.
+        """
         self._find_libraries()
-        self._settings = {}
+        for item, before in self._before.items():
+            after, base = item.read(), self._settings[item]
+            if after == before:
+                continue
+            if base != before and not item.names_parts and item.name not in self._earlier:
+                self._earlier.append(item.name)
+            if base != before and item.names_parts:
+                parts = {name: after.get(name, MISSING) for name in _changed(before, after)}
+                after = {name: value for name, value in {**base, **parts}.items() if value is not MISSING}
+            self._settings[item] = after
         self._tables = {owner: before for owner, before in self._tables.items() if _is_equal(vars(owner), before)}
         self._add_new()
 
@@ -245,20 +262,13 @@ class State:
             if after != before:
                 parts = _changed_keys(before, after) if item.names_parts else []
                 phrases.append(item.name + (f" ({_listed(parts)})" if parts else ""))
-        if self._n_threads() != self._threads:
+        if self._n_threads() != self._threads and "the threads of linear algebra" not in phrases:
             phrases.append("the threads of linear algebra")
-        if functions and (replaced := [f"{_name(owner)}.{name}" for owner, name in self._replaced()]):
-            phrases.append(_listed(replaced))
-        return phrases
+        return [*phrases, *(self._replaced_functions() if functions else ())]
 
     def restore(self) -> None:
         """Restore this state, as far as it can be restored."""
-        for owner, name in list(self._replaced()):
-            with suppress(Exception):
-                if name in self._tables[owner]:
-                    setattr(owner, name, self._tables[owner][name])
-                else:
-                    delattr(owner, name)
+        self._restore_functions()
         for item, value in self._settings.items():
             with suppress(Exception):
                 if item.write is not None and item.read() != value:
@@ -267,6 +277,19 @@ class State:
             with suppress(Exception):
                 if library.get_num_threads() != count:
                     library.set_num_threads(count)
+
+    def _replaced_functions(self) -> list[str]:
+        """Return the replaced functions as one phrase; empty if there are none."""
+        replaced = [f"{_name(owner)}.{name}" for owner, name in self._replaced()]
+        return [_listed(replaced)] if replaced else []
+
+    def _restore_functions(self) -> None:
+        for owner, name in list(self._replaced()):
+            with suppress(Exception):
+                if name in self._tables[owner]:
+                    setattr(owner, name, self._tables[owner][name])
+                else:
+                    delattr(owner, name)
 
     def _add_new(self) -> None:
         """Add the settings and names of libraries and modules that are not recorded yet."""
@@ -372,9 +395,12 @@ def _name(owner: Any) -> str:
     return str(owner.__name__) if isinstance(owner, ModuleType) else f"{owner.__module__}.{owner.__qualname__}"
 
 
+def _changed(before: Mapping[Any, Any], after: Mapping[Any, Any]) -> list[Any]:
+    return [name for name in before.keys() | after.keys() if before.get(name, MISSING) != after.get(name, MISSING)]
+
+
 def _changed_keys(before: Mapping[Any, Any], after: Mapping[Any, Any]) -> list[str]:
-    names = [name for name in before.keys() | after.keys() if before.get(name, MISSING) != after.get(name, MISSING)]
-    return sorted(os.fsdecode(name) for name in names)
+    return sorted(os.fsdecode(name) for name in _changed(before, after))
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -163,6 +163,20 @@ def test_an_import_of_an_installed_library_is_no_change(tmp_path, monkeypatch):
         assert "environment variables (OWN_THINGS)" in state.changes()
 
 
+def test_an_import_within_a_block_that_changes_a_setting_is_no_change(tmp_path, monkeypatch):
+    """The setting is as before when the block ends."""
+    library = tmp_path / "site-packages" / "set_inside.py"
+    library.parent.mkdir()
+    library.write_text("INSIDE = 1\n")
+    monkeypatch.syspath_prepend(library.parent)
+    with followed() as state:
+        with np.errstate(over="ignore", invalid="ignore"):
+            importlib.import_module("set_inside")
+        assert state.changes() == []
+        np.seterr(under="raise")
+        assert state.changes() == ["NumPy's error state (under)"]
+
+
 def test_cells_in_this_process_use_one_thread_and_its_own_number_comes_back():
     def counts():
         return [library.num_threads for library in ThreadpoolController().lib_controllers]
