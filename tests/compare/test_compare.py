@@ -213,6 +213,7 @@ class Bowl(FunctionScene):
 """
 
 
+@pytest.mark.slow
 def test_a_scene_with_one_parameter_more_compares_as_the_same(tmp_path):
     """From its file to the exit status, each version in a process of its own."""
     (tmp_path / "own").mkdir()

@@ -46,6 +46,7 @@ def test_statistics_agree_with_other_code():
     assert result.curves["iqm"].iloc[0] == 0.0
 
 
+@pytest.mark.slow
 def test_interval_of_the_interquartile_mean_holds_the_truth():
     held = []
     for seed in range(60):

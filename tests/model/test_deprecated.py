@@ -139,6 +139,7 @@ def messages(caught):
     return "\n".join(str(one.message) for one in caught if one.category is DeprecationWarning)
 
 
+@pytest.mark.slow
 def test_an_old_estimator_runs_on_old_scenes(settings):
     with pytest.warns(DeprecationWarning, match="is now called") as caught:
         rows = bench.run(

@@ -124,6 +124,7 @@ def test_gradients_through_quaternions_equal_differences(scene):
     np.testing.assert_allclose(adjoint_gradient(p, path), gradient, atol=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_windows_and_traces_work_on_a_manifold():
     p = problem(Tumbling())
     noise = np.random.default_rng(2).standard_normal((2, 3, p.program.n_noise))

@@ -122,6 +122,7 @@ def test_parameter_is_checked(tree):
     assert "did you mean 'factor'" in done.stderr
 
 
+@pytest.mark.slow
 def test_failing_plugin_fails_the_kit_for_itself_alone(tree):
     done = tree.run("check", "failing", "linear")
     assert done.returncode == 1

@@ -274,11 +274,13 @@ def test_one_outlier_is_noticed():
     assert "the largest residual is 6 times the stated noise" in verdict.sentence()
 
 
+@pytest.mark.slow
 def test_faults_of_a_sensor_are_named(tmp_path):
     for fault, word in (("gain 0.99", "a gain of sensor 0"), ("drift 2 sigma", "a drift of sensor 0")):
         assert word in own_record(tmp_path, fault)["reason"]
 
 
+@pytest.mark.slow
 def test_small_terms_are_noticed_in_many_records_together():
     """A drag of .001 v|v|: a test of one record that knows the term would notice it in 37%."""
     clean, noise = next((record, noise) for label, record, noise in wrong_models.cases() if label == "0.001 v|v|")

@@ -159,6 +159,7 @@ def test_the_impulse_of_a_bounce_is_read_from_the_velocity_jump():
     assert list(np.flatnonzero(table["switch"])) == [hit[0], hit[0] + 1]
 
 
+@pytest.mark.slow
 def test_complementarity_forces_and_solver():
     scene = Pushing(push=1.0)
     law = Complementarity(kappa=1e-8)
