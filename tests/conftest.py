@@ -1,6 +1,9 @@
 """Settings and fixtures of all tests: quick compilation, and the registered backends."""
 
+import gc
 import os
+import sys
+from pathlib import Path
 
 import pytest
 from browser import CHROMIUM, MISSING, chromium
@@ -66,6 +69,20 @@ def remove_plugin_folders():
     if registry.folders() != before:
         registry._folders[:] = before
         registry.entries.cache_clear()
+
+
+MOST_MAPPINGS = 40_000
+"""Memory mappings of a process from which compiled programs are dropped; Linux allows 65,530, and each program has several."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def drop_compiled_programs():
+    """Drop JAX's compiled programs after a module, if the process has nearly as many memory mappings as it may have."""
+    yield
+    maps = Path("/proc/self/maps")
+    if "jax" in sys.modules and maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPPINGS:
+        sys.modules["jax"].clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

@@ -71,6 +71,11 @@ class Setting:
     names_parts: bool = False
     """Whether the value is a mapping whose changed keys are listed."""
 
+    @property
+    def is_scoped(self) -> bool:
+        """Whether a ``with`` block of the library sets it, so that it may differ while a library is imported in one."""
+        return self.name in SCOPED
+
 
 def _torch() -> Any:
     return sys.modules["torch"]
@@ -183,6 +188,16 @@ SETTINGS = (
 """The settings that decide numbers or how they are computed."""
 
 
+SCOPED = (
+    "NumPy's error state",
+    "NumPy's error handler",
+    "NumPy's buffer size",
+    "the decimal context",
+    "SciPy's error state",
+)
+"""The settings that a ``with`` block of their library sets."""
+
+
 class State:
     """The state of this process at one moment, to be compared with later ones.
 
@@ -224,18 +239,16 @@ class State:
         self._add_new()
 
     def before_import(self) -> None:
-        """Note the state, and undo replaced functions, since the functions after an import are adopted."""
-        self._before = {item: item.read() for item in self._settings}
-        replaced = self._replaced_functions()
-        threads = ["the threads of linear algebra"] if self._n_threads() != self._threads else []
-        self._earlier += [phrase for phrase in (*threads, *replaced) if phrase not in self._earlier]
-        if replaced:
-            self._restore_functions()
+        """Note the changes up to now and undo them, since the state after an import is adopted."""
+        self._before = {item: item.read() for item in self._settings if item.is_scoped}
+        self._earlier += [phrase for phrase in self.changes(scoped=False) if phrase not in self._earlier]
+        if self._earlier:
+            self.restore(scoped=False)
 
     def after_import(self) -> None:
         """Adopt what an import has changed, and add new modules.
 
-        A setting that differed before the import is not adopted: it may be one of a block, such as ``numpy.errstate``.
+        A setting of a ``with`` block such as ``numpy.errstate``, in which the library is imported, is not adopted.
         """
         self._find_libraries()
         for item, before in self._before.items():
@@ -248,16 +261,20 @@ class State:
                 parts = {name: after.get(name, MISSING) for name in _changed(before, after)}
                 after = {name: value for name, value in {**base, **parts}.items() if value is not MISSING}
             self._settings[item] = after
+        self._settings = {item: value for item, value in self._settings.items() if item.is_scoped}
         self._tables = {owner: before for owner, before in self._tables.items() if _is_equal(vars(owner), before)}
         self._add_new()
 
-    def changes(self, functions: bool = True) -> list[str]:
+    def changes(self, functions: bool = True, scoped: bool = True) -> list[str]:
         """Return what has changed, as phrases such as ``NumPy's error state (divide)``.
 
         Without ``functions``, replaced functions of modules and classes are not searched for, which takes most of the time.
+        Without ``scoped``, settings of ``with`` blocks are left out.
         """
         phrases = list(self._earlier)
         for item, before in self._settings.items():
+            if item.is_scoped and not scoped:
+                continue
             after = item.read()
             if after != before:
                 parts = _changed_keys(before, after) if item.names_parts else []
@@ -266,12 +283,12 @@ class State:
             phrases.append("the threads of linear algebra")
         return [*phrases, *(self._replaced_functions() if functions else ())]
 
-    def restore(self) -> None:
-        """Restore this state, as far as it can be restored."""
+    def restore(self, scoped: bool = True) -> None:
+        """Restore this state, as far as it can be restored; without ``scoped``, settings of ``with`` blocks are left."""
         self._restore_functions()
         for item, value in self._settings.items():
             with suppress(Exception):
-                if item.write is not None and item.read() != value:
+                if item.write is not None and (scoped or not item.is_scoped) and item.read() != value:
                     item.write(value)
         for library, count in zip(self._libraries, self._threads, strict=True):
             with suppress(Exception):
