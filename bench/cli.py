@@ -309,30 +309,23 @@ def _plan(words: list[str]) -> int:
 
 
 def _list(words: list[str]) -> int:
-    """List all plugins, or of the given kinds and names also their parameters."""
+    """List the plugins of the given kinds or names, or all."""
     from bench.api import described, matching_plugins
     from bench.experiment.words import parse_words
     from bench.model.identity import text_of
     from bench.model.parameters import parameters
-    from bench.report.terminal import open_console
 
     names, _, _ = parse_words(words, "list", {})
-    width = open_console().width
     for kind, listed in matching_plugins(names).items():
         if listed:
             print(f"\n{printable(kind)}")
         for name, entry in sorted(listed.items()):
-            text = printable(described(entry))
-            if entry.available and not names:
-                text = textwrap.shorten(text, max(width - 24, 20), placeholder=" ...")
-            print(f"  {printable(name):<22}{text}")
-            for parameter in parameters(entry.plugin).values() if entry.plugin and names else ():
+            print(f"  {printable(name):<22}{printable(described(entry))}")
+            for parameter in parameters(entry.plugin).values() if entry.plugin else ():
                 unit = f" [{parameter.unit}]" if parameter.unit else ""
                 choices = f" ({' | '.join(parameter.choices)})" if parameter.choices else ""
                 line = f"{parameter.name}={text_of(parameter.default)}{unit}  {parameter.doc}{choices}"
                 print(f"      {printable(line)}")
-    if not names:
-        print("\nParameters: python -m bench list KIND or NAME")
     return 0
 
 
@@ -468,8 +461,8 @@ VERBS = {
         "Cells that cannot run are listed with their reason.\n" + SETTINGS, "Experiments",
     ),
     "list": Verb(
-        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: capabilities, availability",
-        "With a KIND or NAME also parameters. KIND is scenes, contacts, integrators, backends, estimators, optimizers or studies.\n", "Experiments",
+        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
+        "KIND is scenes, contacts, integrators, backends, estimators, optimizers or studies.\n", "Experiments",
     ),
     "engines": Verb(
         _main_of("bench.engines.command"), "engines [install NAME ... [--again]] [plugins=DIR]", "physics engines in a Python of their own: versions, installation",

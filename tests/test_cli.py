@@ -277,16 +277,6 @@ def test_list_takes_a_kind(capsys):
     assert kinds == ["scenes"]
 
 
-def test_list_alone_is_an_overview_within_the_page_and_names_give_parameters(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    assert main(["list"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 80  # all are available here
-    assert not any(line.lstrip().startswith("sigma=") for line in lines)
-    assert main(["list", "pushing"]) == 0
-    assert "sigma=" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("verb", ["gradcheck", "trace"])
 def test_a_scene_has_to_be_named(verb, capsys):
     assert main([verb]) == 2

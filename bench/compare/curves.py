@@ -248,12 +248,10 @@ def _lines(
     x: tuple[str, np.ndarray], name: str,
 ) -> list[dict[str, object]]:  # fmt: skip
     """Return a line per point of ``x``: the statistic ``along`` it with its stratified bootstrap interval."""
-    rng = np.random.default_rng(0)
-    drawn = [along([part[rng.integers(0, len(part), len(part))] for part in parts]) for _ in range(DRAWS)]
-    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    intervals = performance.bootstrap_along(parts, along, draws=DRAWS)
     return [
-        {**shared, x[0]: float(place), name: float(value), f"{name}_low": float(a), f"{name}_high": float(b)}
-        for place, value, a, b in zip(x[1], along(parts), low, high, strict=True)
+        {**shared, x[0]: float(place), name: float(value), f"{name}_low": low, f"{name}_high": high}
+        for place, value, (low, high) in zip(x[1], along(parts), intervals, strict=True)
     ]
 
 

@@ -60,7 +60,7 @@ class Tesseract:
 
     def functions(self) -> tuple[Callable[[np.ndarray], float], Callable[[np.ndarray], np.ndarray]]:
         """Return the functions :meth:`cost` and :meth:`gradient`, for a simulator's file."""
-        return lambda theta: self.cost(theta), lambda theta: self.gradient(theta)
+        return self.cost, self.gradient
 
     def _filled(self, theta: np.ndarray) -> dict[str, Any]:
         inputs = dict(self._inputs)

@@ -5,9 +5,10 @@ Intervals are at 95%.
 Sources: Wilson 1927 (success rates), Hansen et al. 2016, *COCO performance assessment* (average runtime, ECDF with
 simulated restarts), Agarwal et al. 2021, *Deep RL at the edge of the statistical precipice* (interquartile mean,
 probability of improvement), Dahl et al. 2023, *AlgoPerf* (the integral of the performance profile), Efron 1979
-(bootstrap), Hesterberg 2015, *What teachers should know about the bootstrap* (its quantiles for few values). Ranks are SciPy's. The Wilson interval and Spearman's rho agree with SciPy's to 1e-14. SciPy's are not used
-because their last digits differ from stored results, SciPy rejects an interval without trials, and its rho is five
-times slower, which matters in a bootstrap. SciPy's bootstrap has no strata and does not skip resamples without a value.
+(bootstrap), Hesterberg 2015, *What teachers should know about the bootstrap* (its quantiles for few values). Ranks are
+SciPy's. The Wilson interval and Spearman's rho agree with SciPy's to 1e-14. SciPy's are not used because their last
+digits differ from stored results, SciPy rejects an interval without trials, and its rho is five times slower, which
+matters in a bootstrap. SciPy's bootstrap has no strata and does not skip resamples without a value.
 """
 
 from __future__ import annotations
@@ -65,16 +66,27 @@ def bootstrap(
     Resamples in which the statistic is NaN are ignored. The interval is NaN if all are. With ``expanded``, :func:`_tail`
     gives the quantiles, for statistics such as means; else they are 2.5% and 97.5%.
     """
+    (interval,) = bootstrap_along(strata, lambda drawn: np.array([statistic(drawn)]), seed, draws, expanded)
+    return interval
+
+
+def bootstrap_along(
+    strata: Sequence[np.ndarray],
+    statistic: Callable[[Sequence[np.ndarray]], np.ndarray],
+    seed: int = 0,
+    draws: int = DRAWS,
+    expanded: bool = True,
+) -> list[Interval]:
+    """Return the intervals of :func:`bootstrap` of each number of a statistic ``(k,)``, from the same resamples."""
     rng = np.random.default_rng(seed)
-    values = np.array(
-        [statistic([part[rng.integers(0, len(part), len(part))] for part in strata]) for _ in range(draws)]
-    )
-    values = values[~np.isnan(values)]
-    if not values.size:
-        return math.nan, math.nan
+    drawn = [statistic([part[rng.integers(0, len(part), len(part))] for part in strata]) for _ in range(draws)]
     tail = _tail([len(part) for part in strata]) if expanded else 0.025
-    low, high = np.quantile(values, [tail, 1.0 - tail], method="nearest")
-    return float(low), float(high)
+    intervals = []
+    for values in np.transpose(drawn):
+        known = values[~np.isnan(values)]
+        ends = np.quantile(known, [tail, 1.0 - tail], method="nearest") if known.size else (math.nan, math.nan)
+        intervals.append((float(ends[0]), float(ends[1])))
+    return intervals
 
 
 def average_runtime(spent: np.ndarray, reached: np.ndarray) -> float:

@@ -70,11 +70,8 @@ class Setting:
     """The library that must be imported; empty for none."""
     names_parts: bool = False
     """Whether the value is a mapping whose changed keys are listed."""
-
-    @property
-    def is_scoped(self) -> bool:
-        """Whether a ``with`` block of the library sets it, so that it may differ while a library is imported in one."""
-        return self.name in SCOPED
+    is_scoped: bool = False
+    """Whether a ``with`` block of the library sets it, so that it may differ while another library is imported in one."""
 
 
 def _torch() -> Any:
@@ -168,13 +165,13 @@ SETTINGS = (
     Setting("the processor cores", _affinity, _write_affinity),
     Setting("the rounding mode", _rounding, lambda mode: _C.fesetround(mode)),
     Setting("denormal numbers", lambda: SMALLEST * ONE != 0.0, lambda _: "torch" in sys.modules and _torch().set_flush_denormal(False)),
-    Setting("the decimal context", lambda: repr(decimal.getcontext()), lambda _: decimal.setcontext(decimal.Context())),
+    Setting("the decimal context", lambda: repr(decimal.getcontext()), lambda _: decimal.setcontext(decimal.Context()), is_scoped=True),
     Setting("the seed of random", random.getstate, random.setstate),
-    Setting("NumPy's error state", np.geterr, lambda state: np.seterr(**state), names_parts=True),
-    Setting("NumPy's error handler", np.geterrcall, np.seterrcall),
-    Setting("NumPy's buffer size", np.getbufsize, np.setbufsize),
+    Setting("NumPy's error state", np.geterr, lambda state: np.seterr(**state), names_parts=True, is_scoped=True),
+    Setting("NumPy's error handler", np.geterrcall, np.seterrcall, is_scoped=True),
+    Setting("NumPy's buffer size", np.getbufsize, np.setbufsize, is_scoped=True),
     Setting("the seed of numpy.random", _numpy_generator, _write_numpy_generator),
-    Setting("SciPy's error state", lambda: sys.modules["scipy.special"].geterr(), lambda state: sys.modules["scipy.special"].seterr(**state), "scipy.special", True),
+    Setting("SciPy's error state", lambda: sys.modules["scipy.special"].geterr(), lambda state: sys.modules["scipy.special"].seterr(**state), "scipy.special", names_parts=True, is_scoped=True),
     Setting("the threads of scipy.fft", lambda: sys.modules["scipy.fft"].get_workers(), None, "scipy.fft"),
     Setting("JAX's configuration", _jax_settings, _write_jax, "jax", True),
     Setting("torch's default type", lambda: _torch().get_default_dtype(), lambda kind: _torch().set_default_dtype(kind), "torch"),
@@ -186,16 +183,6 @@ SETTINGS = (
     Setting("the seed of torch", lambda: _torch().random.get_rng_state().numpy().tobytes(), lambda state: _torch().random.set_rng_state(_torch().frombuffer(bytearray(state), dtype=_torch().uint8)), "torch"),
 )  # fmt: skip
 """The settings that decide numbers or how they are computed."""
-
-
-SCOPED = (
-    "NumPy's error state",
-    "NumPy's error handler",
-    "NumPy's buffer size",
-    "the decimal context",
-    "SciPy's error state",
-)
-"""The settings that a ``with`` block of their library sets."""
 
 
 class State:
@@ -220,7 +207,7 @@ class State:
         self._earlier: list[str] = []
         """Changes found before an import changed the state further."""
         self._before: dict[Setting, Any] = {}
-        """The settings before the present import."""
+        """The scoped settings before the present import."""
         self.adopt()
         _ImportWatch.install()
         _ImportWatch.states.append(self)
@@ -248,20 +235,13 @@ class State:
     def after_import(self) -> None:
         """Adopt what an import has changed, and add new modules.
 
-        A setting of a ``with`` block such as ``numpy.errstate``, in which the library is imported, is not adopted.
+        A setting that a ``with`` block may have set before the import is not adopted, since the block undoes it.
         """
         self._find_libraries()
-        for item, before in self._before.items():
-            after, base = item.read(), self._settings[item]
-            if after == before:
-                continue
-            if base != before and not item.names_parts and item.name not in self._earlier:
-                self._earlier.append(item.name)
-            if base != before and item.names_parts:
-                parts = {name: after.get(name, MISSING) for name in _changed(before, after)}
-                after = {name: value for name, value in {**base, **parts}.items() if value is not MISSING}
-            self._settings[item] = after
-        self._settings = {item: value for item, value in self._settings.items() if item.is_scoped}
+        self._settings = {
+            item: item.read() if before == self._settings[item] else self._settings[item]
+            for item, before in self._before.items()
+        }
         self._tables = {owner: before for owner, before in self._tables.items() if _is_equal(vars(owner), before)}
         self._add_new()
 
@@ -412,12 +392,9 @@ def _name(owner: Any) -> str:
     return str(owner.__name__) if isinstance(owner, ModuleType) else f"{owner.__module__}.{owner.__qualname__}"
 
 
-def _changed(before: Mapping[Any, Any], after: Mapping[Any, Any]) -> list[Any]:
-    return [name for name in before.keys() | after.keys() if before.get(name, MISSING) != after.get(name, MISSING)]
-
-
 def _changed_keys(before: Mapping[Any, Any], after: Mapping[Any, Any]) -> list[str]:
-    return sorted(os.fsdecode(name) for name in _changed(before, after))
+    names = [name for name in before.keys() | after.keys() if before.get(name, MISSING) != after.get(name, MISSING)]
+    return sorted(os.fsdecode(name) for name in names)
 
 
 def _listed(names: Sequence[str]) -> str:

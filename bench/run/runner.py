@@ -110,10 +110,9 @@ class _Run:
             if answers:
                 yield answers
             current = "; ".join(str(item) for item in launcher.current)
-            is_reference = tasks[
-                0
-            ].reference  # references count as no cells, so the counts of cells stand still meanwhile
-            self._on_progress(f"{current} ({n_done} of {len(tasks)} references done)" if is_reference else current)
+            if tasks[0].reference:  # references are no cells, so the counts of cells stand still meanwhile
+                current += f" ({n_done} of {len(tasks)} references done)"
+            self._on_progress(current)
 
     def _finish(self, results: list[Result], stored: bool = False) -> None:
         """Store rows, unless the machine that measured them has, and report them; raises :class:`Stopped` if due."""

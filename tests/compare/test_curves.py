@@ -44,6 +44,8 @@ def test_statistics_agree_with_other_code():
     assert result.curves["share"].iloc[-1] == 1.0
     assert result.curves["iqm"].iloc[-1] == pytest.approx(line["iqm"])
     assert result.curves["iqm"].iloc[0] == 0.0
+    ends = ["iqm_low", "iqm_high"]  # one number has one interval
+    assert result.curves[ends].iloc[-1].tolist() == line[ends].tolist()
 
 
 @pytest.mark.slow

@@ -76,7 +76,7 @@ def tree(tmp_path_factory) -> Tree:
 
 @pytest.fixture(scope="module")
 def listing(tree) -> str:
-    done = tree.run("list", *("scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "studies"))
+    done = tree.run("list")
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -116,7 +116,7 @@ def headline(measured: pd.DataFrame) -> str:
         for engine, part in good.groupby("engine", sort=False)
     ]
     rest = measured["engine"].nunique() - len(counts)
-    others = f", the other {rest} none" if rest and counts else ""
+    others = f", none known of the other {rest}" if rest and counts else ""
     return f"Gradients that can be used: {', '.join(counts) or 'none'}{others}"
 
 
