@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import multiprocessing
@@ -13,8 +14,11 @@ import threading
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from typing import Any, TypeVar
+
+import psutil
 
 from bench.model import blocks, guard
 
@@ -51,27 +55,57 @@ def run_tasks(tasks: Sequence[Callable[[], T]]) -> list[T]:
 def _finished(tasks: Sequence[Callable[[], Any]], n_workers: int) -> list[Future[bytes]]:
     """Run all tasks and return their completed futures; an interrupt kills the workers."""
     global _tasks
-    others = set(multiprocessing.active_children())
+    others = set(psutil.Process().children())
+    interrupts: list[tuple[Any, ...]] = []
+
+    def kill() -> None:
+        for worker in set(psutil.Process().children()) - others:
+            with contextlib.suppress(psutil.Error):
+                worker.kill()
+
+    def interrupt(*arguments: Any) -> None:
+        """Kill the workers, which ends the waiting. Raising here could leave a worker that has only just been forked."""
+        interrupts.append(arguments)
+        kill()
+
     start = partial(_start_worker, os.getpid())
     outer, _tasks = _tasks, tasks
+    handler: Any = signal.getsignal(signal.SIGINT)
     gc.freeze()  # without this, the first garbage collection in a worker would copy all memory pages
     try:
+        if callable(handler):
+            signal.signal(signal.SIGINT, interrupt)
         pool = ProcessPoolExecutor(n_workers, multiprocessing.get_context("fork"), start)
         with pool, warnings.catch_warnings():
             # newer Pythons warn about any library's threads; libraries whose threads do not survive a fork are in UNSAFE
             warnings.simplefilter("ignore", DeprecationWarning)
             try:
-                futures = [pool.submit(_run, place) for place in range(len(tasks))]
+                futures = [_submitted(pool, place) for place in range(len(tasks))]
+                if interrupts:
+                    kill()  # workers that were started after the interrupt
                 for future in futures:
                     future.exception()
             except BaseException:
-                for worker in set(multiprocessing.active_children()) - others:
-                    worker.kill()
+                kill()
                 raise
     finally:
         _tasks = outer
         gc.unfreeze()
+        if callable(handler):
+            signal.signal(signal.SIGINT, handler)
+    if interrupts:
+        handler(*interrupts[0])
     return futures
+
+
+def _submitted(pool: ProcessPoolExecutor, place: int) -> Future[bytes]:
+    """Submit the task at this place; if a worker has already been killed, the future has this error."""
+    try:
+        return pool.submit(_run, place)
+    except BrokenProcessPool as error:
+        future: Future[bytes] = Future()
+        future.set_exception(error)
+        return future
 
 
 def _start_worker(parent: int) -> None:

@@ -170,9 +170,18 @@ print({{os.getpid() == own for _ in range(3)}} == set(run_tasks([lambda: time.sl
     assert ran(code) == "True"
 
 
+SLOW_START = """
+from multiprocessing import process
+start = process.BaseProcess.start
+process.BaseProcess.start = lambda self: (start(self), time.sleep(0.3))
+"""
+"""The first worker is at work, and sends its interrupt, while the second one is started."""
+
+
 @linux
-def test_an_interrupt_ends_the_workers_and_is_raised():
-    code = """
+@pytest.mark.parametrize("slow", ["", SLOW_START])
+def test_an_interrupt_ends_the_workers_and_is_raised(slow):
+    code = f"""{slow}
 def work():
     os.kill(own, signal.SIGINT)
     time.sleep(5)
