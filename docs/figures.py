@@ -83,6 +83,14 @@ def trusted(*estimators: str) -> dict[str, Any]:
     )
 
 
+def engine(*backends: str, column: str = "rmse_rel", **conditions: Any) -> pd.Series:
+    """Return a column of ``engines`` for ``fobg`` on ``pushing`` from 32 samples and 30 steps, on the backends given."""
+    rows = select(
+        rows_of("engines"), status="ok", scene="pushing", estimator="fobg", samples=32, horizon=30, **conditions
+    )
+    return rows.loc[rows["backend"].isin(backends), column]
+
+
 def three_errors(**conditions: Any) -> pd.DataFrame:
     """Return the gradients of ``three_errors``, once each, although two estimators have rows of them."""
     rows = select(rows_of("three_errors"), status="ok", **conditions)
@@ -275,6 +283,16 @@ FIGURES: dict[str, Callable[[], str]] = {
     "pushing-16": lambda: number(
         score("fobg", experiment="speed_accuracy", scene="pushing", backend="jax", samples=16)
     ),
+    "engines-soft": lambda: span(engine("jax", "implicit", "mujoco", "mjx", stiffness=(1e2, 1e3))),
+    **{
+        f"engines-stiff-{name}": lambda name=name: count(float(number(engine(name, stiffness=1e4).max(), 3)))  # type: ignore[misc]
+        for name in ("jax", "mujoco", "mjx")
+    },
+    "engines-ms-minimal": lambda: span(1e3 * engine("jax", "implicit", column="time_s")),
+    **{
+        f"engines-ms-{name}": lambda name=name: span(1e3 * engine(name, column="time_s"))  # type: ignore[misc]
+        for name in ("mjx", "mujoco")
+    },
     "three-confirmed": lambda: count(len(confirmed())),
     "three-missed": lambda: count((confirmed()["model_error_rel"] > 0.1).sum()),
     "trap-program": lambda: number(trap()["program_error_rel"].max()),
