@@ -75,7 +75,12 @@ def compare_opened(
         runs = [results[name].rows for results in again if name in results]
         judged |= {column.name: column for column in one.columns.compared}
         table, time_remarks = compare_cells(one.rows, two.rows, one.columns, request.timings, runs)
-        own = (*row_remarks(one, two), *machine_remarks(one, two, request.timings), *time_remarks)
+        own = (
+            *row_remarks(one, two),
+            *version_remarks(one.rows, two.rows),
+            *machine_remarks(one, two, request.timings),
+            *time_remarks,
+        )
         remarks += [f"{name}: {remark}" for remark in own]
         parts.append(table.assign(experiment=name))
     table = pd.concat(parts, ignore_index=True)
@@ -95,6 +100,27 @@ def row_remarks(old: Results, new: Results) -> list[str]:
         if own:
             remarks.append(f"rows {when} do not store {', '.join(own)}: the present default is assumed")
     return remarks
+
+
+def version_remarks(old: pd.DataFrame, new: pd.DataFrame) -> list[str]:
+    """Return a remark with the libraries whose versions differ, as ``newton 1.0.0 to 1.8.0``."""
+    was, now = (_library_versions(rows) for rows in (old, new))
+    moved = [
+        f"{library} {' and '.join(was[library])} to {' and '.join(now[library])}"
+        for library in was
+        if library in now and was[library] != now[library]
+    ]
+    return [f"other versions: {', '.join(moved)}"] if moved else []
+
+
+def _library_versions(rows: pd.DataFrame) -> dict[str, list[str]]:
+    """Return the versions of each library that a column ``versions`` has, as ``engine:library`` in an engine's Python."""
+    found: dict[str, list[str]] = {}
+    for texts in rows.get("versions", pd.Series(dtype=str)).dropna().unique():
+        for library, separator, version in (part.partition("=") for part in str(texts).split(";")):
+            if separator and version not in found.setdefault(library, []):
+                found[library].append(version)
+    return {library: sorted(versions) for library, versions in found.items()}
 
 
 def machine_remarks(old: Results, new: Results, timings: bool) -> list[str]:

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from bench.compare.cells import rows_by_cell
+from bench.compare.judging import ROUNDING, Row, numbers, value
 from bench.compare.sources import Results, open_results
 from bench.errors import UserError
 from bench.experiment.columns import Column, Columns, text
@@ -27,7 +28,8 @@ PANELS = 16
 """Most series that are drawn."""
 ERROR = Column("error", label="relative error", digits=3)
 ERRORS = ("paired", "interval", "exact")
-"""Comparison rules of columns that contain an error. The history uses the first such column of a study."""
+"""Comparison rules of columns that contain an error. A series is followed by the column that has a ratio in the most
+cells, the first of them if several have."""
 NOT_RUN = ("unsupported", "unavailable")
 """Statuses of cells that never ran, which do not count as failures."""
 LONGEST = 18
@@ -39,8 +41,10 @@ class History:
     """Errors and failures, one line per result, experiment and series."""
 
     table: pd.DataFrame
-    """``result``, ``experiment``, ``series``, ``error`` (geometric mean of the ratios to the first result, over the cells
-    that are ok in all results), ``cells`` (their number), ``failed`` and ``of`` (all cells of the series)."""
+    """``result``, ``experiment``, ``series`` (an estimator, or a backend in studies without), ``column`` (the error's),
+    ``error`` (geometric mean of the ratios to the first result, over the cells that are ok in all results), ``cells``
+    (their number), ``moved`` (the largest distance of a cell's gradient from that of the first result, relative to its
+    norm, in studies that store gradients), ``failed`` and ``of`` (all cells of the series)."""
     names: Sequence[str]
 
 
@@ -66,36 +70,53 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
     for experiment in shared:
         tables = [rows_by_cell(result[experiment].rows) for result in results]
         columns = results[0][experiment].columns
-        first = list(tables[0].values())
-        estimators = dict.fromkeys(str(row["estimator"]) for row in first)
-        for series in estimators:
-            keys = [
-                key for key, row in tables[0].items() if row["estimator"] == series and row["status"] not in NOT_RUN
-            ]
+        by = "estimator" if any(row["estimator"] for row in tables[0].values()) else "backend"
+        names_of_series = dict.fromkeys(str(row[by]) for row in tables[0].values())
+        for series in names_of_series:
+            keys = [key for key, row in tables[0].items() if row[by] == series and row["status"] not in NOT_RUN]
             ok_in_all = [key for key in keys if all(table.get(key, {}).get("status") == "ok" for table in tables)]
-            for name, table in zip(names, tables, strict=True):
+            rows = [[table[key] for key in ok_in_all] for table in tables]
+            column = _error_column(columns, rows)
+            vector = next((c for c in columns.compared if c.comparison and c.comparison.by == "vector"), None)
+            for name, table, own in zip(names, tables, rows, strict=True):
                 mine = [table[key] for key in keys if key in table]
-                error, count = _mean_ratio(columns, [(tables[0][key], table[key]) for key in ok_in_all])
+                error, count = _mean_ratio(column, rows[0], own)
+                moved = max((_distance(vector, *pair) for pair in zip(rows[0], own, strict=True)), default=math.nan)
                 failed = len(keys) - len(mine) + sum(row["status"] != "ok" for row in mine)
-                lines.append((name, experiment, series if len(estimators) > 1 else "", error, count, failed, len(keys)))
-    titles = ["result", "experiment", "series", "error", "cells", "failed", "of"]
+                shown = series if len(names_of_series) > 1 else ""
+                called = column.comparison.called if column and column.comparison else ""
+                lines.append((name, experiment, shown, called, error, count, moved, failed, len(keys)))
+    titles = ["result", "experiment", "series", "column", "error", "cells", "moved", "failed", "of"]
     return History(pd.DataFrame(lines, columns=titles), list(names))
 
 
-def _mean_ratio(
-    columns: Columns, pairs: Sequence[tuple[Mapping[str, object], Mapping[str, object]]]
-) -> tuple[float, int]:
+def _mean_ratio(column: Column | None, first: Sequence[Row], own: Sequence[Row]) -> tuple[float, int]:
     """Return the geometric mean of the error ratios of pairs of rows, and the number of pairs with a ratio."""
-    column = _error_column(columns)
     if column is None:
         return math.nan, 0
-    values = np.array([[float(str(row.get(column.name, "nan"))) for row in pair] for pair in pairs]).reshape(-1, 2)
+    values = np.array([[value(row, column.name) for row in pair] for pair in zip(first, own, strict=True)])
+    values = values.reshape(-1, 2)
     values = values[np.isfinite(values).all(axis=1) & (values > 0).all(axis=1)]
     return (float(np.exp(np.log(values[:, 1] / values[:, 0]).mean())), len(values)) if len(values) else (math.nan, 0)
 
 
-def _error_column(columns: Columns) -> Column | None:
-    return next((c for by in ERRORS for c in columns.compared if c.comparison and c.comparison.by == by), None)
+def _error_column(columns: Columns, rows: Sequence[Sequence[Row]]) -> Column | None:
+    """Return the column of an error that has a ratio in the most cells of all results; None if no column has any."""
+    errors = [c for by in ERRORS for c in columns.compared if c.comparison and c.comparison.by == by]
+    counts = [min(_mean_ratio(column, rows[0], own)[1] for own in rows) for column in errors]
+    return errors[counts.index(max(counts))] if any(counts) else None
+
+
+def _distance(column: Column | None, first: Row, own: Row) -> float:
+    """Return the distance of a row's gradient from the first one's, relative to its norm; NaN without a gradient."""
+    if column is None:
+        return math.nan
+    was, now = numbers(first, column.name), numbers(own, column.name)
+    if not was.size or was.shape != now.shape:
+        return math.nan
+    if not was.any():
+        return math.inf if now.any() else 0.0
+    return math.hypot(*(now - was)) / math.hypot(*was)
 
 
 def write(history: History, out: Path) -> list[Path]:
@@ -122,13 +143,16 @@ def views(history: History) -> Views:
     )  # fmt: skip
     changes = _changes(table)
     moved = changes[changes > 0].sort_values(ascending=False, kind="stable")
-    total = counted(len(changes), "series", "series")
-    finding = (
-        f"No error changed by more than {CHANGED - 1:.0%} and no number of failed cells changed in any of {total}."
-    )
+    compared = table.groupby("line")[["cells", "moved"]].max()
+    blind = int(((compared["cells"] == 0) & compared["moved"].isna()).sum())
+    total = counted(len(changes) - blind, "series", "series")
+    what = f"in error by more than {CHANGED - 1:.0%}, in gradient or in failed cells"
+    finding = f"None of {total} changed {what}."
     if len(moved):
-        finding = f"{len(moved)} of {total} changed in error by more than {CHANGED - 1:.0%} or in failed cells"
-        finding += f", most {moved.index[0]}."
+        finding = f"{len(moved)} of {counted(len(changes), 'series', 'series')} changed {what}, most {moved.index[0]}."
+    if blind:
+        finding = f"{finding} " if len(moved) or blind < len(changes) else ""
+        finding += f"{counted(blind, 'series', 'series')} cannot be compared: no cell has an error in all results."
     names = list(moved.index[:PANELS]) or list(changes.index[:PANELS])
     frame = pd.concat([table[table["line"] == name] for name in names], ignore_index=True)
     failures = {
@@ -147,24 +171,32 @@ def views(history: History) -> Views:
         text("experiment"),
         text("series"),
         replace(ERROR, label="error"),
-        Column("cells"),
+        text("column", label="error of"),
+        Column("cells", format="setting"),
         text("failures", label="failed"),
     ]
     notes = [
         "error: geometric mean of the ratios to the errors of the first result, over the cells that are ok in all results. Below 1 is better."
     ]
+    if table["moved"].notna().any():
+        columns.insert(-1, Column("moved", label="gradient moved"))
+        notes.append(
+            "gradient moved: largest distance of a cell's gradient from that of the first result, relative to its norm."
+        )
     every = Table("history", table, columns, finding.rstrip("."), notes, data=history.table)
     return Views([finding], [every], [chart])
 
 
 def _changes(table: pd.DataFrame) -> pd.Series:
-    """Return how far each series moved: the logarithm of its largest factor, 0 below 1%, plus the change in failures."""
+    """Return how far each series moved: the logarithm of its largest factor, 0 below 1%, plus failures and gradients."""
     parts = {}
     for name, part in table.groupby("line", sort=False):
         factor = np.abs(np.log(part["error"].to_numpy(float)))
         factor = factor[np.isfinite(factor)].max(initial=0.0)
         failures = (part["failed"].max() - part["failed"].min()) / max(part["of"].max(), 1)
+        distance = part["moved"].max() if part["moved"].notna().any() else 0.0
         parts[name] = (factor if factor > math.log(CHANGED) else 0.0) + failures
+        parts[name] += math.log1p(distance) if distance > ROUNDING else 0.0
     return pd.Series(parts, dtype=float)
 
 

@@ -11,6 +11,7 @@ The study names the rule of each column (:class:`bench.experiment.columns.Compar
   possible). In either case the change must also be at least EFFECT.
 - ``exact``, for columns that are computed without noise: the value changed by a factor of at least EFFECT, and by more
   than ROUNDING.
+- ``vector``, for gradients that are computed without noise: it moved by more than ROUNDING of its norm.
 - ``verdict``: the verdict moved in the study's order, which lists the worst first.
 
 Times (``time``) are judged by :mod:`bench.compare.timings`, over all cells together.
@@ -107,7 +108,7 @@ def _pair(rule: ComparisonRule, old: Row, new: Row) -> _Pair | None:
     """Return the stored estimates of two rows of the same noise, or None if a row does not store them."""
     if rule.by != "paired":
         return None
-    means, references = ([_numbers(row, name) for row in (old, new)] for name in (rule.mean, rule.reference))
+    means, references = ([numbers(row, name) for row in (old, new)] for name in (rule.mean, rule.reference))
     variances = [value(row, rule.variance) for row in (old, new)]
     if not means[0].size or not means[0].shape == means[1].shape == references[0].shape:
         return None
@@ -159,9 +160,10 @@ def _reference_change(pair: _Pair, errors: list[float]) -> Change | None:
     return Change("changed", f"the same estimates, but the reference moved by {number(distance, 3)}")
 
 
-def _numbers(row: Row, name: str) -> np.ndarray:
-    numbers = row.get(name)
-    return np.asarray(numbers, dtype=float) if isinstance(numbers, list | np.ndarray) else np.empty(0)
+def numbers(row: Row, name: str) -> np.ndarray:
+    """Return the list of numbers in column ``name`` of a row; an empty array if there is none."""
+    stored = row.get(name)
+    return np.asarray(stored, dtype=float) if isinstance(stored, list | np.ndarray) else np.empty(0)
 
 
 def _interval(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
@@ -197,6 +199,17 @@ def _exact(column: Column, columns: Columns, old: Row, new: Row) -> Change | Non
     return _size_change(column, old, new) if is_changed else None
 
 
+def _vector(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
+    was, now = numbers(old, column.name), numbers(new, column.name)
+    if not was.size or was.shape != now.shape:
+        return None
+    norm, distance = math.hypot(*was), math.hypot(*(now - was))
+    if not distance > ROUNDING * max(norm, math.hypot(*now)):
+        return None
+    size = f"by {number(distance / norm)} of its norm" if norm > 0 else f"from 0 to norm {number(math.hypot(*now))}"
+    return Change("changed", f"{_rule(column).called} moved {size}")
+
+
 def _verdict(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
     was, now = old.get(column.name, ""), new.get(column.name, "")
     if was == now:
@@ -208,7 +221,7 @@ def _verdict(column: Column, columns: Columns, old: Row, new: Row) -> Change | N
 
 
 RULES: dict[str, Callable[[Column, Columns, Row, Row], Change | None]] = {
-    "paired": _paired, "interval": _interval, "spread": _spread, "exact": _exact, "verdict": _verdict,
+    "paired": _paired, "interval": _interval, "spread": _spread, "exact": _exact, "vector": _vector, "verdict": _verdict,
 }  # fmt: skip
 
 

@@ -30,11 +30,12 @@ class ComparisonRule:
       ``mean`` or the variance in the column ``variance`` moved by more than rounding; worse or better by the root mean
       squared error about the previous gradient in the column ``reference``.
     - ``exact``: computed without noise; changed by a ratio that matters and by more than rounding.
+    - ``vector``: a list of numbers computed without noise; changed by more than rounding, neither better nor worse.
     - ``time``: seconds, compared on request only, and relative to the spread between runs.
     - ``verdict``: one of ``order``, which starts with the worst.
     """
 
-    by: Literal["interval", "spread", "paired", "exact", "time", "verdict"]
+    by: Literal["interval", "spread", "paired", "exact", "vector", "time", "verdict"]
     called: str
     """The column's name in sentences."""
     neutral: bool = False

@@ -582,23 +582,43 @@ def test_history_follows_errors_and_failures_in_the_order_given(tmp_path):
 def test_history_draws_what_changed():
     """A panel per series that moved by more than 1% or failed elsewhere, the largest change first; NaN is no change."""
     lines = [
-        (result, "some", series, error, 3, failed, 4)
-        for series, errors, failures in (
-            ("same", (1.0, 1.001, 0.999), (0, 0, 0)), ("little", (1.0, 1.0, 1.1), (0, 0, 0)), ("much", (1.0, 3.0, 1.0), (0, 0, 0)),
-            ("lost", (1.0, 1.0, 1.0), (1, 1, 2)), ("unknown", (math.nan,) * 3, (4, 4, 4)),
+        (result, "some", series, "RMSE", error, 0 if math.isnan(error) else 3, moved, failed, 4)
+        for series, errors, moves, failures in (
+            ("same", (1.0, 1.001, 0.999), (0, 0, 0), (0, 0, 0)), ("little", (1.0, 1.0, 1.1), (math.nan,) * 3, (0, 0, 0)),
+            ("much", (1.0, 3.0, 1.0), (0, 0, 0), (0, 0, 0)), ("lost", (1.0, 1.0, 1.0), (0, 0, 0), (1, 1, 2)),
+            ("moved", (1.0, 1.0, 1.0), (0, 0.01, 0.01), (0, 0, 0)), ("unknown", (math.nan,) * 3, (math.nan,) * 3, (4, 4, 4)),
         )
-        for result, error, failed in zip("abc", errors, failures, strict=True)
+        for result, error, moved, failed in zip("abc", errors, moves, failures, strict=True)
     ]  # fmt: skip
-    names = ["result", "experiment", "series", "error", "cells", "failed", "of"]
+    names = ["result", "experiment", "series", "column", "error", "cells", "moved", "failed", "of"]
     made = history.views(history.History(pd.DataFrame(lines, columns=names), ["a", "b", "c"]))
-    assert made.findings == ["3 of 5 series changed in error by more than 1% or in failed cells, most some: much."]
+    what = "changed in error by more than 1%, in gradient or in failed cells"
+    blind = "1 series cannot be compared: no cell has an error in all results."
+    assert made.findings == [f"4 of 6 series {what}, most some: much. {blind}"]
     (chart,) = made.charts
-    assert list(dict.fromkeys(chart.frame["line"])) == ["some: much", "some: lost", "some: little"]
+    assert list(dict.fromkeys(chart.frame["line"])) == ["some: much", "some: lost", "some: little", "some: moved"]
     assert chart.panel_notes == {"some: lost": "failed: 1, 1, 2 of 4"}
     still = history.views(history.History(pd.DataFrame(lines[:3], columns=names), ["a", "b", "c"]))
-    assert still.findings == [
-        "No error changed by more than 1% and no number of failed cells changed in any of 1 series."
-    ]
+    assert still.findings == [f"None of 1 series {what}."]
+    unknown = history.views(history.History(pd.DataFrame(lines[-3:], columns=names), ["a", "b", "c"]))
+    assert unknown.findings == [blind]
+
+
+def test_a_gradient_that_a_release_of_an_engine_changes_is_told(tmp_path):
+    """By compare and by history, with the versions, although the errors of both releases are 0 where no noise is."""
+    columns, rows = of_study("engines", "scenes=[bounce_once]", "contacts=[penalty]", "estimators=null")
+    rows = rows.assign(bias=0.0, program_error_rel=1e-5)
+    before = rows.assign(gradient=[[1.0, -2.0]] * len(rows), versions="numpy=2;newton:newton=1.0.0")
+    after = rows.assign(gradient=[[1.0, -2.001]] * len(rows), versions="numpy=2;newton:newton=1.8.0")
+    found = compared(before, after, False, columns)
+    assert only(found, "changed") == "gradient moved by 4.5e-4 of its norm"
+    assert set(compared(before, before, False, columns)["outcome"]) == {"same"}
+    assert command.version_remarks(before, after) == ["other versions: newton:newton 1.0.0 to 1.8.0"]
+    places = [str(save(r, tmp_path / name)) for name, r in (("a", before), ("b", after))]
+    assert cli.main(["history", *places, f"out={tmp_path / 'out'}"]) == 0
+    table = pd.read_csv(tmp_path / "out" / "history.csv")
+    assert list(table["moved"].round(5)) == [0.0, 0.00045]
+    assert "1 of 1 series changed" in (tmp_path / "out" / "history.md").read_text()
 
 
 def test_results_are_named_by_what_differs():

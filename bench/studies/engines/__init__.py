@@ -52,7 +52,8 @@ class Engines(Study):
                measured=True),
         Column("memory_mb", "largest resident memory of the process that runs the engine", "MB", label="memory",
                measured=True),
-        numbers("gradient", "gradient at theta without noise, by coordinate of theta"),
+        numbers("gradient", "gradient at theta without noise, by coordinate of theta",
+                comparison=ComparisonRule("vector", "gradient")),
         numbers("model_gradient", "the gradient that model_error_rel compares with, by coordinate of theta"),
     )  # fmt: skip
 
