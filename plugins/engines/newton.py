@@ -52,6 +52,7 @@ class _Batch:
         if program["has_ground"]:
             all_worlds.add_ground_plane(cfg=shape)
         self._model = all_worlds.finalize(requires_grad=True)
+        self._model.set_gravity(tuple(self._program["gravity"]))
         self._solver = newton.solvers.SolverFeatherstone(self._model, angular_damping=0.0)
         self._before, self._after = self._model.state(), self._model.state()
         self._control = self._model.control()
@@ -59,7 +60,7 @@ class _Batch:
         self._contacts = self._pipeline.contacts() if self._pipeline else None
 
     def _builder(self):
-        return newton.ModelBuilder(up_axis="Z", gravity=tuple(self._program["gravity"]))
+        return newton.ModelBuilder(up_axis="Z")
 
     def _add_bodies(self, builder, shape):
         links, shapes, chains = [], {}, []
