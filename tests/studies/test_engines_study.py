@@ -10,7 +10,7 @@ import pytest
 import bench
 from bench.cli import main
 from bench.engines.process import close_engines
-from bench.studies.engines.views import LEVELS, level
+from bench.studies.engines.views import LEVELS, level, with_limits
 
 TOYS = Path(__file__).resolve().parents[1] / "engines" / "toys"
 
@@ -59,11 +59,14 @@ def test_the_table_and_the_grid_are_written(results):
     [
         ("right", {}),
         ("own", {"model_error_rel": 0.5}),
-        ("noisy", {"rmse_rel": 2.0}),
-        ("open", {"rmse_rel": 1.1}),
-        ("open", {"rmse_rel": 0.6}),
+        ("noisy", {"variance": 4.0}),
+        ("noisy", {"bias_low": 1.5, "bias_high": 2.0}),
+        ("open", {"variance": 1.2}),
+        ("open", {"variance": 0.36}),
+        ("open", {"bias_high": 1.1}),
         ("open", {"reference_se": 0.6}),
-        ("noisy", {"rmse_rel": 20.0, "reference_se": 3.0}),
+        ("open", {"rmse_rel": 0.0, "bias_high": 0.7, "reference_se": 0.3}),
+        ("noisy", {"variance": 400.0, "reference_se": 3.0}),
         ("wrong", {"program_error_rel": 0.5}),
         ("wrong", {"program_error_rel": np.nan}),
         ("wrong", {"nan_share": 0.1}),
@@ -74,7 +77,24 @@ def test_the_table_and_the_grid_are_written(results):
 def test_levels_of_a_gradient(expected, changes):
     good = {
         "status": "ok", "gradient": [1.0], "program_error_rel": 1e-6, "model_error_rel": 0.01, "rmse_rel": 0.2,
-        "nan_share": 0.0, "repeats": 8, "reference_se": 0.02, "reference_norm": 1.0,
+        "bias_low": 0.0, "bias_high": 0.05, "variance": 0.04, "nan_share": 0.0, "repeats": 8, "reference_se": 0.02, "reference_norm": 1.0,
     }  # fmt: skip
     assert level(pd.Series(good | changes)) == expected
     assert expected in LEVELS
+
+
+def test_an_error_below_that_of_its_reference_is_shown_as_a_limit():
+    """It was shown as 0, which its definition gives where the reference's error exceeds all of the distance."""
+    row = {"repeats": 8, "reference_norm": 1.0, "bias_low": 0.0, "variance": 0.04}
+    rows = pd.DataFrame(
+        [
+            row | {"rmse_rel": 0.2, "bias_high": 0.05, "reference_se": 0.02},
+            row | {"rmse_rel": 0.0, "bias_high": 0.30, "reference_se": 0.20},
+            row | {"rmse_rel": 0.0, "bias_high": 0.90, "reference_se": 0.60},
+        ]
+    )
+    shown = with_limits(rows)
+    assert list(shown["rmse_is_limit"]) == [False, True, True]
+    assert shown["rmse_rel"].iloc[0] == 0.2
+    assert 0.5 < shown["rmse_rel"].iloc[1] < 1.0
+    assert np.isnan(shown["rmse_rel"].iloc[2])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 from scipy.special import chdtri
 
@@ -41,15 +43,17 @@ LEVELS = {
 NOTES = (
     "Program error: distance of the gradient from differences of the engine's own cost. Model error: distance from rigid "
     "contact's gradient where it has a closed form, otherwise from the gradient of the scene's own program. RMSE: of "
-    "`samples` averaged gradients, or costs with scores, relative to the engine's own grad J_sigma. Times are of a batch "
-    "of 64 rollouts. Pipe: share of the gradients' time that is spent outside the engine's process.",
+    "`samples` averaged gradients, or costs with scores, relative to the engine's own grad J_sigma; with `<` it is the end of "
+    "its interval, since the reference is not known well enough. Times are of a batch of 64 rollouts. Pipe: share of the gradients' time that is spent outside the engine's process.",
 )
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the findings, the table with a line per scene and engine, and the grid of usable gradients."""
     arranged = arrange(experiment, rows)
+    arranged = replace(arranged, rows=with_limits(arranged.rows))
     own = [experiment.columns.by_name[name] for name in SHOWN]
+    own = [replace(column, limit="rmse_is_limit") if column.name == "rmse_rel" else column for column in own]
     lines = engine_table(experiment, rows, arranged, own, "gradients of physics engines", NOTES)
     measured = arranged.rows[arranged.rows["status"].isin(("ok", "nonfinite"))]
     if measured.empty:
@@ -78,16 +82,29 @@ def level(row: pd.Series) -> str:
 
 
 def rmse_interval(row: pd.Series) -> tuple[float, float]:
-    """Return a 95% interval of a row's relative RMSE, from the spread over its repeats and its reference's error.
+    """Return an interval of at least 95% of a row's relative RMSE, from those of its bias, its variance and the norm.
 
-    It is that of the standard deviation of normal numbers, and wide: the error counts as one number per repeat.
+    The variance's interval is that of normal numbers, one per repeat. The reference's error widens that of the bias, and
+    is two standard errors of the norm. The upper end is infinite where the norm may be 0.
     """
     free = max(int(row["repeats"]) - 1, 1)
-    low, high = (math.sqrt(free / float(chdtri(free, tail))) for tail in (0.025, 0.975))
-    reach = 2.0 * row["reference_se"] / row["reference_norm"]
-    down = math.hypot(math.log(low), math.log1p(reach))  # independent errors of logarithms
-    up = math.hypot(math.log(high), math.log1p(-reach)) if reach < 1 else math.inf
-    return row["rmse_rel"] * math.exp(-down), row["rmse_rel"] * math.exp(up)
+    low, high = (math.sqrt(row["variance"] * free / float(chdtri(free, tail))) for tail in (0.025, 0.975))
+    reach, norm = 2.0 * row["reference_se"], row["reference_norm"]
+    upper = math.hypot(row["bias_high"], high) / (norm - reach) if norm > reach else math.inf
+    return math.hypot(row["bias_low"], low) / (norm + reach), upper
+
+
+def with_limits(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with the upper end of the RMSE's interval where the reference is not known well enough for the RMSE.
+
+    The column ``rmse_is_limit`` is true there. Where the interval has no upper end the RMSE is missing.
+    """
+    known = rows["reference_norm"].notna()
+    hidden = known & ~(rows["rmse_rel"] > 2.0 * rows["reference_se"] / rows["reference_norm"])
+    limits = pd.Series({i: rmse_interval(row)[1] for i, row in rows[hidden].iterrows()}, dtype=float)
+    shown = rows.assign(rmse_is_limit=hidden)
+    shown.loc[hidden, "rmse_rel"] = limits.where(np.isfinite(limits))
+    return shown
 
 
 def usable(measured: pd.DataFrame) -> str:
