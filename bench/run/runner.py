@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
 from bench.experiment.cell import Cell
@@ -20,6 +22,8 @@ from bench.run.tasks import FAILED, Task, group_by_program, result_of, row_of
 
 Result = tuple[Cell, dict[str, Any]]
 """A cell and the results of its row."""
+REPEAT_S = 1.0
+"""Seconds between reports of the tasks being worked on, while one task keeps this process busy (``workers=0``)."""
 
 
 def run(
@@ -50,9 +54,35 @@ class _Run:
     ) -> None:
         self._experiment, self._store = experiment, store
         self._on_finished, self._on_progress = on_finished, on_progress
+        self._current = ""
+        """The tasks that a launcher is working on; empty between two launches."""
+
+    @contextmanager
+    def _repeated_progress(self) -> Iterator[None]:
+        """Report progress from a thread too, since a task that runs in this process stops all reports until its end."""
+        is_over = threading.Event()
+
+        def repeat() -> None:
+            while not is_over.wait(REPEAT_S):
+                with suppress(Exception):  # a plugin may have closed or replaced the stream
+                    if current := self._current:
+                        self._on_progress(current)
+
+        thread = threading.Thread(target=repeat, name="bench-progress", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            is_over.set()
+            thread.join()
 
     def run_all(self, planned: list[Planned]) -> None:
         """Store a row for every cell that has none."""
+        in_process = self._experiment.execution.workers == 0
+        with self._repeated_progress() if in_process else nullcontext():
+            self._run_all(planned)
+
+    def _run_all(self, planned: list[Planned]) -> None:
         due = [item for item in planned if not item.stored]
         kind = next((item.machine for item in planned if item.machine), "")
         refused = [(i.cell, dict(zip(("status", "reason"), i.refusal, strict=True))) for i in due if i.refusal]
@@ -104,15 +134,19 @@ class _Run:
         with guard.capture_output("a plugin"), guard.protect_process():
             groups = group_by_program(tasks)
         n_done = 0
-        for answers in launcher.run(groups):
-            guard.raise_pending_interrupt()
-            n_done += len(answers)
-            if answers:
-                yield answers
-            current = "; ".join(str(item) for item in launcher.current)
-            if tasks[0].reference:  # references are no cells, so the counts of cells stand still meanwhile
-                current += f" ({n_done} of {len(tasks)} references done)"
-            self._on_progress(current)
+        try:
+            for answers in launcher.run(groups):
+                guard.raise_pending_interrupt()
+                n_done += len(answers)
+                if answers:
+                    yield answers
+                current = "; ".join(str(item) for item in launcher.current)
+                if tasks[0].reference:  # references are no cells, so the counts of cells stand still meanwhile
+                    current += f" ({n_done} of {len(tasks)} references done)"
+                self._current = current
+                self._on_progress(current)
+        finally:
+            self._current = ""
 
     def _finish(self, results: list[Result], stored: bool = False) -> None:
         """Store rows, unless the machine that measured them has, and report them; raises :class:`Stopped` if due."""

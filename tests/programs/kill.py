@@ -76,6 +76,8 @@ def run():
     try:
         runpy.run_module("bench", run_name="__main__", alter_sys=True)
     finally:
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, signal.SIG_IGN)  # the command has ended
         mark("end")
 """
 """Defines ``run``, the command ``python -m bench``, which also writes the start of each phase to the file ``PHASES``."""

@@ -2,6 +2,7 @@
 
 import io
 import math
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,10 +11,15 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from bench.experiment import config
-from bench.run import progress
+from bench.run import progress, runner
 from bench.run.execute import execute
 from bench.run.progress import progress_line, remaining_seconds
+from bench.run.references import References
 
+PUSHING = [
+    "scenes=[pushing]", "scene.pushing.horizon=2", "backends=[numpy]", "estimators=[reinforce]", "samples=8", "repeats=4",
+    "workers=0", "timing=false", "reference.samples=256", "reference.tolerance=9",
+]  # fmt: skip
 LONG = "pushing, penalty[stiffness=1e4], jax, alpha_order[delta=0.95,gamma=4,sharing=shared]"
 FACTS = ["312/672, 3 timeout", "about 25 s left"]
 
@@ -104,20 +110,33 @@ def test_a_run_says_after_5_s_which_reference_it_computes(monkeypatch, capsys):
     assert said == ["mine: 0/12 cells; now reference of callable callable (2 of 12 references done)"] * 2
 
 
+def test_a_run_in_this_process_says_which_reference_it_is_busy_with(tmp_path, monkeypatch, capsys):
+    said = threading.Event()
+    compute, show = References._compute, progress.Lines.show
+
+    def busy(self, cell):
+        assert said.wait(60), "nothing is said while a reference is computed"
+        return compute(self, cell)
+
+    def counted(self):
+        show(self)
+        if threading.current_thread() is not threading.main_thread():
+            said.set()
+
+    monkeypatch.setattr(References, "_compute", busy)
+    monkeypatch.setattr(progress.Lines, "show", counted)
+    monkeypatch.setattr(progress, "FIRST_LINE_S", 0.0)
+    monkeypatch.setattr(runner, "REPEAT_S", 0.01)
+    execute(config.load([*PUSHING, f"results_dir={tmp_path}"]), quiet=False)
+    lines = capsys.readouterr().err.splitlines()
+    assert "custom: 0/1 cells; now reference of pushing" in lines[0]
+    assert threading.active_count() == 1
+
+
 def test_references_are_counted_while_they_are_computed(tmp_path, monkeypatch):
     lines = []
     monkeypatch.setattr(progress.Progress, "working", lambda self, text: lines.append(text))
-    words = [
-        "scenes=[pushing]",
-        "backends=[numpy]",
-        "estimators=[reinforce]",
-        "samples=8",
-        "scene.pushing.horizon=2",
-        "repeats=4",
-        "workers=0",
-    ]
-    words += ["timing=false", "sweep.sigma=[0.1,0.2]", "reference.samples=256", "reference.tolerance=9"]
-    execute(config.load([*words, f"results_dir={tmp_path}"]), quiet=True)
+    execute(config.load([*PUSHING, "sweep.sigma=[0.1,0.2]", f"results_dir={tmp_path}"]), quiet=True)
     counted = [line for line in lines if line.startswith("reference of pushing")]
     assert counted[0].endswith("(0 of 2 references done)")
     assert any(line.endswith("(1 of 2 references done)") for line in counted)
