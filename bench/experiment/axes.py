@@ -187,7 +187,9 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
     texts = [name for name in experiment.columns.of_kind("text") if name in wide]
     escaped = {name: {text: _escape_formula(text) for text in wide[name].unique()} for name in texts}
-    return wide.assign(**{name: wide[name].map(escaped[name]) for name in texts})
+    # a column without formulas keeps its strings, of which equal ones are one object
+    changed = [name for name in texts if any(new is not old for old, new in escaped[name].items())]
+    return wide.assign(**{name: wide[name].map(escaped[name]) for name in changed})
 
 
 def _escape_formula(text: Any) -> Any:

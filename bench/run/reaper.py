@@ -6,6 +6,7 @@ kernel kills the workers when the run ends, but not the processes that the worke
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -15,6 +16,8 @@ from contextlib import suppress
 
 MARK = "BENCH_WORKER"
 """Environment variable that marks a worker and every process it starts, even in another session."""
+DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of prctl(2)."""
 PASSES, PAUSE_S = 5, 0.2
 """Number of searches for marked processes, which may start others meanwhile, and pause in seconds after each search."""
 PROGRAM = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.reaper import main; main()"
@@ -46,6 +49,8 @@ def main() -> None:
     """Wait until standard input is closed, then kill all processes whose mark starts with the first argument."""
     for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(name, signal.SIG_IGN)
+    with suppress(OSError, AttributeError):  # on Linux the end of the run resumes this process if it is stopped
+        ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGCONT, 0, 0, 0)
     sys.stdin.buffer.read()
     for _ in range(PASSES):
         kill_marked_processes(sys.argv[1])

@@ -19,6 +19,7 @@ from typing import Any, Protocol
 
 from bench.errors import StorageError, failure
 from bench.model import guard, isolation, registry
+from bench.run.reaper import DEATH_SIGNAL
 
 LENGTH = struct.Struct(">Q")
 """The length of a message in bytes, which precedes the message."""
@@ -32,8 +33,6 @@ ENCODER = json.JSONEncoder()
 """The encoder of messages, created before a plugin can replace it."""
 END_OF_OUTPUT = b"\x1ebench-end-of-output\x1e\n"
 """What a worker prints after each item, so that its output is not taken for the next item's."""
-DEATH_SIGNAL = 1
-"""PR_SET_PDEATHSIG of prctl(2)."""
 
 
 class ConnectionLost(Exception):

@@ -304,6 +304,8 @@ class Kills:
             time.sleep(0.05)
         for orphan in left_in(self.cut):
             self.fault("orphans", f"{what}: {orphan}")
+            with contextlib.suppress(psutil.Error):
+                orphan.kill()
         for path in self.cut.rglob("[!.]*"):
             if path.is_file() and broken(path):
                 self.fault("half files", f"{what}: {path}")

@@ -429,7 +429,7 @@ def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own)
     assert [axis["label"] for axis in data["charts"][0]["y"]] == ["weight [kg]"]
     assert data["charts"][0]["x"][0]["column"] == "mass"
     assert data["filters"] == ["mass", "outcome"]
-    assert data["tables"]["rows"]["mass"] == [1, 2, 3]
+    assert data["tables"]["rows"]["mass"]() == [1, 2, 3]
 
 
 def test_verdicts_and_what_was_swept_can_be_filtered_by():

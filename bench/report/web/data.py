@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import Any
 
 import pandas as pd
@@ -39,7 +40,8 @@ def page_data(
     """Return the data of an experiment's page. ``commands`` are the words that run each row's cell.
 
     The table ``rows`` has a line per cell, with a column for every swept parameter. Each chart has a table of its own;
-    columns that it lacks come from the cells.
+    columns that it lacks come from the cells. The columns of tables are functions that return them, since all columns of
+    many cells together need a lot of memory.
     """
     arranged = arrange(experiment, rows.reset_index(drop=True))
     swept = [axis.column for axis in arranged.axes]
@@ -196,8 +198,13 @@ def _look(style: Style) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------------- encoding
 
 
-def _encoded(frame: pd.DataFrame, names: Collection[str], flags: Collection[str]) -> dict[str, Any]:
-    return {c: encode(frame[c].astype(float) if c in flags else frame[c]) for c in frame if c in names}
+def _encoded(frame: pd.DataFrame, names: Collection[str], flags: Collection[str]) -> dict[str, Callable[[], Any]]:
+    """Return functions that encode the columns ``names`` of a table."""
+
+    def encoded(name: str) -> Any:
+        return encode(frame[name].astype(float) if name in flags else frame[name])
+
+    return {name: partial(encoded, name) for name in frame if name in names}
 
 
 def encode(values: pd.Series) -> Any:

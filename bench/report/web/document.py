@@ -64,7 +64,8 @@ def blocks(
 
 
 def json_blocks(value: Any) -> Iterator[str]:
-    """Yield a value as JSON: the items of nested dictionaries one by one."""
+    """Yield a value as JSON: the items of nested dictionaries one by one. Of a function its result is yielded."""
+    value = value() if callable(value) else value
     if isinstance(value, dict) and value:
         for number, (name, inner) in enumerate(value.items()):
             yield f"{',' if number else '{'}{json.dumps(name)}:"
