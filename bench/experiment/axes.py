@@ -93,6 +93,7 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
     full name: for example, scene and contact law may both have a ``stiffness``.
     """
     import numpy as np
+    import pandas as pd
 
     table = flatten(rows).drop_duplicates()
     coordinates = _varying_coordinates(table) if THETA in swept(sweep) else ()
@@ -111,8 +112,8 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
             if not is_known.any():
                 continue
             if not clash and column in rows and column not in COUNTS:
-                shown = np.asarray(rows[column], dtype=float)
-                if not np.array_equal(shown[is_known], values[is_known]):
+                is_number = pd.api.types.is_numeric_dtype(rows[column])
+                if not is_number or not np.array_equal(rows.loc[is_known, column].to_numpy(float), values[is_known]):
                     axis = Axis(part[0] if "." in part[0] else f"swept.{own_name}", axis.names, axis.unit, axis.doc)
             result.append(axis)
     together = [*_zipped_names(sweep), *([frozenset(coordinates)] if len(coordinates) > 1 else [])]

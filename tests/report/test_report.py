@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import json
 import math
 import re
 import shutil
@@ -31,6 +32,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from bench.cli import main
+from bench.experiment.axes import axes
 from bench.experiment.experiment import TableLayout
 from bench.report import latex, views, writer
 from bench.report.cells import readable
@@ -595,6 +597,12 @@ def test_the_axis_of_zipped_parameters_names_all_of_them():
         assert other in figures[f"bias_variance_{name}"].x[0].heading
     shown = views.arrange(experiment(sweep=sweep), rows)
     assert [axis.title for axis in shown.axes] == ["stiffness [N/m], with dt", "dt [s], with stiffness"]
+
+
+def test_a_swept_parameter_named_like_a_column_of_lists_is_an_axis_of_its_own():
+    parameters = [json.dumps({"scene": {"name": "quadruped", "gain": value}}) for value in (1.0, 2.0)]
+    rows = pd.DataFrame({"parameters": parameters, "gain": [[1.0], [2.0, 3.0]]})
+    assert [axis.column for axis in axes({"gain": [1.0, 2.0]}, rows)] == ["swept.gain"]
 
 
 @pytest.mark.parametrize("values", [STIFFNESS, (1000.0, 1500.0, 2000.0)], ids=["logarithmic", "linear"])
