@@ -191,8 +191,10 @@ def _rule(name: str, columns: Columns) -> str:
         return "is not an object of plugins and their values"
     if name in COUNTS:
         return f"is not a whole number of at least {COUNTS[name]}"
-    kind = columns.by_name[name].kind
-    return {"number": "is negative", "text": "is not a string", "list": "is not a list of numbers or strings"}[kind]
+    if name in columns.vectors:
+        return "is not a list of numbers"
+    text = f"is not a string of at most {MAX_TEXT:,} characters"
+    return {"number": "is negative", "text": text, "list": "is not a list of numbers or strings"}[columns.by_name[name].kind]
 
 
 def _each(values: Iterable[Any], check: Callable[[Any], bool]) -> np.ndarray:
