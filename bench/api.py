@@ -152,11 +152,12 @@ def load(directory: str | Path) -> pd.DataFrame:
 
     directory = Path(directory).expanduser()
     rows = Store(directory, Columns.of()).load() if directory.is_dir() else pd.DataFrame()
+    study = None if rows.empty else registry.entries()["studies"].get(str(rows["study"].iloc[0]))
+    if study and study.plugin and issubclass(study.plugin, Study):
+        rows = Store(directory, study.plugin.columns).load()  # without rows that the study cannot have stored
     if rows.empty:
         raise UserError(f"no rows are stored in '{directory}': run an experiment first, its folder is results_dir/name")
-    study = registry.entries()["studies"].get(str(rows["study"].iloc[0]))
-    columns = study.plugin.columns if study and study.plugin and issubclass(study.plugin, Study) else Columns.of()
-    rows = completed_rows(newest_rows(columns.typed(rows)))
+    rows = completed_rows(newest_rows(rows))
     swept_axes = axes.axes(recorded_sweep(directory), rows)
     return rows.assign(**{axis.column: axes.values_of(axis, rows) for axis in swept_axes if axis.column not in rows})
 

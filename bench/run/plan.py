@@ -100,8 +100,11 @@ def _rows_of_older_code(experiment: Experiment, rows: pd.DataFrame, keys: set[st
 def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataFrame, str]:
     """Return the stored rows of the experiment's cells, also of older code, and a sentence on how they differ from all rows.
 
-    If none of its cells is stored, all rows are returned. The sentence is empty if the rows are exactly the cells.
+    If none of its cells is stored, all rows are returned. The sentence is empty if the rows are exactly the cells, or if
+    there are none.
     """
+    if rows.empty:
+        return rows, ""
     try:
         with guard.capture_output("a plugin"), guard.protect_process():
             every = cells(experiment)

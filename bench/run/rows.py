@@ -246,7 +246,10 @@ def _is_vector(value: Any) -> bool:
 
 
 def _is_scalar(value: Any) -> bool:
-    return value is None or isinstance(value, int | float) or (isinstance(value, str) and _is_text(value))
+    """Return whether a value is a number that int64 or float64 can hold, a string that can be written, or None."""
+    if isinstance(value, int):
+        return abs(value) < 2**63
+    return value is None or isinstance(value, float) or (isinstance(value, str) and _is_text(value))
 
 
 def _is_parameters(text: Any) -> bool:

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from helpers import row, table
 
+from bench import load
 from bench.cli import main
 from bench.errors import StorageError
 from bench.report import index
@@ -58,7 +59,7 @@ def test_a_spoilt_row_is_left_out_and_named(tmp_path, capsys, name):
 SMALL = {
     "surrogate": {"reason": "\ud800"}, "status": {"status": 5}, "text": {"scene": ["a"]}, "number": {"bias": "abc"},
     "true": {"seed": True}, "list": {"mean_estimate": "x"}, "nested": {"mean_estimate": [[1]]}, "big": {"bias": 10**400},
-    "extra": {"extra": {"a": [1]}}, "date": {"stored_at": "x"}, "parameters": {"parameters": {"a": 1}},
+    "extra": {"extra": {"a": [1]}}, "extra_big": {"extra": 2**70}, "date": {"stored_at": "x"}, "parameters": {"parameters": {"a": 1}},
     "deep": {"parameters": "[" * DEEP + "]" * DEEP}, "variance": {"variance": -1.0}, "seed": {"seed": 0.5},
 }  # fmt: skip
 
@@ -76,6 +77,16 @@ def test_a_spoilt_small_row_is_left_out_and_its_file_is_kept(tmp_path, capsys, n
     assert list(pd.read_parquet(tmp_path / "rows.parquet")["key"]) == [good["key"]]
     (kept,) = tmp_path.glob("left_out-*.json")
     assert kept.read_text() == text
+
+
+@pytest.mark.parametrize("name", ["big", "variance", "nested"])
+def test_rows_are_loaded_as_their_study_reads_them(tmp_path, capsys, name):
+    (tmp_path / "pending").mkdir()
+    good = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in row(seed=1).items()}
+    text = json.dumps([good, {**good, "key": "other", "seed": 2.0, **SMALL[name]}])
+    (tmp_path / "pending" / "a.json").write_text(text)
+    assert list(load(tmp_path)["key"]) == [good["key"]]
+    assert "1 of 2 rows are left out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["status", "samples", "repeats", "seed"])
