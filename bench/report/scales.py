@@ -38,7 +38,7 @@ def log_axis(
     getattr(panel, f"set_{which}scale")("log")
     getattr(panel, f"set_{which}lim")(low, high)
     ticks = list(wanted)
-    if not ticks or high > 1e3 * low or np.diff(np.log10(ticks)).min() <= 0.15:
+    if not ticks or high > 1e3 * low or np.diff(np.log10(ticks)).min(initial=math.inf) <= 0.15:
         words = 3 if text is not None else 4  # labels with a unit are wider than numbers
         ticks = _round_ticks(low, high, words if which == "x" else 5)
     if text is None:

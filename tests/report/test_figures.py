@@ -7,7 +7,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bench.report import figures
+from bench.report import figures, scales
 
 
 def half_a_pixel(shift):
@@ -42,3 +42,9 @@ def test_a_layout_is_computed_once_and_kept_for_all_formats(tmp_path):
     for axes in figure.axes:
         assert axes.get_position().bounds == pytest.approx([round(x, 6) for x in axes.get_position().bounds], abs=1e-12)
     assert all(axes.get_tightbbox().x0 >= -1 for axes in figure.axes), "labels are inside the figure"
+
+
+def test_one_value_on_a_logarithmic_axis_has_its_label():
+    panel = Figure().subplots()
+    scales.log_axis(panel, "x", 2.0, 4.5, [3.0])
+    assert list(panel.get_xticks()) == [3.0]
