@@ -296,6 +296,8 @@ class Pool:
                 worker = self._start_worker()
                 worker.queue = groups.popleft()
                 self._workers.append(worker)
+        if self._reaper is not None:  # it starts while the workers do
+            self._reaper.wait_until_ready()
         for worker in self._workers:
             while worker.queue and worker.capacity > 0:
                 if (answer := worker.send_next()) is not None:

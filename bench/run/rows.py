@@ -193,8 +193,10 @@ def _rule(name: str, columns: Columns) -> str:
         return f"is not a whole number of at least {COUNTS[name]}"
     if name in columns.vectors:
         return "is not a list of numbers"
-    text = f"is not a string of at most {MAX_TEXT:,} characters"
-    return {"number": "is negative", "text": text, "list": "is not a list of numbers or strings"}[columns.by_name[name].kind]
+    kind = columns.by_name[name].kind
+    if kind == "text":
+        return f"is not a string of at most {MAX_TEXT:,} characters"
+    return "is negative" if kind == "number" else "is not a list of numbers or strings"
 
 
 def _each(values: Iterable[Any], check: Callable[[Any], bool]) -> np.ndarray:

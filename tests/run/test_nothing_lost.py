@@ -19,6 +19,7 @@ from bench.interrupts import out_of_memory
 from bench.run import files
 from bench.run.files import TEMPORARY, remove_stale, temporary
 from bench.run.pool import Pool, ResourceLimits, _Worker
+from bench.run.reaper import Reaper
 from bench.run.store import Store
 from bench.run.worker import LENGTH, Channel, ConnectionLost, MalformedMessage
 from bench.studies.bias_variance.columns import COLUMNS
@@ -325,6 +326,18 @@ def test_an_open_connection_without_messages_is_not_a_fault():
             Channel(one).receive()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="processes stop otherwise")
+def test_a_reaper_that_is_stopped_at_its_start_is_resumed():
+    reaper = Reaper("nobody")
+    try:
+        reaper._process.send_signal(signal.SIGSTOP)
+        reaper.wait_until_ready()
+        assert reaper._process.poll() is None
+        assert psutil.Process(reaper._process.pid).status() != psutil.STATUS_STOPPED
+    finally:
+        reaper.close()
+
+
 HELD = """
 import ctypes, os, subprocess, sys
 from bench.run.pool import _Worker, Pool, ResourceLimits
@@ -368,7 +381,7 @@ def test_workers_that_hold_the_interpreter_lock_end_with_their_run(tmp_path):
             break
         time.sleep(0.05)
     assert len(left()) >= 4  # the run, its reaper, the worker and what it started
-    (reaper,) = (process for process in left() if "bench.run.reaper" in " ".join(process.cmdline()))
+    (reaper,) = (process for process in left() if "bench/run/reaper.py" in " ".join(process.cmdline()))
     reaper.suspend()
     run.kill()
     run.wait()
