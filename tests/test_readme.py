@@ -173,8 +173,8 @@ def planned(words):
 def test_commands_can_be_planned(folder, monkeypatch):
     monkeypatch.chdir(folder)
     assert len(COMMANDS) > 20
-    for page, words in COMMANDS:
-        assert cli.main(planned(words)) == 0, (page, words)
+    for words in {tuple(planned(words)) for _, words in COMMANDS}:
+        assert cli.main(list(words)) == 0, words
 
 
 def test_readme_example_runs(folder, monkeypatch, capsys):

@@ -68,7 +68,7 @@ def test_registered_plugin_loads(entry):
 def few_programs(monkeypatch):
     """Checks of backends, scenes and contact laws run one program of each sort, or every fourth scene with contacts.
 
-    Scenes are compared on backends that differ and compile within a second: without equations ``implicit`` is ``jax``.
+    Scenes are compared on ``numpy`` and ``jax``; the slow tests compare them on all backends.
     """
     programs, scenes = tuple(distinguishing_programs(all_programs())), sound_scenes()
     touching = [scene for scene in scenes if isinstance(scene, ContactScene) and scene.continuous]
@@ -77,7 +77,7 @@ def few_programs(monkeypatch):
     monkeypatch.setattr(
         conformance.scenes,
         "available",
-        lambda kind: [p for p in available(kind) if p.name not in ("fused", "implicit")],
+        lambda kind: [p for p in available(kind) if p.name not in ("fused", "implicit", "torch")],
     )
     monkeypatch.setattr(conformance.contacts, "sound_scenes", lambda: touching[::4])
 

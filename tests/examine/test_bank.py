@@ -3,7 +3,9 @@
 import pytest
 import simulators
 
-SLOW = ("contact", "missing contact term", "missing damper")
+SLOW = (
+    "contact", "missing contact term", "missing damper", "last step forgotten", "gradient elsewhere", "noise reused shifted",
+)  # fmt: skip
 """Cases whose rollouts take long in Python; the quick tests have others of their kind."""
 UNNAMED = ("rounded",)
 """A fault that is caught, and called `unsettled` where the budget ends before a staircase is looked for."""

@@ -64,7 +64,7 @@ def separate(rtol, calls=3000, forgotten=0.0, **settings):
     )
 
 
-@pytest.mark.parametrize("rtol", [1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("rtol", [1e-3, *(pytest.param(rtol, marks=pytest.mark.slow) for rtol in (1e-4, 1e-5))])
 def test_a_separately_solved_adjoint_is_a_discretisation_gap(rtol):
     report = separate(rtol)
     assert (report.status, report.cause) == (3, "adaptive"), str(report)

@@ -177,7 +177,7 @@ def tree(tmp_path_factory) -> Tree:
     return made
 
 
-@pytest.fixture(scope="module", params=[2, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[pytest.param(n, marks=pytest.mark.slow) for n in (2, 1)])
 def run(request, tree):
     """All faults among sound cells, run by one or two workers."""
     names = [name for fault in EXPECTED for name in (fault, "fobg")]
@@ -297,6 +297,7 @@ def test_stopping_a_run_leaves_rows_and_no_process(tree, sent, status):
     assert "2 cells, 1 stored, 1 to run" in done.stdout
 
 
+@pytest.mark.slow
 def test_an_interrupt_that_a_plugin_swallows_still_stops_the_run(tree):
     words = [*BASE, "estimators=[swallows,fobg]", "name=swallowed", "results_dir=out", "workers=0"]
     process = start(tree, *words)

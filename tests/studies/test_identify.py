@@ -247,9 +247,9 @@ def test_a_record_of_the_model_is_explained(tmp_path):
     [
         ("right", 0.0, 0.13),
         ("0.004 v|v|", 0.95, 1.0),
-        ("offset 0.5 sigma", 0.95, 1.0),
-        ("noise AR 0.9", 0.95, 1.0),
-        ("drift 0.5 sigma", 0.8, 1.0),
+        pytest.param("offset 0.5 sigma", 0.95, 1.0, marks=pytest.mark.slow),
+        pytest.param("noise AR 0.9", 0.95, 1.0, marks=pytest.mark.slow),
+        pytest.param("drift 0.5 sigma", 0.8, 1.0, marks=pytest.mark.slow),
     ],
 )
 def test_wrong_models_are_noticed_and_the_right_one_is_not_blamed(name, least, most):
