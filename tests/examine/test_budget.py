@@ -119,30 +119,38 @@ def test_a_gradient_that_compiles_too_long_is_tried_once():
     assert len(tried) == 1
 
 
-def test_a_first_call_is_not_charged_for_the_time_that_other_programs_take(monkeypatch):
-    """1 s of work that takes 10 s on a loaded machine, and 10 s of sleep, within a limit of 2 s."""
-    now, spent = [0.0], [0.0, 0.0]
+@pytest.fixture
+def first_call(monkeypatch):
+    """A clock with a limit of 2 s, and a first call up to a time, with seconds on a processor and of waiting for one."""
+    now, spent = [0.0], (0.0, 0.0)
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    monkeypatch.setattr(sys.modules[ExaminationClock.__module__], "thread_times", lambda: {"thread": (spent[0], spent[1])})
+    monkeypatch.setattr(sys.modules[ExaminationClock.__module__], "thread_times", lambda: {"thread": spent})
     clock = ExaminationClock(60.0, compile_budget=2.0)
-    with clock.interrupt_when_over(first=True):
-        now[0], spent[:] = 10.0, [1.0, 9.0]
-        signal.raise_signal(signal.SIGALRM)
+
+    def call(end, running, waiting):
+        nonlocal spent
+        with clock.interrupt_when_over(first=True):
+            now[0], spent = end, (running, waiting)
+            signal.raise_signal(signal.SIGALRM)
+
+    return clock, call
+
+
+def test_a_first_call_is_not_charged_for_the_time_that_other_programs_take(first_call):
+    """1 s of work that takes 10 s on a loaded machine, then 10 s of sleep."""
+    clock, call = first_call
+    call(10.0, 1.0, 9.0)
     assert clock.compile_s == 10.0
     assert clock.compile_budget - clock.compile_s == pytest.approx(1.0)
-    with pytest.raises(OutOfTime), clock.interrupt_when_over(first=True):
-        now[0] = 20.0
-        signal.raise_signal(signal.SIGALRM)
+    with pytest.raises(OutOfTime):
+        call(20.0, 1.0, 9.0)
 
 
-def test_other_programs_extend_first_calls_tenfold_at_most(monkeypatch):
-    now, spent = [0.0], [0.0, 0.0]
-    monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    monkeypatch.setattr(sys.modules[ExaminationClock.__module__], "thread_times", lambda: {"thread": (spent[0], spent[1])})
-    clock = ExaminationClock(60.0, compile_budget=2.0)
-    with pytest.raises(OutOfTime), clock.interrupt_when_over(first=True):
-        now[0], spent[:] = 20.5, [0.0, 20.5]
-        signal.raise_signal(signal.SIGALRM)
+def test_other_programs_extend_first_calls_tenfold_at_most(first_call):
+    _, call = first_call
+    call(19.5, 0.0, 19.5)
+    with pytest.raises(OutOfTime):
+        call(21.5, 0.0, 21.5)
 
 
 def test_lost_time_is_that_of_waiting_for_a_processor():
