@@ -81,11 +81,13 @@ class Load:
     @property
     def lost(self) -> float:
         """Seconds by which the work so far took longer than on an idle machine; 0 where unknown."""
-        spent = [0.0, 0.0]
-        for thread, times in thread_times().items():
-            for k, (now, before) in enumerate(zip(times, self._before.get(thread, (0.0, 0.0)), strict=True)):
-                spent[k] += max(now - before, 0.0)
-        return lost_time(*spent, self.seconds, len(os.sched_getaffinity(0)) if spent[1] else 1)
+        running = waiting = 0.0
+        for thread, now in thread_times().items():
+            before = self._before.get(thread, (0.0, 0.0))
+            running += max(now[0] - before[0], 0.0)
+            waiting += max(now[1] - before[1], 0.0)
+        processors = len(os.sched_getaffinity(0)) if waiting else 1
+        return lost_time(running, waiting, self.seconds, processors)
 
 
 def lost_time(running: float, waiting: float, seconds: float, processors: int) -> float:

@@ -196,8 +196,7 @@ def newton_body(solver_name, start=(0.12, -1.0), steps=30, axis=2):
             by_place, by_speed = states[0].joint_q.grad.numpy(), states[0].joint_qd.grad.numpy()
         return float((place - np.float32(0.3)) ** 2), [float(by_place[2]), float(by_speed[axis])]
 
-    # Newton compiles all collision kernels, which takes longer than the default of 300 s on a loaded machine
-    return lambda x: rollout(x)[0], list(start), {"grad": lambda x: rollout(x)[1], "compile_budget": 900}
+    return lambda x: rollout(x)[0], list(start), {"grad": lambda x: rollout(x)[1]}
 
 
 WRONG = ("wrong_adjoint", "missing_term", "wrong_factor", "disconnected")
