@@ -36,7 +36,7 @@ gallery: $(VENV)/.installed
 
 # The examples on other people's engines, in environments of their own: their pins and ours do not live together.
 examples: .venv-engines/.installed .venv-nimble/.installed
-	.venv-engines/bin/python examples/table.py docs/examine.md
+	.venv-engines/bin/python examples/table.py
 
 .venv-engines/.installed .venv-nimble/.installed: .venv-%/.installed: examples/requirements-%.txt
 	$(PYTHON) -m venv .venv-$*

@@ -1,12 +1,15 @@
-"""The engines' table: runs each example in a process of its own, and writes what its reports say as a table.
+"""The table of the examples: runs each example in a process of its own, and stores what its reports say.
 
-    python examples/table.py [OUT.md] [NAME ...]
+    python examples/table.py [--only NAME ...]
 
-An example whose libraries are missing is a row that names them. The reports' texts are written to standard error.
+Each finished example replaces its rows in `examples/table.json` and in the table of `docs/examine.md`; with ``--only``, the
+rows of other examples stay. An example whose libraries are missing is skipped and named. The reports' texts are written to
+standard error.
 """
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import json
 import math
@@ -15,7 +18,6 @@ import re
 import runpy
 import subprocess
 import sys
-from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -45,8 +47,10 @@ HEAD = (
     "gradient",
     "spent",
 )
+STORE, PAGE = HERE / "table.json", HERE.parent / "docs/examine.md"
+"""The file of the rows by example, and the page with the table."""
 BEGIN, END = "<!-- engines -->\n", "<!-- end -->"
-"""What a page has around the table."""
+"""What the page has around the table."""
 MARK = "\x1eROWS "
 
 
@@ -70,7 +74,7 @@ def row(report: Any, version: str, example: str) -> list[str]:
     parts = [part for part in report.check.parts if math.isfinite(part.error)] if report.check else []
     off = f"{number(100 * max(part.error for part in parts))}%" if parts and report.gradient else "-"
     judged = "not checked" if not report.gradient else "right" if report.check and report.check.trusted else "wrong"
-    if report.gradient and report.cause in ("undecided", "unsettled", "nonfinite", "nondeterministic"):
+    if report.gradient and (report.derivative == "not shown" or report.cause == "nondeterministic"):
         judged = "unknown"
     biases = []
     for one in report.smoothed:
@@ -106,52 +110,64 @@ def record(path: Path) -> None:
     print(MARK + json.dumps([row(report, version, path.stem) for report in found]), flush=True)
 
 
-def rows(name: str) -> list[list[str]]:
-    """Return the rows of an example, or one that says why there are none."""
+def rows(name: str) -> tuple[list[list[str]], str]:
+    """Return the rows of an example; without rows, the reason."""
     path = HERE / f"{name}.py"
     missing = [one for one in imported(path.read_text()) if importlib.util.find_spec(one) is None]
     if missing:
-        return [[name, f"not installed: {', '.join(missing)}", *["-"] * (len(HEAD) - 2)]]
+        return [], f"not installed: {', '.join(missing)}"
     words = [sys.executable, __file__, "--record", name]
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, cwd=HERE.parent)
     except subprocess.TimeoutExpired:
-        return [[name, f"no end after {LIMIT} s", *["-"] * (len(HEAD) - 2)]]
+        return [], f"no end after {LIMIT} s"
     text, _, found = done.stdout.partition(MARK)
     print(text, file=sys.stderr, flush=True)
     if not found:
         print(done.stderr, file=sys.stderr, flush=True)
-        last = (done.stderr.strip().splitlines() or ["no report"])[-1]
-        return [[name, f"failed: {last}", *["-"] * (len(HEAD) - 2)]]
-    return json.loads(found.splitlines()[0])
+        return [], f"failed: {(done.stderr.strip().splitlines() or ['no report'])[-1]}"
+    return json.loads(found.splitlines()[0]), ""
 
 
-def as_text(table: Sequence[Sequence[str]]) -> str:
-    """Return a table in Markdown."""
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in table)
+def stored() -> dict[str, list[list[str]]]:
+    """Return the stored rows by example."""
+    return json.loads(STORE.read_text()) if STORE.exists() else {}
 
 
-def write(path: Path, table: Sequence[Sequence[str]]) -> None:
-    """Put the table into a page, in place of the one that it has, or into a file of its own."""
-    before, begin, rest = (path.read_text() if path.exists() else "").partition(BEGIN)
-    path.write_text(f"{before}{begin}{as_text(table)}{END}{rest.partition(END)[2]}" if begin else as_text(table))
+def as_text(table: dict[str, list[list[str]]]) -> str:
+    """Return rows by example as a table in Markdown."""
+    every = [HEAD, ["---"] * len(HEAD), *(row for name in ORDER for row in table.get(name, []))]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in every)
 
 
-def main(words: list[str]) -> int:
-    """Write the table of all examples, or of those named."""
-    if words[:1] == ["--record"]:
-        record(HERE / f"{words[1]}.py")
+def write(table: dict[str, list[list[str]]]) -> None:
+    """Store rows by example, and put the table into the page."""
+    ordered = {name: table[name] for name in ORDER if name in table}
+    STORE.write_text(json.dumps(ordered, indent=1, ensure_ascii=False) + "\n")
+    before, begin, rest = PAGE.read_text().partition(BEGIN)
+    PAGE.write_text(f"{before}{begin}{as_text(ordered)}{END}{rest.partition(END)[2]}")
+
+
+def main() -> int:
+    """Run all examples, or those named, and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", choices=ORDER, default=ORDER, metavar="NAME", help=", ".join(ORDER))
+    parser.add_argument("--record", help=argparse.SUPPRESS)
+    chosen = parser.parse_args()
+    if chosen.record:
+        record(HERE / f"{chosen.record}.py")
         return 0
-    out = [Path(word) for word in words if word.endswith(".md")]
-    names = [word for word in words if not word.endswith(".md")] or ORDER
-    table = [HEAD, ["---"] * len(HEAD)]
-    for name in names:
-        table += rows(name)
-        for path in out:  # after each example, so that what is done is kept
-            write(path, table)
-    print(as_text(table))
-    return int(any("failed: " in cells[1] for cells in table))
+    status = 0
+    for name in chosen.only:
+        found, reason = rows(name)
+        if found:
+            write(stored() | {name: found})  # after each example, so that what is done is kept
+        else:
+            print(f"{name}: {reason}; its rows stay as they are", flush=True)
+            status = max(status, int(not reason.startswith("not installed")))
+    print(as_text(stored()))
+    return status
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -13,6 +13,7 @@ import numpy as np
 
 from bench.errors import UserError
 from bench.examine import diagnosis
+from bench.examine.clock import ExaminationClock
 from bench.examine.gradient import GradientStages
 from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
 from bench.examine.report import Report
@@ -101,7 +102,7 @@ def examine(
     >>> report.status, report.cause
     (0, 'smooth')
     """
-    clock = Clock(
+    clock = ExaminationClock(
         _time_limit(budget, calls), progress, _call_limit(calls), parse_duration(compile_budget, "compile_budget")
     )
     if not isinstance(noise, int | np.integer) or noise < 0:
@@ -124,7 +125,7 @@ def examine(
             simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
         except OutOfTime:
             limit = "compile_budget" if not clock.is_terminated else "the time until SIGTERM"
-            took = f"the first call of the cost took longer than {limit}={clock.compile_budget:g} seconds"
+            took = f"the first call of the cost took longer than {limit}={clock.compile_limit:g} seconds"
             raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
         examination = _Examination(simulator, setup, clock)
         try:

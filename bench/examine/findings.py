@@ -38,7 +38,7 @@ EXPLANATIONS = {
     "jump": "the cost jumps at theta, so it has no derivative",
     "kink": "theta is on a kink, with two slopes and no derivative",
     "saturated": "the gradient is right and exactly 0, though wider steps show a slope: the input is clipped, or has no effect here",
-    "zero": "the gradient and all differences are exactly 0: does this input have any effect?",
+    "zero": "the gradient and all differences are 0, or below the cost's rounding: does this input have any effect?",
     "raised": "the gradient could not be computed",
     "undecided": "the budget ended before the gradient was checked",
     "rough": "the cost changes as much between neighbouring thetas as over a wide step: a seed or hash taken from theta, or chaos",
@@ -376,7 +376,7 @@ class Findings:
         if cause == "overwritten":
             return f"{text}{self._overwritten_text()} ({self._worst_size(self.wrong_checks[0])})"
         if cause == "zero":
-            return "zero: no input moves the cost, and its gradient is exactly 0: does theta reach the simulator?"
+            return "zero: no input moves the cost, and its gradient is 0, or below rounding: does theta reach the simulator?"
         if cause == "no_effect":
             return f"{text} ({', '.join(self.zeros[:6])})"
         if cause == "rough":

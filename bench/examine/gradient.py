@@ -15,9 +15,9 @@ from functools import partial
 
 import numpy as np
 
-from bench.examine.quick import ROUNDS, QuickCheck
+from bench.examine.quick import ROUNDS, QuickCheck, is_nothing
 from bench.examine.subspace import Subspace, choose, locate
-from bench.measure.gradcheck import EPS, FAULTS, Check, Options, Part, check, most_severe
+from bench.measure.gradcheck import EPS, FAULTS, TRUSTED, Check, Options, Part, check, most_severe
 from bench.model.simulator.clock import Clock, OutOfTime
 from bench.model.simulator.simulator import Simulator
 
@@ -404,7 +404,7 @@ class GradientStages:
             outcome = recaused(
                 replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
             )
-        return self._with_roughness(self._without_small_spread(space, outcome))
+        return self._with_roughness(self._without_small_spread(space, _with_zeros(outcome)))
 
     def _spread_of_gradients(self, space: Subspace) -> float:
         """Return the largest difference between equal calls of the gradient, relative to its norm."""
@@ -475,6 +475,14 @@ class GradientStages:
 
 def _are_equal(values: np.ndarray) -> bool:
     return bool(np.isfinite(values).all() and (values == values[0]).all())
+
+
+def _with_zeros(outcome: Check) -> Check:
+    """Return a check in which a derivative below the rounding of a cost that does not move is ``zero``."""
+    zeros = [p for p in outcome.parts if p.verdict in (*TRUSTED, "unsettled") and is_nothing(p.sample)]
+    if all(part.verdict == "zero" for part in zeros):
+        return outcome
+    return recaused(outcome, lambda part: replace(part, verdict="zero") if any(part is p for p in zeros) else part)
 
 
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:

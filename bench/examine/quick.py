@@ -105,8 +105,7 @@ class QuickCheck:
         program = difference if self.gradient is None else float(self.gradient[index])
         sample = Sample(step, minus, self.centre, plus, program, np.zeros(step.size, bool), scale=float(self.scale[index]),
                         unit=self.unit, noise=self.floor)  # fmt: skip
-        is_still = bool(((minus == self.centre) & (plus == self.centre)).all())
-        verdict = self._judge(program, difference, uncertainty, differences, bounds, is_still)
+        verdict = self._judge(program, difference, uncertainty, differences, bounds, is_nothing(sample))
         return Part(name, index, program, difference, uncertainty, float(step[best]), float(left[best]), float(right[best]),
                     float("nan"), verdict, sample)  # fmt: skip
 
@@ -117,13 +116,13 @@ class QuickCheck:
         uncertainty: float,
         differences: np.ndarray,
         bounds: np.ndarray,
-        is_still: bool,
+        is_zero: bool,
     ) -> str:
         if not np.isfinite(self.centre) or not np.isfinite(differences).any():
             return "nonfinite"
         if not np.isfinite(program):
             return "nan_gradient"
-        if program == 0.0 and is_still:
+        if is_zero:
             return "zero"
         size = max(abs(program), abs(difference))
         apart = abs(program - difference)
@@ -133,6 +132,15 @@ class QuickCheck:
         if apart > CLEAR * uncertainty and apart > float(np.cbrt(self.unit)) * size:
             return "disconnected" if program == 0.0 else "wrong_adjoint"
         return "smooth" if uncertainty <= SETTLED * size else "unsettled"
+
+
+def is_nothing(sample: Sample) -> bool:
+    """Return whether a cost does not move, and its derivative is 0 or changes it by less than its rounding.
+
+    The derivative's change is that over the whole scale of the input.
+    """
+    is_still = ((sample.minus == sample.centre) & (sample.plus == sample.centre)).all()
+    return bool(is_still and abs(sample.derivative) * sample.scale <= ROUNDED * sample.unit * abs(sample.centre))
 
 
 def _ratio(part: Part) -> Ratio:

@@ -50,10 +50,27 @@ def test_an_example_ends_in_a_report(path):
     assert any(line.startswith(ENDS) for line in done.stdout.splitlines()), done.stdout
 
 
-def test_the_table_has_a_row_of_each_example_and_names_what_is_missing():
+def test_the_page_has_the_stored_table_of_all_examples():
     table = runpy.run_path(str(ROOT / "examples" / "table.py"))
     assert sorted(table["ORDER"]) == [path.stem for path in EXAMPLES]
-    (row,) = (
-        table["rows"]("drake_ball") if importlib.util.find_spec("pydrake") is None else [["", "not installed: pydrake"]]
-    )
-    assert row[1] == "not installed: pydrake"
+    stored = table["stored"]()
+    assert list(stored) == list(table["ORDER"])
+    assert all(len(row) == len(table["HEAD"]) for rows in stored.values() for row in rows)
+    page = (ROOT / "docs/examine.md").read_text()
+    assert page.partition(table["BEGIN"])[2].partition(table["END"])[0] == table["as_text"](stored)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pydrake") is not None, reason="needs an environment without Drake")
+def test_an_example_without_its_library_has_no_rows_and_names_it():
+    table = runpy.run_path(str(ROOT / "examples" / "table.py"))
+    assert table["rows"]("drake_ball") == ([], "not installed: pydrake")
+
+
+def test_the_page_has_a_row_of_each_case_of_engines():
+    import engine_cases
+
+    page = (ROOT / "docs/examine.md").read_text()
+    rows = page.partition(engine_cases.BEGIN)[2].partition(engine_cases.END)[0].splitlines()[2:]
+    cells = [[cell.strip() for cell in row.strip("|").split(" | ")] for row in rows]
+    assert [row[0] for row in cells] == list(engine_cases.CASES)
+    assert [row[2] for row in cells] == [engine_cases.said(one.expected[0]) for one in engine_cases.CASES.values()]

@@ -282,6 +282,17 @@ def test_a_cost_that_no_input_moves_is_never_right():
     assert (report.status, report.cause, report.derivative) == (3, "zero", "not shown")
 
 
+@pytest.mark.parametrize("calls", [8, 30, 3000])
+def test_a_gradient_below_the_rounding_of_a_cost_that_stays_is_zero(calls):
+    """As of a body that rests on the ground at the end: its tape returns 1e-16 beside differences of 0."""
+    report = bench.examine(
+        lambda x: 0.04, [0.12, -1.0], grad=lambda x: [-2.5e-16, -4.7e-18], progress=False, calls=calls
+    )
+    assert (report.status, report.cause, report.derivative) == (3, "zero", "not shown"), str(report)
+    wrong = bench.examine(lambda x: 0.04, [0.12, -1.0], grad=lambda x: [-2.5e-6, 0.0], progress=False, calls=calls)
+    assert (wrong.status, wrong.derivative) == (1, "wrong"), str(wrong)
+
+
 def test_an_exception_at_other_thetas_does_not_hide_an_error_at_theta():
     def grad(x):
         if abs(x[0] - START[0]) > 1e-3:
