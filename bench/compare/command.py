@@ -115,12 +115,12 @@ def version_remarks(old: pd.DataFrame, new: pd.DataFrame) -> list[str]:
 
 def _library_versions(rows: pd.DataFrame) -> dict[str, list[str]]:
     """Return the versions of each library that a column ``versions`` has, as ``engine:library`` in an engine's Python."""
-    found: dict[str, list[str]] = {}
+    versions: dict[str, list[str]] = {}
     for texts in rows.get("versions", pd.Series(dtype=str)).dropna().unique():
         for library, separator, version in (part.partition("=") for part in str(texts).split(";")):
-            if separator and version not in found.setdefault(library, []):
-                found[library].append(version)
-    return {library: sorted(versions) for library, versions in found.items()}
+            if separator and version not in versions.setdefault(library, []):
+                versions[library].append(version)
+    return {library: sorted(numbers) for library, numbers in versions.items()}
 
 
 def machine_remarks(old: Results, new: Results, timings: bool) -> list[str]:

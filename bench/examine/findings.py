@@ -442,7 +442,9 @@ class Findings:
         if self.derivative == NONE:
             return f"Derivative: none given. By differences the cost has one here ({self.derivative_cause}: {how})"
         size = self._agreement()
-        return f"Derivative: right. {size} ({self.derivative_cause}: {'at few steps' if self.is_quick else how})"
+        how = "at few steps" if self.is_quick else how
+        how += "" if self.check is None or self.check.draws else ", at this theta only"
+        return f"Derivative: right. {size} ({self.derivative_cause}: {how})"
 
     def _agreement(self) -> str:
         """Return how far a right gradient agrees with the differences."""
@@ -725,6 +727,9 @@ class Findings:
             lines.append(text)
         rest = [] if self.gradient else ["any gradient"]
         rest += [f"{what} (budget)" for what in self.left_out]
+        is_said = any("other thetas" in what for what in self.left_out)
+        if self.gradient and self.check is not None and not self.check.draws and not is_said:
+            rest.append("the gradient at other thetas around this one (budget)")
         rest += (
             ["the gradient under noise on theta (no sigma)"]
             if self.gradient and not self.requested and not self.smoothed

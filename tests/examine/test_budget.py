@@ -235,3 +235,16 @@ def test_time_lost_to_other_programs_is_not_charged(monkeypatch):
 def test_calls_is_a_whole_number(calls):
     with pytest.raises(UserError, match="is not a number of calls"):
         bench.examine(cost, THETA, progress=False, calls=calls)
+
+
+def test_a_gradient_that_is_right_at_one_theta_is_said_to_be_right_there_only():
+    """A cache that is never cleared gives the right gradient at the first theta, where few calls end the check."""
+
+    def stale(x):
+        return np.cos(np.array([0.3, 0.7]))
+
+    few = bench.examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, calls=30, progress=False)
+    assert "at this theta only" in few.conclusion
+    assert "other thetas around this one (budget)" in str(few)
+    many = bench.examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, progress=False)
+    assert many.cause == "stale_gradient"

@@ -82,9 +82,9 @@ def level(row: pd.Series) -> str:
 
 
 def rmse_interval(row: pd.Series) -> tuple[float, float]:
-    """Return an interval of at least 95% of a row's relative RMSE, from those of its bias, its variance and the norm.
+    """Return an interval of at least 95% of a row's relative RMSE, from the intervals of bias, variance and norm.
 
-    The variance's interval is that of normal numbers, one per repeat. The reference's error widens that of the bias, and
+    The variance's interval is that of normal numbers, one per repeat. The reference's error widens the interval of the bias, and
     is two standard errors of the norm. The upper end is infinite where the norm may be 0.
     """
     free = max(int(row["repeats"]) - 1, 1)
