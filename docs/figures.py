@@ -91,6 +91,12 @@ def engine(*backends: str, column: str = "rmse_rel", **conditions: Any) -> pd.Se
     return rows.loc[rows["backend"].isin(backends), column]
 
 
+def engine_gradient(column: str, scene: str = "bounce_once", contact: str = "penalty", **conditions: Any) -> pd.Series:
+    """Return a column of ``engine_gradients`` by backend, without backends that have no value."""
+    rows = select(rows_of("engine_gradients"), status="ok", scene=scene, contact=contact, **conditions)
+    return rows.set_index("backend")[column].dropna()
+
+
 def three_errors(**conditions: Any) -> pd.DataFrame:
     """Return the gradients of ``three_errors``, once each, although two estimators have rows of them."""
     rows = select(rows_of("three_errors"), status="ok", **conditions)
@@ -293,6 +299,18 @@ FIGURES: dict[str, Callable[[], str]] = {
         f"engines-ms-{name}": lambda name=name: span(1e3 * engine(name, column="time_s"))  # type: ignore[misc]
         for name in ("mjx", "mujoco")
     },
+    "eg-bounce": lambda: span(engine_gradient("rmse_rel").drop("drake")),
+    "eg-bounce-drake": lambda: number(engine_gradient("rmse_rel", backend="drake").item()),
+    "eg-bounce-costs": lambda: span(engine_gradient("zeroth_rmse_rel")),
+    "eg-nimble-model": lambda: percent(engine_gradient("model_error_rel", contact="impulse", backend="nimble").item()),
+    "eg-nimble-program": lambda: percent(
+        engine_gradient("program_error_rel", contact="impulse", backend="nimble").item()
+    ),
+    "eg-nimble-cartpole": lambda: percent(
+        engine_gradient("model_error_rel", "cartpole", "none", backend="nimble").item()
+    ),
+    "eg-pipe-bounce": lambda: span(100 * engine_gradient("pipe_share"), suffix="%"),
+    "eg-pipe-cartpole": lambda: span(100 * engine_gradient("pipe_share", "cartpole", "none"), suffix="%"),
     "three-confirmed": lambda: count(len(confirmed())),
     "three-missed": lambda: count((confirmed()["model_error_rel"] > 0.1).sum()),
     "trap-program": lambda: number(trap()["program_error_rel"].max()),

@@ -24,6 +24,8 @@ ACCURATE = 0.02
 have two digits."""
 SAME = 0.1
 """Relative model error up to which a gradient counts as the gradient of the model."""
+NAMED = 2
+"""Most engines without a usable gradient that the title names."""
 USELESS = 1.0
 """Relative RMSE from which on an estimate is no better than the zero estimate."""
 SHOWN = (
@@ -43,8 +45,8 @@ LEVELS = {
 NOTES = (
     "Program error: distance of the gradient from differences of the engine's own cost. Model error: distance from rigid "
     "contact's gradient where it has a closed form, otherwise from the gradient of the scene's own program. RMSE: of "
-    "`samples` averaged gradients, or costs with scores, relative to the engine's own grad J_sigma; with `<` it is the end of "
-    "its interval, since the reference is not known well enough. Times are of a batch of 64 rollouts. Pipe: share of the gradients' time that is spent outside the engine's process.",
+    "`samples` averaged gradients, or costs with scores, relative to the engine's own grad J_sigma; where that is not "
+    "known well enough, the upper end of the interval. Times are of a batch of 64 rollouts. Pipe: share of the gradients' time that is spent outside the engine's process.",
 )
 
 
@@ -132,8 +134,9 @@ def headline(measured: pd.DataFrame) -> str:
         f"{engine} {len(part)} of {int((measured['engine'] == engine).sum())}"
         for engine, part in good.groupby("engine", sort=False)
     ]
-    rest = measured["engine"].nunique() - len(counts)
-    others = f", none known of the other {rest}" if rest and counts else ""
+    rest = [str(engine) for engine in measured["engine"].unique() if engine not in set(good["engine"])]
+    names = ", ".join(rest) if len(rest) <= NAMED else f"the other {len(rest)}"
+    others = f"; none known for {names}" if rest and counts else ""
     return f"Gradients that can be used: {', '.join(counts) or 'none'}{others}"
 
 
@@ -185,5 +188,6 @@ def _chart(measured: pd.DataFrame, title: str) -> Chart:
     return Chart(
         "engines", title, frame, [text("place", label="")], [text("engine", label="")], "grid",
         level="level", cell="cell", styles=LEVELS, height=0.3, across=1,
+        subtitle="number: model error, the relative distance from the model's gradient",
         text="A cell per engine and scene (rigid: with the law `impulse`), with the model error of its gradient. An empty cell: the engine does not run it.",
     )  # fmt: skip
