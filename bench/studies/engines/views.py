@@ -124,7 +124,7 @@ def _counts(measured: pd.DataFrame) -> str:
         good, undecided = int(part["level"].isin(("right", "own")).sum()), int((part["level"] == "open").sum())
         count = f"{good} of {len(part)}" + (f" and {undecided} open" if undecided else "")
         engines.setdefault(count, []).append(str(engine))
-    return "; ".join(f"{count}: {', '.join(names)}" for count, names in engines.items())
+    return ", ".join(f"{count} ({', '.join(names)})" for count, names in engines.items())
 
 
 def headline(measured: pd.DataFrame) -> str:
