@@ -20,7 +20,7 @@ from bench import cli
 from bench.experiment import config, grid
 from bench.experiment.columns import Column, Columns
 from bench.experiment.study import Study
-from bench.experiment.views import Chart, Mark, Views
+from bench.experiment.views import Chart, Mark, Style, Views
 from bench.model import registry
 from bench.report import reproduce
 from bench.report.finish import views_of
@@ -559,6 +559,30 @@ def test_cells_of_a_map_may_have_colours_and_texts_of_their_own(browser, tmp_pat
     assert browser.do("document.querySelector('.plot').data[0].x") == ["b", "a"]
     assert browser.do("document.querySelector('.plot').getBoundingClientRect().height") == 60 + 24 * 15
     assert browser.said == []
+
+
+def test_cells_of_a_map_have_the_colours_of_its_legend(browser, tmp_path):
+    """Also where a style names its colour as Matplotlib does: one such colour made all cells those of Plotly."""
+    frame = pd.DataFrame({"x": ["a", "b", "c"] * 2, "y": ["1"] * 3 + ["2"] * 3, "level": ["good", "bad", "none"] * 2})
+    frame = frame.assign(cell="12.34")
+    styles = {
+        "good": Style("#009E73", letter="+"),
+        "bad": Style("tab:red", letter="x"),
+        "none": Style("0.85", letter="-"),
+    }
+    x, y = Column("x", kind="text"), Column("y", kind="text")
+    chart = Chart("map", "Map", frame, [x], [y], "grid", level="level", cell="cell", styles=styles)
+    rows, path = small_rows(), tmp_path / "report.html"
+    path.write_text(
+        document.assemble(experiment(), rows, Views(["It works"], charts=[chart]), [["a=1"]] * len(rows), {})
+    )
+    browser.open(path)
+    legend = browser.do("[...document.querySelectorAll('b.level')].map((one) => one.style.background)")
+    assert legend == ["rgb(0, 158, 115)", "rgb(214, 39, 40)", "rgb(217, 217, 217)"]
+    cells = browser.do("document.querySelector('.plot').data[0].colorscale.map((one) => one[1])")
+    assert sorted(set(cells)) == ["#009e73", "#d62728", "#d9d9d9"]
+    assert browser.do("document.querySelector('.plot').data[1].text") == ["12.34"] * 6
+    assert browser.do("NARROWEST * 3") < browser.do("document.querySelector('.plot').clientWidth")
 
 
 @dataclass(frozen=True)

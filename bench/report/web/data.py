@@ -185,8 +185,10 @@ def _axis(column: Column, chart: Chart) -> dict[str, Any]:
 
 def _look(style: Style) -> dict[str, Any]:
     """Return the style of one series: its colours on a light and a dark background, symbol, dash, letter and meaning."""
+    from matplotlib.colors import to_hex
+
     look = {
-        "colour": [style.colour, DARK.get(style.colour, style.colour)],
+        "colour": [to_hex(style.colour), to_hex(DARK.get(style.colour, style.colour))],  # browsers know no grey "0.85"
         "symbol": SYMBOLS.get(style.marker, "circle") if style.marker else "line",
         "dash": DASHES.get(str(style.line), "dash"),
         "letter": style.letter,

@@ -315,6 +315,7 @@ function readable(hex, least) {
   return ink();
 }
 
+const NARROWEST = 52; // width of a map's column in pixels below which its cells have letters instead of their texts
 const isMap = (chart) => Boolean(chart.level || chart.fill);
 
 /* The number of names on the vertical axis, each of which takes a line. */
@@ -357,6 +358,7 @@ function drawChart(chart) {
     note.hidden = !chart.notes[name];
     const lines = lineCount(chart, facets.get(name));
     plot.style.height = lines > 12 ? `${60 + 24 * lines}px` : "";
+    plot.style.minHeight = isMap(chart) && lines <= 12 ? `${150 + 24 * lines}px` : ""; // with slanted names below, on a phone
     const [traces, layout] = isMap(chart) ? mapFigure(chart, facets.get(name)) : pointFigure(chart, name, facets.get(name), range);
     Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true });
     plot.removeAllListeners("plotly_click");
@@ -666,7 +668,9 @@ function mapFigure(chart, panel) {
   const grid = (make) => ys.map((y) => xs.map((x) => (at(x, y) ? make(at(x, y), x, y) : null)));
   const worst = (found) => found.reduce((a, b) => (names.indexOf(b.level) > names.indexOf(a.level) ? b : a));
   const fill = (found) => worst(found).fill || filling(worst(found).level);
-  const text = (found) => (chart.cell ? worst(found).cell : looks(worst(found).level).letter || "");
+  const letter = (found) => looks(worst(found).level).letter || "";
+  const isNarrow = 0.75 * chart.panels.clientWidth < NARROWEST * xs.length;
+  const text = (found) => (chart.cell && !(isNarrow && letter(found)) ? worst(found).cell : letter(found));
   const label = (found, x, y) => [`<b>${plotted(worst(found).level || text(found))}</b>`,
     `${plotted(chart.xAxis.label)} ${plotted(x)}`, `${plotted(chart.yAxis.label)} ${plotted(y)}`,
     worst(found).row < 0 ? "" : plotted(reader("rows", "reason")(worst(found).row) || ""),

@@ -188,6 +188,6 @@ def _chart(measured: pd.DataFrame, title: str) -> Chart:
     return Chart(
         "engines", title, frame, [text("place", label="")], [text("engine", label="")], "grid",
         level="level", cell="cell", styles=LEVELS, height=0.3, across=1,
-        subtitle="number: model error, the relative distance from the model's gradient",
-        text="A cell per engine and scene (rigid: with the law `impulse`), with the model error of its gradient. An empty cell: the engine does not run it.",
+        subtitle="Number: model error, the relative distance from the model's gradient.",
+        text="A cell per engine and scene (rigid: with the law impulse). An empty cell: the engine does not run it.",
     )  # fmt: skip
