@@ -5,6 +5,9 @@ RUN := $(BIN)/python -m bench
 
 .PHONY: run test lint slow docs site gallery examples clean
 
+# Twice JAX crashed while it compiled a program of MJX in a process that had compiled hundreds of others; the cause is unknown.
+MJX := tests/plugins/test_engines.py tests/plugins/test_mjx_solver.py
+
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
 
@@ -12,7 +15,8 @@ test: $(VENV)/.installed
 	$(BIN)/python -m pytest
 
 slow: $(VENV)/.installed
-	$(BIN)/python -m pytest -m slow --dist worksteal
+	$(BIN)/python -m pytest -m slow --dist worksteal $(addprefix --ignore=,$(MJX))
+	$(BIN)/python -m pytest -m slow $(MJX)
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
