@@ -16,7 +16,7 @@ test: $(VENV)/.installed
 
 slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -m slow --dist worksteal $(addprefix --ignore=,$(MJX))
-	$(BIN)/python -m pytest -m slow $(MJX)
+	$(BIN)/python -m pytest -m slow --dist worksteal $(MJX)
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
