@@ -13,6 +13,7 @@ from rich.console import Console
 from bench.experiment import config
 from bench.run import progress, runner
 from bench.run.execute import execute
+from bench.run.launchers import launcher
 from bench.run.progress import progress_line, remaining_seconds
 from bench.run.references import References
 
@@ -135,6 +136,7 @@ def test_a_run_in_this_process_says_which_reference_it_is_busy_with(tmp_path, mo
 
 def test_references_are_counted_while_they_are_computed(tmp_path, monkeypatch):
     lines = []
+    monkeypatch.setattr(launcher, "BATCH_S", -1.0)  # otherwise answers of quick tasks come together
     monkeypatch.setattr(progress.Progress, "working", lambda self, text: lines.append(text))
     execute(config.load([*PUSHING, "sweep.sigma=[0.1,0.2]", f"results_dir={tmp_path}"]), quiet=True)
     counted = [line for line in lines if line.startswith("reference of pushing")]
