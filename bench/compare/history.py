@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from bench.compare.cells import rows_by_cell
-from bench.compare.judging import ROUNDING, Row, numbers, value
+from bench.compare.judging import ROUNDING, Row, distance, value
 from bench.compare.sources import Results, open_results
 from bench.errors import UserError
 from bench.experiment.columns import Column, Columns, text
@@ -70,6 +70,7 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
     for experiment in shared:
         tables = [rows_by_cell(result[experiment].rows) for result in results]
         columns = results[0][experiment].columns
+        vectors = [column for column in columns.compared if column.comparison and column.comparison.by == "vector"]
         by = "estimator" if any(row["estimator"] for row in tables[0].values()) else "backend"
         names_of_series = dict.fromkeys(str(row[by]) for row in tables[0].values())
         for series in names_of_series:
@@ -77,11 +78,13 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
             ok_in_all = [key for key in keys if all(table.get(key, {}).get("status") == "ok" for table in tables)]
             rows = [[table[key] for key in ok_in_all] for table in tables]
             column = _error_column(columns, rows)
-            vector = next((c for c in columns.compared if c.comparison and c.comparison.by == "vector"), None)
             for name, table, own in zip(names, tables, rows, strict=True):
                 mine = [table[key] for key in keys if key in table]
                 error, count = _mean_ratio(column, rows[0], own)
-                moved = max((_distance(vector, *pair) for pair in zip(rows[0], own, strict=True)), default=math.nan)
+                moved = max(
+                    (distance(vector, *pair) for vector in vectors for pair in zip(rows[0], own, strict=True)),
+                    default=math.nan,
+                )
                 failed = len(keys) - len(mine) + sum(row["status"] != "ok" for row in mine)
                 shown = series if len(names_of_series) > 1 else ""
                 called = column.comparison.called if column and column.comparison else ""
@@ -105,18 +108,6 @@ def _error_column(columns: Columns, rows: Sequence[Sequence[Row]]) -> Column | N
     errors = [c for by in ERRORS for c in columns.compared if c.comparison and c.comparison.by == by]
     counts = [min(_mean_ratio(column, rows[0], own)[1] for own in rows) for column in errors]
     return errors[counts.index(max(counts))] if any(counts) else None
-
-
-def _distance(column: Column | None, first: Row, own: Row) -> float:
-    """Return the distance of a row's gradient from the first one's, relative to its norm; NaN without a gradient."""
-    if column is None:
-        return math.nan
-    was, now = numbers(first, column.name), numbers(own, column.name)
-    if not was.size or was.shape != now.shape:
-        return math.nan
-    if not was.any():
-        return math.inf if now.any() else 0.0
-    return math.hypot(*(now - was)) / math.hypot(*was)
 
 
 def write(history: History, out: Path) -> list[Path]:
@@ -194,9 +185,9 @@ def _changes(table: pd.DataFrame) -> pd.Series:
         factor = np.abs(np.log(part["error"].to_numpy(float)))
         factor = factor[np.isfinite(factor)].max(initial=0.0)
         failures = (part["failed"].max() - part["failed"].min()) / max(part["of"].max(), 1)
-        distance = part["moved"].max() if part["moved"].notna().any() else 0.0
+        moved = part["moved"].max() if part["moved"].notna().any() else 0.0
         parts[name] = (factor if factor > math.log(CHANGED) else 0.0) + failures
-        parts[name] += math.log1p(distance) if distance > ROUNDING else 0.0
+        parts[name] += math.log1p(moved) if moved > ROUNDING else 0.0
     return pd.Series(parts, dtype=float)
 
 

@@ -199,14 +199,21 @@ def _exact(column: Column, columns: Columns, old: Row, new: Row) -> Change | Non
     return _size_change(column, old, new) if is_changed else None
 
 
-def _vector(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
+def distance(column: Column, old: Row, new: Row) -> float:
+    """Return the distance of two rows' vectors relative to the old norm, infinite from 0; NaN where one is missing."""
     was, now = numbers(old, column.name), numbers(new, column.name)
     if not was.size or was.shape != now.shape:
+        return math.nan
+    norm, moved = math.hypot(*was), math.hypot(*(now - was))
+    return moved / norm if norm > 0 else math.inf if moved > 0 else 0.0
+
+
+def _vector(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
+    moved = distance(column, old, new)
+    if not moved > ROUNDING:
         return None
-    norm, distance = math.hypot(*was), math.hypot(*(now - was))
-    if not distance > ROUNDING * max(norm, math.hypot(*now)):
-        return None
-    size = f"by {number(distance / norm)} of its norm" if norm > 0 else f"from 0 to norm {number(math.hypot(*now))}"
+    norm = number(math.hypot(*numbers(new, column.name)))
+    size = f"by {number(moved)} of its norm" if math.isfinite(moved) else f"from 0 to norm {norm}"
     return Change("changed", f"{_rule(column).called} moved {size}")
 
 

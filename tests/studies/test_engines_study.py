@@ -10,6 +10,12 @@ import pytest
 import bench
 from bench.cli import main
 from bench.engines.process import close_engines
+from bench.experiment import config
+from bench.report import finish
+from bench.report.views import newest_rows
+from bench.report.web.data import page_data
+from bench.run.execute import store_of
+from bench.run.plan import requested_rows
 from bench.studies.engines.views import LEVELS, level, with_limits
 
 TOYS = Path(__file__).resolve().parents[1] / "engines" / "toys"
@@ -98,3 +104,20 @@ def test_an_error_below_that_of_its_reference_is_shown_as_a_limit():
     assert shown["rmse_rel"].iloc[0] == 0.2
     assert 0.5 < shown["rmse_rel"].iloc[1] < 1.0
     assert np.isnan(shown["rmse_rel"].iloc[2])
+
+
+def test_the_page_shows_the_limit_that_the_table_shows():
+    """The page showed the stored number, where the table had the end of its interval."""
+    standard = Path(__file__).resolve().parents[2] / "results" / "standard"
+    made = config.load(["+experiment=engine_gradients", f"results_dir={standard}"])
+    rows, _ = requested_rows(made, newest_rows(store_of(made).load()))
+    shown = finish.views_of(made, rows)
+    data = page_data(made, rows, shown, [[]] * len(rows))
+    newton = "scene == 'cartpole' and backend == 'newton'"
+    place = rows.reset_index(drop=True).query(newton).index[0]
+    limit = shown.tables[0].frame.query(newton)["rmse_rel"].item()
+    assert rows["rmse_rel"].iloc[place] < limit / 5
+    assert next(column for column in data["columns"] if column["name"] == "rmse_rel")["kind"] == "limit"
+    cells = {name: data["tables"]["rows"][name]() for name in ("rmse_rel", "rmse_is_limit")}
+    assert cells["rmse_is_limit"][place] == 1.0
+    assert cells["rmse_rel"][place] == pytest.approx(limit, rel=1e-5)  # the page has six digits

@@ -32,6 +32,11 @@ SHOWN = (
     "program_error_rel", "model_error_rel", "rmse_rel", "zeroth_rmse_rel", "nan_share", "value_s", "gradient_s", "first_s",
     "pipe_share", "memory_mb",
 )  # fmt: skip
+DETAILS = (
+    "difference_step", "model", "reference_norm", "reference_se", "reference_method", "bias", "bias_low", "bias_high",
+    "variance", "pass_share",
+)  # fmt: skip
+"""Further columns of the page."""
 LEVELS = {
     "right": Style(PALETTE[3], letter="+", meaning="derivative of its program, and near the model's gradient"),
     "own": Style(PALETTE[0], letter="o", meaning="derivative of its program, which is not near the model"),
@@ -46,7 +51,8 @@ NOTES = (
     "Program error: distance of the gradient from differences of the engine's own cost. Model error: distance from rigid "
     "contact's gradient where it has a closed form, otherwise from the gradient of the scene's own program. RMSE: of "
     "`samples` averaged gradients, or costs with scores, relative to the engine's own grad J_sigma; where that is not "
-    "known well enough, the upper end of the interval. Times are of a batch of 64 rollouts. Pipe: share of the gradients' time that is spent outside the engine's process.",
+    "known well enough, the upper end of the interval. Times are of a batch of 64 rollouts. Pipe: share of the gradients' "
+    "time that is spent outside the engine's process.",
 )
 
 
@@ -54,8 +60,9 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the findings, the table with a line per scene and engine, and the grid of usable gradients."""
     arranged = arrange(experiment, rows)
     arranged = replace(arranged, rows=with_limits(arranged.rows))
-    own = [experiment.columns.by_name[name] for name in SHOWN]
-    own = [replace(column, limit="rmse_is_limit") if column.name == "rmse_rel" else column for column in own]
+    columns = experiment.columns.by_name
+    columns = columns | {"rmse_rel": replace(columns["rmse_rel"], limit="rmse_is_limit")}
+    own, details = ([columns[name] for name in names] for names in (SHOWN, DETAILS))
     lines = engine_table(experiment, rows, arranged, own, "gradients of physics engines", NOTES)
     measured = arranged.rows[arranged.rows["status"].isin(("ok", "nonfinite"))]
     if measured.empty:
@@ -66,7 +73,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     )
     findings = [usable(measured), models(measured), costs(measured)]
     findings = [finding for finding in findings if finding]
-    return Views(findings, [lines], [_chart(measured, headline(measured))], remarks=reasons(rows))
+    charts = [_chart(measured, headline(measured))]
+    return Views(findings, [lines], charts, rows=arranged.rows, columns=[*own, *details], remarks=reasons(rows))
 
 
 def level(row: pd.Series) -> str:
@@ -86,8 +94,8 @@ def level(row: pd.Series) -> str:
 def rmse_interval(row: pd.Series) -> tuple[float, float]:
     """Return an interval of at least 95% of a row's relative RMSE, from the intervals of bias, variance and norm.
 
-    The variance's interval is that of normal numbers, one per repeat. The reference's error widens the interval of the bias, and
-    is two standard errors of the norm. The upper end is infinite where the norm may be 0.
+    The variance's interval is that of normal numbers, one per repeat. The reference's error is in the interval of the bias,
+    and makes that of the norm two standard errors wide. The upper end is infinite where the norm may be 0.
     """
     free = max(int(row["repeats"]) - 1, 1)
     low, high = (math.sqrt(row["variance"] * free / float(chdtri(free, tail))) for tail in (0.025, 0.975))
