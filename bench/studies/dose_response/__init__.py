@@ -1,0 +1,96 @@
+"""Measures what an error in the gradient costs: updates to a target against the error, within a problem and an optimizer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, numbers, text
+from bench.experiment.experiment import Experiment
+from bench.experiment.session import Session
+from bench.experiment.study import Study
+from bench.experiment.views import Views
+from bench.model import Estimator, Optimizer, Plugin, param
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class DoseResponse(Study):
+    """Searches with gradients of known error at their best rate, and counts the updates until the regret has fallen."""
+
+    name = "dose_response"
+    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "estimator", "optimizer")
+    columns: ClassVar[Columns] = Columns.of(
+        text("optimizer", "identity string of the optimizer"),
+        text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",
+             label="class"),
+        Column("error", "root mean squared error of the gradient relative to its norm, median over ten thetas of a path that "
+               "all methods of the problem share", label="relative error"),
+        Column("bias", "norm of the mean error relative to the gradient's norm, median over the thetas"),
+        Column("spread", "root mean squared distance of an estimate from their mean, relative, median over the thetas"),
+        Column("cosine", "mean cosine of estimate and gradient, median over the thetas"),
+        Column("sign_agreement", "share of components with the right sign, median over the thetas", label="right signs"),
+        Column("error_start", "relative error at the start"),
+        Column("budget", "most updates of a search: a search that misses a target is censored there", format="setting"),
+        Column("runs", "searches that score; 1 if the gradient does not depend on the noise", format="setting"),
+        Column("lowest", "lowest regret of the searches at the rate of the last target, share of the first, median"),
+        Column("start_cost", "objective at the start"),
+        Column("optimum", "lowest cost known, from before the searches", label="J*"),
+        text("optimum_status", "source of the optimum"),
+        Column("rollouts_per_update", "costs of an update"),
+        Column("gradients_per_update", "gradients of an update"),
+        Column("tuning_rollouts", "costs of all searches that choose the rate"),
+        Column("tuning_gradients", "gradients of all searches that choose the rate"),
+        Column("rollout_s", "time of a cost in a batch of 256", "s", format="seconds", measured=True),
+        Column("gradient_s", "time of a gradient in a batch of 256", "s", format="seconds", measured=True),
+        text("hypotheses", "hash of the file of hypotheses at the time of the measurement"),
+        numbers("updates", "updates to 1/10, 1/30, 1/100, 1/300 and 1/1000 of the first regret, `runs` each; empty: missed",
+                table=False),
+        numbers("best_rates", "rate of each target, chosen on seeds that do not score", table=False),
+        numbers("is_inside", "whether the rate of each target is inside the grid of rates", table=False),
+        numbers("rates", "rates tried", table=False),
+        numbers("rate_updates", "median updates to each target at each rate", table=False),
+        numbers("path_errors", "relative error at each of the ten thetas", table=False),
+    )  # fmt: skip
+
+    iterations: int = param(200, "most updates of a search", positive=True)
+    seeds: int = param(6, "searches that score, if gradients depend on the noise", positive=True)
+    tuning_seeds: int = param(3, "searches per rate that choose the rate", positive=True)
+    rates: int = param(7, "rates of the first grid, half a decade apart", low=3)
+    widenings: int = param(3, "times that the grid is widened by two rates where the best is at its edge", low=0)
+
+    def grid(self) -> list[float]:
+        """Return the first grid of rates, in units of the largest element of the first step: 0.003 to 3 for 7 rates."""
+        half = (self.rates - 1) / 2
+        return [0.1 * 10 ** (0.5 * (i - half)) for i in range(self.rates)]
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Return one cell's results by column."""
+        from bench.studies.dose_response.measure import measure
+
+        return measure(cell, session, self)
+
+    def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
+        """Return the plugins, without the estimator if the optimizer uses only costs: it then has no effect."""
+        optimizer = given.get("optimizer")
+        if isinstance(optimizer, Optimizer) and "gradient" not in optimizer.needs:
+            return given | {"estimator": None}
+        return given
+
+    def unsupported_reason(self, cell: Cell) -> str | None:
+        """Return why a cell cannot be searched, or None."""
+        optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
+        assert isinstance(optimizer, Optimizer)
+        assert estimator is None or isinstance(estimator, Estimator)
+        if missing := sorted(optimizer.needs - {"value", "gradient"}):
+            return f"optimizer {optimizer.name} needs {' and '.join(missing)}, which this study does not compute"
+        if "gradient" in optimizer.needs and estimator is not None and not estimator.gives_gradient:
+            return f"optimizer {optimizer.name} needs gradients, which {estimator.name} does not give"
+        return None
+
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views | None:
+        """Return the cost of an error by class, with the natural methods on it, tables and findings."""
+        return None

@@ -1,0 +1,223 @@
+"""Runs the searches of one method on one problem: tunes the rate, then scores it on other seeds, in shared batches."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from bench.measure import noise
+from bench.model import Answer, Estimator, Optimizer, Problem
+from bench.model.parameters import parameters
+from bench.studies.optimise.batched import run_batched
+
+TARGETS = (10.0, 30.0, 100.0, 300.0, 1000.0)
+"""Factors by which the regret of a search has to fall."""
+DIVERGED = 1e3
+"""Multiple of the first regret above the start cost at which a search has diverged."""
+MOST_NUMBERS = 1 << 23
+"""Most numbers of noise or gradients that a shared call of several searches may hold (64 MiB)."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """The problem that searches share: the scored noise, the first cost, the optimum, and the number of updates."""
+
+    scene: str
+    scored: np.ndarray
+    """Noise of the objective, ``(n_w, M)``: one column of zeros for the cost without noise."""
+    start: float
+    optimum: float
+    iterations: int
+
+    @property
+    def levels(self) -> np.ndarray:
+        """The costs of :data:`TARGETS`."""
+        return self.optimum + (self.start - self.optimum) / np.asarray(TARGETS)
+
+
+@dataclass(frozen=True)
+class Method:
+    """An optimizer with its gradient: an estimator and its samples, or None for an optimizer that uses only costs."""
+
+    optimizer: Optimizer
+    estimator: Estimator | None
+    samples: int
+    is_random: bool = True
+    """Whether gradients depend on the noise; if not, all seeds have the same path."""
+
+
+@dataclass
+class Search:
+    """The result of one search."""
+
+    updates: list[float]
+    """Updates until each target; infinite if it was missed."""
+    rollouts: float
+    """Rollouts per update, without those that score the path."""
+    gradients: float
+    lowest: float
+    """Lowest regret over the first regret."""
+    steps: int
+    thetas: list[np.ndarray] = dataclasses.field(default_factory=list)
+
+
+@lru_cache(maxsize=32)
+def _noise(seed: int, scene: str, samples: int, width: int, iteration: int) -> np.ndarray:
+    """Return the noise of one update, which searches at several rates share."""
+    return noise.draw(seed, scene, 1, samples, width, f"dose_response: samples {iteration}")
+
+
+def objective(problem: Problem, theta: np.ndarray, scored: np.ndarray) -> float:
+    """Return the scored objective at ``theta (d,)``. Its rollouts are not counted."""
+    before = problem.usage.rollouts
+    cost = float(problem.value(theta, scored).mean())
+    problem.usage.rollouts = before
+    return cost
+
+
+def follow(problem: Problem, method: Method, task: Task, seed: int, keep: bool = False) -> Search:
+    """Search until the last target, divergence or the number of updates; ``keep`` returns theta at every update."""
+    optimizer, width = method.optimizer, problem.program.n_noise
+    state = optimizer.start(np.array(problem.program.theta0, dtype=np.float64))
+    updates, lowest, thetas, i = [math.inf] * len(TARGETS), math.inf, [], 0
+    problem.usage.rollouts = problem.usage.gradients = 0
+    first = task.start - task.optimum
+    while True:
+        cost = objective(problem, state["theta"], task.scored)
+        if keep:
+            thetas.append(np.array(state["theta"]))
+        if not math.isfinite(cost) or cost > task.start + DIVERGED * first:
+            break
+        lowest = min(lowest, (cost - task.optimum) / first)
+        updates = [min(u, i) if cost <= level else u for u, level in zip(updates, task.levels, strict=True)]
+        if i >= task.iterations or math.isfinite(updates[-1]):
+            break
+        i += 1
+        draws = optimizer.draws(problem.dim)
+        points = optimizer.ask(
+            state, noise.draw(seed, task.scene, 1, draws, problem.dim, f"dose_response: points {i}")[0].T
+        )
+        needs = optimizer.required_fields(state)
+        drawn = _noise(seed if method.is_random else 0, task.scene, method.samples, width, i if method.is_random else 0)
+        value = gradient = None
+        if "value" in needs:
+            scored = task.scored
+            costs = problem.value(np.repeat(points, scored.shape[1], axis=1), np.tile(scored, (1, points.shape[1])))
+            value = costs.reshape(points.shape[1], -1).mean(axis=1)
+        if "gradient" in needs:
+            assert method.estimator is not None
+            gradient = np.stack([method.estimator.estimate(problem, point, drawn)[0] for point in points.T], axis=1)
+        state = optimizer.tell(state, points, Answer(value, gradient))
+    share = 1.0 / max(i, 1)
+    return Search(updates, problem.usage.rollouts * share, problem.usage.gradients * share, lowest, i, thetas)
+
+
+def run_searches(
+    problem: Problem, task: Task, methods: Sequence[Method], seeds: Sequence[int], keep: bool = False
+) -> list[Search]:
+    """Return the searches of each pair of method and seed; searches share calls of the problem."""
+    samples = max(max(m.samples for m in methods) if methods[0].is_random else 1, task.scored.shape[1])
+    group = max(1, MOST_NUMBERS // (samples * max(problem.dim, problem.program.n_noise)))
+    results: list[Search] = []
+
+    def job(method: Method, seed: int) -> Callable[[Problem], dict[str, Any]]:
+        return lambda lane: {"search": follow(lane, method, task, seed, keep)}
+
+    jobs = [job(method, seed) for method, seed in zip(methods, seeds, strict=True)]
+    for start in range(0, len(jobs), group):
+        for outcome in run_batched(problem, jobs[start : start + group]):
+            if isinstance(outcome, BaseException):
+                raise outcome
+            results.append(outcome["search"])
+    return results
+
+
+# ------------------------------------------------------------------------------------------------------ tuning
+
+
+@dataclass
+class Tuning:
+    """The searches of a method by rate, and the best rate of each target."""
+
+    rates: list[float]
+    updates: np.ndarray
+    """Median updates until each target, infinite where most searches miss it: ``(rates, targets)``."""
+    best: list[int]
+    """Index of the best rate of each target."""
+    rollouts: float
+    """Rollouts of all searches of the tuning."""
+    gradients: float
+    is_inside: list[bool]
+    """Whether the best rate of each target is inside the grid."""
+
+
+def tuned_parameter(optimizer: Optimizer) -> str | None:
+    """Return the parameter that is tuned: the rate, else the initial width, or None."""
+    return next((name for name in ("rate", "width", "first") if name in parameters(type(optimizer))), None)
+
+
+def unit_rate(optimizer: Optimizer, gradient: np.ndarray | None) -> float:
+    """Return the value of the tuned parameter at which the largest element of the first step is about 1."""
+    name = tuned_parameter(optimizer)
+    if name != "rate" or gradient is None:
+        return 1.0
+    state = dataclasses.replace(optimizer, rate=1.0).start(0.0 * gradient)  # type: ignore[call-arg]
+    moved = dataclasses.replace(optimizer, rate=1.0).tell(state, state["theta"][:, None], Answer(None, gradient[:, None]))  # type: ignore[call-arg]
+    size = float(np.abs(moved["theta"]).max())
+    return 1.0 / size if size > 0 else 1.0
+
+
+def tune(
+    problem: Problem,
+    task: Task,
+    method: Method,
+    seeds: Sequence[int],
+    grid: Sequence[float],
+    widenings: int,
+) -> Tuning:
+    """Search at each rate of a log-spaced grid, widen the grid until the best rates are inside, and return all.
+
+    The best rate of a target has the lowest median number of updates. Where no rate reaches the target in most seeds,
+    it has the lowest median of the lowest regret.
+    """
+    name = tuned_parameter(method.optimizer)
+    found: dict[float, list[Search]] = {}
+    rates = list(grid) if name else [0.0]
+    step = grid[1] / grid[0] if len(grid) > 1 else 10**0.5
+    for widening in range(widenings + 1):
+        missing = [rate for rate in rates if rate not in found]
+        pairs = [(rate, seed) for rate in missing for seed in seeds]
+        methods = [with_rate(method, rate) for rate, _ in pairs]
+        for (rate, _), search in zip(pairs, run_searches(problem, task, methods, [s for _, s in pairs]), strict=True):
+            found.setdefault(rate, []).append(search)
+        rates = sorted(found)
+        updates = np.array([np.median([s.updates for s in found[rate]], axis=0) for rate in rates])
+        lowest = np.array([np.median([s.lowest for s in found[rate]]) for rate in rates])
+        best = [int(np.lexsort((lowest, updates[:, k]))[0]) for k in range(len(TARGETS))]
+        if not name or widening == widenings:
+            break
+        wider = ([rates[0] / step**2, rates[0] / step] if min(best) == 0 else []) + (
+            [rates[-1] * step, rates[-1] * step**2] if max(best) == len(rates) - 1 else []
+        )
+        if not wider:
+            break
+        rates = sorted([*rates, *wider])
+    everything = [search for some in found.values() for search in some]
+    return Tuning(
+        rates, updates, best, sum(s.rollouts * s.steps for s in everything), sum(s.gradients * s.steps for s in everything),
+        [not name or 0 < b < len(rates) - 1 for b in best],
+    )  # fmt: skip
+
+
+def with_rate(method: Method, rate: float) -> Method:
+    """Return the method with a value of its tuned parameter."""
+    name = tuned_parameter(method.optimizer)
+    if name is None:
+        return method
+    return dataclasses.replace(method, optimizer=dataclasses.replace(method.optimizer, **{name: rate}))
