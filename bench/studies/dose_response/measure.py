@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.errors import Unsupported
 from bench.experiment.cell import Cell
+from bench.experiment.config import config_dir
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import Estimator, Optimizer, Problem
@@ -29,7 +29,7 @@ from bench.studies.dose_response.search import (
 )
 from bench.studies.optimise.search import scene_class
 
-HYPOTHESES = Path(__file__).resolve().parents[3] / "conf" / "hypotheses" / "dose_response.md"
+HYPOTHESES = config_dir() / "hypotheses" / "dose_response.md"
 """The hypotheses that were written before the first run."""
 TUNING_SEED = 10_000
 """First seed of the searches that choose the rate."""
