@@ -91,6 +91,8 @@ class DoseResponse(Study):
             return f"optimizer {optimizer.name} needs gradients, which {estimator.name} does not give"
         return None
 
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views | None:
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return the cost of an error by class, with the natural methods on it, tables and findings."""
-        return None
+        from bench.studies.dose_response.views import views
+
+        return views(experiment, rows)
