@@ -264,7 +264,100 @@ def scenes_table() -> str:
     return block(head + [f"| {scene} | " + " | ".join(map(number, values)) + " |" for scene, values in ratios.items()])
 
 
+def dose(table: str) -> pd.DataFrame:
+    """Return a table of ``dose_response`` as stored."""
+    return pd.read_csv(STANDARD / "dose_response" / f"{table}.csv", keep_default_na=True)
+
+
+def with_interval(row: Any, name: str) -> str:
+    """Return a quantity of a row with its interval, or a dash where it is unknown."""
+    value, low, high = (float(getattr(row, f"{name}{end}")) for end in ("", "_low", "_high"))
+    if not np.isfinite(value):
+        return "-"
+    return f"{number(value)} [{number(low)}, {number(high) if high < 1e4 else 'no limit'}]"
+
+
+def dose_answer() -> str:
+    """Return the findings of ``dose_response``, a line each."""
+    found = json.loads((STANDARD / "dose_response" / "findings.json").read_text())
+    return block([f"- {sentence}" for sentence in (found["findings"] if isinstance(found, dict) else found)])
+
+
+def dose_fits() -> str:
+    """Return what an error costs by class and target as a Markdown table."""
+    head = ["| class | regret | problems | random error 1 / 0.1 | bias 0.5 / 0.05 | c_b / c_s |", "|---|---|--:|--:|--:|--:|"]
+    names = ("tenfold", "tenfold_bias", "bias_over_spread")
+    return block(head + [
+        f"| {row.scene_class} | {row.target_name} | {row.problems} | " + " | ".join(with_interval(row, name) for name in names) + " |"
+        for row in dose("fits").itertuples()
+    ])  # fmt: skip
+
+
+def dose_verdicts() -> str:
+    """Return the number of verdicts by hypothesis as a Markdown table."""
+    rows = dose("hypotheses").replace({"verdict": {"not known": "open"}})
+    counts = rows[rows["hypothesis"] != "all"].groupby("hypothesis")["verdict"].value_counts().unstack(fill_value=0)
+    counts = counts.reindex(columns=["confirmed", "refuted", "open"], fill_value=0)
+    lines = [f"| {name} | {row.confirmed} | {row.refuted} | {row.open} |" for name, row in counts.iterrows()]
+    return block(["| hypothesis | confirmed | refuted | open |", "|---|--:|--:|--:|", *lines])
+
+
+def dose_costs() -> str:
+    """Return the share of problems on which the first order is cheaper as a Markdown table."""
+    rows = dose("costs").query("target == 100")
+    head = ["| class | " + " | ".join(["1", "2", "4", "measured"]) + " | cheaper |", "|---|--:|--:|--:|--:|---|"]
+    lines = []
+    for name, part in rows.groupby("scene_class", sort=False):
+        shares = [f"{line.wins} of {line.problems}" for line in part.itertuples()]
+        verdicts = set(part["verdict"])
+        lines.append(f"| {name} | {' | '.join(shares)} | {verdicts.pop() if len(verdicts) == 1 else 'not known'} |")
+    return block(head + lines)
+
+
+def dose_second() -> str:
+    """Return the second analysis of ``dose_response`` as a Markdown table."""
+    head = ["| class | analysis | problems | random error 1 / 0.1 | c_b / c_s |", "|---|---|--:|--:|--:|"]
+    rows = dose("second_analysis").sort_values("scene_class", kind="stable")
+    return block(head + [
+        f"| {row.scene_class} | {row.analysis} | {row.problems} | {with_interval(row, 'tenfold')} | "
+        f"{with_interval(row, 'bias_over_spread')} |" for row in rows.itertuples()
+    ])  # fmt: skip
+
+
+def dose_data() -> str:
+    """Return the number of cells, problems and problems that count, by class."""
+    rows, problems = rows_of("dose_response"), dose("problems")
+    counted = problems["reason_100"].isna() | (problems["reason_100"] == "")
+    by_class = [f"{name} {int(part.sum())} of {len(part)}" for name, part in counted.groupby(problems["scene_class"], sort=False)]
+    dims = rows["dim"].dropna()
+    ok = f"{count((rows['status'] == 'ok').sum())} of {count(len(rows))} cells gave a result"
+    return block([
+        f"{ok}, on {len(problems)} problems of {int(dims.min())} to {int(dims.max())} coordinates. Problems that count for the target 1/100: "
+        f"{', '.join(by_class)}."
+    ])  # fmt: skip
+
+
+def dose_rates() -> str:
+    """Return what a wrong rate costs the best gradient."""
+    rows = dose("controls")
+    texts = []
+    for name, label in (("above", "ten times its best rate"), ("below", "a tenth of it")):
+        tried = rows[name].dropna()
+        middle = float(tried.median())
+        much = f"{number(middle)} times the updates" if np.isfinite(middle) else "no arrival"
+        texts.append(f"at {label} {much} ({int((tried > 2).sum())} of {len(tried)} problems need more than twice as many, or miss)")
+    return block([f"A right gradient with a wrong rate, to 1/100, median over problems: {' and '.join(texts)}."])
+
+
 FIGURES: dict[str, Callable[[], str]] = {
+    "dose-answer": dose_answer,
+    "dose-fits": dose_fits,
+    "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
+    "dose-verdicts": dose_verdicts,
+    "dose-costs": dose_costs,
+    "dose-second": dose_second,
+    "dose-data": dose_data,
+    "dose-rates": dose_rates,
     "fobg-soft": lambda: span(pushing("fobg", stiffness=SOFT)["rmse_rel"]),
     "reinforce-soft": lambda: span(pushing("reinforce", stiffness=SOFT)["rmse_rel"]),
     "fobg-stiff": lambda: interval(pushing("fobg", stiffness=1e4)),

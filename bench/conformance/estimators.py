@@ -121,6 +121,18 @@ def varying_oracle(estimator: Estimator) -> Oracle:
     raise Skipped("supports no oracle whose samples all differ")
 
 
+def skip_if_plain(estimator: Estimator, oracle: Oracle) -> None:
+    """Raise :class:`Skipped` for an estimator that declares a bias and returns the gradient at w = 0.
+
+    That gradient is exact for the cost without noise, so it has no variance and uses no sample.
+    """
+    if not estimator.unbiased and oracle.continuous:
+        plain = oracle.problem.grad(oracle.problem.program.theta0, np.zeros((oracle.problem.program.n_noise, 1)))[:, 0]
+        values = estimates(estimator, oracle, draw_noise(oracle, 2, 8, "plain"))
+        if (values == values[0]).all() and distance(values[0], plain) < DIFFERENCED:
+            raise Skipped("returns the gradient at w = 0, which uses no sample")
+
+
 def usable(estimator: Estimator, candidates: Iterable[Oracle]) -> Iterator[Oracle]:
     """Return the oracles that the estimator supports."""
     return (oracle for oracle in candidates if estimator.unsupported_reason(oracle.problem.program) is None)
@@ -187,6 +199,7 @@ def diagnostics_are_as_declared(estimator: Estimator) -> str:
 def repeats_are_independent(estimator: Estimator) -> str:
     """Verify that estimate r depends only on ``noise[r]``."""
     oracle = varying_oracle(estimator)
+    skip_if_plain(estimator, oracle)
     noise = np.array(draw_noise(oracle, 6, 8))
     whole = estimates(estimator, oracle, noise)
     order = np.array([3, 0, 5, 1, 4, 2])
@@ -208,6 +221,7 @@ def repeats_are_independent(estimator: Estimator) -> str:
 def uses_every_sample(estimator: Estimator) -> str:
     """Verify that the estimate depends on the noise of each of 8 samples, or else of each eighth of 4096 samples."""
     oracle = varying_oracle(estimator)
+    skip_if_plain(estimator, oracle)
     unused = set(range(8))
     for size in (1, 512):
         noise = draw_noise(oracle, 8, 8 * size)
@@ -226,6 +240,7 @@ def uses_every_sample(estimator: Estimator) -> str:
 def variance_falls_as_one_over_n(estimator: Estimator) -> str:
     """Verify the slope of log variance against log N: -1 for sample means and unbiased estimators, else at most -1."""
     oracle = varying_oracle(estimator)
+    skip_if_plain(estimator, oracle)
     counts, groups = np.array([32, 128, 512]), 16
     logs = np.empty((len(counts), groups))
     for i, n in enumerate(counts):
@@ -249,6 +264,7 @@ def bias_is_as_declared(estimator: Estimator) -> str:
     candidates = list(usable(estimator, [o for o in oracles() if o.continuous]))
     if not candidates:
         raise Skipped("supports no continuous oracle")
+    skip_if_plain(estimator, varying_oracle(estimator))
     return _verify_bias(estimator, candidates)
 
 
@@ -320,6 +336,7 @@ def _standard_errors(estimator: Estimator, oracle: Oracle, count: int, repeats: 
 def needs_are_truthful(estimator: Estimator) -> str:
     """Verify that the estimator uses every capability in ``needs``, and no other capability."""
     oracle = varying_oracle(estimator)
+    skip_if_plain(estimator, oracle)
     recording = RecordingProblem(oracle.problem, estimator.needs)
     estimates(estimator, oracle, draw_noise(oracle, 4, 8), recording)
     unused = sorted(estimator.needs - recording.used)

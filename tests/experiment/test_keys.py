@@ -26,6 +26,7 @@ CELLS = {
                  "estimators=[fobg]"],
     "adam": [*OPTIMISE, "optimizers=[adam]"],
     "cem": [*OPTIMISE, "optimizers=[cem]"],
+    "dose_response": ["study=dose_response", *PUSH, "estimators=[fobg]", "optimizers=[adam]"],
     **{study: [f"study={study}", *PUSH] for study in ("engines", "gradient_check", "growth", "stability", "three_errors", "twins")},
     "solver": ["study=solver", "scenes=[pushing]", "contacts=[penalty]", "backends=[mujoco]"],
     "identify": ["study=identify", "scenes=[spring_record]", "integrators=[rk4]", "backends=[numpy]"],
@@ -33,7 +34,7 @@ CELLS = {
 """One cell of every kind whose keys are compared."""
 BIAS = "fobg windowed total_propagation callable"
 REFERENCED = f"{BIAS} engines three_errors"
-ESTIMATED = f"{BIAS} engines adam cem gradient_check growth stability three_errors twins"
+ESTIMATED = f"{BIAS} engines adam cem dose_response gradient_check growth stability three_errors twins"
 MOVED = {
     "measure/__init__": "",
     "measure/adequacy": "identify",
@@ -48,20 +49,20 @@ MOVED = {
     "measure/gradcheck/verdicts": "gradient_check",
     "measure/identification": "identify",
     "measure/jumps": f"{REFERENCED} gradient_check",
-    "measure/noise": f"{BIAS} engines adam cem gradient_check growth solver three_errors twins identify",
+    "measure/noise": f"{BIAS} engines adam cem dose_response gradient_check growth solver three_errors twins identify",
     "measure/performance": "identify",
     "measure/quadrature": REFERENCED,
     "measure/reference": REFERENCED,
     "measure/smoothed": REFERENCED,
-    "measure/solve": "adam cem",
+    "measure/solve": "adam cem dose_response",
     "measure/statistics": REFERENCED,
     "measure/timing": f"{BIAS} engines solver twins",
     "model/__init__": "",
     "model/adjoint": "engines windowed total_propagation",
     "model/manifold": "engines windowed total_propagation solver",
     "model/estimator": ESTIMATED,
-    "model/known_solutions": "windowed adam cem identify",
-    "model/optimizer": "adam cem identify",
+    "model/known_solutions": "windowed adam cem dose_response identify",
+    "model/optimizer": "adam cem dose_response identify",
     "model/simulator/__init__": "",
     "model/simulator/clock": "callable",
     "model/simulator/example": "",
@@ -71,6 +72,7 @@ MOVED = {
     "model/simulator/tree": "callable",
     "run/references": REFERENCED,
     "studies/bias_variance/measure": BIAS,
+    "studies/dose_response/measure": "dose_response",
     "studies/engines/measure": "engines",
     "studies/gradient_check/measure": "gradient_check",
     "studies/growth/measure": "growth",

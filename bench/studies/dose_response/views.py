@@ -76,6 +76,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     tables = [
         Table("dose_response", fit_lines, FITS, "What an error costs in updates",
               [note.format(hash=listed(hashes) if hashes else "none") for note in FIT_NOTES], terminal=True, page=True, data=data),
+        Table("fits", fit_lines, [], files=["csv"]),
         Table("hypotheses", verdicts, [text("hypothesis"), CLASS, TARGET, text("verdict"), text("evidence"),
                                        Column("needed", label="problems needed")], "Hypotheses", VERDICT_NOTES, page=True),
         Table("costs", costs.assign(target_name=costs["target"].map(_regret), ratio_name=costs["ratio"].map(_ratio)),

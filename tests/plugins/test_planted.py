@@ -1,0 +1,110 @@
+"""The estimator that plants errors: each has the kind and size that it states."""
+
+import math
+
+import numpy as np
+import pytest
+from bench.plugins.estimators.fobg import Fobg
+from bench.plugins.estimators.planted import Planted, direction
+from bench.plugins.scenes.heaviside import Heaviside
+from bench.plugins.scenes.quadratic import Quadratic
+from scipy.stats import f, kstest
+
+import bench
+from bench.studies.dose_response.measure import compare
+
+ROUNDING = 1e-12
+"""Relative rounding of sums of 20 numbers."""
+UNLIKELY = 1e-4
+"""Probability below which a distribution counts as another one."""
+D = 20
+
+
+def problem(scene=None):
+    return bench.problem(scene or Quadratic(dimension=D, condition=5.0), backend="numpy")
+
+
+def drawn(repeats=400, samples=4, width=D, seed=0):
+    return np.random.default_rng(seed).standard_normal((repeats, samples, width))
+
+
+def measured(estimator, theta=None, **sizes):
+    p = problem()
+    theta = p.program.theta0 + 1.0 if theta is None else theta
+    exact = p.grad(theta, np.zeros((D, 1)))[:, 0]
+    return compare(estimator.estimate(p, theta, drawn(**sizes)), exact, 0.0)
+
+
+@pytest.mark.parametrize("bias", [0.1, 0.9])
+def test_planted_bias_has_its_size_and_no_spread(bias):
+    found = measured(Planted(base="best", bias=bias))
+    assert found["bias"] == pytest.approx(bias, rel=1e-7)
+    assert found["spread"] == pytest.approx(0.0, abs=1e-7)  # the numpy backend's gradients are differences
+
+
+@pytest.mark.parametrize("angle", [30.0, 90.0, 120.0])
+def test_planted_rotation_has_its_angle_and_keeps_the_length(angle):
+    p = problem()
+    theta = p.program.theta0 + 1.0
+    exact = p.grad(theta, np.zeros((D, 1)))[:, 0]
+    turned = Planted(base="best", angle=angle).estimate(p, theta, drawn(repeats=1))[0]
+    assert np.linalg.norm(turned) == pytest.approx(np.linalg.norm(exact), rel=ROUNDING)
+    cosine = turned @ exact / (np.linalg.norm(turned) * np.linalg.norm(exact))
+    assert cosine == pytest.approx(math.cos(math.radians(angle)), abs=ROUNDING)
+    assert measured(Planted(base="best", angle=angle))["error"] == pytest.approx(2 * math.sin(math.radians(angle / 2)), rel=1e-7)
+
+
+@pytest.mark.parametrize("noise", [0.3, 3.0])
+def test_planted_noise_has_its_size_and_no_bias(noise):
+    repeats = 4000
+    found = measured(Planted(base="best", noise=noise), repeats=repeats)
+    # the mean square of a chi-square with D repeats degrees of freedom has the relative deviation sqrt(2 / (D repeats))
+    assert found["spread"] == pytest.approx(noise, rel=4 * math.sqrt(2 / (D * repeats)))
+    assert found["bias"] < 4 * noise / math.sqrt(repeats)
+
+
+def test_heavy_tailed_errors_follow_an_f_distribution_whose_mean_is_the_stated_square():
+    p, tails, noise = problem(), 3, 0.7
+    theta = p.program.theta0 + 1.0
+    exact = p.grad(theta, np.zeros((D, 1)))[:, 0]
+    errors = Planted(base="best", noise=noise, tails=tails).estimate(p, theta, drawn(repeats=5000)) - exact
+    squares = (errors**2).sum(axis=1) / (noise**2 * exact @ exact)
+    # |t|^2 / d of a multivariate t vector is F(d, tails), with mean tails / (tails - 2)
+    assert kstest(squares * tails / (tails - 2), f(D, tails).cdf).pvalue > UNLIKELY
+    assert kstest(squares, f(D, 300).cdf).pvalue < UNLIKELY  # a normal error is told apart
+
+
+def test_errors_relative_to_the_start_grow_as_the_gradient_falls():
+    p = problem()
+    theta0 = p.program.theta0
+    near = 0.1 * theta0
+    exact = [p.grad(theta, np.zeros((D, 1)))[:, 0] for theta in (theta0, near)]
+    assert np.linalg.norm(exact[0]) > 5 * np.linalg.norm(exact[1])
+    found = Planted(base="best", bias=0.5, scale="start").estimate(p, near, drawn(repeats=1))[0] - exact[1]
+    np.testing.assert_allclose(found, 0.5 * np.linalg.norm(exact[0]) * direction(D), rtol=1e-7)
+
+
+def test_without_an_error_it_equals_fobg():
+    p, w = problem(), drawn()
+    np.testing.assert_array_equal(Planted().estimate(p, p.program.theta0, w), Fobg().estimate(p, p.program.theta0, w))
+
+
+def test_best_gradient_of_a_jump_comes_from_costs():
+    p = problem(Heaviside())
+    w = drawn(repeats=8, samples=4000, width=1)
+    mean = Planted(base="best").estimate(p, p.program.theta0, w).mean()
+    truth = p.program.closed_form_gradient()[0]
+    assert mean == pytest.approx(truth, rel=0.1)  # 10 standard errors of 32,000 samples
+    assert Fobg().estimate(p, p.program.theta0, w).mean() == 0.0
+
+
+def test_rotation_of_one_coordinate_is_refused():
+    reason = Planted(angle=30.0).unsupported_reason(problem(Heaviside()).program)
+    assert reason is not None
+    assert "at least 2 coordinates" in reason
+
+
+def test_noise_without_samples_left_for_the_base_is_an_error():
+    p = problem()
+    with pytest.raises(ValueError, match="needs 2 samples, got 1"):
+        Planted(noise=1.0).estimate(p, p.program.theta0, drawn(samples=1))
