@@ -285,7 +285,10 @@ def dose_answer() -> str:
 
 def dose_fits() -> str:
     """Return what an error costs by class and target as a Markdown table."""
-    head = ["| class | regret | problems | random error 1 / 0.1 | bias 0.5 / 0.05 | c_b / c_s |", "|---|---|--:|--:|--:|--:|"]
+    head = [
+        "| class | regret | problems | random error 1 / 0.1 | bias 0.5 / 0.05 | c_b / c_s |",
+        "|---|---|--:|--:|--:|--:|",
+    ]
     names = ("tenfold", "tenfold_bias", "bias_over_spread")
     return block(head + [
         f"| {row.scene_class} | {row.target_name} | {row.problems} | " + " | ".join(with_interval(row, name) for name in names) + " |"
@@ -324,11 +327,27 @@ def dose_second() -> str:
     ])  # fmt: skip
 
 
+def dose_shapes() -> str:
+    """Return the comparison of noise of fixed and relative size as a Markdown table."""
+    head = [
+        "| class | regret | problems | fixed size / relative | first order / fixed size | zeroth order / fixed size |",
+        "|---|---|--:|--:|--:|--:|",
+    ]
+    names = ("fixed_over_relative", "first_over_fixed", "zeroth_over_fixed")
+    return block(head + [
+        f"| {row.scene_class} | 1/{row.target:g} | {row.problems} | " + " | ".join(with_interval(row, name) for name in names) + " |"
+        for row in dose("shapes").itertuples()
+    ])  # fmt: skip
+
+
 def dose_data() -> str:
     """Return the number of cells, problems and problems that count, by class."""
     rows, problems = rows_of("dose_response"), dose("problems")
     counted = problems["reason_100"].isna() | (problems["reason_100"] == "")
-    by_class = [f"{name} {int(part.sum())} of {len(part)}" for name, part in counted.groupby(problems["scene_class"], sort=False)]
+    by_class = [
+        f"{name} {int(part.sum())} of {len(part)}"
+        for name, part in counted.groupby(problems["scene_class"], sort=False)
+    ]
     dims = rows["dim"].dropna()
     ok = f"{count((rows['status'] == 'ok').sum())} of {count(len(rows))} cells gave a result"
     return block([
@@ -345,7 +364,9 @@ def dose_rates() -> str:
         tried = rows[name].dropna()
         middle = float(tried.median())
         much = f"{number(middle)} times the updates" if np.isfinite(middle) else "no arrival"
-        texts.append(f"at {label} {much} ({int((tried > 2).sum())} of {len(tried)} problems need more than twice as many, or miss)")
+        texts.append(
+            f"at {label} {much} ({int((tried > 2).sum())} of {len(tried)} problems need more than twice as many, or miss)"
+        )
     return block([f"A right gradient with a wrong rate, to 1/100, median over problems: {' and '.join(texts)}."])
 
 
@@ -357,6 +378,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "dose-costs": dose_costs,
     "dose-second": dose_second,
     "dose-data": dose_data,
+    "dose-shapes": dose_shapes,
     "dose-rates": dose_rates,
     "fobg-soft": lambda: span(pushing("fobg", stiffness=SOFT)["rmse_rel"]),
     "reinforce-soft": lambda: span(pushing("reinforce", stiffness=SOFT)["rmse_rel"]),

@@ -51,7 +51,9 @@ def test_planted_rotation_has_its_angle_and_keeps_the_length(angle):
     assert np.linalg.norm(turned) == pytest.approx(np.linalg.norm(exact), rel=ROUNDING)
     cosine = turned @ exact / (np.linalg.norm(turned) * np.linalg.norm(exact))
     assert cosine == pytest.approx(math.cos(math.radians(angle)), abs=ROUNDING)
-    assert measured(Planted(base="best", angle=angle))["error"] == pytest.approx(2 * math.sin(math.radians(angle / 2)), rel=1e-7)
+    assert measured(Planted(base="best", angle=angle))["error"] == pytest.approx(
+        2 * math.sin(math.radians(angle / 2)), rel=1e-7
+    )
 
 
 @pytest.mark.parametrize("noise", [0.3, 3.0])

@@ -45,7 +45,9 @@ def curvature(problem):
 def test_descent_along_a_rotated_gradient_takes_the_updates_of_its_closed_form(bowl, angle):
     """|x|^2 falls by 1 - 2 s cos(angle) + s^2 per step of s = rate times curvature."""
     share = 0.3
-    method = Method(GradientDescent(rate=share / curvature(bowl)), Planted(base="best", angle=angle), 1, is_random=False)
+    method = Method(
+        GradientDescent(rate=share / curvature(bowl)), Planted(base="best", angle=angle), 1, is_random=False
+    )
     search = follow(bowl, method, task_of(bowl), seed=0)
     factor = 1 - 2 * share * math.cos(math.radians(angle)) + share**2
     expected = [math.ceil(math.log(k) / -math.log(factor) - 1e-9) for k in TARGETS]
@@ -131,7 +133,9 @@ def simulated(seed, problems=8, methods=30, budget=250.0):
     growth = 1 + TRUE_C[0] * spread**TRUE_P + TRUE_C[1] * bias**TRUE_P
     time = floor[problem] + np.log(growth) + TRUE_SCATTER * rng.standard_normal(n)
     is_missed = time > math.log(budget)
-    return Data(problem, np.minimum(time, math.log(budget)), is_missed, np.c_[spread, bias], np.ones(n), np.zeros((n, 0)))
+    return Data(
+        problem, np.minimum(time, math.log(budget)), is_missed, np.c_[spread, bias], np.ones(n), np.zeros((n, 0))
+    )
 
 
 def test_fit_recovers_planted_coefficients_from_censored_searches():
@@ -160,7 +164,10 @@ def test_derivatives_of_the_likelihood_agree_with_differences():
         for scatter in ("normal", "extreme"):
             value, slope = model._negative(x, data, form, scatter)
             steps = 1e-6 * np.eye(x.size)
-            differences = [(model._negative(x + s, data, form, scatter)[0] - model._negative(x - s, data, form, scatter)[0]) / 2e-6 for s in steps]
+            differences = [
+                (model._negative(x + s, data, form, scatter)[0] - model._negative(x - s, data, form, scatter)[0]) / 2e-6
+                for s in steps
+            ]
             np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-4 * abs(value) / x.size)
 
 
@@ -168,7 +175,7 @@ def test_left_out_problems_prefer_the_form_that_made_them():
     data = simulated(3, problems=8)
     only_random = data.errors[:, 1] == 0
     part = Data(*(getattr(data, f.name)[only_random] for f in dataclasses.fields(Data)))
-    part = model.with_errors(part, part.errors[:, :1])
+    part = dataclasses.replace(part, errors=part.errors[:, :1])
     own, power, none = (np.nanmean(model.left_out_likelihoods(part, form)) for form in ("floor", "power", "none"))
     assert own > power > none
 
@@ -178,6 +185,17 @@ def test_a_fit_without_a_reached_target_is_an_error():
     missed = dataclasses.replace(data, is_missed=np.ones_like(data.is_missed))
     with pytest.raises(ValueError, match="no search reached its target"):
         fit(missed)
+
+
+def test_a_power_at_its_bound_is_not_identified():
+    """Without an effect of the error's size, only of its presence, the power goes to its lower bound."""
+    data = simulated(0)
+    present = data.errors.sum(axis=1) > 0.3
+    errors = np.where(present[:, None], data.errors, 0.0)
+    log_time = 3.0 + 1.0 * present + 0.1 * np.random.default_rng(0).standard_normal(len(present))
+    jump = dataclasses.replace(data, errors=errors, log_time=log_time, is_missed=np.zeros(len(present), dtype=bool))
+    assert not fit(jump).is_identified
+    assert fit(data).is_identified
 
 
 def test_interval_of_too_few_problems_is_open():
@@ -215,8 +233,15 @@ def test_needed_problems_grow_as_the_effect_shrinks():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dose")
-    words = ["experiment=dose_response/quick", "backends=[numpy]", "scenes=[spring_record,double_integrator]", "workers=0",
-             f"results_dir={folder}", "study=dose_response[iterations=30,seeds=1,tuning_seeds=1,widenings=1]", "repeats=4"]
+    words = [
+        "experiment=dose_response/quick",
+        "backends=[numpy]",
+        "scenes=[spring_record,double_integrator]",
+        "workers=0",
+        f"results_dir={folder}",
+        "study=dose_response[iterations=30,seeds=1,tuning_seeds=1,widenings=1]",
+        "repeats=4",
+    ]
     return bench.run(words)
 
 
@@ -236,7 +261,9 @@ def test_planted_errors_of_a_run_have_their_size_on_the_common_path(run):
 
 def test_problems_that_the_best_gradient_solves_in_a_few_updates_do_not_count():
     base = {"scene_class": "smooth", "target": 100.0, "budget": 50.0, "error": 0.0, "kind": analysis.BEST}
-    table = pd.DataFrame([base | {"problem": name, "median": m} for name, m in (("easy", 2.0), ("fine", 9.0), ("hard", math.inf))])
+    table = pd.DataFrame(
+        [base | {"problem": name, "median": m} for name, m in (("easy", 2.0), ("fine", 9.0), ("hard", math.inf))]
+    )
     known = analysis.floors(table).set_index("problem")["reason"]
     assert known["fine"] == ""
     assert known["easy"] == "the best gradient needs 2 updates"

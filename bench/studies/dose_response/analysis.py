@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from scipy.special import stdtrit
 
+from bench.measure.performance import wilson
 from bench.report.text import axis_value
 from bench.studies.dose_response.model import (
     Data,
@@ -22,11 +24,11 @@ from bench.studies.dose_response.model import (
     estimate,
     fit,
     left_out_likelihoods,
-    with_errors,
 )
 from bench.studies.dose_response.search import TARGETS
-from bench.measure.performance import wilson
 
+CLASSES = ("smooth", "stiff", "discontinuous", "chaotic", "identification")
+"""The classes of problems, in the order in which they are shown."""
 MAIN = 100.0
 """The target of the main chart and findings."""
 SHOWN = (10.0, 100.0, 1000.0)
@@ -74,6 +76,11 @@ def searches(rows: pd.DataFrame) -> pd.DataFrame:
     table = pd.DataFrame(lines)
     if table.empty:
         return table
+    # times belong to the problem, and only some of its cells may have been timed
+    for name in ("rollout_s", "gradient_s"):
+        table[name] = table.groupby("problem")[name].transform("median")
+    table["place"] = table["scene_class"].map({name: i for i, name in enumerate(CLASSES)})
+    table = table.sort_values("place", kind="stable", ignore_index=True)
     most = table[table["kind"] == BEST].groupby("problem")["samples"].transform("max")
     copies = table["kind"].eq(BEST) & table["samples"].ne(most.reindex(table.index))
     return table[~copies].reset_index(drop=True)
@@ -147,8 +154,12 @@ def counted(table: pd.DataFrame) -> pd.DataFrame:
 # ------------------------------------------------------------------------------------------------------------ fits
 
 
-def data_of(lines: pd.DataFrame, errors: Sequence[str] = ("spread", "bias"), effects: bool = True) -> Data:
-    """Return the searches of a class and target as data of a fit; effects are those of natural first and zeroth order."""
+def data_of(
+    lines: pd.DataFrame,
+    errors: Sequence[str] = ("spread", "bias"),
+    effects: Sequence[str] = ("first order", "zeroth order"),
+) -> Data:
+    """Return the searches of a class and target as data of a fit, with an effect for each kind in ``effects``."""
     runs = [len(times) for times in lines["times"]]
     index = np.repeat(np.arange(len(lines)), runs)
     times = np.concatenate(list(lines["times"])) if len(lines) else np.empty(0)
@@ -156,7 +167,7 @@ def data_of(lines: pd.DataFrame, errors: Sequence[str] = ("spread", "bias"), eff
     is_missed = ~np.isfinite(times)
     values = np.stack([_predictor(lines, name) for name in errors], axis=1)[index]
     kinds = lines["kind"].to_numpy()[index]
-    columns = [kinds == "first order", kinds == "zeroth order"] if effects else []
+    columns = [kinds == kind for kind in effects]
     return Data(
         pd.factorize(lines["problem"])[0][index], np.log(np.where(is_missed, budget, np.maximum(times, 1.0))), is_missed,
         values, 1.0 / np.asarray(runs, dtype=float)[index],
@@ -166,7 +177,7 @@ def data_of(lines: pd.DataFrame, errors: Sequence[str] = ("spread", "bias"), eff
 
 def _predictor(lines: pd.DataFrame, name: str) -> np.ndarray:
     values = lines[name].to_numpy(float)
-    return np.maximum(1.0 - values, 0.0) if name in ("cosine", "sign_agreement") else values
+    return np.asarray(np.maximum(1.0 - values, 0.0) if name in ("cosine", "sign_agreement") else values)
 
 
 QUANTITIES: dict[str, Callable[[Fit], float]] = {
@@ -180,6 +191,15 @@ QUANTITIES: dict[str, Callable[[Fit], float]] = {
 }
 """Quantities of a fit: updates with a random error of 0.5 over those without; a random error of 1 over 0.1; a bias of 0.5 over
 0.05; c_b / c_s; p; natural zeroth order over first order, and first order over planted errors, at equal bias and spread."""
+
+
+SHAPES: dict[str, Callable[[Fit], float]] = {
+    "fixed_over_relative": lambda f: float(np.exp(f.effects[2])),
+    "first_over_fixed": lambda f: float(np.exp(f.effects[0] - f.effects[2])),
+    "zeroth_over_fixed": lambda f: float(np.exp(f.effects[1] - f.effects[2])),
+}
+"""Updates at equal median error, in a fit with an effect of planted noise of fixed size: of that noise over noise relative to the
+gradient, and of natural first and zeroth order over that noise."""
 
 
 @dataclass(frozen=True)
@@ -200,18 +220,23 @@ def class_fits(
     targets: Sequence[float] = SHOWN,
     scatter: Scatter = "normal",
     draws: int = DRAWS,
-    names: Sequence[str] = tuple(QUANTITIES),
+    quantities_of: Mapping[str, Callable[[Fit], float]] = MappingProxyType(QUANTITIES),
+    effects: Sequence[str] = ("first order", "zeroth order"),
 ) -> Iterator[ClassFit]:
     """Yield the fit of each class and target; without quantities where a class has too few problems."""
-    for (scene_class, target), part in lines[lines["target"].isin(targets)].groupby(["scene_class", "target"], sort=False):
-        n, data = part["problem"].nunique(), data_of(part)
+    for (scene_class, target), part in lines[lines["target"].isin(targets)].groupby(
+        ["scene_class", "target"], sort=False
+    ):
+        n, data = part["problem"].nunique(), data_of(part, effects=effects)
         missed = float((data.weight * data.is_missed).sum() / data.weight.sum())
         quantities: dict[str, Estimate] = {}
         if n >= LEAST_PROBLEMS and not data.is_missed.all():
             fitted = fit(data, "floor", scatter)
-            samples = bootstrap(data, fitted, draws)
+            # a power at its bound is not identified, so nothing that follows from it is known
+            samples = bootstrap(data, fitted, draws) if fitted.is_identified else []
             quantities = {
-                name: estimate(QUANTITIES[name](fitted), [QUANTITIES[name](sample) for sample in samples], n) for name in names
+                name: estimate(value(fitted), [value(sample) for sample in samples], n)
+                for name, value in quantities_of.items()
             }
         yield ClassFit(str(scene_class), float(target), n, missed, quantities)
 
@@ -231,13 +256,14 @@ def left_out(lines: pd.DataFrame, target: float = MAIN) -> pd.DataFrame:
         scores = {}
         for label, (form, name) in models.items():
             known = part[part[name].notna()]
-            data = with_errors(data_of(known, [name], effects=False), data_of(known, [name], effects=False).errors)
-            scores[label] = left_out_likelihoods(data, form)  # type: ignore[arg-type]
+            scores[label] = left_out_likelihoods(data_of(known, [name], effects=()), form)  # type: ignore[arg-type]
         main = scores.pop("1 + c error^p")
         for label, score in scores.items():
             gains = (score - main)[np.isfinite(score - main)]
             mean, low, high = mean_interval(gains)
-            result.append({"scene_class": scene_class, "model": label, "gain": mean, "low": low, "high": high, "n": gains.size})
+            result.append(
+                {"scene_class": scene_class, "model": label, "gain": mean, "low": low, "high": high, "n": gains.size}
+            )
     return pd.DataFrame(result, columns=["scene_class", "model", "gain", "low", "high", "n"])
 
 
@@ -357,10 +383,22 @@ def second_analysis(lines: pd.DataFrame, draws: int = 40) -> pd.DataFrame:
     ]  # fmt: skip
     result = []
     for label, chosen, target, scatter in cases:
-        for one in class_fits(chosen, [target], scatter, draws, names):
+        for one in class_fits(chosen, [target], scatter, draws, {name: QUANTITIES[name] for name in names}):
             entry: dict[str, Any] = {"scene_class": one.scene_class, "analysis": label, "problems": one.n}
             for name in names:
                 quantity = one.quantities.get(name, Estimate(math.nan, math.nan, math.nan, one.n))
                 entry |= {name: quantity.value, f"{name}_low": quantity.low, f"{name}_high": quantity.high}
             result.append(entry)
+    return pd.DataFrame(result)
+
+
+def shapes(lines: pd.DataFrame) -> pd.DataFrame:
+    """Return :data:`SHAPES` by class and target, a comparison that was not planned before the run."""
+    result = []
+    for one in class_fits(lines, SHOWN, quantities_of=SHAPES, effects=("first order", "zeroth order", FIXED)):
+        entry: dict[str, Any] = {"scene_class": one.scene_class, "target": one.target, "problems": one.n}
+        for name in SHAPES:
+            quantity = one.quantities.get(name, Estimate(math.nan, math.nan, math.nan, one.n))
+            entry |= {name: quantity.value, f"{name}_low": quantity.low, f"{name}_high": quantity.high}
+        result.append(entry)
     return pd.DataFrame(result)

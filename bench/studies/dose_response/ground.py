@@ -67,7 +67,7 @@ def scored_noise(problem: Problem, scene: str) -> np.ndarray:
     width = problem.program.n_noise
     if problem.program.continuous:
         return np.zeros((width, 1))
-    return noise.draw(0, scene, 1, SCORED, width, "dose_response: scores")[0].T
+    return noise.draw(0, scene, 1, SCORED, width, "dose_response: scores")[0].T  # type: ignore[no-any-return]
 
 
 def ground_of(cell: Cell, problem: Problem, session: Session, settings: Any) -> Ground:
@@ -100,8 +100,14 @@ def _compute(cell: Cell, problem: Problem, session: Session, settings: Any, opti
     if "gradient" not in optimizer.needs:
         return empty
     task = Task(cell.scene.name, scored, start, optimum, settings.iterations)
-    method = Method(optimizer, BestGradient(), 1 if problem.program.continuous else PRECISE, not problem.program.continuous)
-    first = BestGradient().estimate(problem, theta0, noise.draw(0, cell.scene.name, 1, method.samples, problem.program.n_noise, "dose_response: first"))[0]
+    method = Method(
+        optimizer, BestGradient(), 1 if problem.program.continuous else PRECISE, not problem.program.continuous
+    )
+    first = BestGradient().estimate(
+        problem,
+        theta0,
+        noise.draw(0, cell.scene.name, 1, method.samples, problem.program.n_noise, "dose_response: first"),
+    )[0]
     scale = unit_rate(optimizer, first)
     tuning = tune(problem, task, method, [0], [scale * r for r in settings.grid()], settings.widenings)
     best = with_rate(method, tuning.rates[tuning.best[-1]])
@@ -144,5 +150,9 @@ def _optimum(cell: Cell, problem: Problem, session: Session, scored: np.ndarray)
     with np.errstate(all="ignore"):
         near = minimize(cost, theta0, jac=slope, method="L-BFGS-B", options={"maxiter": 200})
         starts = [theta0, near.x] if not problem.program.continuous else [near.x]
-        ends = [minimize(cost, x, method="Powell", options={"maxfev": SEARCHED}) for x in starts] if theta0.size <= 100 else []
+        ends = (
+            [minimize(cost, x, method="Powell", options={"maxfev": SEARCHED}) for x in starts]
+            if theta0.size <= 100
+            else []
+        )
     return float(min([near.fun, *(end.fun for end in ends)])), "lowest cost found by L-BFGS and Powell's method"

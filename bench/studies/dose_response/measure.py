@@ -169,6 +169,4 @@ def _times(cell: Cell, problem: Problem, calls: int = 5) -> dict[str, float]:
     return seconds
 
 
-
-
 __all__ = ["TARGETS", "compare", "errors_on_path", "hypotheses_hash", "measure"]

@@ -55,7 +55,12 @@ class Data:
         index = np.concatenate(places) if places else np.empty(0, dtype=int)
         numbers = np.repeat(np.arange(len(places)), [len(place) for place in places])
         return Data(
-            numbers, self.log_time[index], self.is_missed[index], self.errors[index], self.weight[index], self.effects[index]
+            numbers,
+            self.log_time[index],
+            self.is_missed[index],
+            self.errors[index],
+            self.weight[index],
+            self.effects[index],
         )
 
 
@@ -72,6 +77,12 @@ class Fit:
     likelihood: float
     form: Form
     scatter: Scatter
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether the power lies inside its bounds: at a bound the errors do not determine it."""
+        low, high = BOUNDS["p"]
+        return self.form != "floor" or 1.05 * low < self.power < high / 1.05
 
     def growth(self, *errors: float) -> float:
         """Return the updates at these errors, one per coefficient, over the updates without an error."""
@@ -95,7 +106,15 @@ def fit(data: Data, form: Form = "floor", scatter: Scatter = "normal", start: Fi
         starts = [np.r_[floors, start.log_c, start.power, start.log_scatter, start.effects]]
     limits = [(None, None)] * groups + [BOUNDS["c"]] * k + [BOUNDS["p"], BOUNDS["scatter"]] + [BOUNDS["effect"]] * m
     ends = [
-        minimize(_negative, x, (data, form, scatter), jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 300, "ftol": 1e-8})
+        minimize(
+            _negative,
+            x,
+            (data, form, scatter),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=limits,
+            options={"maxiter": 300, "ftol": 1e-8},
+        )
         for x in starts
     ]
     best = min(ends, key=lambda end: end.fun)
@@ -189,11 +208,6 @@ def left_out_likelihoods(data: Data, form: Form, scatter: Scatter = "normal") ->
         end = minimize(negative, _floors_at_start(own), jac=True, method="L-BFGS-B")
         result[g] = -end.fun / own.weight.sum()
     return result
-
-
-def with_errors(data: Data, errors: np.ndarray) -> Data:
-    """Return the searches with other errors ``(n, k)``."""
-    return replace(data, errors=errors)
 
 
 @dataclass(frozen=True)

@@ -168,7 +168,9 @@ def unit_rate(optimizer: Optimizer, gradient: np.ndarray | None) -> float:
     if name != "rate" or gradient is None:
         return 1.0
     state = dataclasses.replace(optimizer, rate=1.0).start(0.0 * gradient)  # type: ignore[call-arg]
-    moved = dataclasses.replace(optimizer, rate=1.0).tell(state, state["theta"][:, None], Answer(None, gradient[:, None]))  # type: ignore[call-arg]
+    moved = dataclasses.replace(optimizer, rate=1.0).tell(  # type: ignore[call-arg]
+        state, state["theta"][:, None], Answer(None, gradient[:, None])
+    )
     size = float(np.abs(moved["theta"]).max())
     return 1.0 / size if size > 0 else 1.0
 

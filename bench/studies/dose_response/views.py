@@ -12,6 +12,7 @@ from bench.experiment.axes import table as csv_table
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
+from bench.measure.performance import wilson
 from bench.report.style import PALETTE, VARIANTS
 from bench.report.text import listed, number
 from bench.report.writer import reasons
@@ -30,7 +31,7 @@ STYLES = {
     BIAS: Style(PALETTE[2], "^"),
     ROTATION: Style(PALETTE[2], "v", VARIANTS[1]),
 }
-NATURAL = ((PALETTE[3], "P"), (PALETTE[5], "X"), (PALETTE[4], "*"), (PALETTE[7], "h"))
+NATURAL = ((PALETTE[3], "P"), (PALETTE[5], "*"), (PALETTE[4], "h"), (PALETTE[7], "p"))
 """Colour and marker of each natural method, drawn as points."""
 CLASS = text("scene_class", label="class")
 TARGET = text("target_name", label="regret")
@@ -64,30 +65,38 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     if table.empty or (table["kind"] == BEST).sum() == 0:
         lines = _method_lines(table) if len(table) else pd.DataFrame()
         shown = [Table("dose_response", lines, METHODS, "Methods", terminal=True, data=data)] if len(lines) else []
-        return Views(["No problem has searches with the best gradient, so nothing can be compared."], shown, remarks=reasons(rows))
+        return Views(
+            ["No problem has searches with the best gradient, so nothing can be compared."],
+            shown,
+            remarks=reasons(rows),
+        )
     lines = analysis.counted(table)
     fits = list(analysis.class_fits(lines))
     costs, rates, smallest = analysis.costs(lines), analysis.wrong_rates(lines), analysis.cheapest_samples(lines)
     models = analysis.left_out(lines)
     verdicts = hypotheses(fits, costs, models, rates, smallest)
     hashes = sorted(set(rows["hypotheses"]) - {""})
-    second = analysis.second_analysis(lines)
+    second, shapes = analysis.second_analysis(lines), analysis.shapes(lines)
     fit_lines = _fit_lines(fits)
     tables = [
         Table("dose_response", fit_lines, FITS, "What an error costs in updates",
               [note.format(hash=listed(hashes) if hashes else "none") for note in FIT_NOTES], terminal=True, page=True, data=data),
         Table("fits", fit_lines, [], files=["csv"]),
         Table("hypotheses", verdicts, [text("hypothesis"), CLASS, TARGET, text("verdict"), text("evidence"),
-                                       Column("needed", label="problems needed")], "Hypotheses", VERDICT_NOTES, page=True),
+                                       Column("needed", label="problems needed", format="setting")], "Hypotheses", VERDICT_NOTES, page=True),
         Table("costs", costs.assign(target_name=costs["target"].map(_regret), ratio_name=costs["ratio"].map(_ratio)),
               [CLASS, TARGET, text("ratio_name", label="a gradient costs"), PROBLEMS,
                interval("share", "first order cheaper", format="percent"),
                Column("cost_ratio", label="cost, first / zeroth order"), text("verdict", label="cheaper")],
               "Rollouts to the target, each order at its best number of samples", COST_NOTES),
-        Table("models", models, [CLASS, text("model"), Column("gain", low="low", high="high"), Column("n", label="problems")],
+        Table("models", models, [CLASS, text("model"), Column("gain", low="low", high="high"), Column("n", label="problems", format="setting")],
               "Other forms and predictors", MODEL_NOTES),
         Table("second_analysis", second, [CLASS, text("analysis"), PROBLEMS, interval("tenfold", "random error 1 / 0.1"),
                                           interval("bias_over_spread", "c_b / c_s")], "Second analysis", SECOND_NOTES),
+        Table("shapes", shapes.assign(target_name=shapes["target"].map(_regret)),
+              [CLASS, TARGET, PROBLEMS, interval("fixed_over_relative", "fixed size / relative"),
+               interval("first_over_fixed", "first order / fixed size"), interval("zeroth_over_fixed", "zeroth order / fixed size")],
+              "Updates at equal median error", SHAPE_NOTES),
         Table("methods", _method_lines(table), METHODS, "Methods at their best rate", METHOD_NOTES),
         Table("problems", _problem_lines(table), PROBLEM_COLUMNS, "Problems", PROBLEM_NOTES),
         Table("controls", rates, [text("problem"), CLASS, Column("above", label="ten times the best rate"),
@@ -133,7 +142,11 @@ def cost_sentence(costs: pd.DataFrame, target: float = MAIN) -> str:
     for name, own in part.groupby("scene_class", sort=False):
         verdicts = set(own["verdict"])
         known[verdicts.pop() if len(verdicts) == 1 else "not known"].append(str(name))
-    parts = [f"the {order} needs fewer on {listed(known[order])}" for order in ("first order", "zeroth order") if known[order]]
+    parts = [
+        f"the {order} needs fewer on {listed(known[order])}"
+        for order in ("first order", "zeroth order")
+        if known[order]
+    ]
     if known["not known"]:
         parts.append(f"this is not known on {listed(known['not known'])}")
     return f"In rollouts to {_regret(target)}, with a gradient charged as 1, 2, 4 or the measured number: {', and '.join(parts)}."
@@ -141,11 +154,15 @@ def cost_sentence(costs: pd.DataFrame, target: float = MAIN) -> str:
 
 def _text(quantity: Estimate) -> str:
     high = number(quantity.high) if quantity.high < 1e4 else "no limit"
-    return f"{number(quantity.value)} [{number(quantity.low)}, {high}]"
+    return f"{number(quantity.value)} [{number(quantity.low) if quantity.low > 1e-4 else '0'}, {high}]"
 
 
 def _regret(target: float) -> str:
     return f"1/{target:g}"
+
+
+def _predictor_name(model: str) -> str:
+    return model.partition("(")[2].partition(")")[0].replace("_", " ")
 
 
 def _ratio(ratio: float) -> str:
@@ -158,12 +175,18 @@ VERDICT_NOTES = (
     "Confirmed or refuted where the 95% interval lies on one side as stated before the run, else open. Problems needed: number "
     "of problems at which an interval of this spread would exclude the boundary, with 80% power.",
 )
-COST_NOTES = ("Share of problems on which the first order needs fewer rollouts. Not known where its interval contains a half.",)
+COST_NOTES = (
+    "Share of problems on which the first order needs fewer rollouts. Not known where its interval contains a half.",
+)
 MODEL_NOTES = (
     "Gain: log likelihood per search on problems left out of the fit, minus that of 1 + c error^p, with the 95% interval over "
     "problems. Below 0: worse.",
 )
 SECOND_NOTES = ("The same quantities with Weibull times, at other targets, and from either half of the problems.",)
+SHAPE_NOTES = (
+    "Not planned before the run. Fixed size: planted noise relative to the gradient at the start, whose relative size grows as the "
+    "gradient falls, as sampling noise does. Relative: planted noise relative to the gradient where it is added.",
+)
 RATE_NOTES = ("Updates to 1/100 over those at the best rate. inf: missed. Empty: not tried.",)
 
 
@@ -188,10 +211,10 @@ def hypotheses(
             continue
         for quantity, name in (("zeroth_over_first", "1 equal error, equal updates: zeroth and first order"),
                                ("first_over_planted", "1 equal error, equal updates: first order and planted")):  # fmt: skip
-            found = one.quantities[quantity]
-            side = found.verdict(1 / CLOSE, CLOSE)
+            ratio = one.quantities[quantity]
+            side = ratio.verdict(1 / CLOSE, CLOSE)
             verdict = {"inside": "confirmed", "open": "open"}.get(side, "refuted")
-            add(name, one, quantity, verdict, CLOSE if found.value > 1 else 1 / CLOSE)
+            add(name, one, quantity, verdict, CLOSE if ratio.value > 1 else 1 / CLOSE)
         ratio = one.quantities["bias_over_spread"]
         add("2 bias costs more than spread", one, "bias_over_spread",
             "confirmed" if ratio.low > 1 else "refuted" if ratio.high < 1 else "open", 1.0)  # fmt: skip
@@ -205,14 +228,20 @@ def hypotheses(
     for _, model in models.iterrows():
         is_form = model["model"] in ("error^p", "no effect")
         verdict = "confirmed" if model["high"] < 0 else "refuted" if model["low"] > 0 else "open"
-        against = f"4 1 + c error^p against {model['model']}" if is_form else f"5 error against {model['model'][5:-3]}"
+        against = (
+            f"4 1 + c error^p against {model['model']}"
+            if is_form
+            else f"5 error against {_predictor_name(model['model'])}"
+        )
         lines.append({"hypothesis": against, "scene_class": model["scene_class"], "target_name": _regret(MAIN), "verdict": verdict,
                       "evidence": f"gain {number(model['gain'])} [{number(model['low'])}, {number(model['high'])}]",
                       "needed": math.nan})  # fmt: skip
     for (scene_class, target), part in costs.groupby(["scene_class", "target"], sort=False):
         found_verdicts = set(part["verdict"])
         agreed = found_verdicts.pop() if len(found_verdicts) == 1 else "not known"
-        evidence = ", ".join(f"{line['wins']} of {line['problems']} ({_ratio(line['ratio'])})" for _, line in part.iterrows())
+        evidence = ", ".join(
+            f"{line['wins']} of {line['problems']} ({_ratio(line['ratio'])})" for _, line in part.iterrows()
+        )
         verdict = {"first order": "confirmed", "zeroth order": "refuted"}.get(agreed, "not known")
         lines.append({"hypothesis": "6 first order cheaper in rollouts", "scene_class": scene_class,
                       "target_name": _regret(target), "verdict": verdict, "evidence": evidence, "needed": math.nan})  # fmt: skip
@@ -226,14 +255,16 @@ def hypotheses(
         if scene_class in halves:
             tried = part[part[["above", "below"]].notna().all(axis=1)]
             hits = int((tried[["above", "below"]].min(axis=1) > halves[scene_class]).sum())
-            low, high = analysis.wilson(hits, len(tried)) if len(tried) else (0.0, 1.0)
+            low, high = wilson(hits, len(tried)) if len(tried) else (0.0, 1.0)
             verdict = "confirmed" if low > 0.5 else "refuted" if high < 0.5 else "open"
             lines.append({"hypothesis": "7 a wrong rate costs more than an error of 0.5", "scene_class": scene_class,
                           "target_name": _regret(MAIN), "verdict": verdict, "evidence": f"{hits} of {len(tried)} problems",
                           "needed": math.nan})  # fmt: skip
     order = {"10": 0, "100": 1, "1000": 2}
     frame = pd.DataFrame(lines, columns=["hypothesis", "scene_class", "target_name", "verdict", "evidence", "needed"])
-    keys = frame["hypothesis"].map(lambda name: (name == "all", name)).astype(str) + frame["target_name"].str[2:].map(order).astype(str)
+    keys = frame["hypothesis"].map(lambda name: (name == "all", name)).astype(str) + frame["target_name"].str[2:].map(
+        order
+    ).astype(str)
     return frame.iloc[keys.argsort(kind="stable")].reset_index(drop=True)
 
 
@@ -247,7 +278,7 @@ METHODS = (
 )  # fmt: skip
 METHOD_NOTES = (
     "Medians over problems at the target 1/100, inf where most miss it. Tuning / search: updates of all searches that choose "
-    "the rate over those of one search to the target.",
+    "the rate, divided by the updates of one search to the target.",
 )
 PROBLEM_COLUMNS = (
     text("problem"), CLASS, Column("floor_10", label="1/10"), Column("floor_100", label="1/100"),
@@ -275,7 +306,9 @@ def _method_lines(table: pd.DataFrame) -> pd.DataFrame:
     known = analysis.floors(table).query("target == @MAIN and reason == ''", local_dict={"MAIN": MAIN})
     part = part.merge(known[["problem", "floor"]], on="problem", how="left")
     updates = part["tuning_rollouts"] / part["rollouts_per_update"].where(part["rollouts_per_update"] > 0)
-    updates = updates.fillna(part["tuning_gradients"] / part["gradients_per_update"].where(part["gradients_per_update"] > 0))
+    updates = updates.fillna(
+        part["tuning_gradients"] / part["gradients_per_update"].where(part["gradients_per_update"] > 0)
+    )
     part = part.assign(
         relative=part["median"] / part["floor"], reached=np.isfinite(part["median"]),
         over_rates=part["median_over_rates"] / part["median"], tuning=updates / part["median"], problems=part["problem"],
@@ -312,7 +345,9 @@ def _chart(lines: pd.DataFrame, fits: Sequence[ClassFit], target: float) -> Char
     points = points[points["error"] > 0].assign(time_low=lambda f: f["time_low"].where(f["time_high"].notna()))
     panels = [one.scene_class for one in own]
     worth = {one.scene_class: one.quantities["tenfold"] for one in own}
-    points = points.assign(place=points["scene_class"].map(panels.index)).sort_values(["place", "method"], kind="stable")
+    points = points.assign(place=points["scene_class"].map(panels.index)).sort_values(
+        ["place", "method"], kind="stable"
+    )
     spans = [f"{_text(q)} on {name}" for name, q in worth.items() if q.low > 1]
     title = (
         f"Ten times less random error saves a factor in updates of {listed(spans)}" if spans
