@@ -52,6 +52,7 @@ class Mjcf(PolicyScene, JointScene):
 
     name = "mjcf"
     neglected_effects = "those that the file neglects"
+    continuous: ClassVar[bool] = False  # the force of a contact with the engine's default impedance jumps at touch-down
     requires: ClassVar[tuple[str, ...]] = ("mujoco",)
     backends: ClassVar[tuple[str, ...]] = ("mujoco", "mjx")
 
