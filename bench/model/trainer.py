@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from bench.errors import Unsupported
 from bench.model.parameters import Plugin, param
 
 TrainerState = Any
@@ -41,7 +42,7 @@ class Trainer(Plugin):
     kind: ClassVar[str] = "trainers"
     requires: ClassVar[tuple[str, ...]] = ("jax", "equinox", "optax")
     first_order: ClassVar[bool] = False
-    """Whether updates use the derivative of the simulation."""
+    """Whether updates use the derivative of the simulation. Its state then has the field ``actor``, see :meth:`parts`."""
 
     steps: int = param(1_024_000, "control steps of a whole run, over all rollouts", "steps", positive=True)
 
@@ -64,3 +65,16 @@ class Trainer(Plugin):
     @abstractmethod
     def action(self, env: Any, state: TrainerState, observation: Any) -> Any:
         """Return the deterministic policy's actions ``(n_u, B)`` for observations ``(n_observations, B)``."""
+
+    def fresh(self, env: Any, state: TrainerState, key: Any) -> TrainerState:
+        """Return the state with all episodes at new starts; by default ``state``."""
+        return state
+
+    def parts(self, env: Any, state: TrainerState, actor: Any, key: Any) -> tuple[Any, Any, Any]:
+        """Return, for another actor, each step's share of the objective, and what a comparison of gradients needs.
+
+        Three arrays ``(h, B)``: the gain of each step, whose sum over a rollout is its return; whether the gradient is
+        cut after the step; and the log probability of its action under ``actor``, as a function of ``actor`` only.
+        Needed only if the trainer is :attr:`first_order`.
+        """
+        raise Unsupported(f"trainer {self.name} takes no first-order steps")

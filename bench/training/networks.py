@@ -16,8 +16,16 @@ ACTIVATIONS = {"elu": jax.nn.elu, "tanh": jnp.tanh, "relu": jax.nn.relu, "silu":
 """Activation functions by name."""
 
 
+SMALLEST_VARIANCE = 1e-5
+"""Added to the variance of a hidden layer, so that equal outputs do not divide by 0."""
+
+
 class Network(eqx.Module):
-    """A perceptron ``(n_in, B) -> (n_out, B)``: weights ``(n_out, n_in)`` and biases ``(n_out, 1)`` by layer."""
+    """A perceptron ``(n_in, B) -> (n_out, B)``: weights ``(n_out, n_in)`` and biases ``(n_out, 1)`` by layer.
+
+    The outputs of each hidden layer are normalised over its units (Ba et al. 2016, arXiv 1607.06450, without gain and
+    bias). Without it, SHAC misses its published range on cart-pole for one seed in five.
+    """
 
     weights: list[Array]
     biases: list[Array]
@@ -41,6 +49,7 @@ class Network(eqx.Module):
         function = ACTIVATIONS[self.activation]
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             x = function(weight @ x + bias)
+            x = (x - x.mean(axis=0)) / jnp.sqrt(x.var(axis=0) + SMALLEST_VARIANCE)
         return self.weights[-1] @ x + self.biases[-1]
 
 

@@ -24,8 +24,8 @@ def step_log(gradient: Any, change: Any, parameters: Any) -> dict[str, Array]:
     """Return norm and largest entry of a gradient, norm of the change, and the largest parameter."""
     largest = [jnp.stack([jnp.abs(x).max() for x in jax.tree.leaves(tree)]).max() for tree in (gradient, parameters)]
     return {
-        "gradient_norm": optax.global_norm(gradient),
+        "gradient_norm": optax.tree.norm(gradient),
         "gradient_largest": largest[0],
-        "step_length": optax.global_norm(change),
+        "step_length": optax.tree.norm(change),
         "parameter_largest": largest[1],
     }

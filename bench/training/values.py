@@ -24,3 +24,12 @@ def td_lambda(reward: Array, value: Array, ended: Array, discount: Any, decay: f
 
     _, targets = jax.lax.scan(back, value[-1], (reward, value, ended), reverse=True)
     return targets
+
+
+def advantages(reward: Array, before: Array, value: Array, ended: Array, discount: Any, decay: float) -> Array:
+    """Return generalised advantages ``(h, B)`` (Schulman et al. 2016, arXiv 1506.02438, equation 16).
+
+    ``before (h, B)`` are the values of the states before each step, ``value (h, B)`` of the states that the steps
+    reached, 0 where none follows. The sum over later steps stops at the end of an episode.
+    """
+    return td_lambda(reward, value, ended, discount, decay) - before

@@ -83,8 +83,8 @@ def jacobian_norm(env: Environment, state: State, action: Array) -> Array:
     return jnp.sqrt((columns**2).sum(axis=(0, 1)))
 
 
-def objective(window: Window, values: Array, discount: Any) -> Array:
-    """Return minus the mean discounted return of a window's parts, over its number of steps: a scalar to minimise.
+def gains(window: Window, values: Array, discount: Any) -> Array:
+    """Return what each step adds to the discounted return of its part of the window, ``(h, B)``.
 
     ``values (h, B)`` are of the reached states, 0 where none follows. A part lasts from the window's start or a cut to
     the next cut or the window's end; its return is ``sum_t gamma^t r_t + gamma^n V`` (Xu et al. 2022, equation 5).
@@ -92,8 +92,7 @@ def objective(window: Window, values: Array, discount: Any) -> Array:
     import jax
     import jax.numpy as jnp
 
-    steps, count = window.reward.shape
-    is_last = jnp.arange(steps) == steps - 1
+    is_last = jnp.arange(window.reward.shape[0]) == window.reward.shape[0] - 1
 
     def add(factor: Array, at: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
         reward, value, cut, last = at
@@ -101,7 +100,35 @@ def objective(window: Window, values: Array, discount: Any) -> Array:
         return jnp.where(cut, 1.0, factor * discount).astype(reward.dtype), gained
 
     _, gained = jax.lax.scan(add, jnp.ones_like(window.reward[0]), (window.reward, values, window.cut, is_last))
-    return -gained.sum() / (steps * count)
+    return gained  # type: ignore[no-any-return]
+
+
+def gains_to_go(gained: Array, cut: Array) -> Array:
+    """Return the sum of :func:`gains` from each step to the end of its part, ``(h, B)``."""
+    import jax
+    import jax.numpy as jnp
+
+    def back(later: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
+        return (at[0] + jnp.where(at[1], 0.0, later),) * 2
+
+    return jax.lax.scan(back, jnp.zeros_like(gained[0]), (gained, cut), reverse=True)[1]  # type: ignore[no-any-return]
+
+
+def log_probability(actor: Any, known: Any, window: Window) -> Array:
+    """Return the log densities of a window's actions under an actor, ``(h, B)``; states and actions are constants."""
+    import jax
+
+    from bench.training.normaliser import normalised
+
+    seen, action = jax.lax.stop_gradient((normalised(known, flat(window.observation)), flat(window.action)))
+    return actor.log_probability(seen, action).reshape(window.reward.shape)  # type: ignore[no-any-return]
+
+
+def flat(steps: Array) -> Array:
+    """Return vectors of steps ``(h, n, B)`` as columns ``(n, h * B)``."""
+    import jax.numpy as jnp
+
+    return jnp.moveaxis(steps, 1, 0).reshape(steps.shape[1], -1)
 
 
 def log_of(window: Window) -> dict[str, Array]:

@@ -72,3 +72,49 @@ def cartpole_program(**kw):
     from bench.model import registry
 
     return PolicyRollout(CartpoleSwing(**kw), None, registry.make("integrators", "semi_implicit_euler"))
+
+
+from bench.model import ContactScene  # noqa: E402
+
+
+@dataclass(frozen=True)
+class Pressed(PolicyScene, ContactScene):
+    """A mass that a policy presses onto the ground: q is its height [m]."""
+
+    name = "pressed"
+    n_q: ClassVar[int] = 1
+    n_u: ClassVar[int] = 1
+    n_contacts: ClassVar[int] = 1
+    n_observations: ClassVar[int] = 2
+    n_start: ClassVar[int] = 2
+    horizon: int = param(20, "steps")
+    dt: float = param(0.01, "")
+    substeps: int = param(1, "")
+
+    def random_start(self, xp, e):
+        return State(0.05 + 0.02 * uniform(xp, e)[None], 0.0 * e[:1])
+
+    def observation(self, xp, q, v):
+        return xp.concat([q, v], axis=0)
+
+    def acceleration(self, xp, q, v, u):
+        return u - 9.81
+
+    def gap(self, xp, q):
+        return q
+
+    def gap_rate(self, xp, q, v):
+        return v
+
+    def contact_acceleration(self, xp, q, force):
+        return force
+
+    def stage_cost(self, xp, q, v, u):
+        return (q[0] + 0.01) ** 2
+
+
+def pressed_program(contact="penalty", **contact_parameters):
+    from bench.model import registry
+
+    law = registry.make("contacts", contact, contact_parameters)
+    return PolicyRollout(Pressed(), law, registry.make("integrators", "semi_implicit_euler"))
