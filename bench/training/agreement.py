@@ -35,7 +35,7 @@ def cosine(parts: Parts, actor: Any, key: Array, copies: int) -> dict[str, Array
             gained, cut, log_probability = jax.vmap(lambda k: parts(actor, k))(keys)
             return (gained, log_probability), cut
 
-        (gained, log_probability), back, cut = jax.vjp(shares, actor, has_aux=True)
+        (gained, _), back, cut = jax.vjp(shares, actor, has_aux=True)
         to_go = jax.vmap(gains_to_go)(gained, cut)
         # the mean over copies is a baseline; the factor makes up for each copy's share in its own
         better = (to_go - to_go.mean(axis=0)) * (copies / 2 / max(copies // 2 - 1, 1))

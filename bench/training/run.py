@@ -66,8 +66,8 @@ class Training:
 
             return agreement.cosine(parts, state.actor, jax.random.PRNGKey(seed), copies)
 
-        found = self._call(f"agreement {copies}", compare, state, np.uint32(seed))
-        return {name: float(value) for name, value in found.items()}
+        cosines = self._call(f"agreement {copies}", compare, state, np.uint32(seed))
+        return {name: float(value) for name, value in cosines.items()}
 
     def gradient(self, state: Any, seed: int, window: int | None = None) -> np.ndarray:
         """Return the derivative of the mean return of rollouts from new starts by the actor's parameters, ``(d,)``.
@@ -112,11 +112,11 @@ class Training:
             jitted = jax.jit(lambda p, *given: function(env.bind(p), *given), donate_argnums=donated)
             call = jitted.lower(self.env.parameters(), *arguments).compile(options)
             _compiled[key] = (call, time.perf_counter() - started)
-        call, seconds = _compiled[key]
+        executable, seconds = _compiled[key]
         if key not in self._used:
             self._used.add(key)
             self.compile_s += seconds
-        return call
+        return executable
 
 
 def _mean_return(trainer: Trainer, env: Environment, state: Any, actor: Any, seed: Any) -> Any:

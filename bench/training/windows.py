@@ -59,7 +59,9 @@ def rollout(
             following, is_cut = Episodes(State(*state), following.age), is_cut | is_stiff
         contacts = jax.lax.stop_gradient(env.contacts(moved.reached))
         reached = env.observe(moved.reached)
-        return following, Window(observation, action, moved.reward, reached, moved.ended, moved.terminated, is_cut, *contacts)
+        return following, Window(
+            observation, action, moved.reward, reached, moved.ended, moved.terminated, is_cut, *contacts
+        )
 
     # the state at the start of a window is a constant
     last, window = jax.lax.scan(step, jax.lax.stop_gradient(first), (noise, numbers))
@@ -100,7 +102,7 @@ def gains(window: Window, values: Array, discount: Any) -> Array:
         return jnp.where(cut, 1.0, factor * discount).astype(reward.dtype), gained
 
     _, gained = jax.lax.scan(add, jnp.ones_like(window.reward[0]), (window.reward, values, window.cut, is_last))
-    return gained  # type: ignore[no-any-return]
+    return gained
 
 
 def gains_to_go(gained: Array, cut: Array) -> Array:
@@ -111,7 +113,7 @@ def gains_to_go(gained: Array, cut: Array) -> Array:
     def back(later: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
         return (at[0] + jnp.where(at[1], 0.0, later),) * 2
 
-    return jax.lax.scan(back, jnp.zeros_like(gained[0]), (gained, cut), reverse=True)[1]  # type: ignore[no-any-return]
+    return jax.lax.scan(back, jnp.zeros_like(gained[0]), (gained, cut), reverse=True)[1]
 
 
 def log_probability(actor: Any, known: Any, window: Window) -> Array:
@@ -121,7 +123,7 @@ def log_probability(actor: Any, known: Any, window: Window) -> Array:
     from bench.training.normaliser import normalised
 
     seen, action = jax.lax.stop_gradient((normalised(known, flat(window.observation)), flat(window.action)))
-    return actor.log_probability(seen, action).reshape(window.reward.shape)  # type: ignore[no-any-return]
+    return actor.log_probability(seen, action).reshape(window.reward.shape)
 
 
 def flat(steps: Array) -> Array:

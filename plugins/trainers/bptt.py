@@ -12,7 +12,7 @@ from .neural import Neural, Run
 class Bptt(Neural):
     """Backpropagation through time: each update takes one step on the derivative of whole episodes' mean return.
 
-    Every update starts ``rollouts`` new episodes, with noise on the actions. There is no critic, no discount and no
+    Every update starts ``rollouts`` new episodes, with noise on the actions. It has neither critic nor discount, and no
     cut except at the ends of episodes. The loss is the mean cost of a control step.
     """
 

@@ -17,8 +17,8 @@ class Shac(ActorCritic):
 
     An update rolls the policy out over ``window`` control steps, with noise on the actions, and takes one step on the
     derivative of the window's return, whose last term is the critic's value (equation 5). The critic is fitted to
-    TD(lambda) returns with values of a target critic that follows it slowly. Windows go on where those of the last
-    update ended, the gradient is cut at the ends of episodes, and the value of an episode at its time limit is that of
+    TD(lambda) returns with values of a target critic that follows it slowly. Windows go on where the last
+    update's windows ended, the gradient is cut at the ends of episodes, and the value of an episode at its time limit is that of
     its last state. With ``cut`` the gradient is also cut after a step with a larger Jacobian (AHAC, Georgiev et al.
     2024, arXiv 2405.17784), and ``entropy`` rewards a wide distribution of actions.
     """
@@ -26,7 +26,9 @@ class Shac(ActorCritic):
     name = "shac"
     first_order: ClassVar[bool] = True
 
-    follow: float = param(0.8, "share by which the target critic approaches the critic per update", positive=True, high=1.0)
+    follow: float = param(
+        0.8, "share by which the target critic approaches the critic per update", positive=True, high=1.0
+    )
     cut: float = param(0.0, "norm of a step's Jacobian above which the gradient is cut; 0: never", low=0.0)
     entropy: float = param(0.0, "weight of the actions' log deviation in the objective", low=0.0)
 

@@ -1,9 +1,12 @@
 """A stand-in for the contract of policy problems, and the cart-pole of OPTIMISE section 7."""
-from dataclasses import dataclass
-from typing import Any, ClassVar
+
 import math
-from bench.model import MechanicalScene, Rollout, State, param
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
+
+from bench.model import MechanicalScene, Rollout, State, param
 
 
 @dataclass(frozen=True)
@@ -55,12 +58,12 @@ class CartpoleSwing(PolicyScene):
         return xp.stack([q[0], v[0], xp.sin(q[1]), xp.cos(q[1]), v[1]])
 
     def acceleration(self, xp, q, v, u):
-        m, M, l, g = 0.1, 1.0, 0.5, 9.81
+        m, M, half, g = 0.1, 1.0, 0.5, 9.81
         f = 10.0 * xp.tanh(u[0])
         s, c = xp.sin(q[1]), xp.cos(q[1])
-        temp = (f + m * l * v[1] ** 2 * s) / (m + M)
-        thacc = (g * s - c * temp) / (l * (4 / 3 - m * c**2 / (m + M)))
-        xacc = temp - m * l * thacc * c / (m + M)
+        temp = (f + m * half * v[1] ** 2 * s) / (m + M)
+        thacc = (g * s - c * temp) / (half * (4 / 3 - m * c**2 / (m + M)))
+        xacc = temp - m * half * thacc * c / (m + M)
         return xp.stack([xacc, thacc])
 
     def stage_cost(self, xp, q, v, u):

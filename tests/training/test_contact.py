@@ -35,7 +35,10 @@ def test_the_log_has_the_contact_of_a_window_and_softer_ground_is_entered_deeper
 
 def test_parameter_values_share_a_compilation():
     runs = [
-        Training(Environment(pressed_program(stiffness=k), registry.make("backends", "jax").ops()), registry.make("trainers", "shac", SHAC))
+        Training(
+            Environment(pressed_program(stiffness=k), registry.make("backends", "jax").ops()),
+            registry.make("trainers", "shac", SHAC),
+        )
         for k in (2e3, 3e3)
     ]
     seconds = []
@@ -49,7 +52,7 @@ def test_parameter_values_share_a_compilation():
 def test_a_contact_law_that_solves_an_equation_trains_on_the_implicit_backend():
     env = Environment(pressed_program("complementarity"), registry.make("backends", "implicit").ops())
     run = Training(env, registry.make("trainers", "shac", SHAC))
-    state, log = run.update(run.start(0))
+    _, log = run.update(run.start(0))
     assert np.isfinite(float(log["gradient_norm"]))
     assert float(log["gradient_norm"]) > 0
     assert np.isnan(float(log["contact_force"]))

@@ -24,7 +24,9 @@ TRAINERS = {
 
 
 def training(name, dtype="float64", horizon=12, substeps=1, dt=1 / 60, **parameters):
-    env = Environment(cartpole_program(horizon=horizon, substeps=substeps, dt=dt), registry.make("backends", "jax").ops(), dtype)
+    env = Environment(
+        cartpole_program(horizon=horizon, substeps=substeps, dt=dt), registry.make("backends", "jax").ops(), dtype
+    )
     return Training(env, registry.make("trainers", name, {**TRAINERS[name], **parameters}))
 
 
@@ -79,7 +81,7 @@ def test_a_planted_first_order_gradient_of_the_wrong_sign_is_seen_in_the_cosine(
             action = jax.lax.stop_gradient(theta)[:, None] + noise
             through = actor[:, None] + noise
             # values are the same in both; the planted one passes the derivative on with the wrong sign
-            gained = -(jax.lax.stop_gradient(2 * through) - through) ** 2 if sign < 0 else -(through**2)
+            gained = -((jax.lax.stop_gradient(2 * through) - through) ** 2) if sign < 0 else -(through**2)
             return gained, jnp.ones((1, 256), bool), -((action - actor[:, None]) ** 2) / 2
 
         return of
@@ -125,7 +127,19 @@ def test_the_objective_of_ppo_is_flat_where_its_ratio_is_clipped():
 @pytest.mark.parametrize("seed", range(2))
 def test_shac_swings_the_cartpole_up(seed):
     """A fifth of the published steps: from about -2,000 for hanging still to above -800."""
-    run = training("shac", "float32", horizon=240, substeps=4, dt=1 / 240, rollouts=64, window=32, hidden=64, passes=16, batches=4, steps=512_000)
+    run = training(
+        "shac",
+        "float32",
+        horizon=240,
+        substeps=4,
+        dt=1 / 240,
+        rollouts=64,
+        window=32,
+        hidden=64,
+        passes=16,
+        batches=4,
+        steps=512_000,
+    )
     numbers = np.random.default_rng(0).standard_normal((8, 256))
     state = run.start(seed)
     for _ in range(run.trainer.updates(run.env)):

@@ -45,7 +45,9 @@ def test_a_healthy_log_shows_no_fault():
 
 
 def test_a_gradient_that_explodes_after_the_contact_starts():
-    found = verdicts(gradient_norm=with_value("gradient_norm", 42, 500.0), contacts=with_value("contacts", slice(40, None), 0.5))
+    found = verdicts(
+        gradient_norm=with_value("gradient_norm", 42, 500.0), contacts=with_value("contacts", slice(40, None), 0.5)
+    )
     assert words(found).startswith("the gradient explodes 2 updates after the contact starts (update 43), to 4")
 
 
@@ -57,7 +59,9 @@ def test_a_gradient_that_explodes_without_contact_names_none():
 
 
 def test_a_contact_long_before_the_explosion_is_not_named():
-    found = verdicts(gradient_norm=with_value("gradient_norm", 80, 1e4), contacts=with_value("contacts", slice(10, None), 1.0))
+    found = verdicts(
+        gradient_norm=with_value("gradient_norm", 80, 1e4), contacts=with_value("contacts", slice(10, None), 1.0)
+    )
     assert words(found).startswith("the gradient explodes at update 81")
 
 
@@ -114,7 +118,9 @@ def test_a_deviation_that_collapses():
 
 
 def test_a_gradient_that_differences_contradict():
-    assert "disagrees with central differences (relative error 0.50)" in words(verdicts(probe={"difference_error": 0.5}))
+    assert "disagrees with central differences (relative error 0.50)" in words(
+        verdicts(probe={"difference_error": 0.5})
+    )
 
 
 def test_a_first_order_gradient_that_points_away():

@@ -69,7 +69,7 @@ def test_the_gradient_of_a_window_is_the_one_of_the_rollout_program(actor):
 
 def test_no_gradient_crosses_the_end_of_an_episode(actor):
     """With an end after step 4, the derivative of all later rewards by the state at the window's start is zero."""
-    env, key = environment(horizon=4), jax.random.PRNGKey(2)
+    env = environment(horizon=4)
     first = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 6))))
 
     def late_reward(q, leak=False):

@@ -66,7 +66,9 @@ class Train(Study):
     cosines: int = param(4, "comparisons of first- with zeroth-order gradients along a run", low=0)
     copies: int = param(16, "rollouts from each start in such a comparison", low=4)
     batches: int = param(16, "independent batches that measure the bias of a window; 0: not measured", low=0)
-    entries: int = param(250, "most entries of a stored log; an entry is the mean or largest value of its updates", low=10)
+    entries: int = param(
+        250, "most entries of a stored log; an entry is the mean or largest value of its updates", low=10
+    )
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Return one cell's results by column: returns along the run, the log, and what the log shows."""

@@ -32,12 +32,14 @@ def runs_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     names = problem_names(arrange(experiment, rows), PARTS, rows=runs)
     given = flatten(runs)
     window = given["trainer.window"].astype(float) if "trainer.window" in given else math.nan
-    return runs.assign(problem=names, method=runs["trainer"], family=runs["trainer"].str.partition("[")[0], window=window)
+    return runs.assign(
+        problem=names, method=runs["trainer"], family=runs["trainer"].str.partition("[")[0], window=window
+    )
 
 
 def final_returns(part: pd.DataFrame) -> np.ndarray:
     """Return the final return of each run, ``(n,)``; a run that ended early counts as its untrained policy."""
-    return part["final_return"].where(part["status"] == "ok", part["first_return"]).to_numpy(float)
+    return np.asarray(part["final_return"].where(part["status"] == "ok", part["first_return"]), dtype=float)
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:

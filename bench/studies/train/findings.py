@@ -40,7 +40,9 @@ def recommendation(summary: pd.DataFrame) -> str:
         if others.empty:
             parts.append(f"The final return{where} of {best['method']} is {_interval(best)}")
         elif behind.empty:
-            reason = "no other is distinguishable" if math.isfinite(best["final_low"]) else "too few seeds for an interval"
+            reason = (
+                "no other is distinguishable" if math.isfinite(best["final_low"]) else "too few seeds for an interval"
+            )
             parts.append(f"Which trainer is best{where} is open: {best['method']} has {_interval(best)}, and {reason}")
         else:
             also = f", not distinguishable from {_names(tied['method'])}" if len(tied) else ""
@@ -127,7 +129,11 @@ def _explodes(fault: Mapping[str, Any]) -> str:
 
 def _zero(fault: Mapping[str, Any]) -> str:
     everywhere = fault["zero"] == fault["updates"]
-    span = f"in all {fault['updates']} updates" if everywhere else f"from update {fault['update']} on, in {fault['zero']} of {fault['updates']} updates"
+    span = (
+        f"in all {fault['updates']} updates"
+        if everywhere
+        else f"from update {fault['update']} on, in {fault['zero']} of {fault['updates']} updates"
+    )
     return f"the gradient is exactly zero {span}"
 
 

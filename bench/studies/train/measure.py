@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import time
@@ -60,8 +61,8 @@ def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
             if log.first_not_finite is not None or update == total:
                 break
         if update in checks:
-            found = training.agreement(state, update + 1, settings.copies)
-            cosines.append((update, found["cosine"], found["cosine_denoised"]))
+            agreement = training.agreement(state, update + 1, settings.copies)
+            cosines.append((update, agreement["cosine"], agreement["cosine_denoised"]))
         if update == halfway and trainer.first_order:
             probe = _probe(training, state, settings.batches)
         started = time.perf_counter()
@@ -71,7 +72,7 @@ def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
         pending.append(entry)
 
     table = np.array(curve)
-    judged = judge(log, table[:, 0], table[:, 3:6], np.array(cosines).reshape(-1, 3), probe)
+    faults = judge(log, table[:, 0], table[:, 3:6], np.array(cosines).reshape(-1, 3), probe)
     bad = log.first_not_finite
     final = table[-1, 3:]
     norms = log.column("gradient_norm")
@@ -82,7 +83,7 @@ def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
         "final_median": final[3], "updates": int(table[-1, 0]), "steps": int(table[-1, 1]), "train_s": spent,
         "compile_s": compile_s, "gradient_typical": float(np.nanmedian(norms)), "gradient_peak": float(np.nanmax(norms)),
         **probe,
-        "verdicts": json.dumps(judged),
+        "verdicts": json.dumps(faults),
         "curve_update": table[:, 0].tolist(), "curve_step": table[:, 1].tolist(), "curve_s": table[:, 2].tolist(),
         "curve_return": table[:, 3].tolist(), "curve_return_low": table[:, 4].tolist(),
         "curve_return_high": table[:, 5].tolist(),
@@ -137,7 +138,7 @@ def _thinned(log: Log, entries: int) -> dict[str, list[float]]:
         values = log.column(name)
         if np.isnan(values).all():
             continue
-        parts = [values[a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        parts = [values[a:b] for a, b in itertools.pairwise(edges)]
         reduced = [part.mean() if name in MEANS else part.max() for part in parts]
         result[f"log_{name}"] = [float(f"{value:.5g}") for value in reduced]
     return result

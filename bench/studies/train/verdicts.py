@@ -52,7 +52,11 @@ class Log:
         for entry in entries:
             values = {name: float(value) for name, value in entry.items()}
             self._entries.append(values)
-            bad = [n for n in ("reward", "loss", "gradient_norm", "parameter_largest") if not math.isfinite(values.get(n, 0.0))]
+            bad = [
+                n
+                for n in ("reward", "loss", "gradient_norm", "parameter_largest")
+                if not math.isfinite(values.get(n, 0.0))
+            ]
             if bad and self.first_not_finite is None:
                 self.first_not_finite = (len(self._entries), bad[0].replace("_", " "))
 
@@ -68,7 +72,7 @@ def judge(
 
     ``evaluated (k,)`` are the updates at which the policy was evaluated, ``returns (k, 3)`` mean and interval of its
     return there, ``cosines (c, 3)`` update, cosine and cosine without noise. A statement about means needs their
-    intervals apart; what noise can explain is no fault.
+    intervals apart; what noise can explain does not count.
     """
     checks = [
         _not_finite(log), _zero(log), _explodes(log), _differences(probe), _cosine(cosines), _worse(log, evaluated, returns),
@@ -93,7 +97,9 @@ def _not_finite(log: Log) -> Verdict | None:
 def _zero(log: Log) -> Verdict | None:
     zero = log.column("gradient_norm") == 0.0
     start = _run_of(zero, min(SILENT, len(log)))
-    return None if start is None else {"code": "zero", "update": start + 1, "zero": int(zero.sum()), "updates": len(log)}
+    return (
+        None if start is None else {"code": "zero", "update": start + 1, "zero": int(zero.sum()), "updates": len(log)}
+    )
 
 
 def _run_of(flags: np.ndarray, length: int) -> int | None:

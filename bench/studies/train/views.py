@@ -33,7 +33,10 @@ WINDOWS = (
 )  # fmt: skip
 FAULTS = (PROBLEM, METHOD, Column("seed", format="setting"), text("words", label="the log shows"))
 COST = Column("cost", label="cost of an episode", low="cost_low", high="cost_high")
-STEP, SECONDS = Column("step", label="control steps", log=False), Column("seconds", label="training time [s]", log=False)
+STEP, SECONDS = (
+    Column("step", label="control steps", log=False),
+    Column("seconds", label="training time [s]", log=False),
+)
 QUANTITIES = {
     "reward": "reward per step",
     "gradient_norm": "gradient norm",
@@ -132,7 +135,9 @@ def _logs(runs: pd.DataFrame, summary: pd.DataFrame, looks: dict[str, Style]) ->
     for i, (problem, part) in enumerate(runs.groupby("problem", sort=False)):
         frame = aggregate.logs(part, tuple(QUANTITIES)).dropna(subset=["value"])
         varies = frame.groupby("quantity")["value"].agg(["min", "max"])
-        shown = [name for name in QUANTITIES if name in varies.index and varies.loc[name, "min"] < varies.loc[name, "max"]]
+        shown = [
+            name for name in QUANTITIES if name in varies.index and varies.loc[name, "min"] < varies.loc[name, "max"]
+        ]
         frame = frame[frame["quantity"].isin(shown)]
         if frame.empty:
             continue
