@@ -9,7 +9,7 @@ means are 4.5 standard errors: one false alarm in 150,000.
 """
 
 # importing these modules registers their checks
-from bench.conformance import backends, contacts, estimators, generic, integrators, optimizers, scenes
+from bench.conformance import backends, contacts, estimators, generic, integrators, optimizers, policies, scenes
 from bench.conformance.kit import CheckResult, Failed, Skipped, check, main, parametrize, verifies
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "main",
     "optimizers",
     "parametrize",
+    "policies",
     "scenes",
     "verifies",
 ]  # fmt: skip

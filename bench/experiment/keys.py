@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.engines.backend import EngineBackend
-from bench.model import CallableScene
+from bench.model import CallableScene, PolicyScene
 from bench.model.parameters import Plugin, remember, values
 from bench.model.sources import code_of, file_of, hash_of, hash_of_tree, imports_of_tree, is_below
 
@@ -60,6 +60,7 @@ def fingerprint(plugin: Plugin | None) -> str:
         hashes = [
             plugin_hash(type(plugin)),
             *([files_hash(plugin.files())] if isinstance(plugin, CallableScene | EngineBackend) else []),
+            *([plugin_hash(type(plugin.plugin))] if isinstance(plugin, PolicyScene) else []),
         ]
         text = json.dumps([plugin.kind, plugin.name, parameters, hashes], default=repr)
         # the plugin is stored too, so that no other object gets its id

@@ -349,6 +349,8 @@ def _cross_checked(
         mirrored = 2.0 * own - w
         baseline = problem.value(theta, own)
         terms = sum((problem.value(theta, s) - baseline) * problem.score(theta, s) for s in (w, mirrored)) / 2.0
+        if not problem.noise_on_theta:
+            return np.asarray(terms)
         step = problem.directions(w)
         return np.asarray(terms - (linear @ step) * step + linear[:, None])
 

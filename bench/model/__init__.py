@@ -37,6 +37,7 @@ from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
+from bench.model.policy import Policy, PolicyScene
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
 from bench.model.program import (
     SURROGATE,
@@ -104,6 +105,8 @@ __all__ = [
     "OptimizerState",
     "Oscillator",
     "Plugin",
+    "Policy",
+    "PolicyScene",
     "Population",
     "Problem",
     "ProcessNoiseScene",

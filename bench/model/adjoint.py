@@ -11,6 +11,7 @@ from bench.model.manifold import difference, n_changes, retract
 from bench.model.ops import LoopOps, State
 from bench.model.problem import Jacobians, Problem
 from bench.model.program import Program, Rollout, rollout
+from bench.model.scene import MechanicalScene
 
 DIFFERENCE_STEP = 1e-6
 """Step of central differences relative to max(1, |x|), for an error of about 1e-10."""
@@ -86,8 +87,9 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
         if m
         else np.zeros((horizon, 0, count))
     )
-    feedback_x = None
-    if back(before) is not None:
+    is_shared = np.ndim(theta) == 1 and program.action_noise
+    feedback_x = _feedback_slopes(scene, path, noisy[:, :1] if is_shared else noisy)
+    if feedback_x is None and back(before) is not None:
         feedback_x = np.stack([_unflatten(row, horizon) for row in by_state(back, before)], axis=1)  # type: ignore[arg-type]
     return Slopes(path.states, path.a, path.b, cost, cost_x, cost_u, feedback_x, noisy)
 
@@ -131,7 +133,8 @@ def by_theta(problem: Problem, path: Slopes, by_control: np.ndarray, adjoint: np
         return scene.feedback(np, np.tile(theta, (1, horizon)), *_split(program, x))
 
     if path.feedback_x is not None:
-        result = result + _theta_differences(back, path.theta, flat)
+        along = scene.pullback(path.theta, np.moveaxis(path.states[:-1], 1, 0), np.moveaxis(by_control, 1, 0))
+        result = result + (_theta_differences(back, path.theta, flat) if along is None else along[0])
     first = path.states[0]
 
     def initial(theta: np.ndarray) -> np.ndarray:
@@ -140,6 +143,19 @@ def by_theta(problem: Problem, path: Slopes, by_control: np.ndarray, adjoint: np
 
     start = _theta_differences(initial, path.theta, adjoint)
     return np.asarray(result + start)
+
+
+def _feedback_slopes(scene: MechanicalScene, path: Jacobians, theta: np.ndarray) -> np.ndarray | None:
+    """Return d feedback / d state, ``(T, m, k, B)``, by the scene's own derivative; None where it has none."""
+    states, rows = np.moveaxis(path.states[:-1], 1, 0), []
+    for i in range(scene.n_u):
+        weights = np.zeros((scene.n_u, *states.shape[1:]))
+        weights[i] = 1.0
+        along = scene.pullback(theta, states, weights, by_theta=False)
+        if along is None:
+            return None
+        rows.append(np.moveaxis(along[1], 0, 1))
+    return np.stack(rows, axis=1) if rows else None
 
 
 # ---------------------------------------------------------------------------------------------------- differences

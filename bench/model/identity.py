@@ -46,7 +46,7 @@ def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
     if bracket:
         if not rest.endswith("]"):
             raise UserError(f"'{text}' is not a plugin: write name or name[parameter=value,...]")
-        for item in filter(None, rest[:-1].split(",")):
+        for item in filter(None, _items(rest[:-1])):
             key, equals, value = item.partition("=")
             if not equals:
                 raise UserError(f"'{item}' in '{text}' is not parameter=value")
@@ -57,6 +57,22 @@ def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
                     f"'{value}' in '{printable(text)[:200]}' is not a value: write parameter=value"
                 ) from None
     return name.strip(), raw
+
+
+def _items(text: str) -> list[str]:
+    """Return the parts of a text between commas that are in no brackets.
+
+    >>> _items("horizon=50,policy=mlp[hidden=8,scale=1]")
+    ['horizon=50', 'policy=mlp[hidden=8,scale=1]']
+    """
+    parts, depth = [""], 0
+    for character in text:
+        depth += {"[": 1, "]": -1}.get(character, 0)
+        if character == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return parts
 
 
 def changed(plugin: Plugin, given: Mapping[str, Any] | None = None) -> dict[str, Any]:

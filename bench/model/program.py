@@ -390,9 +390,13 @@ class Rollout(Program):
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
         """Return the state after one integrator step under the control ``u (n_u, B)``."""
+        return self.integrator.step(self.dynamics(ops), state, u, self.scene.dt)
+
+    def dynamics(self, ops: Ops) -> Dynamics:
+        """Return the scene's dynamics under its contact law, as the integrator uses them."""
         if self._varying and self.needs_root:
             ops = _VaryingOps(ops, [(self.parts[axis], name) for axis, name in self._varying])
-        return self.integrator.step(Dynamics(ops, self.scene, self.contact), state, u, self.scene.dt)
+        return Dynamics(ops, self.scene, self.contact)
 
     def steps(self, ops: Ops, theta: Array, w: Array) -> Iterator[tuple[State, Array]]:
         """Yield the state and control of each step, then the final state with the last control."""
@@ -539,7 +543,7 @@ def compose(
     if isinstance(scene, CallableScene):
         return CallableProgram(scene, contact, integrator, decision)
     if isinstance(scene, MechanicalScene):
-        return Rollout(scene, contact, integrator, decision)
+        return (scene.program_type or Rollout)(scene, contact, integrator, decision)
     raise Unsupported(
         f"scene {scene.name} is neither a FunctionScene, a CallableScene nor a MechanicalScene: derive it from one of these"
     )

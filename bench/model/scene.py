@@ -103,6 +103,8 @@ class MechanicalScene(Scene):
     """Whether theta is the sequence of controls, step by step."""
     contact_values: ClassVar[Mapping[str, Any]] = {}
     """Default values for parameters of the scene's contact laws; the user's values have priority."""
+    program_type: ClassVar[Any] = None
+    """The class of its programs, for a role whose rollouts need one of their own; None: :class:`~.program.Rollout`."""
 
     horizon: int = param(100, "number of time steps", "steps", positive=True)
     dt: float = param(0.01, "length of a time step", "s", positive=True)
@@ -144,6 +146,16 @@ class MechanicalScene(Scene):
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array | None:
         """Return the feedback part of the control law, ``(n_u, B)``, or None. It is added to the open-loop part."""
+        return None
+
+    def pullback(
+        self, theta: np.ndarray, states: np.ndarray, weights: np.ndarray, by_theta: bool = True
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the derivatives of sum(weights * feedback) by theta ``(d, K)`` and by the states ``(n, T, B)``.
+
+        Theta is ``(d, K)``, K is B or 1, states are ``(n, T, B)`` and weights ``(n_u, T, B)``. The first derivative is 0
+        without ``by_theta``. None, the default: estimators take central differences of the feedback, 2 d evaluations.
+        """
         return None
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array | float:

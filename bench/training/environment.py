@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from bench.errors import Unsupported
 from bench.model import ContactScene, ForceLaw, State
 from bench.model.ops import Array
+from bench.model.policy import PolicyScene
 
 
 class Episodes(NamedTuple):
@@ -41,16 +42,16 @@ class Environment:
 
     def __init__(self, program: Any, ops: Any, dtype: str = "float64") -> None:
         scene = program.scene
-        if not hasattr(scene, "random_start") or not hasattr(scene, "observation"):
+        if not isinstance(scene, PolicyScene):
             raise Unsupported(f"scene {scene.name} is not a policy problem: it has no observations and random starts")
         if getattr(ops.xp, "__name__", "") != "jax.numpy":
             raise Unsupported("training needs a backend with the operations of jax.numpy, such as jax or implicit")
         self.program, self.ops, self.dtype = program, ops, dtype
 
     @property
-    def scene(self) -> Any:
-        """The scene, a ``PolicyScene``."""
-        return self.program.scene
+    def scene(self) -> PolicyScene:
+        """The scene."""
+        return self.program.scene  # type: ignore[no-any-return]
 
     @property
     def n_observations(self) -> int:
@@ -68,9 +69,9 @@ class Environment:
         return int(self.scene.horizon)
 
     @property
-    def discount(self) -> Any:
-        """Factor on the value of the next state."""
-        return self.scene.discount
+    def n_start(self) -> int:
+        """Number of standard normal numbers that decide a start."""
+        return int(self.scene.n_start)
 
     @property
     def structure(self) -> tuple[Any, ...]:
@@ -97,7 +98,12 @@ class Environment:
         """Return episodes at their starts, from standard normal ``numbers (n_start, B)``."""
         import jax.numpy as jnp
 
-        q, v = self.scene.random_start(self.ops.xp, numbers)
+        if self.n_start:
+            q, v = self.scene.random_start(self.ops.xp, numbers)
+        else:
+            # the scene has one start, which depends on no theta
+            nothing = jnp.zeros((self.scene.theta0().size, numbers.shape[1]), self.dtype)
+            q, v = self.scene.initial_state(self.ops.xp, nothing)
         return Episodes(State(q, v), jnp.zeros(numbers.shape[1], dtype=jnp.int32))
 
     def observe(self, state: State) -> Array:
@@ -114,9 +120,10 @@ class Environment:
         reached = State(*self.program.step(self.ops, before, action))
         age = episodes.age + 1
         finite = jnp.isfinite(jnp.concatenate(reached)).all(axis=0)
-        terminated = scene.has_ended(xp, reached.q, reached.v) | ~finite
+        over = scene.has_ended(xp, reached.q, reached.v)
+        terminated = ~finite if over is None else over | ~finite
         ended = terminated | (age >= self.length)
-        # the value of the state after the last step of an episode is the scene's terminal cost; 0 in most scenes
+        # the last step of an episode also pays the scene's terminal cost, 0 in most scenes
         reward = reward - jnp.where(ended, scene.terminal_cost(xp, reached.q, reached.v), 0.0)
         fresh = jax.lax.stop_gradient(self.start(numbers).state)
         state = State(*(jnp.where(ended, new, old) for new, old in zip(fresh, reached, strict=True)))

@@ -46,7 +46,7 @@ def rollout(
     key_action, key_start = jax.random.split(key)
     count = first.age.shape[0]
     noise = env.normal(key_action, (length, env.n_actions, count))
-    numbers = env.normal(key_start, (length, env.scene.n_start, count))
+    numbers = env.normal(key_start, (length, env.n_start, count))
 
     def step(episodes: Episodes, drawn: tuple[Array, Array]) -> tuple[Episodes, Window]:
         observation = env.observe(episodes.state)

@@ -75,7 +75,7 @@ class TotalPropagation(DiagnosticEstimator):
         # a step's action affects its own cost and all later costs
         cost_to_go = np.cumsum(path.cost[::-1], axis=0)[::-1][:-1].reshape(-1, repeats, samples)
         cost_to_go = (cost_to_go - cost_to_go.mean(axis=2, keepdims=True)) * (samples / (samples - 1))
-        actions_noise = w.reshape(*first.shape[:2], repeats, samples)
+        actions_noise = w[: len(w) - problem.program.exogenous].reshape(*first.shape[:2], repeats, samples)
         zeroth = cost_to_go[:, None] * actions_noise / problem.sigma
         by_action = first.reshape(zeroth.shape)
         weight = _weight(zeroth.var(axis=3, ddof=1), by_action.var(axis=3, ddof=1))[..., None]

@@ -15,6 +15,7 @@ class ActorCritic(Neural):
     """Trains an actor on windows of control steps that end in a critic's value; windows go on between updates."""
 
     window: int = param(32, "h, control steps of a window", "steps", positive=True)
+    discount: float = param(0.99, "gamma, factor on the value of the next control step", positive=True, high=1.0)
     critic_rate: float = param(1e-3, "first learning rate of the critic", positive=True)
     decay: float = param(0.95, "lambda of returns and advantages", low=0.0, high=1.0)
     passes: int = param(16, "passes over the states of a window", positive=True)

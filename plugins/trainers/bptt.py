@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from bench.model import param
+
 from .neural import Neural, Run
 
 
@@ -18,6 +20,8 @@ class Bptt(Neural):
 
     name = "bptt"
     first_order: ClassVar[bool] = True
+
+    discount: float = param(1.0, "gamma, factor on the reward of the next control step", positive=True, high=1.0)
 
     def steps_per_update(self, env: Any) -> int:
         """Return rollouts times the length of an episode."""
@@ -35,7 +39,7 @@ class Bptt(Neural):
 
         def loss(actor: Any) -> tuple[Any, Any]:
             window = self._window(env, state, actor, key_window)
-            return -window.reward.mean(), window
+            return -self._gains(window).mean(), window
 
         (cost, window), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
         change, memory = self.actor_optimizer(env).update(gradient, state.memory)
@@ -52,7 +56,14 @@ class Bptt(Neural):
         from bench.training import windows
 
         window = self._window(env, state, actor, key)
-        return window.reward, window.cut, windows.log_probability(actor, state.normaliser, window)
+        return self._gains(window), window.cut, windows.log_probability(actor, state.normaliser, window)
+
+    def _gains(self, window: Any) -> Any:
+        import jax.numpy as jnp
+
+        from bench.training import windows
+
+        return windows.gains(window, jnp.zeros_like(window.reward), self.discount)
 
     def _window(self, env: Any, state: Run, actor: Any, key: Any) -> Any:
         import jax

@@ -81,7 +81,7 @@ class Evolution(Trainer):
             seen = normaliser.normalised(state.normaliser, observation).T[:, :, None]
             return jax.vmap(lambda network, x: network(x))(networks, seen)[:, :, 0].T
 
-        numbers = env.normal(key_start, (env.scene.n_start, half))
+        numbers = env.normal(key_start, (env.n_start, half))
         first = env.start(jnp.concatenate([numbers, numbers], axis=1))
         _, window = windows.rollout(env, policy, first, env.length, key_rollout)
         # an episode counts up to its first end

@@ -26,6 +26,8 @@ class Run(NamedTuple):
     episodes: Any
     key: Any
     critic: Critic | None = None
+    returns: Any = None
+    """Running mean and variance of returns, for a critic in their unit; None for a critic of raw returns."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +62,13 @@ class Neural(Trainer):
         key, key_actor, key_start = jax.random.split(jax.random.PRNGKey(seed), 3)
         layers = [env.n_observations, self.hidden, self.hidden, env.n_actions]
         actor = Actor(key_actor, layers, env.dtype, log_deviation=self.log_deviation)
-        episodes = env.start(env.normal(key_start, (env.scene.n_start, self.rollouts)))
+        episodes = env.start(env.normal(key_start, (env.n_start, self.rollouts)))
         known = normaliser.start(env.n_observations, env.dtype)
         return Run(actor, self.actor_optimizer(env).init(actor), known, episodes, key)
 
     def fresh(self, env: Any, state: Any, key: Any) -> Any:
         """Return the state with all episodes at new starts."""
-        return state._replace(episodes=env.start(env.normal(key, (env.scene.n_start, self.rollouts))))
+        return state._replace(episodes=env.start(env.normal(key, (env.n_start, self.rollouts))))
 
     def action(self, env: Any, state: Any, observation: Any) -> Any:
         """Return the mean of the policy's distribution."""

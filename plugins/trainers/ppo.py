@@ -30,6 +30,12 @@ class Ppo(ActorCritic):
     range: float = param(0.2, "distance of a ratio from 1 at which the objective is clipped", positive=True)
     entropy: float = param(0.0, "weight of the actions' log deviation in the objective", low=0.0)
 
+    def start(self, env: Any, seed: Any) -> Run:
+        """Return a new actor and critic, and episodes at their starts."""
+        from bench.training import normaliser
+
+        return super().start(env, seed)._replace(returns=normaliser.start(1, env.dtype))
+
     def actor_optimizer(self, env: Any) -> Any:
         """Return the actor's optimizer, which takes a step per pass and batch."""
         return self.adam(self.actor_rate, self.updates(env) * self.passes * self.batches)
@@ -59,10 +65,14 @@ class Ppo(ActorCritic):
         episodes, window = self.window_of(env, state, state.actor, key_window)
         seen = normaliser.normalised(state.normaliser, windows.flat(window.observation))
         action = windows.flat(window.action)
-        value = self.values_of(state, critic.network, window)
-        before = critic.network(seen).reshape(value.shape)
-        advantage = values.advantages(window.reward, before, value, window.ended, env.discount, self.decay)
-        targets, advantage = (advantage + before).reshape(-1), advantage.reshape(-1)
+        # the critic is in units of the returns so far, so that its rate suits rewards of any scale
+        unit = jnp.sqrt(state.returns.mean**2 + state.returns.variance)
+        value = unit * self.values_of(state, critic.network, window)
+        before = unit * critic.network(seen).reshape(value.shape)
+        advantage = values.advantages(window.reward, before, value, window.ended, self.discount, self.decay)
+        targets, advantage = (advantage + before).reshape(1, -1), advantage.reshape(-1)
+        returns = normaliser.updated(state.returns, targets)
+        targets = targets[0] / unit
         old = state.actor.log_probability(seen, action)
         actor_optimizer, critic_optimizer = self.actor_optimizer(env), self.critic_optimizer(env)
 
@@ -84,10 +94,10 @@ class Ppo(ActorCritic):
         first = (state.actor, state.memory, critic.network, critic.memory)
         (actor, memory, network, critic_memory), (costs, misfits, logs) = jax.lax.scan(step, first, order)
         log = {
-            "loss": costs[0], "value_loss": misfits[-self.batches :].mean(),
+            "loss": costs[0], "value_loss": misfits[-self.batches :].mean() * unit[0] ** 2,
             "deviation": jnp.exp(actor.log_deviation).mean(), **windows.log_of(window),
             **{name: part[0] for name, part in logs.items()},
             "step_length": optax.tree.norm(jax.tree.map(lambda a, b: a - b, actor, state.actor)),
         }  # fmt: skip
         known = normaliser.updated(state.normaliser, windows.flat(window.observation))
-        return Run(actor, memory, known, episodes, key, Critic(network, critic.target, critic_memory)), log
+        return Run(actor, memory, known, episodes, key, Critic(network, critic.target, critic_memory), returns), log

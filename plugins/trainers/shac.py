@@ -47,14 +47,14 @@ class Shac(ActorCritic):
         def loss(actor: Any) -> tuple[Any, Any]:
             episodes, window = self.window_of(env, state, actor, key_window, self.cut)
             value = self.values_of(state, critic.target, window)
-            cost = -windows.gains(window, value, env.discount).mean()
+            cost = -windows.gains(window, value, self.discount).mean()
             return cost - self.entropy * actor.log_deviation.sum(), (episodes, window, value)
 
         (cost, (episodes, window, value)), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
         change, memory = self.actor_optimizer(env).update(gradient, state.memory)
         actor = optax.apply_updates(state.actor, change)
 
-        targets = values.td_lambda(window.reward, value, window.ended, env.discount, self.decay)
+        targets = values.td_lambda(window.reward, value, window.ended, self.discount, self.decay)
         seen = windows.flat(window.observation)
         network, critic_memory, value_loss = fitting.fit(
             self.critic_optimizer(env), critic.network, critic.memory, normaliser.normalised(state.normaliser, seen),
@@ -74,5 +74,5 @@ class Shac(ActorCritic):
 
         assert state.critic is not None
         _, window = self.window_of(env, state, actor, key, self.cut)
-        gained = windows.gains(window, self.values_of(state, state.critic.target, window), env.discount)
+        gained = windows.gains(window, self.values_of(state, state.critic.target, window), self.discount)
         return gained, window.cut, windows.log_probability(actor, state.normaliser, window)

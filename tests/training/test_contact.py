@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from standin import pressed_program
+from problems import pressed_program
 
 from bench.model import State, registry
 from bench.training.environment import Environment

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from standin import cartpole_program
+from problems import cartpole_program
 
 from bench.model import registry
 from bench.training.agreement import cosine
@@ -23,9 +23,9 @@ TRAINERS = {
 }
 
 
-def training(name, dtype="float64", horizon=12, substeps=1, dt=1 / 60, **parameters):
+def training(name, dtype="float64", horizon=12, substeps=1, **parameters):
     env = Environment(
-        cartpole_program(horizon=horizon, substeps=substeps, dt=dt), registry.make("backends", "jax").ops(), dtype
+        cartpole_program(horizon=horizon, substeps=substeps), registry.make("backends", "jax").ops(), dtype
     )
     return Training(env, registry.make("trainers", name, {**TRAINERS[name], **parameters}))
 
@@ -132,7 +132,6 @@ def test_shac_swings_the_cartpole_up(seed):
         "float32",
         horizon=240,
         substeps=4,
-        dt=1 / 240,
         rollouts=64,
         window=32,
         hidden=64,

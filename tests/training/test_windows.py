@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from standin import cartpole_program
+from problems import cartpole_program
 
 from bench.model import Rollout, State, registry
 from bench.training import windows
@@ -18,15 +18,15 @@ ROUNDING = 1e-10
 
 
 def environment(horizon=240, **parameters):
-    parameters = {"substeps": 1, "dt": 1 / 60, **parameters}  # a quarter of the program to compile
+    parameters = {"substeps": 1, **parameters}  # a quarter of the program to compile
     return Environment(cartpole_program(horizon=horizon, **parameters), registry.make("backends", "jax").ops())
 
 
-def window_return(env, actor, length, key, cut=0.0, first=None):
+def window_return(env, actor, length, key, cut=0.0, first=None, discount=0.99):
     """Return gains of a window without a value at its end, and the window."""
     first = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 6)))) if first is None else first
     _, window = windows.rollout(env, actor.sample, first, length, key, cut)
-    return windows.gains(window, jnp.zeros_like(window.reward), env.discount).sum(), window
+    return windows.gains(window, jnp.zeros_like(window.reward), discount).sum(), window
 
 
 @pytest.fixture
@@ -48,23 +48,28 @@ def test_the_gradient_of_a_window_agrees_with_central_differences(actor):
     assert float(ends[0] - ends[1]) / (2 * step) == pytest.approx(float(along), rel=DIFFERENCE)
 
 
-def test_the_gradient_of_a_window_is_the_one_of_the_rollout_program(actor):
-    """The window's discounted cost, written as the cost of the program's own rollout with the policy as feedback."""
-    env, key = environment(discount=1.0), jax.random.PRNGKey(2)
-    first = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 6))))
-    noise = env.normal(jax.random.split(key)[0], (5, 1, 6))
+def test_the_gradient_of_a_window_is_that_of_fobg_on_the_whole_program():
+    """Without discount and value, a window as long as the horizon has the cost of the sweep's own program."""
+    steps, count, sigma = 5, 6, 0.3
+    program = cartpole_program(horizon=steps, substeps=1, sigma=sigma, policy="mlp[hidden=4]")
+    backend, key = registry.make("backends", "jax"), jax.random.PRNGKey(2)
+    env, scene = Environment(program, backend.ops()), program.scene
+    noise = np.asarray(env.normal(jax.random.split(key)[0], (steps, 1, count)))
+    numbers = np.random.default_rng(0).standard_normal((8, count))
+    w = np.concatenate([noise.reshape(steps, count), numbers])
+    problem, theta = backend.compile(program), scene.theta0() + 0.1
+    fobg = registry.make("estimators", "fobg").estimate(problem, theta, np.moveaxis(w, 0, -1)[None])[0]
 
-    def cost(actor):
-        state, total = first.state, 0.0
-        for t in range(5):
-            u = actor.sample(env.observe(state), noise[t])
-            total += env.scene.stage_cost(jnp, state.q, state.v, u).sum()
-            state = env.program.step(env.ops, state, u)
-        return total
+    def mean_return(theta):
+        def policy(observation, noise):
+            return scene.plugin.act(jnp, theta[:, None], observation) + sigma * noise
 
-    ours = jax.grad(lambda a: -window_return(env, a, 5, key, first=first)[0])(actor)
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(jax.grad(cost)(actor)), strict=True):
-        np.testing.assert_allclose(a, b, rtol=ROUNDING, atol=ROUNDING * float(jnp.abs(b).max()))
+        _, window = windows.rollout(env, policy, env.start(jnp.asarray(numbers)), steps, key)
+        return windows.gains(window, jnp.zeros_like(window.reward), 1.0).sum(axis=0).mean()
+
+    gradient = -np.asarray(jax.grad(mean_return)(jnp.asarray(theta)))
+    assert np.abs(fobg).max() > 0
+    np.testing.assert_allclose(gradient, fobg, rtol=ROUNDING, atol=ROUNDING * np.abs(fobg).max())
 
 
 def test_no_gradient_crosses_the_end_of_an_episode(actor):

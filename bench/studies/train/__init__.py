@@ -12,6 +12,7 @@ from bench.experiment.session import Session
 from bench.experiment.study import Study
 from bench.experiment.views import Views
 from bench.model import Trainer, param
+from bench.model.policy import PolicyScene
 from bench.model.trainer import LOGGED
 
 if TYPE_CHECKING:
@@ -80,8 +81,8 @@ class Train(Study):
         """Return why a policy cannot be trained in a cell, or None."""
         if not isinstance(cell.parts["trainer"], Trainer):
             return "a trainer is needed: see `python -m bench list trainers`"
-        if not (hasattr(cell.scene, "random_start") and hasattr(cell.scene, "observation")):
-            return f"scene {cell.scene.name} has no observations and random starts, which a policy is trained on"
+        if not isinstance(cell.scene, PolicyScene):
+            return f"scene {cell.scene.name} has no observations, from which a policy acts: choose a policy scene"
         if not hasattr(cell.backend, "ops"):
             return f"backend {cell.backend.name} does not run programs in JAX, which trainers do"
         return None

@@ -37,7 +37,7 @@ def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
     env = Environment(cell.program(), backend.ops(), backend.dtype)  # type: ignore[attr-defined]
     training = Training(env, trainer)
     # all trainers and seeds are evaluated from the same starts
-    starts = noise.draw(0, cell.scene.name, 1, settings.starts, env.scene.n_start, "train: starts")[0].T
+    starts = noise.draw(0, cell.scene.name, 1, settings.starts, env.n_start, "train: starts")[0].T
     total, per_update = trainer.updates(env), trainer.steps_per_update(env)
     marks = set(np.unique(np.linspace(0, total, min(settings.evaluations, total) + 1).round().astype(int)).tolist())
     checks = _spread(total, settings.cosines) if trainer.first_order else set()

@@ -1,0 +1,78 @@
+"""Checks of policies on random observations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.conformance.kit import Skipped, require, verifies
+from bench.conformance.subjects import DIFFERENCED, ROUNDED, available, distance, rng
+from bench.model import Policy
+
+INPUTS, OUTPUTS, COLUMNS = 3, 2, 5
+"""Numbers of observations, controls and columns of the checks."""
+MANY = 40
+"""Number of columns in which every unit of a network is active somewhere."""
+ACTIVE = 0.75
+"""Least share of the parameters that must move a control."""
+STEP = 1e-6
+"""Relative step of the central differences."""
+
+
+def _subject(policy: Policy, columns: int = COLUMNS) -> tuple[np.ndarray, np.ndarray]:
+    """Return a theta ``(d, COLUMNS)`` around the initial one and observations ``(INPUTS, columns)``."""
+    random, theta = rng("policy"), policy.initial(INPUTS, OUTPUTS)
+    spread = 0.1 * random.standard_normal((len(theta), COLUMNS))
+    return theta[:, None] + spread, random.standard_normal((INPUTS, columns))
+
+
+@verifies(Policy)
+def theta_has_the_declared_shapes(policy: Policy) -> str:
+    """Verify that the initial theta is a finite vector of the declared length, the same at every call."""
+    theta = policy.initial(INPUTS, OUTPUTS)
+    size = policy.size(INPUTS, OUTPUTS)
+    require(theta.shape == (size,), f"theta is {theta.shape}, and its shapes have {size} numbers")
+    require(theta.dtype == np.float64 and np.isfinite(theta).all(), "theta must be finite and of type float64")
+    require(np.array_equal(theta, policy.initial(INPUTS, OUTPUTS)), "the initial theta differs between calls")
+    return ", ".join(f"{name} {shape}" for name, shape in policy.shapes(INPUTS, OUTPUTS).items())
+
+
+@verifies(Policy)
+def shared_theta_acts_like_columns(policy: Policy) -> str:
+    """Verify that a theta ``(d, 1)`` and the same theta repeated ``(d, B)`` give the same controls ``(n_outputs, B)``."""
+    theta, observations = _subject(policy)
+    shared = policy.act(np, theta[:, :1], observations)
+    repeated = policy.act(np, np.repeat(theta[:, :1], COLUMNS, axis=1), observations)
+    require(shared.shape == (OUTPUTS, COLUMNS), f"controls are {shared.shape}, not {(OUTPUTS, COLUMNS)}")
+    off = distance(shared, repeated)
+    require(off < ROUNDED, f"a shared theta and its copies differ by {off:.1e}")
+    changed = observations.copy()
+    changed[:, 2] += 1.0
+    kept = np.arange(COLUMNS) != 2
+    off = distance(policy.act(np, theta, changed)[:, kept], policy.act(np, theta, observations)[:, kept])
+    require(off < ROUNDED, "a column changes the controls of others")
+    return f"to {off:.0e}"
+
+
+@verifies(Policy)
+def derivatives_agree(policy: Policy) -> str:
+    """Verify that JAX and central differences agree on the derivatives by theta, and that theta moves the controls."""
+    if not {"jax"} <= {backend.name for backend in available("backends")}:
+        raise Skipped("JAX is not installed")
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+    theta, observations = _subject(policy, MANY)
+    theta, weights = theta[:, :1], rng("weights").standard_normal((OUTPUTS, MANY))
+
+    def total(theta: np.ndarray) -> float:
+        return float((weights * policy.act(np, theta, observations)).sum())
+
+    exact = np.asarray(jax.grad(lambda theta: (weights * policy.act(jnp, theta, observations)).sum())(theta))[:, 0]
+    steps = STEP * np.eye(len(theta))[:, :, None]
+    differences = np.array([(total(theta + step) - total(theta - step)) / (2 * STEP) for step in steps])
+    off = float(np.abs(exact - differences).max() / np.abs(differences).max())
+    require(off < DIFFERENCED, f"the derivatives differ from differences by {off:.1e}")
+    share = float(np.mean(differences != 0))  # a rectified unit may be inactive at every observation
+    require(share > ACTIVE, f"only {share:.0%} of {len(theta)} parameters move a control")
+    return f"{len(theta)} parameters, to {off:.0e}"

@@ -1,0 +1,220 @@
+"""Policies, and the scenes and programs that use them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import bench
+from bench.errors import UserError
+from bench.experiment import config, grid
+from bench.experiment.by_name import compile_problem, make
+from bench.experiment.keys import fingerprint
+from bench.measure import noise
+from bench.model import LoopOps, State, adjoint_gradient, slopes
+from bench.model.policy import policy_of, uniform
+from bench.plugins.scenes.cartpole_swing import CartpoleSwing
+
+REVERSED = 1e-9
+"""Relative difference of gradients by one reverse pass and step by step: rounding over 30 steps."""
+DIFFERENCED = 1e-6
+"""Relative error of central differences of the cost, whose steps are 1e-6."""
+
+
+def problem(policy="mlp[hidden=8]", backend="jax", **parameters):
+    scene = make("scenes", f"cartpole_swing[policy={policy},horizon=30]")
+    return compile_problem(dataclasses.replace(scene, **parameters), None, "semi_implicit_euler", backend)
+
+
+def sample(problem, count=6):
+    return noise.draw(0, "policy", 1, count, problem.program.n_noise, "test")[0].T
+
+
+def test_a_linear_policy_is_its_matrix():
+    policy = policy_of("linear")
+    theta = np.arange(1.0, 9.0)[:, None]
+    x = np.array([[1.0], [2.0], [3.0]])
+    assert policy.act(np, theta, x)[:, 0] == pytest.approx([1 + 4 + 9 + 7, 4 + 10 + 18 + 8])
+
+
+def test_a_network_with_one_unit_is_its_formula():
+    policy = policy_of("mlp[hidden=1]")
+    theta = np.array([0.5, -0.25, 0.1, 2.0, 0.3])[:, None]  # weights, bias, weight, bias
+    x = np.array([[0.4], [0.8]])
+    assert policy.act(np, theta, x)[0, 0] == pytest.approx(2.0 * np.tanh(0.5 * 0.4 - 0.25 * 0.8 + 0.1) + 0.3)
+    assert list(policy.shapes(2, 1).items()) == [
+        ("weight_0", (1, 2)), ("bias_0", (1,)), ("weight_1", (1, 1)), ("bias_1", (1,)),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("activation", ["elu", "relu"])
+def test_activations_far_from_zero_have_finite_values(activation):
+    values = policy_of(f"mlp[hidden=4,activation={activation}]").act(
+        np, np.full((4 * 3 + 5, 1), 500.0), np.ones((2, 3))
+    )
+    assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        ("mpl", "policy.*'mpl'.*'mlp'"),
+        ("mlp[hidden=8x]", "widths such as 64x64"),
+        ("mlp[width=8]", "parameter of policy mlp.*'width'"),
+        ("mlp[activation=tan]", "mlp.activation.*'tan'.*'tanh'"),
+    ],
+)
+def test_an_invalid_policy_is_named(policy, message):
+    with pytest.raises(UserError, match=message):
+        make("scenes", f"cartpole_swing[policy={policy}]")
+
+
+def test_lists_and_numbers_are_widths():
+    assert policy_of("mlp[hidden=[8,4]]") == policy_of("mlp[hidden=8x4]")
+    assert policy_of("mlp[hidden=8]").widths == [8]
+
+
+def test_two_normal_numbers_give_a_uniform_one():
+    drawn = uniform(np, np.random.default_rng(0).standard_normal((2, 200_000)))[0]
+    counts = np.histogram(drawn, 20, (0, 1))[0]
+    assert counts.sum() == drawn.size
+    assert ((counts - 1e4) ** 2 / 1e4).sum() < 43.8  # 99.9% quantile of chi-square with 19 degrees of freedom
+
+
+@pytest.mark.parametrize("where", ["action", "parameter"])
+@pytest.mark.parametrize("policy", ["linear", "mlp[hidden=8]"])
+def test_backends_agree_on_costs_and_gradients(policy, where):
+    exact = problem(policy, noise=where)
+    theta, w = exact.program.theta0, sample(exact)
+    for backend in ("torch", "numpy"):
+        other = problem(policy, backend, noise=where)
+        assert other.value(theta, w) == pytest.approx(exact.value(theta, w), rel=1e-12)
+        scale = np.abs(exact.grad(theta, w)).max()
+        assert np.abs(other.grad(theta, w) - exact.grad(theta, w)).max() < DIFFERENCED * scale
+
+
+@pytest.mark.parametrize("where", ["action", "parameter"])
+def test_the_adjoint_step_by_step_is_the_gradient(where):
+    exact = problem(noise=where)
+    theta, w = exact.program.theta0, sample(exact)
+    path = slopes(exact, theta, w)
+    scale = np.abs(exact.grad(theta, w)).max()
+    assert np.abs(adjoint_gradient(exact, path) - exact.grad(theta, w)).max() < REVERSED * scale
+
+
+def test_the_adjoint_without_jax_takes_differences(monkeypatch):
+    exact = problem()
+    theta, w = exact.program.theta0, sample(exact)
+    by_product = adjoint_gradient(exact, slopes(exact, theta, w))
+    monkeypatch.setattr(CartpoleSwing, "pullback", lambda *_, **__: None)
+    by_differences = adjoint_gradient(exact, slopes(exact, theta, w))
+    assert np.abs(by_differences - by_product).max() < DIFFERENCED * np.abs(by_product).max()
+
+
+def test_a_window_as_long_as_the_rollout_is_fobg():
+    exact = problem()
+    drawn = noise.draw(0, "policy", 2, 8, exact.program.n_noise, "test")
+    whole = make("estimators", "fobg").estimate(exact, exact.program.theta0, drawn)
+    windowed = make("estimators", "windowed[steps=30]").estimate(exact, exact.program.theta0, drawn)
+    assert windowed == pytest.approx(whole, rel=REVERSED)
+
+
+@pytest.mark.parametrize("estimator", ["reinforce", "total_propagation[per=action]"])
+def test_zeroth_order_agrees_with_first_order(estimator):
+    exact = problem("linear", horizon=10)
+    theta, program = exact.program.theta0, exact.program
+    first = make("estimators", "fobg").estimate(exact, theta, noise.draw(0, "a", 64, 64, program.n_noise, "test"))
+    other = make("estimators", estimator).estimate(exact, theta, noise.draw(1, "b", 64, 1024, program.n_noise, "test"))
+    error = np.sqrt((first.var(axis=0, ddof=1) + other.var(axis=0, ddof=1)) / 64)
+    assert (np.abs(first.mean(axis=0) - other.mean(axis=0)) < 4.5 * error).all()
+
+
+def test_substeps_are_steps_of_the_integrator():
+    coarse, fine = problem(substeps=1, horizon=8), problem(substeps=4, horizon=2)
+    start, u = State(np.array([[0.1], [2.0]]), np.array([[0.3], [-0.2]])), np.array([[0.7]])
+    a, b = start, start
+    for _ in range(4):
+        a = coarse.program.step(LoopOps(), a, u)
+    fine.program.scene = dataclasses.replace(fine.program.scene, dt=4 * coarse.program.scene.dt)
+    b = fine.program.step(LoopOps(), b, u)
+    assert np.concatenate(a) == pytest.approx(np.concatenate(b), rel=1e-13)
+
+
+class Ending(CartpoleSwing):
+    """A cart-pole whose rollouts end where the cart passes 1 m."""
+
+    def has_ended(self, xp, q, v):
+        return xp.abs(q[0]) > 1.0
+
+    def stage_cost(self, xp, q, v, u):
+        return xp.where(self.has_ended(xp, q, v), 0.0 * q[0], super().stage_cost(xp, q, v, u))
+
+
+def test_a_rollout_that_has_ended_stays_and_costs_nothing():
+    scene = Ending(policy="linear", horizon=60)
+    given = compile_problem(scene, None, "semi_implicit_euler", "numpy")
+    theta = given.program.theta0 + np.array([0, 0, 0, 0, 0, 3.0])  # a bias that pushes the cart away
+    w = sample(given, 16)
+    path = given.program.steps(LoopOps(), theta[:, None], w)
+    states = np.stack([state.q[0] for state, _ in path])
+    ended = np.abs(states) > 1.0
+    assert ended[-1].any()
+    first = np.argmax(ended, axis=0)
+    for column in np.flatnonzero(ended[-1]):
+        assert (states[first[column] :, column] == states[first[column], column]).all()
+    longer = compile_problem(dataclasses.replace(scene, horizon=90), None, "semi_implicit_euler", "numpy")
+    column = np.flatnonzero(ended[-1])[:1]
+    more = np.concatenate([w[:60], np.zeros((30, 16)), w[60:]])[:, column]
+    assert longer.value(theta, more) == pytest.approx(given.value(theta, w[:, column]), rel=1e-13)
+
+
+def test_the_start_is_near_hanging():
+    scene = CartpoleSwing()
+    q, v = scene.random_start(np, np.random.default_rng(0).standard_normal((8, 4000)))
+    assert np.abs(q[0]).max() < np.pi / 2
+    assert np.abs(q[1] + np.pi).max() < np.pi / 2
+    assert np.abs(v).max() < 0.25
+    assert q.std(axis=1) == pytest.approx([np.pi / np.sqrt(12)] * 2, rel=0.05)
+
+
+def test_energy_is_kept_without_force():
+    scene = CartpoleSwing()
+    program = compile_problem("cartpole_swing[substeps=400]", None, "semi_implicit_euler", "numpy").program
+
+    def energy(q, v):
+        m, l, total = scene.pole_mass, scene.length, scene.cart_mass + scene.pole_mass
+        kinetic = 0.5 * total * v[0] ** 2 + m * l * np.cos(q[1]) * v[0] * v[1] + 0.5 * (4 / 3) * m * l**2 * v[1] ** 2
+        return kinetic + m * scene.gravity * l * np.cos(q[1])
+
+    state = State(np.array([[0.0], [2.0]]), np.array([[0.1], [0.4]]))
+    before = energy(*state)
+    for _ in range(60):
+        state = program.step(LoopOps(), state, np.zeros((1, 1)))
+    assert energy(*state) == pytest.approx(before, rel=1e-4)  # 24,000 steps of first order
+
+
+def test_the_policy_is_in_the_key_of_a_cell():
+    def key(policy):
+        given = ["scenes=['cartpole_swing[policy=" + policy + "]']", "backends=[jax]", "estimators=[fobg]"]
+        return grid.cells(config.load(["name=keys", *given]))[0].key
+
+    assert len({key("linear"), key("mlp"), key("mlp[hidden=8]")}) == 3
+
+
+def test_the_code_of_the_policy_is_in_the_fingerprint(monkeypatch):
+    from bench.experiment import keys
+
+    before = fingerprint(CartpoleSwing())
+    read = keys.plugin_hash
+    monkeypatch.setattr(keys, "plugin_hash", lambda cls: read(cls) + "changed" * (cls.kind == "policies"))
+    assert fingerprint(CartpoleSwing()) != before
+
+
+def test_policies_are_swept(tmp_path):
+    rows = bench.run(
+        name="policies", scenes=["cartpole_swing[horizon=20]"], backends=["jax"], estimators=["fobg"],
+        sweep={"policy": ["linear", "mlp[hidden=[8]]"]}, samples=4, repeats=4, timing=False, results_dir=tmp_path,
+        reference={"samples": 256},
+    )  # fmt: skip
+    assert rows.status.tolist() == ["ok", "ok"]
+    assert sorted(rows.dim) == [6, 57]
