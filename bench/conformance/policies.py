@@ -47,8 +47,8 @@ def shared_theta_acts_like_columns(policy: Policy) -> str:
     require(off < ROUNDED, f"a shared theta and its copies differ by {off:.1e}")
     changed = observations.copy()
     changed[:, 2] += 1.0
-    kept = np.arange(COLUMNS) != 2
-    off = distance(policy.act(np, theta, changed)[:, kept], policy.act(np, theta, observations)[:, kept])
+    others = np.arange(COLUMNS) != 2
+    off = distance(policy.act(np, theta, changed)[:, others], policy.act(np, theta, observations)[:, others])
     require(off < ROUNDED, "a column changes the controls of others")
     return f"to {off:.0e}"
 

@@ -94,10 +94,9 @@ class Estimator(Plugin):
                 return f"{condition}cost times score lacks a term, which {self.name} does not add"
             if "explicit" not in provides:
                 return f"{condition}{self.name} needs explicit, which {backend} lacks"
-        if self.needs_directions and program.n_noise < program.dim:
-            return (
-                f"{self.name} needs {program.dim} normal numbers per sample, and the noise model has {program.n_noise}"
-            )
+        own = program.n_noise - program.exogenous
+        if self.needs_directions and own < program.dim:
+            return f"{self.name} needs {program.dim} normal numbers per sample, and the noise model has {own}"
         return self.unsupported_reason(program)
 
 

@@ -186,8 +186,9 @@ class Problem(ABC):
 
         Raises :class:`Unsupported` if a sample has fewer than d normal numbers.
         """
-        if w.shape[0] < self.dim:
-            raise Unsupported(f"needs {self.dim} normal numbers per sample, and this noise model has {w.shape[0]}")
+        own = w.shape[0] - self.program.exogenous
+        if own < self.dim:
+            raise Unsupported(f"needs {self.dim} normal numbers per sample, and this noise model has {own}")
         return w[: self.dim]
 
     def displaced(self, shift: np.ndarray, theta: np.ndarray, w: np.ndarray) -> np.ndarray:

@@ -20,6 +20,10 @@ EQUIVALENT: dict[str, str] = {
     "3147665b5d159b338401dc886e5d51746ed6b1fc0fc2d1fb0f4c5ac7fd7207f4": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
     # bench/measure/reference.py: noise on the actions beside a scene's own noise, which no stored scene has
     "8e9c1980ecf41fda3cffe337a73bda5f04f968b11b11f7bd78492e9239172a70": "f4ea930fd9b4c514b92e905d9ee99b00899e60ecef16cc4e558020bce228ddd2",
+    # bench/model/estimator.py: noise on the actions beside a scene's own noise, which no stored scene has
+    "d7e31de64a5307aa7f7f65dbdf54b7c9c13a4e599a1d4303edfbd8131e19ad15": "297f51107543e92425d4da900ff76f5713b7be2f7b41083c98ff121267327fdc",
+    # bench/model/problem.py: noise on the actions beside a scene's own noise, which no stored scene has
+    "fb66e3862742a7acb080bbaf2136a9569274a440ddd3aae74b0feba3375a853b": "b537cd67e11a1065dce873c040744092aa6c8dbc2af87f4d4b4942d39197585c",
     # bench/model/adjoint.py: uses a scene's own derivative of the feedback, which no stored scene has
     "3b9ae75589f9edcd8828b01e2472dbfc566660187ee6e0903b48de9da7df27a5": "d6d35bf0003a6041adf76a4e9ccca9ede0b96e1241a58774c8fbf795bedcd942",
     # plugins/estimators/total_propagation.py: leaves out the numbers of a random start, which no stored scene has

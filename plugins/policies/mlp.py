@@ -16,7 +16,7 @@ class Mlp(Policy):
     """A multilayer perceptron: hidden layers with an activation function, and a linear last layer.
 
     Theta holds weight and bias of each layer in turn. Initial weights are normal with deviation 1 / sqrt(inputs of the
-    layer) (LeCun et al. 1998), those of the last layer times ``scale``; initial biases are 0.
+    layer) (LeCun et al. 1998), in the last layer times ``scale``; initial biases are 0.
     """
 
     name = "mlp"

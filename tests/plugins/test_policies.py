@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from bench.plugins.scenes.cartpole_swing import CartpoleSwing
 
 import bench
 from bench.errors import UserError
@@ -13,7 +14,6 @@ from bench.experiment.keys import fingerprint
 from bench.measure import noise
 from bench.model import LoopOps, State, adjoint_gradient, slopes
 from bench.model.policy import policy_of, uniform
-from bench.plugins.scenes.cartpole_swing import CartpoleSwing
 
 REVERSED = 1e-9
 """Relative difference of gradients by one reverse pass and step by step: rounding over 30 steps."""
@@ -182,9 +182,11 @@ def test_energy_is_kept_without_force():
     program = compile_problem("cartpole_swing[substeps=400]", None, "semi_implicit_euler", "numpy").program
 
     def energy(q, v):
-        m, l, total = scene.pole_mass, scene.length, scene.cart_mass + scene.pole_mass
-        kinetic = 0.5 * total * v[0] ** 2 + m * l * np.cos(q[1]) * v[0] * v[1] + 0.5 * (4 / 3) * m * l**2 * v[1] ** 2
-        return kinetic + m * scene.gravity * l * np.cos(q[1])
+        m, half, total = scene.pole_mass, scene.length, scene.cart_mass + scene.pole_mass
+        kinetic = (
+            0.5 * total * v[0] ** 2 + m * half * np.cos(q[1]) * v[0] * v[1] + 0.5 * (4 / 3) * m * half**2 * v[1] ** 2
+        )
+        return kinetic + m * scene.gravity * half * np.cos(q[1])
 
     state = State(np.array([[0.0], [2.0]]), np.array([[0.1], [0.4]]))
     before = energy(*state)

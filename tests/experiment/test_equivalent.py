@@ -1,0 +1,47 @@
+"""Files whose changes decide no stored number: the stored rows still come out."""
+
+import json
+
+import numpy as np
+import pytest
+from trees import ROOT
+
+import bench
+from bench.experiment import config
+from bench.experiment.axes import build_plugins
+from bench.experiment.by_name import compile_problem
+from bench.measure import noise
+from bench.model.sources import EQUIVALENT, code_hash, hash_of_tree
+
+SAME = 1e-9
+"""Relative difference of numbers computed by other versions of the same libraries on another processor."""
+FILES = [path for folder in ("bench", "plugins") for path in sorted((ROOT / folder).rglob("*.py"))]
+
+
+def own_hash(path):
+    import ast
+
+    return hash_of_tree(ast.parse(path.read_bytes()))
+
+
+def test_every_entry_is_in_use_and_leads_to_one_earlier_version():
+    present = {own_hash(path) for path in FILES}
+    assert set(EQUIVALENT) <= present, "an entry whose file has changed since belongs to no file"
+    assert not set(EQUIVALENT.values()) & set(EQUIVALENT), "an earlier version is itself listed as a later one"
+    assert all(code_hash(path) == EQUIVALENT.get(own_hash(path), own_hash(path)) for path in FILES)
+
+
+@pytest.mark.parametrize("name", ["quick", "estimators", "windows", "stiffness_sweep"])
+def test_stored_estimates_come_out_again(name):
+    experiment = config.load([f"experiment={name}", f"results_dir={ROOT / 'results/standard'}"])
+    rows = bench.load(experiment.directory)
+    rows = rows[(rows.status == "ok") & rows.backend.str.startswith("jax")]
+    for _, row in rows.groupby("estimator").head(1).iterrows():
+        parts = build_plugins(json.loads(row["parameters"]))
+        problem = compile_problem(parts["scene"], parts["contact"], parts["integrator"], row["backend"])
+        drawn = noise.shared(
+            int(row["seed"]), parts["scene"].name, int(row["repeats"]), int(row["samples"]), problem.program.n_noise
+        )
+        mean = parts["estimator"].estimate(problem, problem.program.theta0, drawn).mean(axis=0)
+        stored = np.asarray(row["mean_estimate"])
+        assert np.abs(mean - stored).max() <= SAME * np.abs(stored).max(), row["estimator"]
