@@ -30,7 +30,9 @@ def training(name, dtype="float64", horizon=12, substeps=1, **parameters):
     return Training(env, registry.make("trainers", name, {**TRAINERS[name], **parameters}))
 
 
-@pytest.mark.parametrize("name", TRAINERS)
+@pytest.mark.parametrize(
+    "name", [name if name == "shac" else pytest.param(name, marks=pytest.mark.slow) for name in TRAINERS]
+)
 def test_a_run_that_is_stored_and_resumed_takes_the_same_path_bit_for_bit(name):
     run = training(name, "float32")
     state = run.start(3)
@@ -53,7 +55,7 @@ def test_a_run_that_is_stored_and_resumed_takes_the_same_path_bit_for_bit(name):
 
 
 def test_seeds_give_different_runs_from_one_compilation():
-    run = training("shac")
+    run = training("shac", "float32")
     first, second = run.start(0), run.start(1)
     assert not np.array_equal(first.actor.mean.weights[0], second.actor.mean.weights[0])
     run.update(first)
@@ -64,10 +66,9 @@ def test_seeds_give_different_runs_from_one_compilation():
 
 def test_first_and_zeroth_order_gradients_of_a_window_agree():
     """Both estimate the derivative of the same objective: with enough rollouts their cosine is 1."""
-    run = training("shac", rollouts=32)
-    state = run.start(0)
-    found = run.agreement(state, 1, 64)
-    assert found["cosine_denoised"] == pytest.approx(1.0, abs=0.1)  # 2,048 rollouts: three times its spread over seeds
+    run = training("shac", "float32")
+    cosines = run.agreement(run.start(0), 1, 256)
+    assert cosines["cosine_denoised"] == pytest.approx(1.0, abs=0.02)  # eight times its spread over seeds
 
 
 def test_a_planted_first_order_gradient_of_the_wrong_sign_is_seen_in_the_cosine():

@@ -118,7 +118,7 @@ def test_a_deviation_that_collapses():
 
 
 def test_a_gradient_that_differences_contradict():
-    assert "disagrees with central differences (relative error 0.50)" in words(
+    assert "disagrees with central differences over a step of fixed length" in words(
         verdicts(probe={"difference_error": 0.5})
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -105,18 +105,22 @@ def _filled(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def windows(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per problem, family and window, for families with several: gradient, bias and final return."""
+    """Return a line per problem, family and window, for families with several: gradient, bias and final return.
+
+    The interval of the bias contains those of all runs.
+    """
     known = runs[runs["window"].notna() & runs["window_gradient"].notna()]
     lines = []
     for (problem, family, window), part in known.groupby(["problem", "family", "window"]):
         final = final_returns(part)
         low, high = interval(final)
-        bias = part["window_bias"].to_numpy(float)
-        bias_low, bias_high = interval(bias)
+        bias = part[["window_bias", "window_bias_low", "window_bias_high"]].dropna()
         lines.append({
             "problem": problem, "family": family, "window": window, "seeds": len(part),
             "window_gradient": float(part["window_gradient"].median()), "gradient_typical": float(part["gradient_typical"].median()),
-            "bias": interquartile_mean(bias), "bias_low": bias_low, "bias_high": bias_high,
+            "bias": interquartile_mean(bias["window_bias"].to_numpy(float)),
+                "bias_low": float(bias["window_bias_low"].min()), "bias_high": float(bias["window_bias_high"].max()),
+                "resolved": f"{(bias['window_bias_low'] > 0).sum()} of {len(part)}",
             "final": interquartile_mean(final), "final_low": low, "final_high": high,
         })  # fmt: skip
     frame = pd.DataFrame(lines)
@@ -125,15 +129,31 @@ def windows(runs: pd.DataFrame) -> pd.DataFrame:
     return frame[frame.groupby(["problem", "family"])["window"].transform("nunique") > 1]
 
 
+LARGE = 10.0
+"""Factor on a run's median gradient norm that an explosion exceeds; below it, the gradient was small before."""
+
+
 def faults(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per run and fault: problem, method, seed and the fault's numbers in ``fault``."""
+    """Return a line per run and fault: problem, method, seed and the fault's numbers in ``fault``.
+
+    An explosion whose norm is ordinary for its run gets the code ``returns``: the gradient nearly vanished before it.
+    """
     lines: list[dict[str, Any]] = []
-    for row in runs[["problem", "method", "seed", "verdicts"]].to_dict("records"):
+    for row in runs.to_dict("records"):
         lines += [
-            {"problem": row["problem"], "method": row["method"], "seed": row["seed"], "fault": fault}
+            {"problem": row["problem"], "method": row["method"], "seed": row["seed"], "fault": _in_scale(fault, row)}
             for fault in json.loads(row["verdicts"] or "[]")
         ]
     return pd.DataFrame(lines, columns=["problem", "method", "seed", "fault"])
+
+
+def _in_scale(fault: dict[str, Any], row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a fault, with the code ``returns`` if it is an explosion to an ordinary norm of its run."""
+    if fault["code"] != "explodes":
+        return fault
+    entry = int(np.searchsorted(np.asarray(row["log_update"], float), fault["update"]))
+    norm = float(row["log_gradient_norm"][entry])
+    return fault if norm > LARGE * row["gradient_typical"] else {**fault, "code": "returns"}
 
 
 def logs(runs: pd.DataFrame, quantities: Sequence[str]) -> pd.DataFrame:

@@ -83,7 +83,7 @@ def window(windows: pd.DataFrame) -> str:
         )
         first, last = part.iloc[0], part.iloc[-1]
         bias = ""
-        if first["bias_low"] > last["bias_high"]:
+        if first["bias_low"] > last["bias_high"]:  # the intervals of all runs
             bias = f", and the gradient's bias falls from {number(first['bias'])} at {first['window']:.0f} to {number(last['bias'])} at {last['window']:.0f} steps"
         parts.append(f"Among windows of {family}, {shown}{bias}")
     return f"{'. '.join(parts)}." if parts else ""
@@ -155,7 +155,13 @@ WORDS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "not_finite": lambda f: f"NaN at update {f['update']}: the {f['quantity']} is not finite",
     "zero": _zero,
     "explodes": _explodes,
-    "differences": lambda f: f"the gradient disagrees with central differences (relative error {number(f['error'])})",
+    "returns": lambda f: (
+        f"the gradient nearly vanishes before update {f['update']} and then grows {number(f['factor'])} times, to its usual size"
+    ),
+    "differences": lambda f: (
+        "the gradient disagrees with central differences over a step of fixed length, by curvature or a wrong derivative "
+        f"(relative error {number(f['error'])})"
+    ),
     "opposed": lambda f: (
         "the first-order gradient points away from the zeroth-order one: cosine "
         f"{number(f['cosine'])} [{number(f['low'])}, {number(f['high'])}]"

@@ -11,7 +11,7 @@ from bench.experiment.axes import table
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
-from bench.report.style import PALETTE, VARIANTS
+from bench.report.style import DEVIANT, VARIANTS, colour, marker
 from bench.report.text import number
 from bench.report.writer import reasons
 from bench.studies.train import aggregate, findings
@@ -29,6 +29,7 @@ WINDOWS = (
     PROBLEM, text("family", label="trainer"), Column("window", label="window", unit="steps", format="setting"),
     Column("window_gradient", label="norm of a window's gradient"),
     Column("bias", label="bias against a whole episode", low="bias_low", high="bias_high", log=False),
+    text("resolved", label="runs with a bias above 0"),
     Column("gradient_typical", label="gradient norm in training"), FINAL,
 )  # fmt: skip
 FAULTS = (PROBLEM, METHOD, Column("seed", format="setting"), text("words", label="the log shows"))
@@ -39,8 +40,8 @@ STEP, SECONDS = (
 )
 QUANTITIES = {
     "reward": "reward per step",
-    "gradient_norm": "gradient norm",
-    "gradient_largest": "largest entry",
+    "gradient_norm": "log10 of the gradient norm",
+    "gradient_largest": "log10 of its largest entry",
     "cosine": "cosine with zeroth order",
     "step_length": "step length",
     "cut": "share of rollouts cut",
@@ -49,8 +50,11 @@ QUANTITIES = {
     "contact_force": "contact force [N]",
 }
 """The quantities of the chart of logs, with their headings."""
+LOGARITHMIC = ("gradient_norm", "gradient_largest")
+"""Quantities that are drawn as their logarithms, since spikes are orders of magnitude high."""
 MAX_LOGS = 4
-"""Most trainers in the printed chart of logs; the page has all."""
+"""Most trainers in the printed chart of logs, the best of each family; the page has all."""
+LINES = (*VARIANTS, *DEVIANT)
 NOTES = (
     "final return: interquartile mean over seeds of the mean undiscounted return of the deterministic policy from the same "
     "starts, with a 95% bootstrap interval over seeds. A run that is not finite counts as its untrained policy. training: "
@@ -61,7 +65,8 @@ NOTES = (
 WINDOW_NOTES = (
     "norm and bias of a window's gradient: of the return of rollouts from new starts, with the policy and critic halfway "
     "through the run, against windows as long as an episode, relative to the norm of the latter. The policies differ "
-    "between windows. Interquartile means over seeds with 95% bootstrap intervals.",
+    "between windows. bias: interquartile mean over runs; its interval contains the 95% intervals of all runs. final return: "
+    "interquartile mean over seeds with a 95% bootstrap interval.",
 )
 PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
         "gradient_peak", "window_gradient", "window_bias", "difference_error")  # fmt: skip
@@ -92,14 +97,12 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
 
 
 def _styles(summary: pd.DataFrame) -> dict[str, Style]:
-    """Return a colour per family of trainers and a line style per member."""
-    looks: dict[str, Style] = {}
+    """Return a colour and marker per trainer, and a line style per family."""
     families = list(dict.fromkeys(summary["family"]))
-    for family in families:
-        for i, method in enumerate(dict.fromkeys(summary.loc[summary["family"] == family, "method"])):
-            colour = PALETTE[families.index(family) % len(PALETTE)]
-            looks[method] = Style(colour, "osD^"[i % 4], VARIANTS[i % len(VARIANTS)])
-    return looks
+    return {
+        method: Style(colour(i), marker(i), LINES[families.index(family) % len(LINES)])
+        for i, (method, family) in enumerate(dict(zip(summary["method"], summary["family"], strict=True)).items())
+    }
 
 
 def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame, texts: list[str]) -> list[Chart]:
@@ -134,6 +137,11 @@ def _logs(runs: pd.DataFrame, summary: pd.DataFrame, looks: dict[str, Style]) ->
     charts = []
     for i, (problem, part) in enumerate(runs.groupby("problem", sort=False)):
         frame = aggregate.logs(part, tuple(QUANTITIES)).dropna(subset=["value"])
+        size = frame["quantity"].isin(LOGARITHMIC)
+        frame = frame.assign(
+            value=np.where(size, np.log10(frame["value"].where(size & (frame["value"] > 0))), frame["value"])
+        )
+        frame = frame.dropna(subset=["value"])
         varies = frame.groupby("quantity")["value"].agg(["min", "max"])
         shown = [
             name for name in QUANTITIES if name in varies.index and varies.loc[name, "min"] < varies.loc[name, "max"]
@@ -142,7 +150,8 @@ def _logs(runs: pd.DataFrame, summary: pd.DataFrame, looks: dict[str, Style]) ->
         if frame.empty:
             continue
         frame = frame.assign(quantity=frame["quantity"].map(QUANTITIES))
-        methods = list(summary.loc[summary["problem"] == problem, "method"])[:MAX_LOGS]
+        own = summary[summary["problem"] == problem]
+        methods = list(own.drop_duplicates("family")["method"])[:MAX_LOGS]
         charts.append(Chart(
             "train_log" if i == 0 else f"train_log_{i + 1}", _log_title(part, methods), frame, [STEP],
             [Column("value", label=" ")], series="method", panel="quantity", styles={m: replace(s, marker="") for m, s in looks.items()},
