@@ -55,6 +55,8 @@ def build(backend: Any, program: Program) -> Any:
     scene, law = program.scene, program.contact
     assert isinstance(scene, MechanicalScene)
     assert isinstance(scene, EngineTwin)
+    if (path := scene.model_file()) is not None:
+        return _as_written(str(path), scene, backend)
     model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/>{scene.mjcf()}</mujoco>')
     expected = (scene.n_q, scene.n_q if scene.n_v is None else scene.n_v, scene.n_u)
     if (model.nq, model.nv, model.nu) != expected:
@@ -70,6 +72,21 @@ def build(backend: Any, program: Program) -> Any:
     option.disableflags = _disabled(mujoco.mjtDisableBit, model, backend.lean)
     if isinstance(law, Penalty):
         _set_springs(model, law, backend.impedance)
+    return model
+
+
+def _as_written(path: str, scene: MechanicalScene, backend: Any) -> Any:
+    """Return the model of an MJCF file with its own contacts and cone, and the backend's integrator and solver."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(path)
+    option, bit = model.opt, mujoco.mjtDisableBit
+    option.timestep = scene.dt / getattr(scene, "substeps", 1)
+    option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{backend.integrator.upper()}")
+    option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{backend.solver.upper()}")
+    option.iterations, option.ls_iterations = backend.iterations, backend.ls_iterations
+    # steps must depend on the state only, and diverging states must show
+    option.disableflags |= int(bit.mjDSBL_WARMSTART | bit.mjDSBL_AUTORESET)
     return model
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.engines.backend import EngineBackend
-from bench.model import CallableScene, PolicyScene
+from bench.model import PolicyScene, Scene
 from bench.model.parameters import Plugin, remember, values
 from bench.model.sources import code_of, file_of, hash_of, hash_of_tree, imports_of_tree, is_below
 
@@ -59,7 +59,11 @@ def fingerprint(plugin: Plugin | None) -> str:
         parameters = dict(sorted(values(plugin).items()))
         hashes = [
             plugin_hash(type(plugin)),
-            *([files_hash(plugin.files())] if isinstance(plugin, CallableScene | EngineBackend) else []),
+            *(
+                [files_hash(plugin.files())]
+                if isinstance(plugin, Scene | EngineBackend) and hasattr(plugin, "files")
+                else []
+            ),
             *([plugin_hash(type(plugin.plugin))] if isinstance(plugin, PolicyScene) else []),
         ]
         text = json.dumps([plugin.kind, plugin.name, parameters, hashes], default=repr)
@@ -86,8 +90,10 @@ def code(*modules: str) -> dict[str, Path]:
 def files_hash(files: Iterable[Path]) -> str:
     """Return the hash of a user's files and of the modules that they import from bench."""
     paths = list(files)
-    modules = [name for path in paths for name in imports_of_tree(ast.parse(path.read_bytes()), path.stem, path)]
-    return hash_of([*paths, *code(*(name for name in modules if name.startswith("bench."))).values()])
+    scripts = [path for path in paths if path.suffix == ".py"]
+    others = [hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.suffix != ".py"]
+    modules = [name for path in scripts for name in imports_of_tree(ast.parse(path.read_bytes()), path.stem, path)]
+    return "".join([hash_of([*scripts, *code(*(n for n in modules if n.startswith("bench."))).values()]), *others])
 
 
 @remember

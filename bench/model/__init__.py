@@ -37,7 +37,7 @@ from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
-from bench.model.policy import Policy, PolicyScene
+from bench.model.policy import Policy, PolicyRollout, PolicyScene
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
 from bench.model.program import (
     SURROGATE,
@@ -106,6 +106,7 @@ __all__ = [
     "Oscillator",
     "Plugin",
     "Policy",
+    "PolicyRollout",
     "PolicyScene",
     "Population",
     "Problem",

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.model.manifold import difference, n_changes, retract
+from bench.model.manifold import difference, n_changes, retract, slope_by_changes
 from bench.model.ops import LoopOps, State
 from bench.model.problem import Jacobians, Problem
 from bench.model.program import Program, Rollout, rollout
@@ -154,7 +154,8 @@ def _feedback_slopes(scene: MechanicalScene, path: Jacobians, theta: np.ndarray)
         along = scene.pullback(theta, states, weights, by_theta=False)
         if along is None:
             return None
-        rows.append(np.moveaxis(along[1], 0, 1))
+        by_change = slope_by_changes(scene, _flatten(path.states[:-1]), along[1].reshape(len(states), -1))
+        rows.append(_unflatten(by_change, states.shape[1]))
     return np.stack(rows, axis=1) if rows else None
 
 

@@ -33,9 +33,12 @@ class JointScene(EngineScene):
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
-        if strange := [joint for joint in getattr(cls, "joints", ()) if joint not in SIZES]:
+        joints = getattr(cls, "joints", None)
+        if not isinstance(joints, tuple):
+            return  # an instance decides
+        if strange := [joint for joint in joints if joint not in SIZES]:
             raise TypeError(f"{cls.__name__} has the joint {strange[0]!r}: allowed are {', '.join(SIZES)}")
-        if hasattr(cls, "joints"):
+        if joints:
             cls.n_q, cls.n_v = (sum(SIZES[joint][i] for joint in cls.joints) for i in (0, 1))
 
     def retract(self, xp: Any, q: Array, change: Array) -> Array:

@@ -108,14 +108,14 @@ class PolicyRollout(Rollout):
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
         """Return the state after ``substeps`` steps of the integrator under ``u (n_u, B)``; unchanged after the end."""
-        scene, after = self.scene, state
-        dynamics = self.dynamics(ops)
-        for _ in range(scene.substeps):
-            after = self.integrator.step(dynamics, after, u, scene.dt / scene.substeps)
-        ended = scene.has_ended(ops.xp, state.q, state.v)
-        if ended is None:
-            return after
-        return State(*(ops.xp.where(ended, old, new) for old, new in zip(state, after, strict=True)))
+        after = state
+        for _ in range(self.scene.substeps):
+            after = self.substep(ops, after, u)
+        return self.stopped(ops.xp, state, after)
+
+    def substep(self, ops: Ops, state: State, u: Array) -> State:
+        """Return the state after one step of the integrator."""
+        return self.integrator.step(self.dynamics(ops), state, u, self.scene.dt / self.scene.substeps)
 
 
 @dataclass(frozen=True)
@@ -151,10 +151,6 @@ class PolicyScene(MechanicalScene):
     def random_start(self, xp: Any, e: Array) -> State:
         """Return the states at t = 0 from standard normal ``e (n_start, B)``; needed only if ``n_start`` is not 0."""
         raise Unsupported(f"scene {self.name} has n_start={self.n_start} and defines no random_start")
-
-    def has_ended(self, xp: Any, q: Array, v: Array) -> Array | None:
-        """Return whether rollouts have ended in these states, ``(B,)``; None if they never end early."""
-        return None
 
     def theta0(self) -> np.ndarray:
         """Return the policy's initial parameters, ``(d,)``."""

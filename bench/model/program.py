@@ -392,6 +392,13 @@ class Rollout(Program):
         """Return the state after one integrator step under the control ``u (n_u, B)``."""
         return self.integrator.step(self.dynamics(ops), state, u, self.scene.dt)
 
+    def stopped(self, xp: Any, before: State, after: State) -> State:
+        """Return the state ``after`` a step, or the state ``before`` it where the rollout had ended."""
+        ended = self.scene.has_ended(xp, before.q, before.v)
+        if ended is None:
+            return after
+        return State(*(xp.where(ended, old, new) for old, new in zip(before, after, strict=True)))
+
     def dynamics(self, ops: Ops) -> Dynamics:
         """Return the scene's dynamics under its contact law, as the integrator uses them."""
         if self._varying and self.needs_root:

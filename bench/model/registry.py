@@ -38,8 +38,8 @@ KINDS = (
     "scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "policies", "trainers", "studies",
 )  # fmt: skip
 """The built-in kinds, in listing order. A plugin may declare another kind."""
-ENGINES = "engines"
-"""Name of the folders with files that only the Pythons of engines import."""
+NOT_PLUGINS = ("engines", "robots")
+"""Names of the folders with files that only the Pythons of engines import, and with models of robots."""
 ENTRY_POINT_GROUP = "bench.plugins"
 NAME = re.compile(r"\w[\w.-]*")
 """Pattern of plugin names. Brackets, commas and spaces are syntax of identity strings, so names contain none."""
@@ -169,7 +169,7 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
     """Yield (kind, full name) of each module in a package and its subfolders; the kind is the module's folder name."""
     for module in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
         name = f"{package.__name__}.{module.name}"
-        if module.name == ENGINES and package.__name__ != CORE:
+        if module.name in NOT_PLUGINS and package.__name__ != CORE:
             continue
         if module.name in KINDS:
             yield from ((module.name, path) for _, path in _modules(importlib.import_module(name)))
@@ -180,7 +180,7 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
         bare = (
             folder.is_dir()
             and folder.name.isidentifier()
-            and folder.name != ENGINES
+            and folder.name not in NOT_PLUGINS
             and not (folder / "__init__.py").exists()
         )
         if bare and any(folder.glob("*.py")):

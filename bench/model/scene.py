@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -146,6 +147,10 @@ class MechanicalScene(Scene):
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array | None:
         """Return the feedback part of the control law, ``(n_u, B)``, or None. It is added to the open-loop part."""
+        return None
+
+    def has_ended(self, xp: Any, q: Array, v: Array) -> Array | None:
+        """Return whether rollouts have ended in these states, ``(B,)``; None if they never end early."""
         return None
 
     def pullback(
@@ -292,6 +297,10 @@ class EngineTwin(ABC):
         scene's contacts. The backend sets time step, solver and contact springs. Gravity is 0 unless an ``<option>``
         sets it.
         """
+
+    def model_file(self) -> Path | None:
+        """Return the MJCF file that is the scene's model, to be used as it is written; None: the twin of :meth:`mjcf`."""
+        return None
 
 
 @dataclass(frozen=True)

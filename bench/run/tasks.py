@@ -13,7 +13,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint
 from bench.experiment.study import Study, study_of
 from bench.measure import noise
-from bench.model import Backend, CallableScene, Plugin, guard, registry
+from bench.model import Backend, Plugin, Scene, guard, registry
 from bench.model.isolation import State, reduced_precision
 from bench.run.plan import versions
 from bench.run.pool import Answer
@@ -115,7 +115,8 @@ def _is_foreign(cell: Cell) -> bool:
     """Return whether a cell runs code from outside this package."""
     parts: list[Plugin | None] = [*cell.parts.values(), cell.study]
     return any(
-        part is not None and (not type(part).__module__.startswith("bench.") or isinstance(part, CallableScene))
+        part is not None
+        and (not type(part).__module__.startswith("bench.") or (isinstance(part, Scene) and hasattr(part, "files")))
         for part in parts
     )
 

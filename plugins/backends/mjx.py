@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from bench.model import (
     Array,
     Backend,
+    EngineTwin,
     JointScene,
     Ops,
     Problem,
@@ -69,11 +71,17 @@ class Mjx(Jax):
     def compile(self, program: Program) -> Problem:
         """Return the twin's steps as jitted functions, compiled at the first call with each batch shape."""
         ops = self.ops()
-        return MjxProblem(MjxProgram(rollout(program), self), ops, self.dtype, self._direction(program))
+        return MjxProblem(_stepped(rollout(program), self), ops, self.dtype, self._direction(program))
 
     def unsupported_reason(self, program: Program) -> str | None:
         """Return why the program cannot run: it has no twin, or MJX cannot differentiate it; or None."""
         reason = mjcf.unsupported_reason(self, program)
+        if reason is None and isinstance(program.scene, EngineTwin) and program.scene.model_file() is not None:
+            return (
+                None
+                if self.is_implicit
+                else f"one solver iteration is exact for springs only: use {self.name}[iterations=20]"
+            )
         if reason is None and self.cone == "elliptic":
             reason = self._elliptic_reason(mjcf.contact_dimensions(program))
         if reason is None and not self.is_implicit and self.mode == "reverse" and self.iterations > 1:
@@ -253,3 +261,28 @@ class MjxProgram(Rollout):
         # MJX creates numbers in JAX's default precision
         with jax.enable_x64(kind == np.float64), self._solver():
             return jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)
+
+
+def _stepped(program: Rollout, backend: Mjx) -> MjxProgram:
+    """Return the program stepped by MJX, with the starts, substeps and ends of its own class."""
+    return _stepped_class(type(program))(program, backend)
+
+
+@cache
+def _stepped_class(own: type[Rollout]) -> type[MjxProgram]:
+    if own is Rollout:
+        return MjxProgram
+    return type(f"Mjx{own.__name__}", (_MjxPolicyProgram, own), {})
+
+
+class _MjxPolicyProgram(MjxProgram):
+    """A program with a policy, stepped by MJX. Its other base class gives the starts and the ends of rollouts."""
+
+    def step(self, ops: Ops, state: State, u: Array) -> State:
+        """Return the state after ``substeps`` MJX steps, compiled once, or the same state after the end."""
+        import jax
+
+        one = super().step
+        scene: Any = self.scene
+        after, _ = jax.lax.scan(lambda at, _: (one(ops, at, u), None), state, length=scene.substeps)
+        return self.stopped(ops.xp, state, after)

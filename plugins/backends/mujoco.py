@@ -87,21 +87,23 @@ class MujocoProblem(NumpyProblem):
         super().__init__(program, backend.dtype, backend.step)
         self._rolled = rollout(program)
         self._backend = backend
-        self._engine = Engine(mjcf.build(backend, program))
+        scene = self._rolled.scene
+        self._substeps = getattr(scene, "substeps", 1)
+        self._engine = Engine(mjcf.build(backend, program), self._substeps)
         self._open_loop = _is_open_loop(self._rolled.scene, self.dim)
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         states, _ = self._rollout(theta, w)
-        return np.asarray(Recorded(self._rolled, states).cost(NumpyOps(), theta, w))
+        return np.asarray(recorded(self._rolled, states).cost(NumpyOps(), theta, w))
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         if self._backend.gradient == "rollouts":
             return super()._grad(theta, w)
         path = self.jacobians(theta, w)
-        return _reverse(Recorded(self._rolled, *path), theta, w, scored=False)
+        return _reverse(recorded(self._rolled, *path), theta, w, scored=False)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return _reverse(Recorded(self._rolled, self._rollout(theta, w)[0]), theta, w, scored=True)
+        return _reverse(recorded(self._rolled, self._rollout(theta, w)[0]), theta, w, scored=True)
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
         """Return the engine's states and controls."""
@@ -112,7 +114,13 @@ class MujocoProblem(NumpyProblem):
         theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
         states, controls = self._rollout(theta, w)
         central = self._backend.differences == "central"
-        return Jacobians(states, controls, *self._engine.jacobians(states, controls, self._backend.step, central))
+        a, b = self._engine.jacobians(states, controls, self._backend.step, central)
+        n_q = self._rolled.scene.n_q
+        for t, x in enumerate(states[:-1]):
+            ended = self._rolled.scene.has_ended(np, x[:n_q], x[n_q:])
+            if ended is not None:
+                a[t][..., ended], b[t][..., ended] = np.eye(a.shape[1])[..., None], 0.0
+        return Jacobians(states, controls, a, b)
 
     def _rollout(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return states ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)``; NaN after the engine has stopped."""
@@ -129,21 +137,22 @@ class MujocoProblem(NumpyProblem):
         states, controls_ = [np.concatenate(state)], []
         for t in range(horizon):
             controls_.append(control(t))
-            states.append(self._engine.rollout(states[-1], controls_[-1][None])[1])
-            state = State(*np.split(states[-1], [self._rolled.scene.n_q]))
+            after = State(*np.split(self._engine.rollout(states[-1], controls_[-1][None])[1], [self._rolled.scene.n_q]))
+            state = self._rolled.stopped(np, state, after)
+            states.append(np.concatenate(state))
         return np.stack(states), np.stack(controls_)
 
 
 class Engine:
-    """A MuJoCo model with one thread and one set of simulation data per core."""
+    """A MuJoCo model with one thread and one set of simulation data per core, and ``substeps`` steps per control."""
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: Any, substeps: int = 1) -> None:
         import mujoco
         from mujoco.rollout import Rollout
 
         # by default MuJoCo writes a log file for a diverging rollout; NaN states report the divergence instead
         mujoco.set_mju_user_warning(lambda message: None)
-        self._mujoco, self._model = mujoco, model
+        self._mujoco, self._model, self._substeps = mujoco, model, substeps
         self._data = [mujoco.MjData(model) for _ in range(cores())]
         self._pool = Rollout(nthread=len(self._data))
 
@@ -153,14 +162,15 @@ class Engine:
         MuJoCo stops a rollout at the first state value beyond 1e10. All later states are NaN.
         """
         start = np.concatenate([np.zeros((1, first.shape[1])), first]).T
-        controls = np.ascontiguousarray(np.moveaxis(controls, -1, 0))
+        controls = np.repeat(np.moveaxis(controls, -1, 0), self._substeps, axis=1)
         kind = int(self._mujoco.mjtState.mjSTATE_CTRL)
         states, _ = self._pool.rollout(
             self._model, self._data, start, controls, control_spec=kind, nstep=controls.shape[1]
         )
         time = self._model.opt.timestep * np.arange(1, controls.shape[1] + 1)
         states[states[:, :, 0] < time - 0.5 * self._model.opt.timestep] = np.nan
-        return np.concatenate([first[None], np.moveaxis(states[:, :, 1:], 0, -1)])
+        every = states[:, self._substeps - 1 :: self._substeps, 1:]
+        return np.concatenate([first[None], np.moveaxis(every, 0, -1)])
 
     def jacobians(
         self, states: np.ndarray, controls: np.ndarray, eps: float, central: bool
@@ -203,7 +213,12 @@ class Engine:
                     if not np.isfinite(points[c, t]).all():
                         break
                     data.qpos, data.qvel, data.ctrl = points[c, t, :nq], points[c, t, nq:], inputs[c, t]
-                    a[c, t], b[c, t] = np.split(derivative(data), [n], axis=1)
+                    step_a, step_b = np.split(derivative(data), [n], axis=1)
+                    for _ in range(self._substeps - 1):
+                        self._mujoco.mj_step(self._model, data)
+                        more_a, more_b = np.split(derivative(data), [n], axis=1)
+                        step_a, step_b = more_a @ step_a, more_a @ step_b + more_b
+                    a[c, t], b[c, t] = step_a, step_b
 
         shares = np.array_split(np.arange(batch), len(self._data))
         with ThreadPoolExecutor(len(self._data)) as threads:
@@ -244,6 +259,13 @@ class Recorded(Rollout):
         return State(after[:n_q], after[n_q:])
 
 
+def recorded(program: Rollout, *path: np.ndarray) -> Rollout:
+    """Return a :class:`Recorded` program with the starts of the program's own class; arguments as there."""
+    own = type(program)
+    replayed: Any = Recorded if own is Rollout else type(f"Recorded{own.__name__}", (Recorded, own), {})
+    return replayed(program, *path)  # type: ignore[no-any-return]
+
+
 def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -> np.ndarray:
     """Return the derivative of column b of the cost, or of the log-probability, by column b of theta, ``(d, B)``."""
     import torch
@@ -259,5 +281,5 @@ def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -
 
 def _is_open_loop(scene: MechanicalScene, dim: int) -> bool:
     """Return whether the control law does not depend on the state."""
-    zero = np.zeros((scene.n_q, 1))
-    return scene.feedback(np, np.zeros((dim, 1)), zero, zero) is None
+    n_v = scene.n_q if scene.n_v is None else scene.n_v
+    return scene.feedback(np, np.zeros((dim, 1)), np.zeros((scene.n_q, 1)), np.zeros((n_v, 1))) is None

@@ -1,0 +1,237 @@
+"""A robot from an MJCF file, with observation and cost from a Python file, under a policy."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from bench.errors import Unsupported, UserError, unknown
+from bench.model import Array, JointScene, State, param
+from bench.model.policy import PolicyScene
+from bench.model.simulator import load_module
+
+ROBOTS = Path(__file__).parents[1] / "robots"
+"""The folder of the built-in robots."""
+FUNCTIONS = ("observation", "stage_cost", "terminal_cost", "has_ended", "random_start")
+"""Functions that the Python file may define; the first two are required."""
+
+
+class Robot(NamedTuple):
+    """What an MJCF file says about a robot."""
+
+    q: np.ndarray
+    """Positions at the start, ``(n_q,)``."""
+    v: np.ndarray
+    """Velocities at the start, ``(n_v,)``."""
+    controls: np.ndarray
+    """Controls at the start, ``(n_u,)``."""
+    joints: tuple[str, ...]
+    """Types of the joints."""
+
+
+@dataclass(frozen=True)
+class Mjcf(PolicyScene, JointScene):
+    """A robot from the MJCF file ``file``, as it is written, under u_t = u0 + action_scale pi(theta, o(x_t)) + sigma w_t.
+
+    A Python file, by default beside the MJCF file and of the same name, defines ``observation(xp, q, v)``, ``(n, B)``,
+    and ``stage_cost(xp, q, v, u)``, ``(B,)``, and may define ``terminal_cost(xp, q, v)``, ``has_ended(xp, q, v)`` and
+    ``random_start(xp, q0, v0, e)``, which returns (q, v) from ``n_start`` standard normal numbers e. q0, v0 and u0 are
+    those of the first keyframe if there is one, else of the model's reference pose. Contacts, limits, friction, springs,
+    actuators and the friction cone are those of the file; the backend decides integrator and solver, ``dt / substeps``
+    is the engine's time step. Orientations are unit quaternions (w, x, y, z).
+
+    Not supported: actuators with activation states, mocap bodies, plugins.
+    """
+
+    name = "mjcf"
+    neglected_effects = "those that the file neglects"
+    continuous: ClassVar[bool] = False  # the force of a contact with the engine's default impedance jumps at touch-down
+    requires: ClassVar[tuple[str, ...]] = ("mujoco",)
+    backends: ClassVar[tuple[str, ...]] = ("mujoco", "mjx")
+
+    sigma: float = param(0.05, "standard deviation of the noise on the controls, or on theta", positive=True)
+    horizon: int = param(20, "number of control steps", "steps", positive=True)
+    dt: float = param(0.01, "length of a control step", "s", positive=True)
+    substeps: int = param(2, "steps of the engine per control step", positive=True)
+    file: str = param("quadruped.xml", "MJCF file; PACKAGE:FILE of an installed Python package, or a built-in robot")
+    functions: str = param("", "Python file with observation and cost; empty: the MJCF file's name with .py")
+    action_scale: float = param(0.3, "controls per unit of the policy's output")
+
+    @property
+    def path(self) -> Path:
+        """The MJCF file. Raises :class:`UserError` if there is none."""
+        package, colon, inside = self.file.partition(":")
+        place = _package_folder(package) / inside if colon and not Path(self.file).exists() else Path(self.file)
+        for path in (place.expanduser(), ROBOTS / self.file):
+            if path.is_file():
+                return path.resolve()
+        built_in = sorted(path.name for path in ROBOTS.glob("*.xml"))
+        if place.suffix == ".xml" and len(place.parts) == 1:
+            raise unknown("MJCF file, or built-in robot:", self.file, built_in)
+        raise UserError(f"mjcf.file={self.file}: there is no such file; built-in robots are {', '.join(built_in)}")
+
+    @property
+    def module(self) -> ModuleType:
+        """The module with observation and cost. Raises :class:`UserError` if it lacks one of them."""
+        place = Path(self.functions).expanduser() if self.functions else self.path.with_suffix(".py")
+        if not place.is_file() and (ROBOTS / place.name).is_file():
+            place = ROBOTS / place.name
+        if not place.is_file():
+            raise UserError(f"mjcf.functions: there is no file {place} with the functions {', '.join(FUNCTIONS[:2])}")
+        module = load_module(str(place))
+        for name in FUNCTIONS[:2]:
+            if not callable(getattr(module, name, None)):
+                raise UserError(f"{place} defines no function {name}: required are {', '.join(FUNCTIONS[:2])}")
+        return module
+
+    @property
+    def robot(self) -> Robot:
+        """The robot's start and joints."""
+        return _read(self.path, self.path.stat().st_mtime_ns)
+
+    def files(self) -> tuple[Path, ...]:
+        """Return all files that decide the robot's motion and cost. If one changes, the scene's cells run again."""
+        return (Path(str(self.module.__file__)), *_model_files(self.path))
+
+    def model_file(self) -> Path:
+        """Return the MJCF file."""
+        return self.path
+
+    def mjcf(self) -> str:
+        """Raise :class:`Unsupported`: the model is a file."""
+        raise Unsupported("the model of scene mjcf is a file, which only backends mujoco and mjx read")
+
+    # ----------------------------------------------------------------------------------------------- dimensions
+
+    @property
+    def joints(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The types of the joints."""
+        return self.robot.joints
+
+    @property
+    def n_q(self) -> int:  # type: ignore[override]
+        """Length of the positions."""
+        return len(self.robot.q)
+
+    @property
+    def n_v(self) -> int:  # type: ignore[override]
+        """Length of the velocities."""
+        return len(self.robot.v)
+
+    @property
+    def n_u(self) -> int:  # type: ignore[override]
+        """Number of actuators."""
+        return len(self.robot.controls)
+
+    @property
+    def n_start(self) -> int:  # type: ignore[override]
+        """Number of standard normal numbers of a random start: ``n_start`` of the Python file, or 0."""
+        return int(getattr(self.module, "n_start", 0))
+
+    @property
+    def n_observations(self) -> int:  # type: ignore[override]
+        """Length of the observation."""
+        q, v = (part[:, None] for part in self.robot[:2])
+        return int(np.shape(self.module.observation(np, q, v))[0])
+
+    # --------------------------------------------------------------------------------------------------- physics
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Return the start of the MJCF file."""
+        zero = 0.0 * theta[:1]
+        return State(*(xp.asarray(part[:, None], dtype=theta.dtype) + zero for part in self.robot[:2]))
+
+    def random_start(self, xp: Any, e: Array) -> State:
+        """Return the random starts of the Python file."""
+        q, v = (xp.asarray(part[:, None], dtype=e.dtype) + 0.0 * e[:1] for part in self.robot[:2])
+        return State(*self._function("random_start")(xp, q, v, e))
+
+    def observation(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return the observation of the Python file."""
+        return self.module.observation(xp, q, v)
+
+    def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
+        """Return u0 + action_scale pi(theta, o), ``(n_u, B)``."""
+        act = self.plugin.act(xp, theta, self.observation(xp, q, v))
+        return xp.asarray(self.robot.controls[:, None], dtype=act.dtype) + self.action_scale * act
+
+    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return the cost of a step of the Python file; 0 after the end."""
+        cost = self.module.stage_cost(xp, q, v, u)
+        ended = self.has_ended(xp, q, v)
+        return cost if ended is None else xp.where(ended, 0.0 * cost, cost)
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return the terminal cost of the Python file, or 0."""
+        function = getattr(self.module, "terminal_cost", None)
+        return 0.0 * v[0] if function is None else function(xp, q, v)
+
+    def has_ended(self, xp: Any, q: Array, v: Array) -> Array | None:
+        """Return whether rollouts have ended, by the Python file; None if they never do."""
+        function = getattr(self.module, "has_ended", None)
+        return None if function is None else function(xp, q, v)
+
+    def _function(self, name: str) -> Callable[..., Any]:
+        function = getattr(self.module, name, None)
+        if not callable(function):
+            raise UserError(f"{self.module.__file__} sets n_start and defines no function {name}")
+        return function  # type: ignore[no-any-return]
+
+
+@cache
+def _read(path: Path, changed: int) -> Robot:
+    """Return the robot of an MJCF file that was last changed at the time ``changed``."""
+    import mujoco
+
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise UserError(f"mjcf.file={path} cannot be read: {error}") from None
+    for count, what in (
+        (model.na, "actuators with activation states"),
+        (model.nmocap, "mocap bodies"),
+        (model.nplugin, "plugins"),
+    ):
+        if count:
+            raise UserError(f"mjcf.file={path} has {what}, which scene mjcf does not support")
+    data = mujoco.MjData(model)
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    types = {
+        int(getattr(mujoco.mjtJoint, f"mjJNT_{name.upper()}")): name for name in ("free", "ball", "slide", "hinge")
+    }
+    return Robot(
+        data.qpos.copy(), data.qvel.copy(), data.ctrl.copy(), tuple(types[int(kind)] for kind in model.jnt_type)
+    )
+
+
+def _model_files(path: Path) -> list[Path]:
+    """Return an MJCF file and the files that it names, and those that these name."""
+    paths, waiting = [], [path]
+    while waiting:
+        current = waiting.pop()
+        if current in paths or not current.is_file():
+            continue
+        paths.append(current)
+        if current.suffix == ".xml":
+            text = current.read_text()
+            folders = re.findall(r'(?:meshdir|texturedir|assetdir)\s*=\s*"([^"]*)"', text)
+            for name in re.findall(r'\bfile\s*=\s*"([^"]*)"', text):
+                waiting += [(current.parent / folder / name).resolve() for folder in ("", *folders)]
+    return paths
+
+
+def _package_folder(package: str) -> Path:
+    import importlib.util
+
+    spec = importlib.util.find_spec(package) if package.isidentifier() else None
+    if spec is None or not spec.submodule_search_locations:
+        raise UserError(f"mjcf.file: the Python package '{package}' is not installed: pip install {package}")
+    return Path(spec.submodule_search_locations[0])

@@ -1,0 +1,171 @@
+"""Scenes from MJCF files: motion, cost and gradients against MuJoCo's own."""
+
+import numpy as np
+import pytest
+
+import bench
+from bench.errors import UserError
+from bench.experiment.by_name import compile_problem, make
+from bench.experiment.keys import fingerprint
+from bench.measure import noise
+
+mujoco = pytest.importorskip("mujoco")
+
+DIFFERENCED = 1e-6
+"""Relative error of differences of the cost, with a step of 1e-6 along a direction of length 1."""
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <body><joint name="hinge" type="hinge" axis="0 1 0" damping="{damping}"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/></body>
+  </worldbody>
+  <actuator><motor joint="hinge"/></actuator>
+  <keyframe><key qpos="0.5" ctrl="0.2"/></keyframe>
+</mujoco>
+"""
+TASK = """
+def observation(xp, q, v):
+    return xp.concat([q, v])
+
+
+def stage_cost(xp, q, v, u):
+    return q[0] ** 2 + 0.01 * u[0] ** 2
+"""
+
+
+@pytest.fixture
+def pendulum(tmp_path):
+    (tmp_path / "pendulum.xml").write_text(PENDULUM.format(damping=0.1))
+    (tmp_path / "pendulum.py").write_text(TASK)
+    return tmp_path / "pendulum.xml"
+
+
+def problem(file="quadruped.xml", backend="mujoco", **values):
+    given = ",".join(f"{name}={value}" for name, value in {"file": file, "horizon": 6, **values}.items())
+    return compile_problem(f"mjcf[{given}]", None, "semi_implicit_euler", backend)
+
+
+def drawn(problem, count=3):
+    return noise.draw(0, "mjcf", 1, count, problem.program.n_noise, "test")[0].T
+
+
+def test_costs_are_those_of_a_loop_over_mujoco(pendulum):
+    given = problem(pendulum, substeps=2, dt=0.02)
+    w = drawn(given, 1)
+    model = mujoco.MjModel.from_xml_path(str(pendulum))
+    data, theta = mujoco.MjData(model), given.program.theta0
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    total = 0.0
+    for t in range(6):
+        u = 0.2 + 0.3 * (theta[:2] @ [data.qpos[0], data.qvel[0]] + theta[2]) + 0.05 * w[t, 0]
+        total += data.qpos[0] ** 2 + 0.01 * u**2
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data)
+        mujoco.mj_step(model, data)
+    assert given.value(theta, w)[0] == pytest.approx(total, rel=1e-12)
+
+
+@pytest.mark.parametrize("values", [{}, {"policy": "mlp[hidden=4]"}, {"noise": "parameter"}])
+def test_gradients_are_differences_of_the_cost(values):
+    given = problem(**values)
+    theta, w = given.program.theta0, drawn(given)
+    along = np.random.default_rng(0).standard_normal(len(theta))
+    along /= np.linalg.norm(along)
+    step = 1e-6 * along
+    differences = (given.value(theta + step, w) - given.value(theta - step, w)) / 2e-6
+    assert along @ given.grad(theta, w) == pytest.approx(differences, rel=100 * DIFFERENCED)
+
+
+def test_windows_follow_the_tangents_of_a_free_joint():
+    given = problem()
+    sample = noise.draw(0, "mjcf", 1, 3, given.program.n_noise, "test")
+    first = make("estimators", "fobg").estimate(given, given.program.theta0, sample)
+    whole = make("estimators", "windowed[steps=3,terminal=learned]").estimate(given, given.program.theta0, sample)
+    assert whole.shape == first.shape
+    from bench.model import adjoint_gradient, slopes
+
+    w = sample[0].T
+    by_steps = adjoint_gradient(given, slopes(given, given.program.theta0, w))
+    assert by_steps == pytest.approx(given.grad(given.program.theta0, w), rel=1e-4, abs=1e-6)
+
+
+def test_a_fallen_robot_stays_where_it_fell(tmp_path):
+    (tmp_path / "pendulum.xml").write_text(PENDULUM.format(damping=0.0))
+    (tmp_path / "pendulum.py").write_text(TASK + "\n\ndef has_ended(xp, q, v):\n    return q[0] < 0.3\n")
+    given = problem(tmp_path / "pendulum.xml", horizon=60)
+    w = drawn(given)
+    path = given.trajectory(given.program.theta0, w)
+    ended = path.states[:, 0] < 0.3
+    assert ended[-1].all()
+    for column in range(3):
+        first = int(np.argmax(ended[:, column]))
+        assert (path.states[first:, :, column] == path.states[first, :, column]).all()
+    longer = problem(tmp_path / "pendulum.xml", horizon=80)
+    more = np.concatenate([w, np.zeros((20, 3))])
+    assert longer.value(given.program.theta0, more) == pytest.approx(given.value(given.program.theta0, w), rel=1e-13)
+    a = given.jacobians(given.program.theta0, w).a
+    assert (a[-1] == np.eye(2)[..., None]).all()
+
+
+def test_a_changed_file_changes_the_key(pendulum):
+    before = fingerprint(make("scenes", f"mjcf[file={pendulum}]"))
+    pendulum.write_text(PENDULUM.format(damping=0.2))
+    assert fingerprint(make("scenes", f"mjcf[file={pendulum}]")) != before
+    changed = fingerprint(make("scenes", f"mjcf[file={pendulum}]"))
+    # a module is imported once per process, so its next version has another name here
+    other = pendulum.with_name("other.py")
+    other.write_text(TASK.replace("0.01", "0.02"))
+    assert make("scenes", f"mjcf[file={pendulum},functions={other}]").files() == (other, pendulum)
+    assert fingerprint(make("scenes", f"mjcf[file={pendulum},functions={other}]")) != changed
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"file": "quadrupd.xml"}, "quadrupd.xml.*quadruped.xml"),
+        ({"file": "/nowhere/robot.xml"}, "there is no such file"),
+        ({"file": "nosuchpackage:robot.xml"}, "pip install nosuchpackage"),
+        ({"functions": "/nowhere/task.py"}, "there is no file /nowhere/task.py"),
+    ],
+)
+def test_a_missing_file_is_named(values, message):
+    with pytest.raises(UserError, match=message):
+        problem(**{"file": "quadruped.xml", **values})
+
+
+def test_a_task_without_a_cost_is_named(pendulum):
+    pendulum.with_suffix(".py").write_text("def observation(xp, q, v):\n    return q\n")
+    with pytest.raises(UserError, match="defines no function stage_cost"):
+        problem(pendulum)
+
+
+def test_a_broken_model_is_named(pendulum):
+    pendulum.write_text("<mujoco><worldbody><bdy/></worldbody></mujoco>")
+    with pytest.raises(UserError, match=r"cannot be read: (.|\n)*bdy"):
+        problem(pendulum)
+
+
+def test_one_solver_iteration_of_mjx_is_refused():
+    with pytest.raises(bench.Unsupported, match=r"use mjx\[iterations=20\]"):
+        problem(backend="mjx")
+
+
+def test_scenes_from_files_run_in_sweeps(pendulum, tmp_path):
+    rows = bench.run(
+        name="robot", scenes=[f"mjcf[file={pendulum},horizon=10]"], backends=["mujoco", "jax"],
+        estimators=["fobg", "reinforce"], samples=8, repeats=8, timing=False, results_dir=tmp_path,
+        reference={"samples": 2048},
+    )  # fmt: skip
+    assert rows.status.tolist().count("ok") == 2
+    assert rows[rows.backend == "jax"].status.eq("unsupported").all()
+    assert (rows[rows.status == "ok"].bias_low == 0).all()
+
+
+@pytest.mark.slow
+def test_mjx_and_mujoco_agree(pendulum):
+    by_c, by_xla = problem(pendulum), problem(pendulum, "mjx[iterations=20]")
+    theta, w = by_c.program.theta0, drawn(by_c)
+    assert by_xla.value(theta, w) == pytest.approx(by_c.value(theta, w), rel=1e-9)
+    assert by_xla.grad(theta, w) == pytest.approx(by_c.grad(theta, w), rel=1e-6)
