@@ -47,7 +47,7 @@ class Train(Study):
                low="window_bias_low", high="window_bias_high", label="bias against a whole episode"),
         Column("window_bias_low", "lower end of its 95% interval over independent batches of rollouts"),
         Column("window_bias_high", "upper end of its 95% interval"),
-        Column("difference_error", "relative distance of a directional derivative halfway from its central difference"),
+        Column("difference_error", "relative distance of a directional derivative halfway from its central difference, the smallest over step lengths"),
         text("verdicts", "JSON list of what the log shows, with the numbers that show it", table=False),
         numbers("curve_update", "updates at which the policy was evaluated", table=False),
         numbers("curve_step", "control steps up to those updates", table=False),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -129,31 +129,15 @@ def windows(runs: pd.DataFrame) -> pd.DataFrame:
     return frame[frame.groupby(["problem", "family"])["window"].transform("nunique") > 1]
 
 
-LARGE = 10.0
-"""Factor on a run's median gradient norm that an explosion exceeds; below it, the gradient was small before."""
-
-
 def faults(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per run and fault: problem, method, seed and the fault's numbers in ``fault``.
-
-    An explosion whose norm is ordinary for its run gets the code ``returns``: the gradient nearly vanished before it.
-    """
+    """Return a line per run and fault: problem, method, seed and the fault's numbers in ``fault``."""
     lines: list[dict[str, Any]] = []
     for row in runs.to_dict("records"):
         lines += [
-            {"problem": row["problem"], "method": row["method"], "seed": row["seed"], "fault": _in_scale(fault, row)}
+            {"problem": row["problem"], "method": row["method"], "seed": row["seed"], "fault": fault}
             for fault in json.loads(row["verdicts"] or "[]")
         ]
     return pd.DataFrame(lines, columns=["problem", "method", "seed", "fault"])
-
-
-def _in_scale(fault: dict[str, Any], row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a fault, with the code ``returns`` if it is an explosion to an ordinary norm of its run."""
-    if fault["code"] != "explodes":
-        return fault
-    entry = int(np.searchsorted(np.asarray(row["log_update"], float), fault["update"]))
-    norm = float(row["log_gradient_norm"][entry])
-    return fault if norm > LARGE * row["gradient_typical"] else {**fault, "code": "returns"}
 
 
 def logs(runs: pd.DataFrame, quantities: Sequence[str]) -> pd.DataFrame:

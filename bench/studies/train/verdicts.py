@@ -10,6 +10,8 @@ import numpy as np
 
 EXPLODES = 100.0
 """Factor on the median norm of the updates before, above which a gradient explodes."""
+LARGE = 10.0
+"""Factor on a run's median norm that an explosion exceeds too; below it, the gradient was small before."""
 MEMORY = 50
 """Updates before, whose median norm is compared."""
 SETTLED = 10
@@ -114,14 +116,18 @@ def _run_of(flags: np.ndarray, length: int) -> int | None:
 
 def _explodes(log: Log) -> Verdict | None:
     norms = log.column("gradient_norm")
-    peaks = []
+    usual = float(np.median(norms[np.isfinite(norms)])) if np.isfinite(norms).any() else math.nan
+    jumps = []
     for i in range(SETTLED, len(norms)):
         before = norms[max(0, i - MEMORY) : i]
         typical = float(np.median(before[np.isfinite(before)])) if np.isfinite(before).any() else math.nan
         if typical > 0 and norms[i] > EXPLODES * typical:
-            peaks.append((i, norms[i] / typical))
-    if not peaks:
+            jumps.append((i, norms[i] / typical))
+    if not jumps:
         return None
+    peaks = [(i, factor) for i, factor in jumps if norms[i] > LARGE * usual]
+    if not peaks:
+        return {"code": "returns", "update": jumps[0][0] + 1, "factor": float(jumps[0][1])}
     first, factor = peaks[0]
     verdict: Verdict = {"code": "explodes", "update": first + 1, "factor": float(factor), "peaks": len(peaks)}
     start = contact_start(log.column("contacts"))
